@@ -1,12 +1,12 @@
 """What the surgeon sees: triangles and cameras in, pixels out. Knows no brain."""
 
-from .optics.camera import Camera, look_at, stereo_pair
+from .optics.camera import Camera, build_stereo_pair, look_at
 from .optics.lens import Lens
 from .overlay.composite import Overlaid, composite
 from .page.browser import Browser
 from .rendering.layer import Layer, Solid
 from .rendering.rasteriser import rasterise
-from .rendering.renderer import Lamp, Picture, Pictures, Renderer, lamp_beside, render
+from .rendering.renderer import Lamp, Picture, Pictures, Renderer, build_lamp, render
 from .screen import read_png, write_png, write_video
 
 __all__ = [
@@ -20,13 +20,13 @@ __all__ = [
     "Pictures",
     "Renderer",
     "Solid",
+    "build_lamp",
+    "build_stereo_pair",
     "composite",
-    "lamp_beside",
     "look_at",
     "rasterise",
     "read_png",
     "render",
-    "stereo_pair",
     "write_png",
     "write_video",
 ]

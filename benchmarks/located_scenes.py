@@ -21,7 +21,7 @@ import numpy as np
 from scenes.play.deformers import Theatre, open_theatre
 from scenes.play.observer import Observer, TumourEstimate
 from scenes.script.scene import find_scene
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from scenes.script.sight import Sight
 
 MOMENTS, COUNTS = 5, (30, 100, 300)
@@ -32,10 +32,10 @@ ERRORS = {"none": Sight(white=2e-5, smooth=2e-5, shift=0.0, turn=0.0), "of sag":
 def estimates(theatre: Theatre, name: str, sights: int) -> dict[str, list[TumourEstimate]]:
     """What is answered of a scene, by the errors of what is seen."""
     scene = find_scene(name)
-    player, last, found = theatre.player("fem", scene), None, {error: [] for error in ERRORS}
+    player, last, found = theatre.build_player("fem", scene), None, {error: [] for error in ERRORS}
     for number in np.linspace(0, len(scene.times), MOMENTS + 1, dtype=int)[1:] - 1:
-        last = player.answer(player.loads(number), last)
-        positions = player.positions(last)
+        last = player.compute_deformation(player.build_loads(number), last)
+        positions = player.compute_positions(last)
         for seed in range(sights):
             for error, sight in ERRORS.items():
                 seen = replace(sight, seed=seed, points=COUNTS[seed % len(COUNTS)])
@@ -60,7 +60,7 @@ def row(answers: list[TumourEstimate]) -> list[str]:
 def main() -> None:
     """Print two rows for each scene."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--anatomy", type=Path, default=template_path(), metavar="A.vtu")
+    parser.add_argument("--anatomy", type=Path, default=get_template_path(), metavar="A.vtu")
     parser.add_argument("--scenes", nargs="+", default=["press", "draw", "retract", "brain_shift", "resection"])
     parser.add_argument("--sights", type=int, default=12, metavar="N")
     args = parser.parse_args()

@@ -6,10 +6,10 @@ that slides along it without friction. What is true lies between the two, and no
 
 import numpy as np
 
-from scenes import template_path
+from scenes import get_template_path
 from sim import Bonded, Elasticity, Fem, Held, Slide, ToolForce, open_cortex, push, read_anatomy
 
-anatomy = read_anatomy(template_path())
+anatomy = read_anatomy(get_template_path())
 cortex = open_cortex(anatomy)
 place = cortex.place(right_mm=0, up_mm=0)
 aside = (place.inward + cortex.right) / np.linalg.norm(place.inward + cortex.right)

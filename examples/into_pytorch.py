@@ -28,7 +28,7 @@ fem = Fem(gel, [Elasticity(), Held(), ToolForce(), NodalForce()], device="cpu", 
 simulate("gel.h5", fem, loads, {"what": "a block of gel, pressed in the middle of its top"})
 
 data = read_dataset("gel.h5")
-motion = 1e3 * data.displacement(gel.tumour_nodes).mean(axis=1)  # (loads, 3) [mm]
+motion = 1e3 * data.read_displacement(gel.tumour_nodes).mean(axis=1)  # (loads, 3) [mm]
 pairs = TensorDataset(torch.tensor(10.0 * forces, dtype=torch.float32), torch.tensor(motion))
 training, fresh = torch.utils.data.random_split(pairs, [36, 12], torch.Generator().manual_seed(0))
 

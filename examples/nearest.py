@@ -10,13 +10,13 @@ from typing import Self
 
 import numpy as np
 
-from surrogate import learner
+from surrogate import register_learner
 from surrogate.regressors.protocol import compute_standardisation
 
 NEIGHBOURS = 8
 
 
-@learner("nearest")
+@register_learner("nearest")
 class Nearest:
     """Inverse squared distances among standardised features. `fit` sets attributes that end in an underscore."""
 

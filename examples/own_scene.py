@@ -21,7 +21,7 @@ SCENE = Scene("circle", __doc__ or "", circle, duration=TURN, viewpoint=Viewpoin
 
 if __name__ == "__main__":
     theatre = open_theatre(device="cpu")
-    frames = list(theatre.player(theatre.best(SCENE), SCENE).frames(every=15))
+    frames = list(theatre.build_player(theatre.select_best(SCENE), SCENE).play_frames(every=15))
     for frame in frames:
         assert frame.deformation.outcome[0].good and frame.distance is not None
         moved, away = 1e3 * frame.moved, 1e3 * frame.distance

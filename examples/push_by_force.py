@@ -4,12 +4,12 @@ The brain that ships is pressed once, by 0.1 N on a footprint of 7 mm in the mid
 elements answer with the motion of every vertex; the mean over the tumour's is printed.
 """
 
-from scenes import template_path
+from scenes import get_template_path
 from sim import Bonded, Elasticity, Fem, Held, ToolForce, open_cortex, push, read_anatomy
 
 MM = 1e-3
 
-anatomy = read_anatomy(template_path())
+anatomy = read_anatomy(get_template_path())
 place = open_cortex(anatomy).place(right_mm=0, up_mm=0)
 fem = Fem(anatomy, [Elasticity(), Held(), Bonded(), ToolForce()], element="smoothed")
 answer = fem.deform(push(place.point, 0.1 * place.inward, footprint=7 * MM), at=anatomy.tumour_nodes)

@@ -6,12 +6,12 @@ where the tumour goes, come out; `Deformation.reaction` is the force that the to
 
 import numpy as np
 
-from scenes import template_path
+from scenes import get_template_path
 from sim import Ball, Bonded, Elasticity, Fem, Held, Loads, ToolContact, Touching, open_cortex, read_anatomy
 
 MM = 1e-3
 
-anatomy = read_anatomy(template_path())
+anatomy = read_anatomy(get_template_path())
 place = open_cortex(anatomy).place(right_mm=0, up_mm=0)
 across = np.cross(place.inward, [1.0, 0.0, 0.0])
 across /= np.linalg.norm(across)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes import Viewpoint, collect, find_scene, open_theatre, read_episodes, template_path
+from scenes import Viewpoint, collect, find_scene, get_template_path, open_theatre, read_episodes
 
 small = Viewpoint(width=160, height=120)
 scene = replace(find_scene("press"), viewpoint=small, duration=1.0, frames_per_second=10.0)
-theatre = open_theatre(template_path(), device="cpu")
-collect(Path("press.h5"), theatre, theatre.player("series-gp", scene), "series-gp", iter)
+theatre = open_theatre(get_template_path(), device="cpu")
+collect(Path("press.h5"), theatre, theatre.build_player("series-gp", scene), "series-gp", iter)
 
 windows = read_episodes("press.h5", ["colour", "depth", "tumour_predicted", "tumour_rest"], window=5, stride=5)
 print(f"{len(windows)} windows of {windows.window} frames")

@@ -10,11 +10,11 @@ from .script.camera_paths import Focus, HandHeld, Microscope, Orbit
 from .script.debulking import Debulking
 from .script.head_posture import Lying
 from .script.scene import Bounds, Scene, find_scene
-from .script.shipped_files import template_path
+from .script.shipped_files import get_template_path
 from .script.sight import Sight, StereoSight
-from .script.site import Site, site_of
+from .script.site import Site, build_site
 from .script.tool import Blade, Instrument, Probe
-from .script.tool_paths import Touch, draw, idle, lay, palpate, press, slide, wander
+from .script.tool_paths import Touch, draw, keep_idle, lay, palpate, press, slide, stroke_cortex
 from .script.viewpoint import Viewpoint
 from .tracked.calibration_file import read_calibration, write_calibration
 
@@ -40,20 +40,20 @@ __all__ = [
     "Theatre",
     "Touch",
     "Viewpoint",
+    "build_site",
     "collect",
     "draw",
     "find_scene",
-    "idle",
+    "get_template_path",
+    "keep_idle",
     "lay",
     "open_theatre",
     "palpate",
     "press",
     "read_calibration",
     "read_episodes",
-    "site_of",
     "slide",
-    "template_path",
-    "wander",
+    "stroke_cortex",
     "write_calibration",
     "write_card",
 ]

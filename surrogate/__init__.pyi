@@ -4,7 +4,7 @@ from .data.dataset import Dataset, read_dataset
 from .data.simulate import simulate
 from .data.tool_loads import draw
 from .data.tool_poses import draw_poses
-from .evaluation.coverage import Coverage, coverage
+from .evaluation.coverage import Coverage, compute_coverage
 from .evaluation.score import Score, score
 from .fitting.fit import fit_tissue
 from .fitting.frame import Frame, Tool, read_tools
@@ -15,9 +15,9 @@ from .locating.observation import Observation
 from .locating.observed_files import read_observation
 from .model.guarded import Guarded
 from .model.learned import Learned
-from .model.own_learners import learner
+from .model.own_learners import register_learner
 from .model.store import load, save
-from .onnx_export.export import onnx_model, write_onnx
+from .onnx_export.export import build_onnx_model, write_onnx
 from .regressors.protocol import Regressor
 from .training.train import Trained, train
 
@@ -35,19 +35,19 @@ __all__ = [
     "Score",
     "Tool",
     "Trained",
-    "coverage",
+    "build_onnx_model",
+    "compute_coverage",
     "draw",
     "draw_poses",
     "fit_tissue",
-    "learner",
     "load",
     "load_locator",
     "load_tissue",
     "make_locator",
-    "onnx_model",
     "read_dataset",
     "read_observation",
     "read_tools",
+    "register_learner",
     "save",
     "save_locator",
     "save_tissue",

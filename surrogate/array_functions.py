@@ -34,7 +34,7 @@ class Rounded:
     step: np.ndarray
 
     @classmethod
-    def of(cls, table: np.ndarray, step: np.ndarray | float) -> Self:
+    def round_table(cls, table: np.ndarray, step: np.ndarray | float) -> Self:
         """Round a table (n, r) to a step, or steps (r,); to longer ones if int16 would not hold the largest number."""
         largest = np.abs(table).max(axis=0, initial=0.0) / np.iinfo(np.int16).max
         step = np.maximum(np.broadcast_to(step, largest.shape), largest).astype(np.float32)

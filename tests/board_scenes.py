@@ -36,7 +36,7 @@ def poses(count, tilt=35.0, seed=0):
 @lru_cache
 def rays():
     """Of each fine pixel without the lens (H, W, 3), z = 1."""
-    fine = CAMERA.scaled(FINE)
+    fine = CAMERA.scale(FINE)
     pixels = fine.straight
     homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=-1)
     return homogeneous @ np.linalg.inv(fine.K).T
@@ -45,7 +45,7 @@ def rays():
 @lru_cache
 def texture():
     """The board with a white border of a square, and pixels a metre."""
-    return np.pad(FACE.picture(160), 160, constant_values=255), 160 / FACE.square
+    return np.pad(FACE.draw(160), 160, constant_values=255), 160 / FACE.square
 
 
 def picture(T):

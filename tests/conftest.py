@@ -149,7 +149,7 @@ def theatre(box):
 def stage():
     from theatres import find_scene, template_theatre
 
-    return template_theatre().stage(find_scene("palpate"))
+    return template_theatre().build_stage(find_scene("palpate"))
 
 
 @pytest.fixture(scope="module")
@@ -259,9 +259,9 @@ def study_rows(study):
 
 @pytest.fixture(scope="module")
 def site(box):
-    from scenes.script.site import site_of
+    from scenes.script.site import build_site
 
-    return site_of(box)
+    return build_site(box)
 
 
 @pytest.fixture(scope="module")

@@ -93,12 +93,12 @@ def test_image_scaling_requires_request_and_same_shape():
         SOME.resize_calibration(640, 360, scale=True)
     assert SOME.resize_calibration(640, 480) is SOME
     half, points = SOME.resize_calibration(320, 240, scale=True), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
-    pixels = [one.camera(np.eye(4)).project(points)[0] + 0.5 for one in (half, SOME)]
+    pixels = [one.build_camera(np.eye(4)).project(points)[0] + 0.5 for one in (half, SOME)]
     assert np.allclose(2.0 * pixels[0], pixels[1]) and half.lens == SOME.lens and half.name == SOME.name
 
 
 def test_the_camera_of_a_calibration_is_opencvs():
-    camera, points = SOME.camera(np.eye(4)), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
+    camera, points = SOME.build_camera(np.eye(4)), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
     wanted = cv2.projectPoints(points, np.zeros(3), np.zeros(3), SOME.K, SOME.lens.coefficients[:5])[0]
     assert np.allclose(camera.project(points)[0], wanted.reshape(-1, 2), atol=1e-9)
     assert repr(SOME) == repr(parse_calibration(to_ros_text(SOME)))

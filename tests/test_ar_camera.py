@@ -13,12 +13,12 @@ from ar.optics.calibration import parse_calibration, to_opencv_text, to_ros_text
 from ar.optics.camera import (
     BASELINE,
     Camera,
+    build_stereo_pair,
     compute_row_time,
     find_row_time,
     look_at,
     project_cv2,
     split_row_bands,
-    stereo_pair,
 )
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, Renderer, render
@@ -88,7 +88,7 @@ def test_half_a_degree_moves_the_picture_by_half_a_degree():
 @pytest.mark.parametrize("aspect", [2.5, 1.6, 1.0, 0.45])
 def test_padding_centres_the_picture_on_a_canvas_of_any_shape(aspect):
     camera = some_camera()
-    canvas = camera.padded(aspect)
+    canvas = camera.pad(aspect)
     assert canvas.width / canvas.height == pytest.approx(aspect, rel=0.01)
     assert canvas.width >= camera.width and canvas.height >= camera.height
     shift = canvas.project(points_in_front())[0] - camera.project(points_in_front())[0]
@@ -97,7 +97,7 @@ def test_padding_centres_the_picture_on_a_canvas_of_any_shape(aspect):
 
 def test_twice_the_pixels_see_the_same_view():
     camera = some_camera()
-    double = camera.scaled(2.0)
+    double = camera.scale(2.0)
     assert (double.width, double.height) == (640, 400)
     assert np.allclose(double.project(points_in_front())[0] + 0.5, 2.0 * (camera.project(points_in_front())[0] + 0.5))
 
@@ -139,7 +139,7 @@ def near_points() -> np.ndarray:
 
 def test_a_camera_is_moved_along_its_own_axes():
     camera, shift = some_camera(), np.array([0.01, -0.02, 0.03])
-    moved = camera.moved(shift)
+    moved = camera.move(shift)
     assert np.allclose(moved.to_camera_frame(points_in_front()), camera.to_camera_frame(points_in_front()) - shift)
     assert moved.centre == pytest.approx(EYE + shift @ camera.T_camera_world[:3, :3])
 
@@ -147,13 +147,13 @@ def test_a_camera_is_moved_along_its_own_axes():
 def test_a_zoom_draws_larger_about_the_principal_point():
     for camera in (some_camera(), seen_by()):
         middle = camera.K[:2, 2]
-        near = camera.zoomed(2.0)
+        near = camera.zoom(2.0)
         ways = [one.project(near_points())[0] - middle for one in (camera, near)]
         assert np.allclose(ways[1], 2.0 * ways[0])
         assert np.abs(project_cv2(near, near_points()) - near.project(near_points())[0]).max() < 1e-8
     for factor in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="above 0"):
-            some_camera().zoomed(factor)
+            some_camera().zoom(factor)
 
 
 def test_focus_changes_the_size_as_a_thin_lens_does():
@@ -170,7 +170,7 @@ def test_focus_changes_the_size_as_a_thin_lens_does():
 
 def test_parallel_eyes_see_the_same_rows_and_depth_by_disparity():
     camera = some_camera()
-    left, right = stereo_pair(camera)
+    left, right = build_stereo_pair(camera)
     assert np.linalg.norm(left.centre - right.centre) == pytest.approx(BASELINE) == pytest.approx(24e-3)
     (u, depth), (v, _) = (one.project(points_in_front()) for one in (left, right))
     assert np.allclose(u[:, 1], v[:, 1])
@@ -180,7 +180,7 @@ def test_parallel_eyes_see_the_same_rows_and_depth_by_disparity():
 def test_converging_eyes_meet_at_the_working_distance():
     camera = some_camera()
     distance = float(np.linalg.norm(TARGET - EYE))
-    left, right = stereo_pair(camera, 30e-3, distance)
+    left, right = build_stereo_pair(camera, 30e-3, distance)
     for one in (left, right):
         assert one.project(TARGET)[0] == pytest.approx([159.5, 99.5], abs=1e-9)
     assert left.to_camera_frame(right.centre)[0] > 0.0 and np.linalg.norm(left.centre - right.centre) == pytest.approx(
@@ -193,21 +193,21 @@ def test_converging_eyes_meet_at_the_working_distance():
 
 def test_points_are_refound_in_both_distorted_images():
     """By OpenCV: undistorted and triangulated."""
-    for pair in (stereo_pair(seen_by(SOME)), stereo_pair(seen_by(SOME), working_distance=0.14)):
+    for pair in (build_stereo_pair(seen_by(SOME)), build_stereo_pair(seen_by(SOME), working_distance=0.14)):
         seen = []
         for one in pair:
             pixels = np.ascontiguousarray(one.project(near_points()[:50])[0])[:, None]
             seen.append(cv2.undistortPoints(pixels, one.K, SOME.coefficients).reshape(-1, 2).T)
         found = cv2.triangulatePoints(*(one.T_camera_world[:3] for one in pair), *seen)
         assert np.abs((found[:3] / found[3]).T - near_points()[:50]).max() < 1e-4
-    pictures = [render(one, scene(), LAMP).colour for one in stereo_pair(seen_by(SOME))]
+    pictures = [render(one, scene(), LAMP).colour for one in build_stereo_pair(seen_by(SOME))]
     assert (pictures[0] != pictures[1]).mean() > 0.1
 
 
 def test_a_pair_that_cannot_be_is_refused():
     for wrong in ((0.0, None), (np.nan, None), (24e-3, 0.0), (24e-3, -1.0)):
         with pytest.raises(ValueError, match="above 0"):
-            stereo_pair(some_camera(), *wrong)
+            build_stereo_pair(some_camera(), *wrong)
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def test_each_row_is_drawn_where_the_camera_is_when_it_is_taken():
     renderer = Renderer(layers, Lamp(np.array([0.0, 0.0, -0.4]), np.zeros(3), 0.2))
     bands = split_row_bands(camera_at, READOUT, GRID)
     vertices = [layer.vertices for layer in layers]
-    drawn = np.concatenate([renderer.picture(camera, vertices).segmentation for _, camera in bands])
+    drawn = np.concatenate([renderer.render(camera, vertices).segmentation for _, camera in bands])
     assert drawn.shape == (300, 400) and len(bands) > 5
     still = CAMERA.project(GRID)[0]
     apart = []
@@ -283,8 +283,10 @@ def test_files_have_the_readout_and_others_stay_as_they_were():
 def player():
     theatre = template_theatre()
     small = replace(USUAL.resize_calibration(800, 600, scale=True), readout=READOUT)
-    view = replace(VIEW.calibrated(small), path=HandHeld(0))
-    return Player(theatre.stage(replace(find_scene("palpate"), viewpoint=view, duration=0.1)), Still(theatre.anatomy))
+    view = replace(VIEW.calibrate(small), path=HandHeld(0))
+    return Player(
+        theatre.build_stage(replace(find_scene("palpate"), viewpoint=view, duration=0.1)), Still(theatre.anatomy)
+    )
 
 
 def test_rolling_shutter_error_is_drawn_on_video(player):

@@ -10,13 +10,17 @@ class TestLead:
         assert lead.leader == 2 and lead.act(2, 1.0) and not lead.act(3, 1.0)
         for visitor in (4, 3):
             lead.ask(visitor, 2.0)
-        assert lead.leader == 2 and "Visitor 4 asks" in lead.words(2, {2, 3, 4}) and "asked" in lead.words(3, {2, 3, 4})
+        assert (
+            lead.leader == 2
+            and "Visitor 4 asks" in lead.describe_control(2, {2, 3, 4})
+            and "asked" in lead.describe_control(3, {2, 3, 4})
+        )
         lead.see({3, 4}, 3.0)
         assert lead.leader == 4 and lead.asking == (3,)
         lead.give(4.0)
         assert lead.leader == 3
         lead.see({4, 5}, 5.0)
-        assert lead.leader == 4 and not lead.words(4, {4})
+        assert lead.leader == 4 and not lead.describe_control(4, {4})
 
     def test_who_does_nothing_for_long_hands_over_on_being_asked(self):
         lead = ControlLock()

@@ -20,17 +20,17 @@ def test_a_cut_holds_camera_tip_and_middle():
     np.testing.assert_allclose(level.across, build_plane(CAMERA, middle, None).across)
     assert abs(level.across @ CAMERA.T_camera_world[1, :3]) < 1e-12
     places = np.array([[0.002, -0.01], [0.0, 0.0]])
-    np.testing.assert_allclose(plane.coordinates(plane.points(places)), places, atol=1e-15)
+    np.testing.assert_allclose(plane.to_plane(plane.to_world(places)), places, atol=1e-15)
 
 
 def test_cut_shows_surface_section_and_no_air():
     picture, at = seen(0.0), tumour()
     plane: CutPlane = build_plane(CAMERA, at.vertices.mean(axis=0), None)
-    roles = Roles((), (CORTEX,)).of(picture.segmentation)
+    roles = Roles((), (CORTEX,)).read_roles(picture.segmentation)
     places, what = compute_profile(CAMERA, plane, picture.depth, roles, 0.04)
-    assert np.abs(plane.points(places)[:, 2]).max() < 2e-4  # the sheet lies at z = 0
-    right = plane.points(places)[:, 0] > 5e-4
-    assert (what[right] == SHUT).all() and not what[plane.points(places)[:, 0] < -5e-4].any()
+    assert np.abs(plane.to_world(places)[:, 2]).max() < 2e-4  # the sheet lies at z = 0
+    right = plane.to_world(places)[:, 0] > 5e-4
+    assert (what[right] == SHUT).all() and not what[plane.to_world(places)[:, 0] < -5e-4].any()
     ink = to_key(compute_ink(GREEN))
     inset = draw_section(CAMERA, at, plane, (places, what), (240, 180), ink)
     bar = np.flatnonzero((inset[-6] == np.asarray(WHITE, np.uint8)).all(axis=1))
@@ -43,7 +43,7 @@ def test_cut_shows_surface_section_and_no_air():
 def test_cut_draws_its_broken_line_at_the_error(error):
     at, ink = tumour(), to_key(compute_ink(GREEN))
     plane = build_plane(CAMERA, at.vertices.mean(axis=0), None)
-    places = plane.coordinates(np.array([[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0]])), np.zeros(2, int)
+    places = plane.to_plane(np.array([[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0]])), np.zeros(2, int)
     with_line, without = (
         draw_section(CAMERA, at, plane, places, (240, 180), ink, error=each) for each in (error, None)
     )

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from test_ar_lens import SOME
 
-from ar.optics.camera import Camera, look_at, stereo_pair
+from ar.optics.camera import Camera, build_stereo_pair, look_at
 from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, Picture, Renderer
 from ar.stereo.disparity import Cloud, compute_stereo_view, find_supported, follow_pixels, triangulate_cloud
@@ -20,7 +20,7 @@ LAMP = Lamp(TARGET + [0.05, 0.05, 0.3], TARGET, radius=0.06)
 def eyes(lens=SOME) -> tuple[Camera, Camera]:
     """They look at the target from 0.3 m, slanting, with lenses that bend and axes that meet there."""
     middle = look_at(TARGET + [0.0, -0.1, 0.28], TARGET, np.array([0.0, 1.0, 0.0]), np.radians(8.0), 320, 240)
-    return stereo_pair(replace(middle, lens=lens), working_distance=0.3)
+    return build_stereo_pair(replace(middle, lens=lens), working_distance=0.3)
 
 
 def bulge(texture: float = 1.0) -> Layer:
@@ -45,7 +45,7 @@ RENDERER = Renderer([SHEET], LAMP, "cpu")
 
 
 def shot(pair: tuple[Camera, Camera], moved: np.ndarray | float = 0.0, renderer: Renderer = RENDERER) -> list[Picture]:
-    return [renderer.picture(eye, [SHEET.vertices + moved]) for eye in pair]
+    return [renderer.render(eye, [SHEET.vertices + moved]) for eye in pair]
 
 
 def taken(picture: Picture, seed: int, darker: float = 1.0) -> np.ndarray:
@@ -65,7 +65,7 @@ def grid(size: int) -> np.ndarray:
 
 def off(found: Cloud, pixels: np.ndarray, geometry: Rectified, left: Camera, picture: Picture) -> np.ndarray:
     """How far off depths are (k,) [m], by the depth that was drawn."""
-    here = geometry.points(pixels[found.which], np.zeros(len(found.which)))
+    here = geometry.compute_points(pixels[found.which], np.zeros(len(found.which)))
     at = left.project(here)[0].round().astype(int)
     true = left.unproject(left.project(here)[0], picture.depth[at[:, 1], at[:, 0]].astype(float))
     return (found.points - true) @ geometry.T_window_world[2, :3]

@@ -28,7 +28,7 @@ def corners_of(camera, noise, seed, faces=(0, 1)):
 
 def test_a_focal_length_is_found_by_the_relief_of_a_target():
     """Of a camera that is stated a tenth too long, and of the true one; of few corners nothing is known."""
-    camera = read_calibration(FILM / "camera.yaml").camera(np.eye(4))
+    camera = read_calibration(FILM / "camera.yaml").build_camera(np.eye(4))
     seen = [(CUBE, corners_of(camera, 0.1, seed)) for seed in range(12)]
     for factor in (1.0, 1.1):
         K = camera.K.copy()

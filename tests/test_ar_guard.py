@@ -209,19 +209,19 @@ class TestToken:
     def test_a_page_on_this_machine_asks_for_none(self, page):
         assert (
             page.token is None
-            and guard.AccessPolicy.of("localhost").token is None
-            and guard.AccessPolicy.of("127.0.0.2").token is None
+            and guard.AccessPolicy.create("localhost").token is None
+            and guard.AccessPolicy.create("127.0.0.2").token is None
         )
 
     def test_a_host_that_others_reach_too_asks_for_one(self, monkeypatch):
         found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.1", "192.0.2.1")]
         monkeypatch.setattr(socket, "getaddrinfo", lambda *words: found)
-        assert guard.AccessPolicy.of("both.example").token is not None
+        assert guard.AccessPolicy.create("both.example").token is not None
 
     def test_the_address_carries_the_token_and_nothing_else_gets_in(self, far):
         token = far.token
         assert len(token) >= 32 and far.address == f"http://localhost:{far.port}/?token={token}"
-        assert guard.AccessPolicy.of("0.0.0.0").token != token
+        assert guard.AccessPolicy.create("0.0.0.0").token != token
         for path in ("/", "/?token=", f"/?token={token[:-1]}", "/?token=%C3%A9", f"/?other={token}"):
             assert ask(far, path)[0] == 403, path
             assert knock(far, path) == 403, path

@@ -65,7 +65,7 @@ def test_addresses_are_printed_with_the_token(proxied):
     ],
 )
 def test_address_is_written_as_browsers_do(text, origin):
-    assert guard.origin_of(text) == origin
+    assert guard.format_origin(text) == origin
 
 
 @pytest.mark.parametrize(
@@ -75,4 +75,4 @@ def test_address_is_written_as_browsers_do(text, origin):
 )
 def test_bad_address_is_rejected(text):
     with pytest.raises(ValueError, match="must be https://NAME"):
-        guard.origin_of(text)
+        guard.format_origin(text)

@@ -14,7 +14,7 @@ class TestHistory:
         for time in np.arange(0.0, 60.0, 0.1):
             history.add(Sample(float(time), (10.0, None), (2.0 if time < 50.0 else None, None)))
         assert history.samples[0].time >= 59.9 - SPAN - 1e-9
-        chart = history.chart()
+        chart = history.draw_chart()
         (band,) = re.findall(r'<polygon points="([^"]*)"', chart)
         heights = {float(point.split(",")[1]) for point in band.split()}
         # Of 20 units, 8 to 12 are 4.
@@ -23,7 +23,7 @@ class TestHistory:
         assert "force: not known" in chart and "distance [mm]" in chart and 'role="img"' in chart
 
     def test_before_anything_is_read_it_is_an_empty_chart(self):
-        chart = History((Line("a<b", "mm", "#fff"),)).chart()
+        chart = History((Line("a<b", "mm", "#fff"),)).draw_chart()
         assert "<polyline" not in chart and "nothing yet" in chart
 
     def test_single_sample_is_a_dot_and_gaps_stay_empty(self):
@@ -32,13 +32,13 @@ class TestHistory:
             history.add(Sample(time, (value,), (None,)))
         history.break_off(8.5)
         history.add(Sample(9.0, (6.0,), (None,)))
-        lines = [line.split() for line in re.findall(r'<polyline points="([^"]*)"', history.chart())]
+        lines = [line.split() for line in re.findall(r'<polyline points="([^"]*)"', history.draw_chart())]
         assert [len(line) for line in lines] == [2] * 4
         widths = [float(line[1].split(",")[0]) - float(line[0].split(",")[0]) for line in lines]
         assert widths == pytest.approx([3.3, 27.5, 3.3, 3.3], abs=0.11)
         history.samples.clear()
         history.add(Sample(9.0, (None,), (None,)))
-        assert ">not known<" in history.chart()
+        assert ">not known<" in history.draw_chart()
 
     def test_scales_end_at_round_numbers(self):
         assert [round_up_scale(value) for value in (0.0, 0.3, 1.0, 1.2, 9.0, 13.9)] == [1.0, 0.5, 1.0, 2.0, 10.0, 20.0]

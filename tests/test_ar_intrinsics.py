@@ -34,7 +34,7 @@ def test_a_camera_is_found_from_pictures():
     # Between the corners rays go where they should.
     rng = np.random.default_rng(3)
     rays = np.column_stack([rng.uniform(-0.4, 0.4, 200), rng.uniform(-0.3, 0.3, 200), np.ones(200)])
-    off = camera.calibration.camera(np.eye(4)).project(rays)[0] - CAMERA.project(rays)[0]
+    off = camera.calibration.build_camera(np.eye(4)).project(rays)[0] - CAMERA.project(rays)[0]
     assert np.linalg.norm(off, axis=1).max() < 0.25
     assert (camera.calibration.width, camera.calibration.height, camera.calibration.name) == (WIDTH, HEIGHT, "mine")
 

@@ -62,9 +62,9 @@ def test_a_lens_that_folds_back_sees_nothing_beyond():
     lens, turn = LENSES["folding"], np.sqrt(2.0 / 3.0)
     assert lens.reach == pytest.approx(turn, rel=2e-3) and lens.reach < turn
     beyond = np.array([[1.2, 0.0], [0.0, -1.5], [4.0, 3.0], [np.nan, 0.0]])
-    assert np.isnan(lens.bent(beyond)).all()
+    assert np.isnan(lens.distort(beyond)).all()
     assert np.abs(by_opencv(lens, beyond[:2])).max() < 0.5  # where it would be drawn, in the midst of the picture
-    assert np.isnan(lens.straight(np.array([[2.0 * turn / 3.0 + 0.01, 0.0], [0.5, 0.5]]))).all()
+    assert np.isnan(lens.undistort(np.array([[2.0 * turn / 3.0 + 0.01, 0.0], [0.5, 0.5]]))).all()
     assert Lens().reach > 20.0 and Lens(0.1).reach > 20.0
     # A denominator that comes to nothing throws places to infinity.
     assert Lens(k4=-1.0).reach == pytest.approx(1.0, rel=2e-3)
@@ -101,9 +101,9 @@ def test_a_camera_projects_as_opencv_and_back(lens):
 def test_scaled_cropped_and_padded_cameras_see_the_same():
     camera, points = seen_by(), points_in_view()
     pixels, _ = camera.project(points)
-    assert np.allclose(camera.scaled(2.0).project(points)[0] + 0.5, 2.0 * (pixels + 0.5))
+    assert np.allclose(camera.scale(2.0).project(points)[0] + 0.5, 2.0 * (pixels + 0.5))
     assert np.allclose(camera.crop_to(slice(20, 150), slice(30, 290)).project(points)[0] + [30, 20], pixels)
-    wide = camera.padded(2.0)
+    wide = camera.pad(2.0)
     assert np.allclose(wide.project(points)[0] - pixels, [(wide.width - 320) // 2, 0.0])
 
 
@@ -127,7 +127,7 @@ def test_small_balls_are_drawn_where_opencv_has_them():
             (at,) = project_cv2(camera, np.array([[x, y, 0.0]]))
             if (at > 8).all() and (at < [631, 471]).all():
                 vertices, triangles = build_sphere(12, 16, 1e-3)
-                mask = compute_silhouette(camera.scaled(3.0), vertices + [x, y, 0.0], triangles)
+                mask = compute_silhouette(camera.scale(3.0), vertices + [x, y, 0.0], triangles)
                 found = (np.argwhere(mask)[:, ::-1].mean(axis=0) + 0.5) / 3.0 - 0.5
                 assert np.abs(found - at).max() < 0.05, (x, y)
 
@@ -136,7 +136,7 @@ def test_image_layers_match_a_large_undistorted_image():
     camera, layers = seen_by(), scene()
     picture = render(camera, layers, LAMP)
     wide = replace(camera, lens=None, K=camera.K + [[0, 0, 200.0], [0, 0, 200.0], [0, 0, 0]], width=720, height=640)
-    straight = render(wide.scaled(3.0), layers, LAMP)
+    straight = render(wide.scale(3.0), layers, LAMP)
     u, v = (3.0 * (camera.straight + 200.5) - 0.5).astype(np.float32).transpose(2, 0, 1)
     wanted = cv2.remap(straight.colour, u, v, cv2.INTER_LINEAR).astype(int)
     ids = cv2.remap(straight.segmentation, u, v, cv2.INTER_NEAREST)
@@ -151,9 +151,9 @@ def test_image_layers_match_a_large_undistorted_image():
 def test_static_and_batched_images_agree_through_lens():
     renderer, still = Renderer(scene(still=True), LAMP), scene()
     cameras = [seen_by(), seen_by(None), seen_by(LENSES["folding"])]
-    together = renderer.pictures(np.stack([ball().vertices] * 3), cameras)
+    together = renderer.render_batch(np.stack([ball().vertices] * 3), cameras)
     for row, camera in enumerate(cameras):
-        one, other = renderer.picture(camera, [ball().vertices]), render(camera, still, LAMP)
+        one, other = renderer.render(camera, [ball().vertices]), render(camera, still, LAMP)
         for name in ("colour", "depth", "segmentation"):
             assert np.array_equal(getattr(one, name), getattr(other, name))
             assert np.array_equal(getattr(together, name).numpy()[row], getattr(other, name))

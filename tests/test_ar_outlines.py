@@ -13,7 +13,7 @@ from ar.overlay.hud import FINE, HEAD, ROW, draw_text_panel, write
 from ar.overlay.marks import BEFORE, Cover, Marks, Words
 from ar.overlay.outlines import compute_ink, compute_iou, compute_silhouette, has_text, measure_outline_gap
 from ar.rendering.layer import Layer, Solid
-from ar.rendering.renderer import Lamp, lamp_beside, render
+from ar.rendering.renderer import Lamp, build_lamp, render
 
 CORTEX, TOOL, TUMOUR = 1, 2, 3
 EYE = np.array([0.0, -0.05, 0.25])
@@ -51,7 +51,7 @@ def tumour(centre=(0.0, 0.0, -0.02), radius: float = 0.012) -> Layer:
     return Layer("tumour", TUMOUR, *ball(centre, radius), colour=(0.2, 0.9, 0.3))
 
 
-LAMP = lamp_beside(camera(), np.zeros(3))
+LAMP = build_lamp(camera(), np.zeros(3))
 
 
 def test_a_picture_has_colour_depth_and_segmentation():

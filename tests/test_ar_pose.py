@@ -92,14 +92,14 @@ def scene():
 
 def test_corners_are_found_where_the_lens_puts_them(scene):
     picture, poses = scene
-    found = Detector((CUBE, PLATE)).seen(picture)
+    found = Detector((CUBE, PLATE)).detect(picture)
     assert len(found["patient"].points) >= 14 and len(np.unique(found["tool"].face)) == 3
     for name, corners in found.items():
         off = corners.pixels - pixels_of(corners.points, poses[name])
         assert np.sqrt(np.square(off).mean()) < 0.3 and np.abs(off.mean(axis=0)).max() < 0.1
-    assert set(Detector((CUBE, PLATE)).seen(picture, ("tool",))) == {"tool"}
-    assert not Detector((build_calibration_board(),)).seen(picture)
-    assert not Detector((CUBE,)).seen(np.full((600, 800), 120, np.uint8))
+    assert set(Detector((CUBE, PLATE)).detect(picture, ("tool",))) == {"tool"}
+    assert not Detector((build_calibration_board(),)).detect(picture)
+    assert not Detector((CUBE,)).detect(np.full((600, 800), 120, np.uint8))
 
 
 def test_tip_error_lies_within_its_covariance(scene):
@@ -137,7 +137,7 @@ def test_a_pose_beside_another_target_has_the_errors_of_both():
         tool = find_pose(CAMERA, CUBE, is_seen_from_front(T, 0.2, rng, CUBE))[1]
         patient = find_pose(CAMERA, PLATE, is_seen_from_front(plate, 0.2, rng))[1]
         assert tool is not None and patient is not None
-        place, covariance = tool.seen_from(patient).point(TIP_AT)
+        place, covariance = tool.transform_to(patient).point(TIP_AT)
         found.append((place - true) @ np.linalg.solve(covariance, place - true))
     assert np.mean(found) == pytest.approx(3.0, rel=0.25)
 

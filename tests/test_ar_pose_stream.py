@@ -14,7 +14,7 @@ def test_tracker_clock_error_is_in_the_covariance(error, expected):
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     still, none = build_pose_stream(times, poses.copy(), np.zeros((len(times), 6, 6))), np.zeros((len(times), 6, 6))
     poses[:, 0, 3] = 0.2 * times
-    found = ExternalTracker(build_pose_stream(times, poses, none), still, Clock(0.0, error)).beside(0.5)
+    found = ExternalTracker(build_pose_stream(times, poses, none), still, Clock(0.0, error)).find_tool(0.5)
     assert found.covariance[0, 0] == pytest.approx(expected**2, abs=1e-12)
     assert np.abs(found.covariance[1:, 1:]).max() < 1e-12
 
@@ -23,4 +23,4 @@ def test_pose_between_samples_weighs_their_covariances():
     stream = build_pose_stream(
         np.array([0.0, 0.04]), np.tile(np.eye(4), (2, 1, 1)), np.stack([np.eye(6), 4.0 * np.eye(6)])
     )
-    np.testing.assert_allclose(stream.at(0.01).covariance, (0.75**2 + 4.0 * 0.25**2) * np.eye(6), atol=1e-12)
+    np.testing.assert_allclose(stream.interpolate(0.01).covariance, (0.75**2 + 4.0 * 0.25**2) * np.eye(6), atol=1e-12)

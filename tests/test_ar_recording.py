@@ -19,12 +19,12 @@ class TestRecording:
         for number in range(20):
             recording.take(to_data_url(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
         recording.take(to_data_url(np.zeros((48, 64, 3), np.uint8)), LONGEST + 1.0)
-        assert len(recording.taken) == 20 and recording.full(LONGEST)
-        (tmp_path / "film.mp4").write_bytes(recording.film(2.0))
+        assert len(recording.taken) == 20 and recording.is_full(LONGEST)
+        (tmp_path / "film.mp4").write_bytes(recording.encode_video(2.0))
         film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
         assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 * RATE
         assert film.read()[1].shape == (48, 64, 3)
 
     def test_of_nothing_there_is_no_film(self):
         with pytest.raises(ValueError, match="at least one image"):
-            PageRecording(0.0).film(1.0)
+            PageRecording(0.0).encode_video(1.0)

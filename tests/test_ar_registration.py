@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from ar.tracking.registration import compute_pair_residuals, refined, register_points
+from ar.tracking.registration import compute_pair_residuals, refine_registration, register_points
 
 SCAN = 1e-3 * np.array(
     [[70.0, 20, 30], [-65, 30, 25], [0, 95, 20], [30, 60, 80], [-40, 10, 90], [5, -80, 60], [50, -50, 70]]
@@ -55,7 +55,7 @@ def test_a_traced_surface_makes_it_surer_and_it_still_holds():
         patient = moved(SCAN[:4]) + 1e-3 * rng.normal(size=(4, 3))
         seen = surface + 3e-4 * rng.normal(size=surface.shape)
         alone.append(register_points(SCAN[:4], patient))
-        both.append(refined(SCAN[:4], patient, seen, on_ellipsoid))
+        both.append(refine_registration(SCAN[:4], patient, seen, on_ellipsoid))
     off = [[np.linalg.norm(each.point(TUMOUR)[0] - moved(TUMOUR)) for each in some] for some in (alone, both)]
     assert np.median(off[1]) < 0.8 * np.median(off[0])
     assert np.mean([held(each) for each in both]) > 0.88
@@ -84,9 +84,9 @@ def test_what_determines_no_registration_is_refused():
     with pytest.raises(ValueError, match=r"stay .* apart"):
         register_points(SCAN, patient[::-1])
     with pytest.raises(ValueError, match="3 points of the surface are too few"):
-        refined(SCAN, patient, patient[:3], on_ellipsoid)
+        refine_registration(SCAN, patient, patient[:3], on_ellipsoid)
     with pytest.raises(ValueError, match=r"stay .* from the surface"):
-        refined(
+        refine_registration(
             SCAN, patient, moved(2.0 * on_ellipsoid(np.random.default_rng(0).normal(size=(50, 3)))[0]), on_ellipsoid
         )
 

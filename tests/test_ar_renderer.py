@@ -106,7 +106,7 @@ def test_what_stands_still_is_drawn_once_and_looks_the_same():
     aside, middle = (0.02, 0.01, 0.02), (0.0, 0.0, 0.03)
     for eye, centre in ((here, middle), (here, aside), (here, middle), (there, middle), (there, aside)):
         moved = replace(scene()[1], vertices=ball(centre).vertices)
-        one, other = renderer.picture(eye, [moved.vertices]), render(eye, [striped(), moved], LAMP)
+        one, other = renderer.render(eye, [moved.vertices]), render(eye, [striped(), moved], LAMP)
         backdrops.append(renderer.backdrop)
         for name in ("colour", "depth", "segmentation"):
             assert np.array_equal(getattr(one, name), getattr(other, name))
@@ -120,7 +120,7 @@ def test_what_stands_still_is_drawn_once_and_looks_the_same():
 def test_static_scene_without_shadows_looks_the_same():
     for layers, moved in (([striped(), ball()], [ball().vertices]), ([striped()], [])):
         still = [replace(layers[0], still=True), *layers[1:]]
-        one, other = Renderer(still, LAMP).picture(camera(), moved), render(camera(), layers, LAMP)
+        one, other = Renderer(still, LAMP).render(camera(), moved), render(camera(), layers, LAMP)
         assert np.array_equal(one.colour, other.colour) and np.array_equal(one.depth, other.depth)
 
 
@@ -130,11 +130,11 @@ def test_pictures_together_are_those_alone():
     centres = [(0.0, 0.0, 0.03), (0.03, 0.0, 0.02), (-0.02, 0.02, 0.04)]
     moved = np.stack([ball(centre).vertices for centre in centres])
     for cameras in ([camera(turn) for turn in (0.0, 0.3, -0.5)], [camera(0.2)]):
-        together = renderer.pictures(moved, cameras)
-        on_device = renderer.pictures(wp.array(moved, dtype=wp.vec3d, device="cpu"), cameras)
+        together = renderer.render_batch(moved, cameras)
+        on_device = renderer.render_batch(wp.array(moved, dtype=wp.vec3d, device="cpu"), cameras)
         assert together.colour.shape == (3, 120, 160)
         for row, vertices in enumerate(moved):
-            alone = renderer.picture(cameras[row % len(cameras)], [vertices])
+            alone = renderer.render(cameras[row % len(cameras)], [vertices])
             for name in ("colour", "depth", "segmentation"):
                 assert np.array_equal(getattr(together, name).numpy()[row], getattr(alone, name))
                 assert np.array_equal(getattr(on_device, name).numpy()[row], getattr(alone, name))
@@ -175,8 +175,8 @@ def drawn_on(device: str) -> tuple[Pictures, Picture, np.ndarray]:
     """Pictures together and alone, and one with an overlay, all drawn by a device."""
     renderer = Renderer(scene(still=True), LAMP, device)
     moved = np.stack([ball((0.01 * row, 0.0, 0.03)).vertices for row in range(4)])
-    together = renderer.pictures(moved, [camera(0.1 * row, 640, 480) for row in range(4)])
-    alone = renderer.picture(camera(0.0, 640, 480), [moved[0]])
+    together = renderer.render_batch(moved, [camera(0.1 * row, 640, 480) for row in range(4)])
+    alone = renderer.render(camera(0.0, 640, 480), [moved[0]])
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG, colour=(0.2, 0.9, 0.3))
     return together, alone, composite(alone, camera(0.0, 640, 480), hidden, cover=Cover((BALL,))).colour
 

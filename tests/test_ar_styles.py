@@ -101,10 +101,10 @@ def test_outline_under_drape_is_broken(style):
 
 
 def test_what_is_said_of_the_ground():
-    assert OPENING.said({CORTEX: 95, DRAPE: 5}) == OPENING.said({}) == ""
-    assert OPENING.said({CORTEX: 50, DRAPE: 30, 7: 20}) == "partly under the drape"
-    assert OPENING.said({CORTEX: 50, DRAPE: 20, 7: 30}) == "partly seen through bone"
-    assert OPENING.said({DRAPE: 95, CORTEX: 5}) == "under the drape"
+    assert OPENING.describe({CORTEX: 95, DRAPE: 5}) == OPENING.describe({}) == ""
+    assert OPENING.describe({CORTEX: 50, DRAPE: 30, 7: 20}) == "partly under the drape"
+    assert OPENING.describe({CORTEX: 50, DRAPE: 20, 7: 30}) == "partly seen through bone"
+    assert OPENING.describe({DRAPE: 95, CORTEX: 5}) == "under the drape"
 
 
 def test_depth_is_the_stronger_the_nearer_and_has_a_scale():

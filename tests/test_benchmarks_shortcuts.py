@@ -11,7 +11,7 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.studies import shortcuts
 from benchmarks.studies.shortcuts import Row, Work, measure, works
-from scenes.script.site import Site, site_of
+from scenes.script.site import Site, build_site
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
 from sim.effects import pushed_effects
@@ -23,7 +23,7 @@ from surrogate.data.tool_loads import draw
 
 @pytest.fixture(scope="module")
 def site(box: Anatomy) -> Site:
-    return site_of(box)
+    return build_site(box)
 
 
 def some(site: Site, **more) -> Work:

@@ -97,4 +97,4 @@ def test_what_is_learnt_of_a_skull_is_of_that_skull(tmp_path):
         assert main(["simulate", str(tmp_path / "brain.vtu"), "--out", str(out), *words]) == 0
         data = read_dataset(out)
         assert read_trained_skull(data.provenance) == skull
-        assert effect in Expansion(data, "cpu").fem().effects
+        assert effect in Expansion(data, "cpu").build_fem().effects

@@ -18,7 +18,7 @@ from scenes.cli import COMMANDS
 from scenes.episodes.episode import MEANINGS as EPISODE
 from scenes.play.deformers import to_model_path
 from scenes.script.scene import SCENES, find_scene
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.bodies.meshfile import read_anatomy
 from surrogate.data.array_meanings import MEANINGS as DATASET
 from surrogate.data.simulate import simulate
@@ -148,7 +148,7 @@ def test_the_code_on_the_page_of_formats_reads_the_files(tmp_path, monkeypatch, 
 
 
 def test_the_page_of_formats_lists_what_a_model_holds():
-    with np.load(to_model_path(template_path())) as archive:
+    with np.load(to_model_path(get_template_path())) as archive:
         header = json.loads(str(archive["header"]))
     rows = re.findall(r"^\| (`\w+`) \| .*$", FORMATS.partition("\n## Model")[2].partition("\n## ")[0], re.M)
     held = {"tool" if name == "ball" else name for name in header["models"]["series-gp"]}  # this file is an older one
@@ -175,7 +175,7 @@ def test_the_motions_of_the_scenes_are_those_that_were_measured():
     known = json.loads(measured)
     assert f"`{known['command']}` measured" in text and known["date"] in text
     assert [row["scene"] for row in known["scenes"]] == list(SCENES)
-    anatomy = read_anatomy(template_path())
+    anatomy = read_anatomy(get_template_path())
     for row in known["scenes"]:
         stated = re.search(rf"^## {row['scene']}\n.*?\| ([\d.]+) mm \|$", text, re.MULTILINE | re.DOTALL)[1]
         assert float(stated) == round(row["moved_mm"], len(stated.partition(".")[2]))

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from scenes.cli import main, make_parsers
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 
 PAGE = (Path(__file__).parents[1] / "docs/tutorial.md").read_text()
 LABELS, OBSERVE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 LINES = [
-    shlex.split(line) for line in re.findall(r"^sulcus .*$", PAGE.replace("$TEMPLATE", str(template_path())), re.M)
+    shlex.split(line) for line in re.findall(r"^sulcus .*$", PAGE.replace("$TEMPLATE", str(get_template_path())), re.M)
 ]
 DEMO, INSPECT, PATIENT, RENDER, LOCATE, LOCATOR = (line[1:] for line in LINES)
 
@@ -38,7 +38,7 @@ def test_tutorial_label_map_gives_the_output_shown(tmp_path, monkeypatch, capsys
 def test_tutorial_tumour_is_located(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for suffix in (".vtu", ".model.npz"):
-        shutil.copy(template_path().with_suffix(suffix), f"patient{suffix}")
+        shutil.copy(get_template_path().with_suffix(suffix), f"patient{suffix}")
     assert main(RENDER) == 0 and Path("frames/frame_0060.png").exists()
     names = {}
     exec(OBSERVE, names)

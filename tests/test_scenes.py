@@ -11,7 +11,7 @@ from ar.optics.camera import project_cv2
 from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clip_surface
 from scenes.script.head_posture import Lying
 from scenes.script.scene import SCENES, find_scene
-from scenes.script.site import site_of
+from scenes.script.site import build_site
 from scenes.script.tool import Probe
 from scenes.script.tool_paths import AIR, Touch, compute_lift
 from scenes.script.viewpoint import UNDER, Viewpoint
@@ -27,7 +27,7 @@ def template():
 
 @pytest.fixture(scope="module", params=["box", "template"])
 def site(request, box, template):
-    return site_of(box) if request.param == "box" else template.site
+    return build_site(box) if request.param == "box" else template.site
 
 
 def sampled(path, times):
@@ -42,7 +42,7 @@ def test_built_in_scenes_say_what_they_are_and_begin_as_the_scan(name, template)
     times = scene.times
     assert times[0] == 0.0 and times[-1] == pytest.approx(scene.duration) and np.allclose(np.diff(times), 1 / 30)
     assert scene.path(0.0).force == 0.0 and scene.lying(0.0) == Lying()
-    loads = scene.loads(template.site, scene.path(0.0), 0.0)
+    loads = scene.build_loads(template.site, scene.path(0.0), 0.0)
     check_causes(scene.get_effects_on(template.anatomy), loads)
 
 
@@ -99,7 +99,7 @@ class TestSite:
 
     def test_a_body_without_opening_is_refused(self, box):
         with pytest.raises(InputError, match="no open cortex"):
-            site_of(replace(box, craniotomy=np.zeros(len(box.mesh.nodes), bool)))
+            build_site(replace(box, craniotomy=np.zeros(len(box.mesh.nodes), bool)))
 
 
 class TestTool:
@@ -107,7 +107,7 @@ class TestTool:
         probe, tip = Probe(), np.array([0.01, 0.02, 0.03])
         inward, aside = np.array([0.0, 0.6, -0.8]), np.array([1.0, 0.0, 0.0])
         for lean in (0.0, 0.4, 0.75):
-            T = replace(probe, lean=lean).pose(tip, inward, aside)
+            T = replace(probe, lean=lean).compute_pose(tip, inward, aside)
             assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3)) and np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
             at = np.asarray(probe.mesh.vertices) @ T[:3, :3].T + T[:3, 3]
             assert ((at - tip) @ inward).max() == pytest.approx(0.0, abs=1e-4)
@@ -116,7 +116,7 @@ class TestTool:
 
     def test_the_ball_has_the_radius_of_the_footprint(self, template):
         scene = find_scene("press")
-        loads = scene.loads(template.site, Touch(force=0.2), 1.5)
+        loads = scene.build_loads(template.site, Touch(force=0.2), 1.5)
         (pushed,) = loads.causes
         mesh = scene.tool.mesh
         ball = np.linalg.norm(mesh.vertices - [0.0, 0.0, scene.tool.radius], axis=1)[:642]
@@ -126,7 +126,7 @@ class TestTool:
 
 class TestCamera:
     def test_looks_at_the_open_cortex_from_outside(self, site):
-        camera = Viewpoint().camera(site)
+        camera = Viewpoint().build_camera(site)
         assert (camera.centre - site.origin) @ site.axis < -0.1
         middle = project_cv2(camera, (site.origin + UNDER * site.axis)[None])[0]
         assert np.allclose(middle, [319.5, 239.5], atol=1e-6)
@@ -141,7 +141,7 @@ class TestCamera:
 
     @pytest.mark.parametrize("tilt", [-0.35, 0.0, 0.5])
     def test_it_stands_as_far_and_as_high_as_asked(self, site, tilt):
-        camera = Viewpoint(distance=0.15, tilt=tilt, fov=0.4, width=200, height=100).camera(site)
+        camera = Viewpoint(distance=0.15, tilt=tilt, fov=0.4, width=200, height=100).build_camera(site)
         away = camera.centre - site.origin - UNDER * site.axis
         along = [away @ way for way in (-site.axis, site.up, site.right)]
         assert along == pytest.approx([0.15 * np.cos(tilt), 0.15 * np.sin(tilt), 0.0], abs=1e-12)
@@ -158,7 +158,7 @@ class TestCamera:
         depth = frame.picture.depth[tuple(pixels.T)]
         seen = frame.camera.unproject(pixels[:, ::-1].astype(float), depth)
         surface = trimesh.Trimesh(
-            play.positions(frame.deformation), template.anatomy.mesh.surface, process=False, validate=False
+            play.compute_positions(frame.deformation), template.anatomy.mesh.surface, process=False, validate=False
         )
         assert trimesh.proximity.closest_point_naive(surface, seen)[1].max() < 2e-5
 
@@ -168,12 +168,12 @@ def test_the_cortex_wears_the_scan(template):
     assert template.intensity is not None
     plain, dressed = (Stage(scene, template.site, scan) for scan in (None, template.intensity))
     rest = template.anatomy.mesh.nodes
-    assert plain.cortex(rest).solid is None
-    layer = dressed.cortex(rest + 0.001)
+    assert plain.build_cortex(rest).solid is None
+    layer = dressed.build_cortex(rest + 0.001)
     assert layer.solid is not None and layer.rest is not None
     # Read at the material points, 2 mm under the surface, wherever they are now.
-    assert np.allclose(layer.rest, dressed.cortex(rest).rest)
-    depth = np.linalg.norm(layer.rest - dressed.cortex(rest).vertices, axis=1)
+    assert np.allclose(layer.rest, dressed.build_cortex(rest).rest)
+    depth = np.linalg.norm(layer.rest - dressed.build_cortex(rest).vertices, axis=1)
     assert np.allclose(depth, 2e-3)
 
 

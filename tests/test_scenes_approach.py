@@ -18,9 +18,9 @@ from scenes.options.placement_options import add_opening_arguments, get_trajecto
 from scenes.play.deformers import Theatre
 from scenes.script.approach import Approach, approach_of
 from scenes.script.scene import PALPATION, find_scene
-from scenes.script.site import Site, site_of
+from scenes.script.site import Site, build_site
 from scenes.script.tool import Blade
-from scenes.script.tool_paths import Touch, idle, press
+from scenes.script.tool_paths import Touch, keep_idle, press
 from sim.bodies.label_volume import volume_subject
 from sim.bodies.markups import read_markup
 from sim.bodies.meshfile import write_anatomy
@@ -34,7 +34,7 @@ def site(tmp_path_factory):
     """A curved cortex, open over a tumour to the right and above."""
     affine, places = grid()
     path = nifti(tmp_path_factory.mktemp("approach") / "a.nii", head(places), affine)
-    return site_of(make_anatomy(volume_subject(path, (1,), (3,)), PLAN))
+    return build_site(make_anatomy(volume_subject(path, (1,), (3,)), PLAN))
 
 
 def marked(folder: Path, points: np.ndarray, kind: str = "Line") -> Path:
@@ -51,7 +51,7 @@ def planned(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A point of the cortex, a direction, and a line through it from 40 mm outside to 30 mm inside."""
     entry = site.nearest(site.origin + right * site.right + up * site.up).point
-    way = site.direction(Touch(tilt=tilt))
+    way = site.compute_direction(Touch(tilt=tilt))
     return entry, way, entry + np.outer([-40e-3, 30e-3], way)
 
 
@@ -61,11 +61,11 @@ def test_the_tool_enters_there_and_pushes_along_it(site, tmp_path, right, up, ti
     """Whichever end was drawn first; the scene's own places and tilts are added."""
     entry, way, line = planned(site, right, up, tilt)
     approach = approach_of(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
-    touch = approach.followed(press(0.3))(2.0)
+    touch = approach.follow(press(0.3))(2.0)
     assert np.linalg.norm(site.nearest(site.origin + touch.x * site.right + touch.y * site.up).point - entry) < 1e-4
     np.testing.assert_allclose(site.direction(touch), way, atol=1e-9)
     assert touch.force == pytest.approx(0.3)
-    aside = approach.followed(lambda time: Touch(2e-3, 1e-3, tilt=(0.2, 0.0)))(0.0)
+    aside = approach.follow(lambda time: Touch(2e-3, 1e-3, tilt=(0.2, 0.0)))(0.0)
     assert aside.x == pytest.approx(touch.x + 2e-3) and aside.y == pytest.approx(touch.y + 1e-3)
     assert np.tan(aside.tilt[0]) == pytest.approx(np.tan(touch.tilt[0]) + np.tan(0.2))
 
@@ -92,15 +92,15 @@ def test_a_shaft_lies_along_a_line_and_the_ball_stays(site, tmp_path, tilt):
     """That of a probe; a point, and a blade, leave the tool as it is."""
     entry, way, line = planned(site, 4e-3, 2e-3, tilt)
     approach = approach_of(read_markup(marked(tmp_path, line)), site)
-    held, plain = approach.held(PALPATION), PALPATION
-    turned, usual = (tool.pose(entry, site.axis, site.right) for tool in (held, plain))
+    held, plain = approach.align_tool(PALPATION), PALPATION
+    turned, usual = (tool.compute_pose(entry, site.axis, site.right) for tool in (held, plain))
     np.testing.assert_allclose(turned[:3, 2], -way, atol=1e-9)
     np.testing.assert_allclose(turned[:3, :3].T @ turned[:3, :3], np.eye(3), atol=1e-12)
     assert np.linalg.det(turned[:3, :3]) == pytest.approx(1.0)
     centres = [pose[:3, 3] + plain.radius * pose[:3, 2] for pose in (turned, usual)]
     np.testing.assert_allclose(*centres, atol=1e-12)
     point = approach_of(read_markup(marked(tmp_path, entry[None], "Fiducial")), site)
-    assert point.held(plain) == plain and approach.held(Blade()) == Blade()
+    assert point.align_tool(plain) == plain and approach.align_tool(Blade()) == Blade()
 
 
 def test_what_misses_the_opening_is_refused(site, tmp_path):
@@ -139,14 +139,14 @@ def test_commands_play_scenes_along_it(site, tmp_path, capsys):
 
     entry, way, line = planned(site, 6e-3, 4e-3, (0.3, 0.1))
     scene = asked("press", line)
-    pushed = scene.loads(site, scene.path(2.0), 2.0).of(Pushed)
+    pushed = scene.build_loads(site, scene.path(2.0), 2.0).of(Pushed)
     assert scene.tool == replace(PALPATION, lean=scene.tool.lean, turn=scene.tool.turn) != PALPATION
     assert pushed is not None and np.linalg.norm(pushed.point[0] - entry) < 1e-4
     np.testing.assert_allclose(pushed.force[0] / np.linalg.norm(pushed.force[0]), way, atol=1e-9)
     assert capsys.readouterr().err == ""
     asked("press", planned(site, site.clearance - 2e-3, 0.0, (0.0, 0.0))[2])
     assert "plan.mrk.json enters, the bone's edge stops the tool" in capsys.readouterr().err
-    assert asked("sag", line).path(1.0) == find_scene("sag").path(1.0) == idle(1.0)
+    assert asked("sag", line).path(1.0) == find_scene("sag").path(1.0) == keep_idle(1.0)
     assert "sag has no tool that could follow" in capsys.readouterr().err
 
 
@@ -172,4 +172,4 @@ def test_a_patient_says_how_its_scenes_follow_it(site, tmp_path):
 
 
 def test_no_trajectory_is_the_middle():
-    assert Approach(0.0, 0.0).followed(short().path)(0.7) == short().path(0.7)
+    assert Approach(0.0, 0.0).follow(short().path)(0.7) == short().path(0.7)

@@ -213,7 +213,7 @@ def test_the_overlay_changes_while_a_solve_is_waited_for(demo, gated):
 
 def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
     prepared, said = threading.Event(), []
-    player = Theatre.player
+    player = Theatre.build_player
 
     def slow(theatre, name, scene):
         assert prepared.wait(30.0)
@@ -235,7 +235,7 @@ def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
 def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
     """A visitor leafs through the scenes while the first is prepared."""
     prepared, made = threading.Event(), []
-    player = Theatre.player
+    player = Theatre.build_player
 
     def slow(theatre, name, scene):
         made.append(scene.name)
@@ -256,7 +256,7 @@ def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
 
 def test_a_question_that_is_taken_back_is_not_prepared_for(gated, monkeypatch):
     made = []
-    player = Theatre.player
+    player = Theatre.build_player
     monkeypatch.setattr(Theatre, "player", lambda *words: made.append(words) or player(*words))
     theatre, turn = Theatre(gated.anatomy, None, {}, "cpu"), threading.Lock()
     gated.let(2)

@@ -65,7 +65,7 @@ def truth(theatre, play, frames):
 
 def broken(play, frames, truth, camera=None):
     figures = measure(play, play.camera_at if camera is None else lambda time: camera, frames, truth)
-    return set(figures.broken(Bounds())), figures
+    return set(figures.find_violations(Bounds())), figures
 
 
 def about(sentences, word):
@@ -79,14 +79,14 @@ def shifted(frame, by):
 
 
 def test_every_bound_has_its_sentence():
-    assert GOOD.broken(Bounds()) == []
-    assert set(SENTENCES) == set(GOOD.row()) - {"leaked", "bond", "doubt"}  # stated, and held to nothing
+    assert GOOD.find_violations(Bounds()) == []
+    assert set(SENTENCES) == set(GOOD.to_row()) - {"leaked", "bond", "doubt"}  # stated, and held to nothing
     for name, (value, words) in SENTENCES.items():
-        (sentence,) = replace(GOOD, **{name: value}).broken(Bounds())
+        (sentence,) = replace(GOOD, **{name: value}).find_violations(Bounds())
         assert words in sentence
     unknown = replace(GOOD, overlap=np.nan, error_mm=np.nan, pixels=np.nan, drawn=np.nan)
-    assert len(unknown.broken(Bounds())) == 4
-    assert json.loads(json.dumps(GOOD.row())) == GOOD.row()
+    assert len(unknown.find_violations(Bounds())) == 4
+    assert json.loads(json.dumps(GOOD.to_row())) == GOOD.to_row()
 
 
 def test_what_passes_the_skull_is_reported(play, frames, truth):

@@ -64,25 +64,25 @@ def player(size, style="window"):
     theatre = open_theatre(device="cpu")
     scene = find_scene("press")
     scene = replace(scene, viewpoint=replace(scene.viewpoint, width=size[0], height=size[1]))
-    return replace(theatre.player("series-gp", scene), style=style)
+    return replace(theatre.build_player("series-gp", scene), style=style)
 
 
 @cache
 def build_tool_frame(size=(640, 360), style="window"):
     play = player(size, style)
-    return play.draw(40, float(play.scene.times[40]), play.touch(40))
+    return play.draw(40, float(play.scene.times[40]), play.get_touch(40))
 
 
 def broken(frame, play):
     """What is wrong with a frame, if the model's own answer is the truth."""
     found = measure(play, play.camera_at, [frame], frame.deformation)
-    return [sentence for sentence in found.broken(Bounds()) if "does not say its" not in sentence]
+    return [sentence for sentence in found.find_violations(Bounds()) if "does not say its" not in sentence]
 
 
 @pytest.mark.parametrize("style", [style for style in STYLES if style != "none"])
 def test_every_style_passes_the_checks(style):
     frame, play = build_tool_frame(style=style), player((640, 360), style)
-    assert measure(play, play.camera_at, [frame], frame.deformation).broken(Bounds()) == []
+    assert measure(play, play.get_camera, [frame], frame.deformation).find_violations(Bounds()) == []
     tool = frame.picture.segmentation == TOOL
     words = (np.abs(frame.shown.astype(int) - frame.picture.colour).max(axis=2) > 2) & tool
     assert words.sum() < 0.1 * tool.sum()  # the lines at the head may stand there
@@ -161,7 +161,7 @@ def test_a_tip_in_the_tumour_is_found_to_be():
 def test_the_same_frame_is_the_same_picture():
     play = player((640, 360), "rings")
     frame = build_tool_frame(style="rings")
-    anew = play.draw(40, float(play.scene.times[40]), play.touch(40))
+    anew = play.draw(40, float(play.scene.times[40]), play.get_touch(40))
     assert np.array_equal(anew.shown, frame.shown)
     assert np.abs(frame.shown.astype(int) - build_tool_frame().shown).max() > 50
 

@@ -31,7 +31,7 @@ def test_help_texts_come_without_warp_and_scipy():
 @pytest.mark.parametrize("name", ["linear", "fem"])
 def test_page_opens_during_compilation_then_plays(name, box, tmp_path, monkeypatch):
     """A model's first answer belongs to what is made ready."""
-    done, predicted = [], SceneSolvers.predicted
+    done, predicted = [], SceneSolvers.predict
     opened = threading.Event()
 
     def slow():

@@ -24,7 +24,7 @@ def poses_after(first, steps):
 
 
 def test_twists_lead_from_pose_to_pose(folder):
-    tool = read_episodes(folder, ["T_world_tool"], window=9).at(1, 0)["T_world_tool"]
+    tool = read_episodes(folder, ["T_world_tool"], window=9).get_window(1, 0)["T_world_tool"]
     steps = build_twists(tool)
     assert np.allclose(poses_after(tool[0], steps), tool, atol=1e-6) and not steps[-1].any() and steps[:-1].any()
     state = build_states(tool)

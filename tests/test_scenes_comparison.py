@@ -24,8 +24,8 @@ from sim.deformation import Outcome
 
 def shown(tally: AccuracyTimeTable, name: str, loads: Iterable[str], milliseconds: float, millimetres: float) -> None:
     for load in loads:
-        tally.took(name, load, 1e-3 * milliseconds)
-        tally.missed(name, load, 1e-3 * millimetres)
+        tally.record_time(name, load, 1e-3 * milliseconds)
+        tally.record_error(name, load, 1e-3 * millimetres)
 
 
 def test_deformers_are_ranked_on_common_loads():
@@ -35,7 +35,7 @@ def test_deformers_are_ranked_on_common_loads():
     shown(tally, "quick", "z", 90.0, 90.0)  # a load that nobody else had does not count against it
     shown(tally, "slow", "abc", 4.0, 0.03)
     shown(tally, "lost", "bcd", 5.0, 0.2)
-    tally.took("unjudged", "a", 1e-3)
+    tally.record_time("unjudged", "a", 1e-3)
     rows = [(row.name, round(row.milliseconds, 9), round(row.millimetres, 9), row.loads) for row in tally.rows]
     assert rows == [("quick", 1.0, 0.2, 2), ("slow", 4.0, 0.03, 2), ("lost", 5.0, 0.2, 2)]
     assert [row.best for row in tally.rows] == [True, True, False]
@@ -97,8 +97,8 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
     """Of a model whose answer is 0.2 mm off everywhere, and of the finite elements' own distance."""
     scene = short()
     whole = Player(Stage(scene, theatre.site), theatre.fem(scene, LIVE))
-    loads = whole.loads(3)
-    answer = whole.answer(loads)
+    loads = whole.build_loads(3)
+    answer = whole.compute_deformation(loads)
 
     class Off:
         def deform(self, loads, start=None, at=None):
@@ -108,7 +108,7 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
     found = compare_with_fem(FemResult(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
     said = format_comparison(found, stale=False, waits="")
     assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
-    tip = whole.drawn(3, whole.touch(3), loads, answer, 0.0).distance
+    tip = whole.draw_frame(3, whole.get_touch(3), loads, answer, 0.0).distance
     assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
     assert " by FEM, without the error of the tumour (" in said
     assert format_comparison(found, stale=True, waits="").startswith('<p class="stale">previous load: ')

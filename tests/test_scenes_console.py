@@ -25,7 +25,7 @@ BEGUN = to_stamp(time.time())
 
 @pytest.fixture(scope="module")
 def follower():
-    return follower_of(template_theatre().stage(find_scene("palpate")))
+    return follower_of(template_theatre().build_stage(find_scene("palpate")))
 
 
 def test_status_changes_are_logged_once(follower):

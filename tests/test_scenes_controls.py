@@ -72,13 +72,13 @@ class TestControls:
 class TestHand:
     def test_still_hand_pauses_script_and_play_resumes(self):
         wish = Requests("svr", Touch())
-        wish.hand(force=0.2)
-        assert not wish.plays and wish.now()[2] == Touch(force=0.2)
+        wish.take_over(force=0.2)
+        assert not wish.plays and wish.read_current()[2] == Touch(force=0.2)
         wish.play(True)
-        assert wish.plays and wish.now()[2] is None
+        assert wish.plays and wish.read_current()[2] is None
 
     def test_where_time_goes_on_the_hand_keeps_the_tool(self):
         wish = Requests("fem", Touch(), clocked=True)
-        wish.hand(depth=1e-3)
+        wish.take_over(depth=1e-3)
         wish.play(True)
-        assert wish.plays and wish.now()[2] == Touch(depth=1e-3)
+        assert wish.plays and wish.read_current()[2] == Touch(depth=1e-3)

@@ -9,7 +9,7 @@ from theatres import PUSHING, player, put, short
 from scenes.cli import main
 from scenes.play.deformers import open_theatre, to_model_path
 from scenes.script.scene import find_scene
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from scenes.script.tool_paths import Touch
 from sim.bodies.intensity import to_intensity_path
 from sim.bodies.meshfile import write_anatomy
@@ -19,7 +19,7 @@ from sim.errors import InputError
 def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
 
     again = open_theatre(put(theatre, tmp_path / "box.vtu"), device="cpu")
-    assert again.anatomy.digest == theatre.anatomy.digest and again.names(short()) == (
+    assert again.anatomy.digest == theatre.anatomy.digest and again.list_deformers(short()) == (
         "linear",
         "svr",
         "guarded",
@@ -27,16 +27,16 @@ def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
     )
     assert again.intensity is not None and theatre.intensity is not None
     assert np.array_equal(again.intensity.values, theatre.intensity.values)
-    assert again.best(short()) == min(theatre.models, key=lambda name: theatre.models[name].bound)
+    assert again.select_best(short()) == min(theatre.models, key=lambda name: theatre.models[name].bound)
     touch = Touch(force=0.2)
     pictures = [player(each, short(), "linear").draw(0, 0.0, touch).shown for each in (theatre, again)]
     assert np.array_equal(pictures[0], pictures[1])
     to_intensity_path(tmp_path / "box.vtu").unlink()
     to_model_path(tmp_path / "box.vtu").unlink()
     bare = open_theatre(tmp_path / "box.vtu", device="cpu")
-    assert bare.intensity is None and bare.names(short()) == ("fem",) and bare.best(short()) == "fem"
+    assert bare.intensity is None and bare.list_deformers(short()) == ("fem",) and bare.select_best(short()) == "fem"
     with pytest.raises(InputError, match=r"'linear'.*fem; `sulcus train`"):
-        bare.deformer("linear", short())
+        bare.build_deformer("linear", short())
 
 
 def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_path):
@@ -52,10 +52,16 @@ def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_pa
 
 
 def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
-    assert to_model_path(template_path()).stat().st_size <= 40_000_000 and to_intensity_path(template_path()).is_file()
+    assert (
+        to_model_path(get_template_path()).stat().st_size <= 40_000_000
+        and to_intensity_path(get_template_path()).is_file()
+    )
     theatre = open_theatre(device="cpu")
     assert {"linear", "ann", "svr"} <= set(theatre.models) and theatre.intensity is not None
-    assert all(model.bound < 1e-3 for model in theatre.models.values()) and theatre.best(find_scene("press")) != "fem"
+    assert (
+        all(model.bound < 1e-3 for model in theatre.models.values())
+        and theatre.select_best(find_scene("press")) != "fem"
+    )
     assert main(["check", *PUSHING, "--every", "60", "--device", "cpu", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["passed"] and [row["scene"] for row in report["scenes"]] == list(PUSHING)

@@ -74,7 +74,7 @@ def test_pose_interpolation_beats_newest_sample(rate, late):
     stream = sampled(swung, np.arange(0.0, 4.0, 1.0 / rate), rng)
     plain, found, inside = [], [], []
     for time in rng.uniform(0.5, 3.5, 300):
-        pose, true = stream.at(time), swung(time)
+        pose, true = stream.interpolate(time), swung(time)
         off = twist(pose.T_camera_target, true)
         inside.append(off @ np.linalg.solve(pose.covariance, off) <= chi2.ppf(0.95, 6))
         found.append(np.linalg.norm(off[:3]))
@@ -89,16 +89,16 @@ def test_pose_gap_extrapolates_for_a_moment_only():
     times = np.concatenate([np.arange(0.0, 1.0, 0.04), np.arange(1.3, 2.0, 0.04)])
     stream = sampled(swung, times)
     last = times[times < 1.0][-1]
-    on, beyond = stream.at(last + 0.9 * AHEAD), stream.at(last + 1.1 * AHEAD)
+    on, beyond = stream.interpolate(last + 0.9 * AHEAD), stream.interpolate(last + 1.1 * AHEAD)
     assert beyond is None and on is not None
     off = twist(on.T_camera_target, swung(last + 0.9 * AHEAD))
     assert off @ np.linalg.solve(on.covariance, off) <= chi2.ppf(0.95, 6)
-    assert np.trace(on.covariance) > 2.0 * np.trace(stream.at(0.5).covariance)
-    assert stream.at(-0.01) is None and stream.age(-0.01) == np.inf and stream.at(1.2) is None
-    assert stream.at(1.3) is not None and stream.at(1.31) is not None
-    assert stream.at(1.3 - 5e-5) is not None and stream.at(1.29) is None  # files round times
-    assert stream.age(1.2) == pytest.approx(1.2 - last) and LONGEST < 0.3
-    assert ExternalTracker(stream, sampled(swung, times[:10])).age(2.5) == pytest.approx(
+    assert np.trace(on.covariance) > 2.0 * np.trace(stream.interpolate(0.5).covariance)
+    assert stream.interpolate(-0.01) is None and stream.compute_age(-0.01) == np.inf and stream.interpolate(1.2) is None
+    assert stream.interpolate(1.3) is not None and stream.interpolate(1.31) is not None
+    assert stream.interpolate(1.3 - 5e-5) is not None and stream.interpolate(1.29) is None  # files round times
+    assert stream.compute_age(1.2) == pytest.approx(1.2 - last) and LONGEST < 0.3
+    assert ExternalTracker(stream, sampled(swung, times[:10])).compute_age(2.5) == pytest.approx(
         2.5 - times[9]
     )  # of the older one
     with pytest.raises(ValueError, match="pose 3 is not later"):
@@ -111,10 +111,10 @@ def test_a_clock_of_24_hours_goes_on_at_midnight():
     stream = build_pose_stream(stamps, np.stack([swung(time) for time in times]), np.tile(NONE, (len(times), 1, 1)))
     for time in (0.4, 1.5):
         for days in (-DAY, 0.0, DAY):
-            pose = stream.at(time + DAY - 1.0 + days)
+            pose = stream.interpolate(time + DAY - 1.0 + days)
             np.testing.assert_allclose(pose.T_camera_target, swung(time), atol=5e-4)
     epoch = sampled(swung, times, offset=1.7e9)  # seconds since 1970: other days are other times
-    assert epoch.at(1.7e9 + 0.5) is not None and epoch.at(1.7e9 + 0.5 + DAY) is None
+    assert epoch.interpolate(1.7e9 + 0.5) is not None and epoch.interpolate(1.7e9 + 0.5 + DAY) is None
 
 
 def test_clocks_are_compared_by_motion_with_an_error_that_holds():
@@ -155,7 +155,9 @@ def bodies(stage):
         return move_about(TRACKER, np.zeros(3), np.array([0.0, 2e-3 * np.sin(4.0 * time), 0.0, 0.0, 0.0, 0.0]))
 
     return {
-        "tool": lambda time: head(time) @ scene.pose(stage.site, scene.path(time)) @ np.linalg.inv(tool.T_cube_tool),
+        "tool": lambda time: (
+            head(time) @ scene.compute_pose(stage.site, scene.path(time)) @ np.linalg.inv(tool.T_cube_tool)
+        ),
         "patient": lambda time: head(time) @ np.linalg.inv(registration.T_patient_scan),
         "head": head,
     }
@@ -190,12 +192,12 @@ def test_a_tool_in_a_film_is_where_another_tracker_has_it(follower, stage, bodie
     assert len(off) == len(truth.times) and off.max() < 6e-4 and (off < 3.0 * spread).all()
     assert late_off.max() > 5e-4 and late_off.max() > 2.0 * off.max()
     eye = CameraMount(np.linalg.inv(truth.T_camera_scan[0] @ np.linalg.inv(bodies["head"](0.0))), 1e-2 * NOISE)
-    looked = replace(right, eye=eye).reference(0.0)
+    looked = replace(right, eye=eye).find_reference(0.0)
     true = truth.T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
     step = twist(looked.T_camera_target, true)
     assert np.linalg.norm(step[:3]) < 1e-3 and step @ np.linalg.solve(looked.covariance, step) < chi2.ppf(0.999, 6)
     riding = replace(eye, body=sampled(lambda time: np.eye(4), times, offset=DAY - 1.0 + late))
-    np.testing.assert_allclose(replace(right, eye=riding).reference(0.0).T_camera_target, looked.T_camera_target)
+    np.testing.assert_allclose(replace(right, eye=riding).find_reference(0.0).T_camera_target, looked.T_camera_target)
 
 
 def test_a_picture_without_poses_is_stale(follower, bodies):
@@ -252,9 +254,9 @@ def test_poses_are_held_against_the_targets_that_pictures_show(follower, bodies,
     assert "moves by" in followed(follower, quick)[-1].words
     eye = CameraMount(np.linalg.inv(truth_of_camera(stage) @ np.linalg.inv(bodies["head"](0.0))), NOISE)
     looked = replace(right, eye=eye)
-    agreed = looked.agreed(0.0, known[0].tracked.poses, Agreement())
+    agreed = looked.compare_targets(0.0, known[0].tracked.poses, Agreement())
     assert not agreed.doubt and set(agreed.places) == {"patient", "tool"}
-    assert "swapped" in looked.swapped.agreed(0.0, known[0].tracked.poses, Agreement()).doubt
+    assert "swapped" in looked.swapped.compare_targets(0.0, known[0].tracked.poses, Agreement()).doubt
 
 
 def truth_of_camera(stage):

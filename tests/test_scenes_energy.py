@@ -11,7 +11,7 @@ import warp as wp
 from conftest import make_box
 
 from scenes.script.scene import SCENES, find_scene
-from scenes.script.site import site_of
+from scenes.script.site import build_site
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, guess
@@ -51,11 +51,11 @@ def posed(name: str) -> tuple[Anatomy, tuple[Effect, ...], Loads, Deformation]:
     """The body, what acts without mass, the load that stays, and what the body starts from, at rest."""
     scene, time = find_scene(name), TAKEN[name]
     effects = scene.get_effects_on(BODY)
-    site = site_of(BODY)
-    loads = scene.loads(site, scene.path(time), time)
+    site = build_site(BODY)
+    loads = scene.build_loads(site, scene.path(time), time)
     body, start = BODY, guess(np.zeros((1, len(BODY.mesh.nodes), 3)))
     if scene.surgery is not None:  # as it was before the last cut
-        stages, done = list_remaining_bodies(BODY, effects), scene.surgery.done(time)
+        stages, done = list_remaining_bodies(BODY, effects), scene.surgery.count_done(time)
         effects = (*(effect for effect in effects if not isinstance(effect, Held | Resection)), Held())
         loads, body = loads.without_kind(Resected), stages[done].anatomy
         before = Fem(stages[done - 1].anatomy, effects, TIGHT, "cpu", element="p1").deform(loads)

@@ -45,7 +45,7 @@ def episode(theatre, tmp_path_factory):
     report = collect(path, theatre, play, "linear", iter)
     assert list(path.parent.iterdir()) == [path]
     with h5py.File(path, "r") as file:
-        yield report, file, play, list(play.frames())
+        yield report, file, play, list(play.play_frames())
 
 
 def decode_recorded(file, name, number, flag=cv2.IMREAD_UNCHANGED):
@@ -257,7 +257,7 @@ class TestRender:
         words = [*RENDER, str(anatomy), "--every", "3", "--plain", "--out", str(tmp_path)]
         assert main(words) == 0
         assert "3 frames by linear" in capsys.readouterr().out
-        shown = [frame.shown for frame in player(theatre, short(), "linear").frames(every=3)]
+        shown = [frame.shown for frame in player(theatre, short(), "linear").play_frames(every=3)]
         for number, colour in zip((0, 3, 6), shown, strict=True):
             assert np.array_equal(cv2.imread(str(tmp_path / f"frame_{number:04d}.png"))[..., ::-1], colour)
 

@@ -21,7 +21,7 @@ from scenes.analysis.error_budget import (
 )
 from scenes.analysis.tracking_errors import change_calibration, sample_usual_covariance
 from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
-from scenes.script.site import site_of
+from scenes.script.site import build_site
 from scenes.script.uncertainty import SURROGATE
 from scenes.tracked.filming import USUAL, VIEW, place_reference
 from sim.errors import InputError
@@ -42,13 +42,13 @@ def sideways(camera, target, time):
 
 @pytest.fixture(scope="module")
 def filmed(box):
-    site, rng = site_of(box), np.random.default_rng(0)
+    site, rng = build_site(box), np.random.default_rng(0)
     ball = rng.normal(size=(60, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     rest = site.origin + 0.015 * site.axis + 5e-3 * ball
     bodies = 1e-3 * rng.normal(size=(100, 1, 3)) + np.zeros_like(rest)
     return Filmed(
-        site=site, viewpoint=VIEW, duration=2.0, T_scan_patient=place_reference(site, VIEW.camera(site)),
+        site=site, viewpoint=VIEW, duration=2.0, T_scan_patient=place_reference(site, VIEW.build_camera(site)),
         covariance=sample_usual_covariance(USUAL), time=1.0, rest=rest,
         field=0.002 * site.axis + np.zeros_like(rest), normals=ball, velocity=np.zeros_like(rest), bodies=bodies,
         meshes=0.2 * DEVIATES, own_mesh=0.05 * DEVIATES, surrogate=0.3e-3,
@@ -125,7 +125,7 @@ def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
     T[:3, :3] = Rotation.from_euler("xyz", [90.0, 0.0, 90.0], degrees=True).as_matrix() @ T[:3, :3]
     turn, shift = np.full(6, 1e-16), np.full(6, 1e-16)
     turn[3 + axis], shift[axis] = 0.02**2, 1e-3**2
-    toward = VIEW.camera(filmed.site).T_camera_world[2, :3]
+    toward = VIEW.build_camera(filmed.site).T_camera_world[2, :3]
     for apart, size in ((T[:3, axis], 0.0), (T[:3, (axis + 1) % 3], 0.02)):
         registered = Registration(np.linalg.inv(T), np.diag(turn), middle - 0.05 * apart, 1e-3, 6)
         found = sample_errors(replace(filmed, T_scan_patient=T, registration=registered), [REGISTRATION], COUNT)
@@ -138,7 +138,7 @@ def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
 def test_rolling_shutter_error_from_camera_motion(filmed):
     calibration = replace(USUAL, readout=0.02)
     moving = replace(filmed, viewpoint=replace(VIEW, calibration=calibration, path=sideways), duration=0.1)
-    camera, middle = VIEW.camera(moving.site), (filmed.rest + filmed.field).mean(axis=0)
+    camera, middle = VIEW.build_camera(moving.site), (filmed.rest + filmed.field).mean(axis=0)
     rows = [
         camera.project(place[None])[0][0, 1] for place in (middle, (filmed.T_scan_patient @ [0.03, 0.02, 0.0, 1.0])[:3])
     ]
@@ -190,7 +190,7 @@ def test_parts_add_up_in_quadrature_and_the_largest_is_named(filmed):
     assert technical < clinical and set(budget.alone) == set(CLINICAL)
     squares = sum(np.mean(budget.alone[name].middle ** 2) for name in TECHNICAL)
     assert np.sqrt(np.mean(budget.technical.middle**2)) == pytest.approx(np.sqrt(squares), rel=0.2)
-    assert budget.largest("middle") == REGISTRATION and budget.held is not None and budget.held[0] > 0.8
+    assert budget.find_largest("middle") == REGISTRATION and budget.held is not None and budget.held[0] > 0.8
 
 
 def test_a_reference_out_of_sight_is_said(filmed):

@@ -40,11 +40,11 @@ def six(shift):
 @pytest.mark.parametrize("shift", [1e-6 * np.eye(3), np.diag([1e-6, 0.0, 0.0])])
 def test_link_bound_of_registration_is_2_80_sigma(shift):
     """The ball that holds 95 % of an isotropic error of 1 mm along each axis."""
-    follower, names = follower_of(template_theatre().stage(find_scene("palpate"))), TransformNames()
+    follower, names = follower_of(template_theatre().build_stage(find_scene("palpate"))), TransformNames()
     given = replace(follower.registration, covariance=six(shift))
     pose = solve_reference_frames(follower.motion.stage).T_scan_tool[10] @ np.linalg.inv(follower.tool.T_cube_tool)
     heard = ReceivedTransforms(names, 1.0).add_transform(names.tool, in_mm(given.T_patient_scan @ pose), 1, 0.0, 0)
-    found = PoseResponder(follower.motion, follower.tool, 5e-4, given).answer(heard, 0.0, 0.0)
+    found = PoseResponder(follower.motion, follower.tool, 5e-4, given).compute_result(heard, 0.0, 0.0)
     assert found.known.parts["registration"] == pytest.approx(2.7955e-3, rel=1e-4)
     assert found.known.band == pytest.approx(np.hypot(2.7955e-3, found.known.motion.error), rel=1e-4)
 
@@ -60,7 +60,7 @@ def test_hand_eye_error_is_that_of_a_camera_moved_by_it():
         ExternalTracker(far, far, eye=CameraMount(each, np.outer(step, step)))
         for each in (T, move_about(T, np.zeros(3), step))
     )
-    found, there = right.reference(0.0), other.reference(0.0).T_camera_target
+    found, there = right.find_reference(0.0), other.find_reference(0.0).T_camera_target
     turn = Rotation.from_matrix(there[:3, :3] @ found.T_camera_target[:3, :3].T).as_rotvec()
     moved = np.append(there[:3, 3] - found.T_camera_target[:3, 3], turn)
     np.testing.assert_allclose(found.covariance, np.outer(moved, moved), rtol=0.0, atol=2e-3 * (moved @ moved))
@@ -88,12 +88,12 @@ class Sinking:
 
 
 def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
-    stage = template_theatre().stage(find_scene("palpate"))
+    stage = template_theatre().build_stage(find_scene("palpate"))
     sinking, pose = Sinking(stage), np.eye(4)
     pose[:3, 3] = stage.site.origin
-    first = ToolMotion(stage, sinking).under(pose, np.diag([1e-6, 1e-8, 1e-8]))
+    first = ToolMotion(stage, sinking).compute_motion(pose, np.diag([1e-6, 1e-8, 1e-8]))
     assert first.moved == pytest.approx(0.0, abs=1e-9) and first.tool == pytest.approx(1.96e-3, rel=1e-3)
-    ToolMotion(stage, sinking).under(pose, 1e-6 * np.eye(3), first)
+    ToolMotion(stage, sinking).compute_motion(pose, 1e-6 * np.eye(3), first)
     assert sinking.starts[0] is None and sinking.starts[2] is first.answer
 
 
@@ -101,8 +101,8 @@ def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
 def test_model_error_without_a_bound_is_the_models_own(bound, expected, doubt, monkeypatch):
     model = SimpleNamespace(bound=bound)
     monkeypatch.setattr("scenes.tracked.tool_motion.find_first_model", lambda deformer, answer: model)
-    stage = template_theatre().stage(find_scene("palpate"))
-    found = ToolMotion(stage, Sinking(stage)).under(np.eye(4), np.zeros((3, 3)))
+    stage = template_theatre().build_stage(find_scene("palpate"))
+    found = ToolMotion(stage, Sinking(stage)).compute_motion(np.eye(4), np.zeros((3, 3)))
     assert (found.model, found.doubt) == (expected, doubt)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from scenes.script.scene import find_scene
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim import Bonded, Elasticity, Fem, Held, ToolForce, open_cortex, push, read_anatomy
 from surrogate.model.own_learners import GROUP
 
@@ -93,7 +93,7 @@ def test_the_command_says_how_large_the_tumour_is(capsys):
     exec(block, names)
     parser = argparse.ArgumentParser()
     names["add_arguments"](parser)
-    assert names["run"](parser.parse_args([str(template_path())])) == 0
+    assert names["run"](parser.parse_args([str(get_template_path())])) == 0
     assert float(capsys.readouterr().out.removesuffix(" ml\n")) == pytest.approx(4 / 3 * np.pi * 1.2**3, rel=0.05)
 
 

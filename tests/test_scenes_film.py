@@ -52,9 +52,9 @@ def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):
     said = json.loads(capsys.readouterr().out)
     assert said["frames"] == 3 and said["tumour_moves_mm"] > 0.01
     theatre = template_theatre()
-    stage = theatre.stage(find_scene("press"))
+    stage = theatre.build_stage(find_scene("press"))
     truth = read_truth(out / "truth.npz", theatre.anatomy.digest, len(stage.tumour_vertices))
-    assert truth.at(1.0 / 3.0) == 1 and truth.at(0.1) is None
+    assert truth.find_image(1.0 / 3.0) == 1 and truth.find_image(0.1) is None
     pictures = list(read_video(out / "frames", 3.0, colour=True))
     assert [read_stamp(each.grey) for each in pictures] == pytest.approx(truth.times, abs=1e-4)
     assert pictures[0].colour is not None and pictures[0].colour.shape == (600, 800, 3)

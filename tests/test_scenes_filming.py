@@ -26,8 +26,8 @@ TARGETS = (build_tool_cube(), build_patient_reference())
 def player():
     """The scene palpate on a brain that stays at rest."""
     theatre = template_theatre()
-    scene = replace(find_scene("palpate"), viewpoint=VIEW.calibrated(SMALL), duration=0.7)
-    return Player(theatre.stage(scene), AtRest(theatre.anatomy))
+    scene = replace(find_scene("palpate"), viewpoint=VIEW.calibrate(SMALL), duration=0.7)
+    return Player(theatre.build_stage(scene), AtRest(theatre.anatomy))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def grey(shot):
 
 def test_both_targets_are_seen_where_they_are(player, shots):
     mounts = mount_targets(player)
-    seen = Tracker(SMALL.camera(np.eye(4)), TARGETS).track(grey(shots[0]))
+    seen = Tracker(SMALL.build_camera(np.eye(4)), TARGETS).track(grey(shots[0]))
     wanted = {
         "tool": shots[0].T_scan_tool @ np.linalg.inv(mounts.tool.T_cube_tool),
         "patient": mounts.T_scan_patient,
@@ -53,12 +53,12 @@ def test_both_targets_are_seen_where_they_are(player, shots):
     for name, T_scan_target in wanted.items():
         off = seen.poses[name].T_camera_target - shots[0].T_camera_scan @ T_scan_target
         assert np.abs(off[:3, 3]).max() < 0.5e-3 and np.abs(off[:3, :3]).max() < 0.01
-    assert len(np.unique(Detector(TARGETS).seen(grey(shots[0]))["tool"].face)) >= 2
+    assert len(np.unique(Detector(TARGETS).detect(grey(shots[0]))["tool"].face)) >= 2
 
 
 def test_what_goes_wrong_does_and_nothing_else(shots):
     detector = Detector(TARGETS)
-    found = [set(detector.seen(grey(shot))) for shot in shots]
+    found = [set(detector.detect(grey(shot))) for shot in shots]
     both = {"tool", "patient"}
     assert found[0] == found[-1] == both  # before and after
     assert found[1:5] == [{"tool"}, {"patient"}, set(), set()]

@@ -96,7 +96,7 @@ def test_tip_covariance_is_turned_into_the_scan(source):
 
 def looking(motion, **given):
     """Return what is known of pictures every 40 ms: `motion` moves the reference before the camera, from the first."""
-    follower = replace(follower_of(template_theatre().stage(find_scene("palpate"))), tool=None, **given)
+    follower = replace(follower_of(template_theatre().build_stage(find_scene("palpate"))), tool=None, **given)
     first = solve_reference_frames(follower.motion.stage).T_camera_scan[0] @ np.linalg.inv(
         follower.registration.T_patient_scan
     )

@@ -15,7 +15,7 @@ from scenes.play.player import Player
 
 
 def test_each_frame_is_drawn_once_in_order_and_sent(box, monkeypatch):
-    drawn, sent, play, put_sight = [], [], Player.drawn, Browser.put_sight
+    drawn, sent, play, put_sight = [], [], Player.draw_frame, Browser.put_sight
 
     def seen(player, number, *rest):
         drawn.append(number)
@@ -27,7 +27,7 @@ def test_each_frame_is_drawn_once_in_order_and_sent(box, monkeypatch):
 
     monkeypatch.setattr(Player, "drawn", seen)
     monkeypatch.setattr(Browser, "put_sight", heard)
-    player = theatre_of(box).player("linear", short())
+    player = theatre_of(box).build_player("linear", short())
     found = list(frames_of(player, 4))
     assert len(found) == 4 and all(len(row) == len(STAGES) and min(row) > 0.0 for row in found)
     assert drawn == [number % len(player.scene.times) for number in range(WARM_UP + 4)]
@@ -43,14 +43,14 @@ def test_a_frame_is_the_sum_of_its_stages():
 
 
 def test_a_batch_is_of_so_many_frames_and_cameras(box, monkeypatch):
-    asked, pictures = [], Renderer.pictures
+    asked, pictures = [], Renderer.render_batch
 
     def heard(renderer, vertices, cameras):
         asked.append((vertices, cameras))
         return pictures(renderer, vertices, cameras)
 
     monkeypatch.setattr(Renderer, "pictures", heard)
-    assert batch_rate(theatre_of(box).player("linear", short()), 3, 0.01) > 0.0
+    assert batch_rate(theatre_of(box).build_player("linear", short()), 3, 0.01) > 0.0
     vertices, cameras = asked[-1]
     assert len(asked) >= 2 and len({vertex.tobytes() for vertex in vertices}) > 1
     assert len({camera.T_camera_world.tobytes() for camera in cameras}) == len(cameras) == len(vertices) == 3

@@ -23,7 +23,7 @@ PARTS = {"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
 )
 def test_what_few_draws_or_folded_tissue_say_is_a_guess(counts, guess):
     found = Uncertainty("press", "mark", 9, 1, **LISTS, parts=PARTS, **counts)
-    assert found.guess == found.at(0.5).guess == guess and found.few == (counts.get("numbers") == 5)
+    assert found.guess == found.evaluate(0.5).guess == guess and found.few == (counts.get("numbers") == 5)
 
 
 def test_a_guess_is_called_so_and_blames_no_part():

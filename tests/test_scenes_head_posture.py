@@ -24,7 +24,7 @@ class TestLying:
     def test_a_full_head_is_wet_and_a_drained_one_dry(self, box, direction):
         nodes = box.mesh.nodes
         for fluid, wet in ((1.0, len(nodes)), (0.0, 0)):
-            found = Lying(direction, fluid).posture(nodes)
+            found = Lying(direction, fluid).build_posture(nodes)
             assert np.linalg.norm(found.direction) == pytest.approx(1.0)
             assert (-nodes @ found.direction[0] < found.csf_level[0]).sum() == wet
 

@@ -38,9 +38,9 @@ def test_a_rigid_matrix_of_single_precision_is_taken_in_metres():
 def test_tracker_frame_bodies_map_to_reference():
     names = TransformNames(tool="StylusTipToTracker")
     heard = ReceivedTransforms(names, 0.3).add_transform(names.tool, matrix(), STAMP, 1.0, 0)
-    assert heard.beside(names.tool, 1.0) == "no ReferenceToTracker yet"
+    assert heard.find_relative(names.tool, 1.0) == "no ReferenceToTracker yet"
     heard = heard.add_transform(names.reference, matrix((0.0, 0.0, 100.0)), STAMP, 0.9, 0)
-    found = heard.beside(names.tool, 1.0)
+    found = heard.find_relative(names.tool, 1.0)
     expected = np.linalg.inv(to_rigid(matrix((0.0, 0.0, 100.0)))) @ to_rigid(matrix())
     assert pytest.approx(expected) == found.T and found.arrived == 0.9
-    assert heard.beside(names.tool, 1.25) == "no new ReferenceToTracker for 0.3 s"
+    assert heard.find_relative(names.tool, 1.25) == "no new ReferenceToTracker for 0.3 s"

@@ -13,7 +13,7 @@ from theatres import small, theatre_of
 from scenes.play.deformers import Theatre, open_theatre
 from scenes.play.reference import solve_reference_frames
 from scenes.script.scene import Scene
-from scenes.script.site import site_of
+from scenes.script.site import build_site
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
@@ -35,7 +35,7 @@ def body() -> Anatomy:
 
 def physics(theatre: Theatre, scene: Scene) -> tuple[str, Tissue | None]:
     """Element and default tissue of a theatre's finite elements."""
-    fem = theatre.deformer("fem", scene)
+    fem = theatre.build_deformer("fem", scene)
     assert isinstance(fem, Fem)
     elasticity = next(effect for effect in fem.effects if isinstance(effect, Elasticity))
     return fem.space.element, elasticity.default
@@ -51,10 +51,14 @@ def test_models_are_judged_with_what_they_were_trained_on(box, body, tmp_path) -
     save(tmp_path / "box.model.npz", trained)
     theatre = open_theatre(tmp_path / "box.vtu", device="cpu")
     assert physics(theatre, small()) == ("smoothed", BRAIN)
-    assert theatre.names(small()) == ("fem",)
-    scene = small().made_of(STIFF, "smoothed")
-    assert physics(theatre, scene) == ("smoothed", STIFF) and theatre.names(scene) == (*trained, "guarded", "fem")
-    loads = [scene.loads(site_of(box), scene.path(1.0), 1.0)]
+    assert theatre.list_deformers(small()) == ("fem",)
+    scene = small().replace_tissue(STIFF, "smoothed")
+    assert physics(theatre, scene) == ("smoothed", STIFF) and theatre.list_deformers(scene) == (
+        *trained,
+        "guarded",
+        "fem",
+    )
+    loads = [scene.build_loads(build_site(box), scene.path(1.0), 1.0)]
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Elasticity))
     right = Fem(box, (Elasticity(STIFF), *others), TRAIN, "cpu", element="smoothed").deform(loads[0])
     found = solve_reference_frames(theatre, scene, loads)
@@ -73,4 +77,4 @@ def test_a_tissue_that_cannot_be_read_is_a_sentence(box) -> None:
     for text in ("jelly", "{}", "[]"):
         broken = replace(theatre, models={"linear": replace(model, training={"tissue": text})})
         with pytest.raises(InputError, match="is no tissue that this version knows"):
-            broken.deformer("linear", small())
+            broken.build_deformer("linear", small())

@@ -74,7 +74,7 @@ def test_lerobots_own_reader_reads_what_ours_reads(lerobot, folder, tmp_path):
     words = [str(FOREIGN), "-c", READ, str(lerobot), str(tmp_path / "cache"), str(out)]
     done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, "HF_HUB_OFFLINE": "1"}, check=False)
     assert done.returncode == 0, done.stderr
-    ours = read_episodes(folder, ["colour", "depth", "tumour_predicted"]).at(1, 2)
+    ours = read_episodes(folder, ["colour", "depth", "tumour_predicted"]).get_window(1, 2)
     with np.load(out) as read:
         assert read["count"] == 16 and read["task"] == TASKS["slide"] and read["action"].shape == (2, 6)
         assert np.allclose(read["depth"] * 1e-5, ours["depth"][0], atol=1e-8)
@@ -96,7 +96,7 @@ def test_without_pyarrow_lerobot_names_what_to_install(folder, tmp_path):
 def test_statistics_of_parts_are_those_of_the_whole():
     rows = np.random.default_rng(0).normal(size=(20, 3))
     rows[3, 1] = np.nan
-    said = (RowStatistics.of(rows[:7]) + RowStatistics.of(rows[7:])).said()
+    said = (RowStatistics.compute(rows[:7]) + RowStatistics.compute(rows[7:])).to_lists()
     for name, of in (("min", np.nanmin), ("max", np.nanmax), ("mean", np.nanmean), ("std", np.nanstd)):
         assert np.allclose(said[name], of(rows, axis=0))
-    assert said["count"] == [20] and RowStatistics.of(np.full((2, 1), np.nan)).said()["mean"] == [0.0]
+    assert said["count"] == [20] and RowStatistics.compute(np.full((2, 1), np.nan)).to_lists()["mean"] == [0.0]

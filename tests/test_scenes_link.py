@@ -11,13 +11,13 @@ from films import FILM
 from programs import main
 
 from scenes.link.frame import HEADER, read_header
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 
 SELF = "localhost", "127.0.0.1", socket.gethostname()
 
 
 def test_server_is_local_and_stops_on_signal():
-    words = ["link", template_path(), "--tool", FILM / "tool.json", "--deformer", "rest", "--port", "0"]
+    words = ["link", get_template_path(), "--tool", FILM / "tool.json", "--deformer", "rest", "--port", "0"]
     command = [sys.executable, "-m", "scenes.cli", *map(str, words), "--device", "cpu"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
@@ -46,7 +46,7 @@ def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay
 
     monkeypatch.setattr("scenes.commands.link.build_mover", lambda *words: (Slow(), "a slow one"))
     words = ["--tool", FILM / "tool.json", "--port", "0", "--device", "cpu", "--seconds", "0.1"]
-    assert main(["link", str(template_path()), *map(str, words)]) == 0
+    assert main(["link", str(get_template_path()), *map(str, words)]) == 0
     out, error = capsys.readouterr()
     assert "one solution takes" in out and said in error and ("too short" in error) == bool(said)
 
@@ -71,7 +71,7 @@ def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay
     ],
 )
 def test_what_cannot_be_served_is_refused(words, why, capsys):
-    assert main(["link", str(template_path()), "--device", "cpu", *words]) == 2
+    assert main(["link", str(get_template_path()), "--device", "cpu", *words]) == 2
     assert why in capsys.readouterr().err
 
 

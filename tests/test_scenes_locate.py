@@ -247,7 +247,7 @@ def test_what_cannot_be_placed_does_not_wait_for_a_locator(tmp_path, capsys, bod
 def test_a_small_locator_has_no_result_of_every_vertex(files, body, tmp_path, capsys):
     folder, _ = files
     path = tmp_path / "small.npz"
-    save_locator(path, load_locator(folder / "box.locator.npz", body).small())
+    save_locator(path, load_locator(folder / "box.locator.npz", body).restrict())
     words = ["locate", str(folder / "box.vtu"), str(folder / "vessels.csv"), "--locator", str(path)]
     assert main([*words, "--out", str(tmp_path / "out.vtu")]) == 2
     assert "is small" in capsys.readouterr().err and not (tmp_path / "out.vtu").exists()
@@ -280,7 +280,7 @@ def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, mon
     assert np.array_equal(load_locator(beside, body).prior.shape, whole.prior.shape)
     assert main(["locator", str(path), "--small", "--json", "--force"]) == 0
     said, small = json.loads(capsys.readouterr().out), load_locator(beside, body)
-    assert not said["whole"] and np.array_equal(small.prior.nodes, whole.small().prior.nodes)
+    assert not said["whole"] and np.array_equal(small.prior.nodes, whole.restrict().prior.nodes)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["box.locator.npz", "box.vtu"]
     assert main(["locator", str(path), "--region", "tumour:9000,0.45", "--force"]) == 0
     assert "region 2 (tumour) 3 times as stiff as the brain, Poisson's ratio 0.45" in capsys.readouterr().out

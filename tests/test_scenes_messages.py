@@ -97,7 +97,7 @@ def test_what_pyigtl_sends_is_what_we_read(version):
 
 def test_polydata_and_status_have_the_layout_of_the_protocol():
     corners = RANDOM.normal(size=(4, 3)).astype(np.float32)
-    body = encode_polydata(corners, SentMesh.of(np.array([[0, 1, 2], [0, 2, 3]])))
+    body = encode_polydata(corners, SentMesh.from_triangles(np.array([[0, 1, 2], [0, 2, 3]])))
     assert struct.unpack(">10I", body[:40]) == (4, 0, 0, 0, 0, 2, 32, 0, 0, 0)
     assert np.array_equal(np.frombuffer(body, ">f4", 12, 40).reshape(4, 3), corners)
     assert struct.unpack(">8I", body[88:]) == (3, 0, 1, 2, 3, 0, 2, 3)
@@ -168,11 +168,11 @@ def test_what_is_no_message_is_refused(read, why):
 def test_a_body_is_known_while_its_transforms_are_new():
     names = TransformNames()
     heard = ReceivedTransforms(names, 0.3)
-    assert heard.beside(names.tool, 0.0) == "no StylusTipToReference yet"
+    assert heard.find_relative(names.tool, 0.0) == "no StylusTipToReference yet"
     heard = heard.add_transform(names.tool, matrix(), STAMP, 1.0, 0)
-    found = heard.beside(names.tool, 1.2)
+    found = heard.find_relative(names.tool, 1.2)
     assert found.stamp == STAMP and found.T[:3, 3] == pytest.approx([0.01, -0.02, 0.03])
-    assert heard.beside(names.tool, 1.4) == "no new StylusTipToReference for 0.4 s"
+    assert heard.find_relative(names.tool, 1.4) == "no new StylusTipToReference for 0.4 s"
     for T, stamp, sender, why in (
         (np.eye(4), STAMP + 9, 0, "identity"),
         (np.diag([0.0, 0.0, 0.0, 1.0]), STAMP + 9, 0, "zeros, which trackers send"),

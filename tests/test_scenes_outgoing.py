@@ -26,13 +26,13 @@ def test_places_inside_the_tumour_move_with_its_volume(stage):
     stretched = stage.nodes, 0.3 * (rest[stage.nodes] - rest[stage.nodes].mean(axis=0))
     moved = TrackingResult(0.0, TumourState.GOOD, "", NOT_SEEN, motion_of(rest, *stretched), band=1e-3)
     assert len(at) == 3
-    body = outgoing.messages(PoseResult(NOW, moved), outgoing.placed(["a", "b", "c"], at))[-2]
+    body = outgoing.build_messages(PoseResult(NOW, moved), outgoing.attach_points(["a", "b", "c"], at))[-2]
     found = 1e-3 * read_points(body[HEADER.size :])[1]
     assert found == pytest.approx(at + 0.3 * (at - rest[stage.nodes].mean(axis=0)), abs=1e-6)
     # A place on the cortex is not sent for a model that knows the tumour alone.
     tumour = replace(moved, motion=motion_of(rest, anatomy.tumour_nodes, 0.0 * rest[anatomy.tumour_nodes]))
-    both = outgoing.placed(["a", "c"], np.vstack([at[:1], rest[anatomy.open_surface[:1, 0]]]))
-    assert read_points(outgoing.messages(PoseResult(NOW, tumour), both)[-2][HEADER.size :])[0] == ["a"]
+    both = outgoing.attach_points(["a", "c"], np.vstack([at[:1], rest[anatomy.open_surface[:1, 0]]]))
+    assert read_points(outgoing.build_messages(PoseResult(NOW, tumour), both)[-2][HEADER.size :])[0] == ["a"]
 
 
 def motion_of(rest, nodes, displacement):

@@ -109,7 +109,7 @@ def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth
             return build_prediction(moved, self.vertices, loads, [False], 0.0, np.full((2, 1), np.nan), "")
 
     falling = Falling(stage.anatomy, stage.tumour_vertices, truth.T_scan_tool, truth.displacement)
-    motion = ToolMotion(stage, falling).under(truth.T_scan_tool[5], np.diag([1e-8, 4e-6, 1e-8]))
+    motion = ToolMotion(stage, falling).compute_motion(truth.T_scan_tool[5], np.diag([1e-8, 4e-6, 1e-8]))
     assert motion.tool == pytest.approx(0.2 * 1.96 * 2e-3, rel=0.01)
 
 

@@ -37,7 +37,7 @@ def page(follower, stage):
     done = threading.Event()
     with opened(follower, stage, film.count) as page:
         page.plays = False
-        page.browser.plays(False)
+        page.browser.show_playback(False)
 
         def play():
             while not done.is_set():

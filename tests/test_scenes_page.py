@@ -19,11 +19,11 @@ def answer(outcome: Outcome, bound: float = 1e-3):
 class TestDigestOfLoads:
     def test_it_is_of_the_load_and_not_of_the_frame(self, theatre):
         scene, site = short(), theatre.site
-        one = compute_loads_digest(scene.loads(site, Touch(force=0.2), 0.1))
-        assert one == compute_loads_digest(scene.loads(site, Touch(force=0.2), 0.1))
+        one = compute_loads_digest(scene.build_loads(site, Touch(force=0.2), 0.1))
+        assert one == compute_loads_digest(scene.build_loads(site, Touch(force=0.2), 0.1))
         others = [Touch(force=0.21), Touch(force=0.2, x=0.004), Touch(force=0.2, tilt=(0.3, 0.0))]
-        assert one not in {compute_loads_digest(scene.loads(site, touch, 0.1)) for touch in others}
-        assert one != compute_loads_digest(scene.loads(site, Touch(force=0.2), 0.2))
+        assert one not in {compute_loads_digest(scene.build_loads(site, touch, 0.1)) for touch in others}
+        assert one != compute_loads_digest(scene.build_loads(site, Touch(force=0.2), 0.2))
 
 
 def test_the_page_reads_what_the_frame_holds(theatre):

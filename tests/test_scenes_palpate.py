@@ -42,7 +42,7 @@ def small(name: str) -> Scene:
 
 @pytest.fixture(scope="module")
 def palpated(theatre):
-    return list(player(theatre, small("palpate"), "fem").frames(10))
+    return list(player(theatre, small("palpate"), "fem").play_frames(10))
 
 
 def untrained(anatomy: Anatomy, scene: Scene) -> Learned:
@@ -110,7 +110,7 @@ class TestPalpate:
         both = replace(theatre, models={"contact": model})
         assert both.names(scene) == ("contact", "guarded", "fem")
         play, by_model = player(both, scene, "guarded"), 0
-        frames = list(play.frames(10))
+        frames = list(play.play_frames(10))
         for frame, solved in zip(frames, palpated, strict=True):
             trained = find_first_model(play.deformer, frame.deformation) is not None
             by_model += trained
@@ -172,6 +172,6 @@ def test_a_moved_tool_needs_a_hand():
 def test_a_tool_in_the_air_touches_nothing(theatre):
     scene = small("palpate")
     fem = theatre.fem(scene, scene.accuracy)
-    loads = scene.loads(theatre.site, Touch(depth=-1e-3), 0.0)
+    loads = scene.build_loads(theatre.site, Touch(depth=-1e-3), 0.0)
     np.testing.assert_array_equal(fem.deform(loads).displacement, 0.0)
     assert Held() in fem.effects

@@ -7,13 +7,13 @@ import pytest
 import trimesh
 
 from scenes.report.picture import find_rested_tip
-from scenes.script.site import site_of
+from scenes.script.site import build_site
 
 
 def test_report_image_tool_rests_without_piercing(box):
-    site, radius = site_of(box), 5e-3
+    site, radius = build_site(box), 5e-3
     nodes = box.mesh.nodes.copy()
-    top = site.contact(0.0, 0.0, radius).point
+    top = site.find_contact(0.0, 0.0, radius).point
     away = np.linalg.norm(nodes - top, axis=1)
     # A dent that is deepest under the tool, and narrower than the ball.
     nodes += 2e-3 * np.exp(-((away / 4e-3) ** 2))[:, None] * site.axis

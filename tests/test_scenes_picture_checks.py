@@ -20,7 +20,7 @@ from scenes.script.tool_paths import press
 
 def filmed(theatre, name="fem", **view):
     scene = small(path=press(0.2, hold=0.5))
-    return player(theatre, replace(scene, viewpoint=replace(scene.viewpoint.calibrated(REAL), **view)), name)
+    return player(theatre, replace(scene, viewpoint=replace(scene.viewpoint.calibrate(REAL), **view)), name)
 
 
 def by_opencv(camera, points):
@@ -48,10 +48,10 @@ def drawn_by_opencv(camera, layer, fine=8, times=4):
 def test_the_overlay_is_in_register_under_each_path(theatre, path):
     """The outline found again in the picture, against the tumour as OpenCV projects it."""
     play = filmed(theatre, path=None if path is None else PATHS[path](1))
-    frames = list(play.frames(every=25))
+    frames = list(play.play_frames(every=25))
     assert len({id(frame.camera) for frame in frames}) == (1 if path is None else len(frames))
     for frame in frames:
-        tumour = play.stage.tumour(play.believed(frame))
+        tumour = play.stage.build_tumour(play.estimate_positions(frame))
         mask, ours = (
             drawn_by_opencv(frame.camera, tumour),
             compute_silhouette(frame.camera, tumour.vertices, tumour.triangles),
@@ -67,12 +67,14 @@ def test_the_overlay_is_in_register_under_each_path(theatre, path):
 @pytest.mark.parametrize("path", PATHS)
 def test_scene_checks_pass_on_path_and_fail_on_other_camera(theatre, path):
     play = filmed(theatre, path=PATHS[path](1), eye="left")
-    frames = list(play.frames(every=30))
+    frames = list(play.play_frames(every=30))
     truth = solve_reference_frames(theatre, play.scene, [frame.loads for frame in frames])
-    figures = measure(play, play.camera_at, frames, truth)
-    assert not figures.broken(Bounds()) and figures.pixels < 1e-6
-    assert measure(play, lambda time: play.camera_at(time + 0.3), frames, truth).broken(Bounds())
-    assert measure(play, lambda time: replace(play.camera_at(time), lens=None), frames, truth).broken(Bounds())
+    figures = measure(play, play.get_camera, frames, truth)
+    assert not figures.find_violations(Bounds()) and figures.pixels < 1e-6
+    assert measure(play, lambda time: play.get_camera(time + 0.3), frames, truth).find_violations(Bounds())
+    assert measure(play, lambda time: replace(play.get_camera(time), lens=None), frames, truth).find_violations(
+        Bounds()
+    )
 
 
 def test_episodes_hold_the_lens_and_the_camera_of_each_frame(theatre, tmp_path):
@@ -82,7 +84,7 @@ def test_episodes_hold_the_lens_and_the_camera_of_each_frame(theatre, tmp_path):
     play = player(theatre, replace(play.scene, duration=0.2), "fem")
     collect(tmp_path / "episode.h5", theatre, play, "fem", lambda frames: frames)
     with h5py.File(tmp_path / "episode.h5") as file:
-        last = play.camera_at(float(play.scene.times[-1]))
+        last = play.get_camera(float(play.scene.times[-1]))
         assert np.array_equal(file["K"][:], play.camera.K) and np.array_equal(file["K_of_frame"][-1], last.K)
         assert not np.array_equal(file["K"][:], last.K) and file["distortion"][:].tolist() == LENS.coefficients.tolist()
         assert np.array_equal(file["T_camera_world"][-1], last.T_camera_world)
@@ -90,4 +92,6 @@ def test_episodes_hold_the_lens_and_the_camera_of_each_frame(theatre, tmp_path):
         positions[file["tumour_nodes"][:]] = file["tumour_predicted"][-1]
         camera = Camera(file["K_of_frame"][-1], file["T_camera_world"][-1], file.attrs["width"], file.attrs["height"])
         mask = cv2.imdecode(file["pictures/tumour_mask"][-1], cv2.IMREAD_GRAYSCALE) > 0
-        assert mask.sum() > 5000 and compute_iou(mask, drawn_by_opencv(camera, play.stage.tumour(positions))) > 0.985
+        assert (
+            mask.sum() > 5000 and compute_iou(mask, drawn_by_opencv(camera, play.stage.build_tumour(positions))) > 0.985
+        )

@@ -55,7 +55,7 @@ def test_interpolated_pose_reports_remaining_error():
     for late, share in ((2, 0.5), (5, 0.3), (12, 0.9), (1, 0.6)):  # poses that came after the picture's
         time = times[-1 - late] + (share - 1.0) * STEP
         placed = at(heard, time)
-        newest = replace(placed, T=heard.course(heard.names.camera)[-1].T)
+        newest = replace(placed, T=heard.list_transforms(heard.names.camera)[-1].T)
         assert off(placed, time) <= placed.moved < 0.2e-3 and off(placed, time) < 0.1 * off(newest, time)
     ahead = at(heard, times[-1] + 0.03)
     assert off(ahead, times[-1] + 0.03) <= ahead.moved < 4e-3
@@ -82,10 +82,10 @@ def test_poses_of_other_client_or_time_are_not_neighbours():
     heard = heard_of(STEP * np.arange(9))
     name = heard.names.camera
     taken_over = heard.add_transform(name, camera(0.4), to_stamp(BEGUN + 0.4), 1.0, 1)
-    assert len(heard.course(name)) == 9 and len(taken_over.course(name)) == 1
+    assert len(heard.list_transforms(name)) == 9 and len(taken_over.list_transforms(name)) == 1
     set_back = heard.add_transform(name, camera(0.4), to_stamp(BEGUN - 60.0), 0.4, 0)
-    assert [sent.stamp for sent in set_back.course(name)] == [to_stamp(BEGUN - 60.0)]
-    assert len(heard_of(STEP * np.arange(200)).course(name)) == 33
+    assert [sent.stamp for sent in set_back.list_transforms(name)] == [to_stamp(BEGUN - 60.0)]
+    assert len(heard_of(STEP * np.arange(200)).list_transforms(name)) == 33
 
 
 @pytest.mark.parametrize(

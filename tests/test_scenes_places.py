@@ -36,7 +36,7 @@ def fields(kinked):
 
 def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
     places = list_places(kinked)
-    errors = places.errors(fields)
+    errors = places.compute_errors(fields)
     assert 0.05e-3 < errors[places.tumour].max() < 1e-3 and errors[places.cortex].max() < 1e-6
     # No field reaches beyond the grid.
     index = fields.grid.index(places.rest)
@@ -45,8 +45,8 @@ def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
     assert exact.sum() > 20 and not inside[places.cortex].any()
     for name in ("forward", "backward"):
         off = replace(fields, **{name: getattr(fields, name) + np.float32(1e-3)})
-        assert np.allclose(places.errors(off)[exact], 3**0.5 * 1e-3, rtol=1e-3)
-        assert np.allclose(places.errors(off)[places.cortex], errors[places.cortex])
+        assert np.allclose(places.compute_errors(off)[exact], 3**0.5 * 1e-3, rtol=1e-3)
+        assert np.allclose(places.compute_errors(off)[places.cortex], errors[places.cortex])
     assert places.cortex.sum() == len(np.unique(kinked.anatomy.open_surface)) + 3 * len(kinked.anatomy.open_surface)
     assert places.tumour.sum() > 4 * (kinked.anatomy.mesh.region == 2).sum()
 
@@ -65,7 +65,7 @@ def test_a_spacing_follows_from_the_tumours_error(kinked, fields):
     assert FINEST <= finer < fields.grid.spacing
     found = compute_fields(kinked, None, lambda more: None)
     places = list_places(kinked)
-    assert places.errors(found)[places.tumour].max() <= ENOUGH and found.grid.spacing < 1e-3
+    assert places.compute_errors(found)[places.tumour].max() <= ENOUGH and found.grid.spacing < 1e-3
     assert find_finer_spacing(kinked, found) is None
     still = choose_moment(kinked.anatomy, 1e-2 * kinked.displacement)
     assert compute_fields(still, None, lambda more: None).grid.spacing == 1e-3
@@ -84,7 +84,7 @@ def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
     """Points of the tetrahedra alone leave the cortex 0.9 mm off."""
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = list_places(dented)
-    errors = places.errors(fields)
+    errors = places.compute_errors(fields)
     assert places.landmarks.sum() == 2 and not fields.folds
     assert errors[places.cortex].max() < 0.2e-3 and errors[places.landmarks].max() < 0.1e-3
 
@@ -92,7 +92,7 @@ def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
 def test_a_spacing_follows_from_the_landmarks_error_too(dented):
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = list_places(dented)
-    assert places.errors(fields)[places.tumour].max() < ENOUGH / 10.0
+    assert places.compute_errors(fields)[places.tumour].max() < ENOUGH / 10.0
     finer = find_finer_spacing(dented, fields)
     assert finer is not None and finer < 1.5e-3
 

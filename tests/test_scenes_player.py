@@ -62,7 +62,7 @@ def test_a_place_under_the_bone_is_refused_said_and_shown(play, way):
 def test_tissue_pressed_into_bone_is_not_reliable(theatre):
     """Drawn aside with all that the model knows, beside the rim: the ball stays inside, and the picture says why."""
     play = player(theatre, replace(small(), viewpoint=Viewpoint()), "fem")
-    reach = play.site.reach(play.scene.tool.radius)
+    reach = play.site.compute_reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
     assert frame.doubt == IN_BONE and all(says(frame.shown, part, compute_ink(WARNING)) for part in IN_BONE.split(": "))
     assert play.site.across(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
@@ -104,7 +104,7 @@ def test_drawing_is_a_function_of_its_moment(play):
 
 def test_frames_that_are_asked_for_together_are_the_same(theatre):
     play = player(theatre, short(), "linear")
-    alone, together = list(play.frames()), list(play.frames(together=4))
+    alone, together = list(play.play_frames()), list(play.play_frames(together=4))
     assert [frame.number for frame in together] == [frame.number for frame in alone]
     for one, other in zip(alone, together, strict=True):
         assert one.touch == other.touch and one.time == other.time
@@ -116,13 +116,13 @@ def test_frames_that_are_asked_for_together_are_the_same(theatre):
 def test_frames_are_stamped_with_their_moment(theatre):
     for name in ("linear", "fem"):
         play = player(theatre, short(), name)
-        frames = list(play.frames())
+        frames = list(play.play_frames())
         assert [frame.number for frame in frames] == list(range(7)) == list(range(len(play.scene.times)))
         for frame, time in zip(frames, play.scene.times, strict=True):
             assert frame.time == time == frame.loads.times[0] == frame.deformation.time[0]
             assert frame.touch == play.scene.path(time) and frame.deformation.outcome[0].good
             assert tuple(frame.seconds) == STAGES and min(frame.seconds.values()) > 0.0
-        assert [frame.number for frame in play.frames(every=3)] == [0, 3, 6]
+        assert [frame.number for frame in play.play_frames(every=3)] == [0, 3, 6]
         pictures = {frame.shown.tobytes() for frame in frames[:4]}
         assert len(pictures) == 4
 
@@ -132,7 +132,7 @@ def test_warm_starts_of_the_loop_change_nothing_that_is_seen(theatre):
     cold = [
         play.draw(number, float(time), play.scene.path(float(time))) for number, time in enumerate(play.scene.times)
     ]
-    for frame, alone in zip(play.frames(), cold, strict=True):
+    for frame, alone in zip(play.play_frames(), cold, strict=True):
         difference = np.linalg.norm(frame.deformation.displacement - alone.deformation.displacement, axis=2)
         assert difference.max() < 5e-5
 
@@ -194,7 +194,7 @@ def test_the_distance_is_that_from_tip_to_tumour(play):
     assert read <= least < read + 2e-4
     if bare is not play:  # what it is off by on average is added
         assert frame.distance == pytest.approx(
-            play.deformer.distance(frame.loads, frame.deformation).value[0], rel=1e-12
+            play.deformer.predict_distance(frame.loads, frame.deformation).value[0], rel=1e-12
         )
 
 

@@ -31,7 +31,7 @@ class TestPriors:
         """One draw in each of so many parts of equal probability."""
         found = sample_priors(20, 3)
         stiffness = np.sort([one.stiffness for one in found])
-        edges = STIFFNESS.at(np.arange(21) / 20.0)
+        edges = STIFFNESS.compute_quantiles(np.arange(21) / 20.0)
         assert (stiffness > edges[:-1]).all() and (stiffness < edges[1:]).all()
         poisson = np.sort([one.poisson for one in found])
         assert np.diff(POISSON.range)[0] > np.ptp(poisson) > 0.9 * np.diff(POISSON.range)[0]

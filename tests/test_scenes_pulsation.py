@@ -15,7 +15,7 @@ from sim.effects import Pulsation
 class TestPulsation:
     def test_the_ball_reads_the_pulse(self, theatre):
         scene = replace(small("pulsation"), duration=3.0)
-        frames = list(player(theatre, scene, "fem").frames(3))
+        frames = list(player(theatre, scene, "fem").play_frames(3))
         reads = np.array([-frame.deformation.reaction[0, 0, 2] for frame in frames if frame.time >= 1.0])
         swells = Pulsation().swelling(np.array([frame.time for frame in frames if frame.time >= 1.0]))
         assert np.corrcoef(reads, swells)[0, 1] > 0.95
@@ -23,6 +23,6 @@ class TestPulsation:
 
     def test_frames_after_one_another_are_the_truth(self, theatre):
         scene = small("pulsation")
-        loads = [scene.loads(theatre.site, scene.path(time), time) for time in (0.0, 0.8, 1.25, 1.6)]
+        loads = [scene.build_loads(theatre.site, scene.path(time), time) for time in (0.0, 0.8, 1.25, 1.6)]
         truth = solve_reference_frames(theatre, scene, loads)
         assert all(outcome.good for outcome in truth.outcome) and truth.displacement[3].any()

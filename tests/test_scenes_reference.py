@@ -72,7 +72,7 @@ def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path):
 def test_what_lies_beyond_is_outside_the_envelope(study):
     training = study.converged.rows(np.flatnonzero(study.discs.train)).of(Pushed)
     outside = study.outside.of(Pushed)
-    assert not compute_training_range(study.patch, training).holds(study.patch, outside).any()
+    assert not compute_training_range(study.patch, training).is_inside(study.patch, outside).any()
     size = np.linalg.norm(outside.force, axis=1)
     assert (size[::3] > 1.19 * np.linalg.norm(training.force, axis=1).max()).all()
     assert (study.patch.compute_edge_distance(outside.point[2::3]) < outside.footprint[2::3]).all()
@@ -85,8 +85,8 @@ def test_the_truth_of_a_frame_knows_what_went_before() -> None:
     theatre = Theatre(anatomy, None, {}, "cpu")
     scene = replace(small(), effects=(Elasticity(RELAXING), Held(), Slide(), ToolForce()), element="p1")
     moments = ((1.5, 0.5), (1.5, 2.0), (0.5, 2.2))
-    loads = [scene.loads(theatre.site, scene.path(moment), time) for moment, time in moments]
-    found, fem, last = solve_reference_frames(theatre, scene, loads).displacement, theatre.fem(scene, TRAIN), None
+    loads = [scene.build_loads(theatre.site, scene.path(moment), time) for moment, time in moments]
+    found, fem, last = solve_reference_frames(theatre, scene, loads).displacement, theatre.build_fem(scene, TRAIN), None
     for row, load in zip(found, loads, strict=True):
         last = fem.deform(load, start=last)
         np.testing.assert_allclose(row, last.displacement[0], atol=1e-9)

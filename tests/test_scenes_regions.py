@@ -46,7 +46,7 @@ class TestData:
         truth = Fem(found.anatomy, pushed_effects(found.anatomy, TISSUE), TRAIN, "cpu", element="p1").deform(
             found.loads
         )
-        stored = found.displacement(np.arange(len(found.anatomy.mesh.nodes)))
+        stored = found.read_displacement(np.arange(len(found.anatomy.mesh.nodes)))
         assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
 
     def test_are_reported_in_every_law_of_it(self, data):
@@ -58,7 +58,7 @@ class TestData:
         assert study.get_tissue_on(whole) == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})
 
     def test_are_trained_on_with_it(self, data):
-        assert TISSUE in Expansion(read_dataset(data), "cpu").fem().effects
+        assert TISSUE in Expansion(read_dataset(data), "cpu").build_fem().effects
 
     def test_do_not_go_on_with_another(self, data, capsys):
         command = ["simulate", str(data.with_name("body.vtu")), "--out", str(data), *RUN]

@@ -8,7 +8,7 @@ import pytest
 from test_ar_registration import SCAN, moved
 
 from ar.tracking.registration import register_points
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from scenes.tracked.registration_file import describe_other_mesh, describe_scan, read_registration, write_registration
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
@@ -39,12 +39,12 @@ def test_a_file_gives_back_what_was_written_and_damage_is_named(tmp_path):
 
 
 def test_it_is_refused_for_another_body_and_not_for_another_mesh(tmp_path):
-    anatomy, path = read_anatomy(template_path()), tmp_path / "r.json"
+    anatomy, path = read_anatomy(get_template_path()), tmp_path / "r.json"
     made = describe_scan(anatomy)
     found = replace(register_points(SCAN, moved(SCAN)), scanned=made)
     write_registration(path, found)
     again = read_registration(path)
-    assert again.scanned.digest == made.digest and again.scanned.apart(made) < 1e-9
+    assert again.scanned.digest == made.digest and again.scanned.compute_distance(made) < 1e-9
     assert describe_other_mesh(again, anatomy, path) == ""
     assert "does not say of which anatomy" in describe_other_mesh(replace(again, scanned=None), anatomy, path)
     meshed = replace(again, scanned=replace(made, digest="other", bounds=made.bounds + 2e-3))

@@ -70,7 +70,7 @@ def straight(player: Player) -> list[Deformation]:
     """The answers of the frames one after the other."""
     last, found = None, []
     for number in range(len(player.scene.times)):
-        last = player.answer(player.loads(number), last)
+        last = player.compute_deformation(player.build_loads(number), last)
         assert last.outcome[0].good
         found.append(last)
     return found
@@ -78,9 +78,9 @@ def straight(player: Player) -> list[Deformation]:
 
 def answer(session: ReplaySession, number: int, touch: Touch | None = None) -> Deformation:
     """What it comes to, step by step."""
-    reached, found = session.towards(number, touch)
+    reached, found = session.approach_frame(number, touch)
     while reached < number:
-        reached, found = session.towards(number, touch)
+        reached, found = session.approach_frame(number, touch)
     assert reached == number
     return found
 
@@ -97,7 +97,7 @@ class TestReel:
         for number in (99, *np.random.default_rng(0).integers(0, 100, 300).tolist()):
             before, reached = ran.total(), -1
             while reached != number:
-                reached, found = reel.towards(number)
+                reached, found = reel.approach_frame(number)
                 assert found == tuple(range(reached + 1)) and reached <= number
             assert ran.total() - before < (101 if number == 99 else -(-100 // IN_ORDER.kept))
         assert len(ran) == 100 and len(reel.kept) <= IN_ORDER.kept
@@ -106,7 +106,7 @@ class TestReel:
         ran: list[int] = []
         reel = FrameCache(50, lambda number, before: ran.append(number))
         for calls in range(1, 20):
-            assert reel.towards(40)[0] == calls - 1 and ran == list(range(calls))
+            assert reel.approach_frame(40)[0] == calls - 1 and ran == list(range(calls))
 
     def test_long_jump_goes_through_frames_from_nearest(self) -> None:
         ran: list[tuple[int, int | None]] = []
@@ -116,7 +116,7 @@ class TestReel:
 
         def way(number: int) -> list[tuple[int, int | None]]:
             ran.clear()
-            while reel.towards(number)[0] != number:
+            while reel.approach_frame(number)[0] != number:
                 pass
             return ran.copy()
 
@@ -140,7 +140,7 @@ def test_jumps_use_frames_where_brain_separates(theatre) -> None:
 
     def course(name: str, anatomy: Anatomy, **values: object) -> ReplayOrder | None:
         scene = replace(find_scene(name), **values)
-        return plan_replay_order(Player(Theatre(anatomy, None, {}, "cpu").stage(scene), AtRest(anatomy)))
+        return plan_replay_order(Player(Theatre(anatomy, None, {}, "cpu").build_stage(scene), AtRest(anatomy)))
 
     assert course("brain_shift", sliding) == ReplayOrder(6, back=True, kept=64)
     assert course("brain_shift", sliding, frames_per_second=10.0) == ReplayOrder(2, back=True, kept=64)
@@ -200,7 +200,7 @@ def test_plain_statics_are_not_run_again(theatre, monkeypatch):
     session, last = ReplaySession(player), None
     assert not player.remembers
     for number in ASKED:
-        reached, found = session.towards(number)
+        reached, found = session.approach_frame(number)
         assert reached == number and asked[-1] is last and found.outcome[0].good
         last = found
     assert len(asked) == len(ASKED)
@@ -243,7 +243,7 @@ class TestPages:
         def seen(page: Demo, **wishes: object) -> Deformation:
             shown[page].clear()
             page.wish.set(**wishes)
-            number, _, hand, off = page.wish.now()
+            number, _, hand, off = page.wish.read_current()
             while not shown[page] or shown[page][-1].number != number or not solved(shown[page][-1]):
                 page.run(0.05)
             run = less if off else full

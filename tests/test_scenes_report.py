@@ -60,7 +60,7 @@ def test_numbers_are_those_recomputed_by_hand(study, page, study_box):
     for name, split in (("discs", study.discs), ("sectors", leave_sectors_out(study.pushed, study.patch))):
         test = split.test
         model = train(data, ["linear"], split=split).models["linear"]
-        truth = data.displacement(study_box.tumour_nodes)[test]
+        truth = data.read_displacement(study_box.tumour_nodes)[test]
         guess = model.deform(data.loads.rows(np.flatnonzero(test)), at=study_box.tumour_nodes).displacement
         wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
         held = stored[2]["own_fem"][name]

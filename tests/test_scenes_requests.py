@@ -35,29 +35,29 @@ class TestWish:
         wish = Requests("linear", Touch())
         wish.set(number=2)
         wish.go_on(0, 3)
-        assert wish.now()[0] == 2
+        assert wish.read_current()[0] == 2
 
     def test_the_hand_holds_what_it_does_not_change(self):
         wish = Requests("linear", Touch(force=0.1))
-        assert wish.now()[2] is None
-        wish.hand(x=0.01)
-        assert wish.now()[2] == Touch(x=0.01, force=0.1)
-        wish.hand(force=0.3)
-        assert wish.now()[2] == Touch(x=0.01, force=0.3)
+        assert wish.read_current()[2] is None
+        wish.take_over(x=0.01)
+        assert wish.read_current()[2] == Touch(x=0.01, force=0.1)
+        wish.take_over(force=0.3)
+        assert wish.read_current()[2] == Touch(x=0.01, force=0.3)
         wish.set(tool=SCRIPT, deformer="fem")
-        assert wish.now()[1:3] == ("fem", None)
+        assert wish.read_current()[1:3] == ("fem", None)
 
     def test_two_sliders_at_once_both_count(self):
         """The page calls each slider on a thread of its own."""
         wish = Requests("linear", Touch(force=0.1))
-        hands = [threading.Thread(target=wish.hand, kwargs=turn) for turn in ({"right": 0.2}, {"up": -0.3})]
+        hands = [threading.Thread(target=wish.take_over, kwargs=turn) for turn in ({"right": 0.2}, {"up": -0.3})]
         with wish.lock:  # both are under way before either is heard
             for hand in hands:
                 hand.start()
             time.sleep(0.05)
         for hand in hands:
             hand.join()
-        assert wish.now()[2] == Touch(force=0.1, tilt=(0.2, -0.3))
+        assert wish.read_current()[2] == Touch(force=0.1, tilt=(0.2, -0.3))
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def running(demo):
 
 def refuse(monkeypatch, refused, error):
     """Have loads refused that `refused` says, by frame number and touch."""
-    loads = Player.loads
+    loads = Player.build_loads
 
     def refusing(player, number, touch=None):
         if refused(number, touch):

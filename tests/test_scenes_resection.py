@@ -53,7 +53,7 @@ def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
     assert [len(step) for step in (*shares, left)] == pytest.approx(3 * [len(tumour) / 3], abs=1.0)
     depth = [-middle[step] @ [0.0, 0.0, 1.0] for step in (*shares, left)]
     assert all(upper.max() <= lower.min() + 1e-4 for upper, lower in pairwise(depth))
-    assert [SURGERY.done(time) for time in (0.0, 0.0499, 0.05, 0.12, 9.0)] == [0, 0, 1, 2, 3]
+    assert [SURGERY.count_done(time) for time in (0.0, 0.0499, 0.05, 0.12, 9.0)] == [0, 0, 1, 2, 3]
 
 
 def test_its_effects_and_causes_are_the_body_s(theatre, scene):
@@ -74,7 +74,7 @@ def test_the_rest_of_the_tumour_is_drawn(play, frames):
         areas.append(int(compute_silhouette(frame.camera, layer.vertices, layer.triangles).sum()))
         assert not stage.anatomy.orphaned[stage.tumour_vertices].any()
         assert frame.deformation.outcome[0].good and frame.moved >= 0.0
-    done = [SURGERY.done(frame.time) for frame in frames]
+    done = [SURGERY.count_done(frame.time) for frame in frames]
     assert done == sorted(done) and set(done) == {0, 1, 2, 3}
     seen = [areas[done.index(step)] for step in range(4)]
     assert seen[0] == pytest.approx(seen[1], rel=0.05) and seen[3] < 0.97 * seen[1]
@@ -95,7 +95,7 @@ def test_what_was_taken_stays_where_the_scan_has_it(play, frames):
 def test_an_episode_says_what_is_left(theatre, play, scene, tmp_path):
     collect(tmp_path / "a.h5", theatre, play, "fem", iter)
     with h5py.File(tmp_path / "a.h5") as file:
-        assert file["done"][:].tolist() == [SURGERY.done(time) for time in scene.times]
+        assert file["done"][:].tolist() == [SURGERY.count_done(time) for time in scene.times]
         left = file["tumour_left"][:]
         assert left.dtype == bool and left[0].all() and not left[-1].all()
         taken = file["tumour_predicted"][-1][~left[-1]] - file["tumour_rest"][:][~left[-1]]
@@ -110,7 +110,7 @@ def test_the_page_shows_the_rest(theatre, scene):
         demo.wish.set(number=6)
         assert wait_for(lambda: demo.run(0.3) and "resection: 3 steps done" in demo.browser.shown[2])
         assert wait_for(lambda: len(demo.browser.meshes["tumour"].faces) < whole)
-        rest = demo.stage.at(scene.loads(theatre.site, Touch(), 0.2)).tumour(theatre.anatomy.mesh.nodes)
+        rest = demo.stage.select_stage(scene.loads(theatre.site, Touch(), 0.2)).build_tumour(theatre.anatomy.mesh.nodes)
         assert np.array_equal(demo.browser.meshes["tumour"].faces, rest.triangles)
         assert wait_for(
             lambda: demo.run(0.2) and np.array_equal(demo.browser.meshes["finite elements"].faces, rest.triangles)

@@ -15,7 +15,7 @@ from sim.tools import compute_distances
 
 class TestRetract:
     def test_the_blade_bears_less_and_less_while_it_is_held(self, theatre):
-        frames = list(player(theatre, small("retract"), "fem").frames(15))
+        frames = list(player(theatre, small("retract"), "fem").play_frames(15))
         (cause,) = frames[-1].loads.causes
         assert isinstance(cause, Retracted)
         reads = np.array([np.linalg.norm(frame.deformation.reaction[0, 0, :3]) for frame in frames])
@@ -27,11 +27,11 @@ class TestRetract:
     @pytest.mark.parametrize("touch", [Touch(depth=-AIR), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)])
     def test_blade_is_laid_clear_of_tissue_then_moved(self, theatre, touch):
         scene, site = small("retract"), theatre.site
-        cause = scene.loads(site, touch, 0.0).of(Retracted)
+        cause = scene.build_loads(site, touch, 0.0).of(Retracted)
         apart = compute_distances(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
         upright = site.direction(touch) @ site.axis
         assert apart.min() == pytest.approx(AIR * upright, abs=0.3e-3)
         moved = cause.pose[0].copy()
         moved[:3, 3] += cause.displacement[0]
-        np.testing.assert_allclose(moved, scene.pose(site, touch), atol=1e-15)
+        np.testing.assert_allclose(moved, scene.compute_pose(site, touch), atol=1e-15)
         assert cause.displacement[0] == pytest.approx((AIR + touch.depth) * site.direction(touch))

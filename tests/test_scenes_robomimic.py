@@ -65,7 +65,7 @@ def test_robomimic_reader_agrees_and_trains(box, tmp_path):
     words = [str(ROBOMIMIC), "-c", READ, str(path), str(out)]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    ours = read_episodes(tmp_path / "in", ["colour", "depth", "T_world_tool", "force"]).at(0, 2)
+    ours = read_episodes(tmp_path / "in", ["colour", "depth", "T_world_tool", "force"]).get_window(0, 2)
     with np.load(out) as read:
         assert read["counts"].tolist() == [7, 9] and np.isfinite(read["losses"]).all() and len(read["losses"]) == 6
         assert np.array_equal(read["colour_image"], ours["colour"]) and ours["colour"].shape[1:3] == (HEIGHT, WIDTH)
@@ -79,7 +79,7 @@ def test_robomimic_has_demonstrations_and_holds_one_out(folder, tmp_path, capsys
     words = ["convert", str(folder), "--to", "robomimic", "--out", str(out), "--json"]
     assert main(words) == 0 and main(words) == 2 and main([*words, "--force"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out"] == 1
-    ours = read_episodes(folder, ["depth", "colour", "T_world_tool"], window=7).at(0, 0)
+    ours = read_episodes(folder, ["depth", "colour", "T_world_tool"], window=7).get_window(0, 0)
     with h5py.File(out) as file:
         demo = file["data/demo_0"]
         assert "RAS [m]" in file["data"].attrs["space"]

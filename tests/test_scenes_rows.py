@@ -57,7 +57,7 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box,
     data, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
     asked = data.loads.rows(np.flatnonzero(data.good)[sectors.test])
     guess = train(data, ["svr"], split=sectors).models["svr"].deform(asked, at=nodes).displacement
-    wanted = 1e3 * np.linalg.norm(guess - data.displacement(nodes)[data.good][sectors.test], axis=2)
+    wanted = 1e3 * np.linalg.norm(guess - data.read_displacement(nodes)[data.good][sectors.test], axis=2)
     mm = row.own_fem["sectors"].mm
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
 

@@ -28,7 +28,7 @@ INK = compute_ink(TUMOUR_COLOUR)
 
 @pytest.fixture(scope="module")
 def parts():
-    stage = template_theatre().stage(find_scene("palpate"))
+    stage = template_theatre().build_stage(find_scene("palpate"))
     calibration, registration = read_calibration(FILM / "camera.yaml"), read_registration(FILM / "registration.json")
     return Follower(calibration, registration, None, ToolMotion(stage, None)), Painter(stage, None, "contour")
 

@@ -91,7 +91,7 @@ def test_custom_tool_uses_its_own_mesh_and_shape(folder, monkeypatch, capsys):
     scene = find_scene("held.py")
     assert np.ptp(scene.tool.mesh.vertices, axis=0) == pytest.approx([0.03, 0.004, 0.05], abs=1e-6)
     box = Theatre(read_anatomy("box.vtu"), None, {}, "cpu")
-    frames = list(box.player("fem", scene).frames(every=15))
+    frames = list(box.build_player("fem", scene).play_frames(every=15))
     assert all(frame.deformation.outcome[0].good for frame in frames)
     assert np.abs(frames[-1].deformation.displacement).max() > 1e-3
     assert (frames[-1].picture.segmentation == TOOL).sum() > 100

@@ -11,8 +11,8 @@ def test_a_film_is_gone_to_and_fro_in(tmp_path):
     film, pictures = SeekableFilm(FILM / "film.mp4", 30.0), list(read_video(FILM / "film.mp4", 30.0, colour=True))
     assert film.count == len(pictures) == 17
     for number in (3, 4, 16, 0):
-        found = film.at(number)
+        found = film.read_image(number)
         assert found.stamped and np.array_equal(found.picture.colour, pictures[number].colour)
     film.count = 40  # as a file may say
-    assert film.at(20) is None and film.count == 20 and film.at(17) is None and film.count == 17
-    assert film.at(16).picture.name == "frame 16"
+    assert film.read_image(20) is None and film.count == 20 and film.read_image(17) is None and film.count == 17
+    assert film.read_image(16).picture.name == "frame 16"

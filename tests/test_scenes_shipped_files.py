@@ -2,10 +2,10 @@
 
 import pytest
 
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 
 MOST = 8_000_000  # bytes; see docs/develop/release.md
-MODELS = sorted(template_path().parent.glob("*.npz"))
+MODELS = sorted(get_template_path().parent.glob("*.npz"))
 
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda path: path.name)

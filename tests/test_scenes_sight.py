@@ -20,7 +20,7 @@ from scenes.play.reference import solve_reference_frames
 from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from scenes.script.sight import Sight
 from scenes.script.tool_paths import press
 from scenes.script.uncertainty import TumourError, Uncertainty
@@ -38,7 +38,7 @@ SIGHT = Sight(points=80, white=1e-4, smooth=1e-4, shift=1e-4, turn=0.0)
 @pytest.fixture(scope="module")
 def theatre(box, tmp_path_factory):
     path = tmp_path_factory.mktemp("sight") / "box.locator.npz"
-    save_locator(path, locator_of(box, solved=True).small())
+    save_locator(path, locator_of(box, solved=True).restrict())
     return Theatre(box, None, {}, "cpu", path)
 
 
@@ -95,7 +95,7 @@ def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
 
 def test_the_checks_pass_and_tell_what_an_estimate_is_worth(play, frames, truth):
     figures = measure(play, play.camera_at, frames, truth)
-    assert figures.broken(Bounds(overlap=0.5, error=3e-3)) == []
+    assert figures.find_violations(Bounds(overlap=0.5, error=3e-3)) == []
     # One frame moves, and by nothing that the locator's dents are: 14 % of it are removed.
     assert figures.covered == 1.0 and 0.1 < figures.removed < 1.0 and figures.error_mm > 0.01
 
@@ -105,7 +105,7 @@ def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
 
     def sentences(wrong):
         figures = measure(play, play.camera_at, [others[0], wrong, *others[1:]], truth)
-        return " ".join(figures.broken(Bounds(overlap=0.0, error=1.0, covered=1.0)))
+        return " ".join(figures.find_violations(Bounds(overlap=0.0, error=1.0, covered=1.0)))
 
     plain = replace(play, stage=replace(play.stage, observer=None))
     undrawn = plain.drawn(frame.number, frame.touch, frame.loads, frame.deformation, 0.1)
@@ -247,7 +247,7 @@ def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
 
 def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
     with pytest.raises(InputError, match="sulcus locator"):
-        Theatre(box, None, {}, "cpu").stage(replace(short(), sight=SIGHT))
+        Theatre(box, None, {}, "cpu").build_stage(replace(short(), sight=SIGHT))
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["--anatomy", str(tmp_path / "box.vtu"), "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["render", "sag", *words]) == 2
@@ -265,11 +265,11 @@ def test_locator_of_other_regions_is_rejected(theatre, scene):
 
 def test_no_trained_model_is_the_truth(scene):
     theatre = open_theatre(device="cpu")
-    assert theatre.names(scene) == ("fem",) and theatre.names(replace(scene, sight=None)) != ("fem",)
+    assert theatre.list_deformers(scene) == ("fem",) and theatre.list_deformers(replace(scene, sight=None)) != ("fem",)
 
 
 def test_what_ships_locates_its_tumour(capsys):
-    assert to_locator_path(template_path()).stat().st_size < 8_000_000
+    assert to_locator_path(get_template_path()).stat().st_size < 8_000_000
     assert main(["check", *SIGHTED, "--every", "40", "--device", "cpu", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["scenes"]
     assert [row["scene"] for row in rows] == list(SIGHTED)

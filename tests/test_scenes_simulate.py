@@ -28,7 +28,7 @@ def test_simulate_answers_by_the_element_asked_for_and_says_so(body, tmp_path, c
     assert data.provenance["element"] == element and data.good.all()
     effects = (Elasticity(), *(effect for effect in small().effects if not isinstance(effect, Elasticity)))
     truth = Fem(body, effects, TRAIN, "cpu", element=element).deform(data.loads).displacement
-    stored = data.displacement(np.arange(len(body.mesh.nodes)))
+    stored = data.read_displacement(np.arange(len(body.mesh.nodes)))
     assert np.linalg.norm(stored - truth) < 1e-3 * np.linalg.norm(truth)
     # The same command goes on where it stopped; with another element it would mix two sets.
     other = "p1" if element != "p1" else "smoothed"
@@ -50,7 +50,7 @@ def test_simulate_takes_quadratic_anatomies_as_they_are(body, tmp_path, capsys) 
     anatomy = Anatomy(mesh, held, np.zeros_like(mesh.nodes), np.append(body.craniotomy, np.zeros(more, bool)))
     data = read_dataset(simulated(anatomy, tmp_path))
     assert data.provenance["element"] == "p2" and data.anatomy.digest == anatomy.digest
-    assert data.displacement(anatomy.tumour_nodes).shape == (2, len(anatomy.tumour_nodes), 3) and data.good.all()
+    assert data.read_displacement(anatomy.tumour_nodes).shape == (2, len(anatomy.tumour_nodes), 3) and data.good.all()
     assert len(anatomy.tumour_nodes) > len(body.tumour_nodes)
     capsys.readouterr()
     assert main(["simulate", str(tmp_path / "body.vtu"), "--out", str(tmp_path / "no.h5"), "--element", "p1"]) == 2

@@ -21,7 +21,7 @@ def seen(values, scene=None):
     """The picture and its segmentation of the template with other grey values."""
     theatre, scene = template_theatre(), scene or small()
     stage = Stage(scene, theatre.site, Intensity(values, theatre.intensity.affine))
-    picture = stage.picture(scene.viewpoint.camera(theatre.site), theatre.anatomy.mesh.nodes, None)
+    picture = stage.render(scene.viewpoint.build_camera(theatre.site), theatre.anatomy.mesh.nodes, None)
     return picture
 
 
@@ -81,7 +81,7 @@ def test_a_scene_shows_its_field_and_the_same_bytes_again():
     stages = [Stage(replace(scene, viewpoint=view), theatre.site, theatre.intensity) for view in views]
     # No deformer is asked.
     players = [Player(stage, cast(Deformer, None)) for stage in stages]
-    frames = [each.drawn(10, each.touch(10), each.loads(10), rest, 0.0) for each in players]
+    frames = [each.draw_frame(10, each.get_touch(10), each.build_loads(10), rest, 0.0) for each in players]
     assert frames[0].picture.colour[0, 0].any() and not frames[1].picture.colour[0, 0].any()
     assert frames[1].picture.colour.tobytes() == frames[2].picture.colour.tobytes()
     assert frames[1].shown.tobytes() == frames[2].shown.tobytes()

@@ -13,7 +13,7 @@ from scenes.play.deformers import AtRest
 from scenes.play.player import REFUSED, Player
 from scenes.play.stereo_observer import StereoObserver
 from scenes.script.scene import find_scene
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from scenes.script.sight import StereoSight
 from sim.deformation import Outcome
 from sim.errors import InputError
@@ -27,9 +27,9 @@ NONE = np.zeros((0, 3))
 
 def observer_of(sight: StereoSight = EXACT) -> StereoObserver:
     """On few pixels."""
-    theatre = replace(template_theatre(), locator_file=to_locator_path(template_path()))
+    theatre = replace(template_theatre(), locator_file=to_locator_path(get_template_path()))
     scene = replace(MICROSCOPE, viewpoint=replace(MICROSCOPE.viewpoint, width=400, height=300), sight=sight)
-    return theatre.stage(scene).observer
+    return theatre.build_stage(scene).observer
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_points_move_as_the_cortex_did_within_their_errors(observer, moved, seen
 
 def test_one_seed_gives_the_same_pictures_and_another_others(observer, moved, shot):
     again = observer_of()
-    same, other = again.shot(30, moved), observer_of(replace(EXACT, seed=1)).shot(30, moved)
+    same, other = again.render_pair(30, moved), observer_of(replace(EXACT, seed=1)).render_pair(30, moved)
     for one, two, three in zip(shot.pictures, same.pictures, other.pictures, strict=True):
         assert np.array_equal(one, two) and np.abs(one.astype(float) - three).mean() > 2.0
     assert not np.array_equal(observer.shot(31, moved).pictures[0], shot.pictures[0])
@@ -87,8 +87,8 @@ def test_one_seed_gives_the_same_pictures_and_another_others(observer, moved, sh
 
 
 def test_a_tracked_microscope_is_off_as_a_whole(observer, shot, seen):
-    off = observer_of(replace(EXACT, shift=1e-3, turn=np.radians(1.0))).seen(shot, NONE)
-    plain = observer_of(EXACT).seen(shot, NONE)
+    off = observer_of(replace(EXACT, shift=1e-3, turn=np.radians(1.0))).observe(shot, NONE)
+    plain = observer_of(EXACT).observe(shot, NONE)
     assert np.allclose(plain.now, seen.now)
     away = np.linalg.norm(off.now[:, None] - plain.now, axis=2)
     pair = np.flatnonzero(away.min(axis=1) < 2e-3)  # a point at the edge of what is seen may be in one of them alone
@@ -116,7 +116,7 @@ def test_a_tool_hides_points_and_moves_none(observer, moved, seen):
 
 def test_without_names_points_are_a_cloud_on_the_moved_cortex(moved, shot):
     observer = observer_of(replace(EXACT, named=False))
-    found = observer.seen(shot, NONE)
+    found = observer.observe(shot, NONE)
     surface = observer.stage.site.anatomy.open_surface
     off = np.linalg.norm(find_closest_points(found.now, moved[surface]).point - found.now, axis=1)
     assert found.rest is None and len(found.now) > 60 and np.median(off) < 0.3e-3
@@ -149,7 +149,7 @@ class TestRefusals:
         later = self.refusal(observer, replace(shot, pictures=shot.pictures[::-1]))
         assert "check that eyes are not swapped" in later or "places of the cortex" in later
         swapped = observer_of()
-        first = swapped.shot(-1, rest)
+        first = swapped.render_pair(-1, rest)
         vars(swapped)["_first_shot"] = replace(first, pictures=first.pictures[::-1])
         said = self.refusal(swapped, replace(shot, pictures=shot.pictures[::-1]))
         assert "from the scan's" in said or "places of the cortex" in said or "pixels apart" in said
@@ -160,7 +160,7 @@ class TestRefusals:
         later = replace(shot, cameras=(shot.cameras[0], shot.cameras[1].perturb(0.1)))
         assert "round the opening seems to have moved" in self.refusal(observer, later)
         crossed = observer_of()
-        first = crossed.shot(-1, rest)
+        first = crossed.render_pair(-1, rest)
         vars(crossed)["_first_shot"] = replace(first, cameras=(first.cameras[0], first.cameras[1].perturb(0.1)))
         assert "mm from the scan's" in self.refusal(crossed, shot)
 
@@ -187,8 +187,8 @@ def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):
     stage = replace(observer.stage, observer=replace(observer, sight=replace(EXACT, darker=0.999)))
     still = AtRest(stage.site.anatomy)
     player = Player(stage, still)
-    answer = replace(still.deform(player.loads(0)), outcome=(Outcome.CONVERGED,))
-    frame = player.drawn(0, player.touch(0), player.loads(0), answer, 0.0)
+    answer = replace(still.deform(player.build_loads(0)), outcome=(Outcome.CONVERGED,))
+    frame = player.draw_frame(0, player.get_touch(0), player.build_loads(0), answer, 0.0)
     assert frame.doubt == REFUSED and frame.estimate.location is None and not len(frame.estimate.observation.now)
     assert "sees nothing" in frame.estimate.refusal and frame.moved == 0.0
 

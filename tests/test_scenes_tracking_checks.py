@@ -73,7 +73,7 @@ class Silent(Painter):
 
 def test_what_was_not_perturbed_passes(film, parts):
     figures = measure_tracking(film, *parts)
-    assert figures.broken() == []
+    assert figures.find_violations() == []
     assert figures.pictures == 16 and figures.confident == figures.unsaid == 0 and figures.back <= 3
     assert 0.0 < figures.off < 1.6
 
@@ -90,20 +90,20 @@ def test_what_was_not_perturbed_passes(film, parts):
 )
 def test_each_judgement_fails_where_it_should(film, parts, follower, painter, broken):
     figures = measure_tracking(film, made(follower, parts[0]), made(painter, parts[1]))
-    assert any(broken in sentence for sentence in figures.broken())
+    assert any(broken in sentence for sentence in figures.find_violations())
 
 
 def test_a_registration_that_is_off_by_two_millimetres_fails(film, parts):
     T = parts[0].registration.T_patient_scan.copy()
     T[:3, 3] += T[:3, :3] @ (2e-3 * film.stage.site.right)
     off = replace(parts[0], registration=replace(parts[0].registration, T_patient_scan=T))
-    (sentence,) = measure_tracking(film, off, parts[1]).broken()
+    (sentence,) = measure_tracking(film, off, parts[1]).find_violations()
     assert "pixels off" in sentence
 
 
 def test_what_never_comes_back_fails():
     never = TrackingFigures(1, 0, 0, np.inf, 0.0)
-    assert never.row()["back"] is None and len(never.broken()) == 1
+    assert never.to_row()["back"] is None and len(never.find_violations()) == 1
 
 
 def test_check_exit_status_is_1_where_tracking_alone_fails(film, parts, monkeypatch, capsys):

@@ -24,7 +24,7 @@ def test_summary_counts_tumours_beyond_their_band_by_1_mm():
 
 def test_outline_error_is_the_same_both_ways():
     """A drawn tumour that is a small piece of the true one, and a true one that is a small piece of the drawn one."""
-    stage = template_theatre().stage(find_scene("palpate"))
+    stage = template_theatre().build_stage(find_scene("palpate"))
     rest, calibration, truth = (
         stage.tumour_at_rest.vertices,
         follower_of(stage).calibration,
@@ -34,7 +34,7 @@ def test_outline_error_is_the_same_both_ways():
     for drawn, true in ((small, rest), (rest, small)):
         motion = BrainMotion(stage.anatomy.mesh.nodes.copy())
         motion.positions[stage.tumour_vertices] = drawn
-        camera, moved = calibration.camera(truth.T_camera_scan[0]), np.tile(true - rest, (len(truth.times), 1, 1))
+        camera, moved = calibration.build_camera(truth.T_camera_scan[0]), np.tile(true - rest, (len(truth.times), 1, 1))
         known = TrackingResult(truth.times[0], TumourState.GOOD, "", TrackedTargets(0, {}, {}, {}), motion, camera)
         outlines.append(compute_overlay_error(known, replace(truth, displacement=moved), calibration, stage).outline)
     assert outlines[0] == pytest.approx(outlines[1]) and outlines[0] > 10.0

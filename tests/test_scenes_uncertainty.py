@@ -15,8 +15,8 @@ from scenes.analysis.uncertainty import (
     apply_sample,
     collect_contributor_values,
     compute_worst_distances,
-    coverage,
     estimate_uncertainty,
+    measure_coverage,
     solve_nominal,
     solve_scene,
     split_contributions,
@@ -129,18 +129,18 @@ class TestEnsemble:
 
         draws, twins = sample_priors(300, 0), sample_priors(300, 1)
         found = estimate_uncertainty(theatre, scene, still, draws, answers(draws))
-        tested = coverage(scene, still, found, twins, answers(twins), 1)
+        tested = measure_coverage(scene, still, found, twins, answers(twins), 1)
         assert tested.patients == 300 and 0.93 < tested.covered < 0.97
         few = [
-            coverage(scene, still, found, sample_priors(20, seed), answers(sample_priors(20, seed)), seed)
+            measure_coverage(scene, still, found, sample_priors(20, seed), answers(sample_priors(20, seed)), seed)
             for seed in range(2, 22)
         ]
         scatter = np.std([one.covered for one in few])
         assert 0.5 * scatter < np.mean([one.deviation for one in few]) < 3.0 * scatter
         tight = replace(found, worst=tuple(0.7 * one for one in found.worst))
-        assert coverage(scene, still, tight, twins, answers(twins), 1).covered < 0.85
+        assert measure_coverage(scene, still, tight, twins, answers(twins), 1).covered < 0.85
         with pytest.raises(InputError, match="1 of 300 synthetic patients"):
-            coverage(scene, still, found, twins, [*answers(twins)[:1], *[None] * 299], 1)
+            measure_coverage(scene, still, found, twins, [*answers(twins)[:1], *[None] * 299], 1)
 
     def test_draws_without_equilibrium_are_counted(self, theatre):
         field = np.ones((9, 3))
@@ -200,7 +200,7 @@ class TestStored:
         knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
         assert knowing.uncertainty(scene) is not None
         others = (
-            scene.made_of(replace(BRAIN, young=4000.0), None), scene.made_of(None, "p1"), replace(scene, name="else"),
+            scene.replace_tissue(replace(BRAIN, young=4000.0), None), scene.replace_tissue(None, "p1"), replace(scene, name="else"),
             replace(scene, path=lambda time: Touch(force=0.1)), replace(scene, effects=scene.effects[:-1]),
         )  # fmt: skip
         assert [knowing.uncertainty(other) for other in others] == [None] * 5
@@ -208,20 +208,20 @@ class TestStored:
     def test_error_interpolates_between_moments_plus_model(self, theatre):
         found = stated(short(), theatre)
         for time, most, largest in ((0.0, 2e-3, "registration"), (0.15, 3.5e-3, "E")):
-            error = found.at(time)
+            error = found.evaluate(time)
             assert error == TumourError(pytest.approx(most), largest, moved=error.moved)
             # How far it has moved has nothing of what puts it elsewhere in the scan, too.
             own = [found.read(size, time) for name, size in found.parts.items() if name != "registration"]
             assert error.moved == pytest.approx(min(1.96 * np.linalg.norm(own), most))
-        assert found.at(0.0, 1.5e-3).moved >= 1.5e-3
-        assert found.at(0.0, 1.5e-3).prior == pytest.approx(2.5e-3)
-        assert found.at(0.0, 9e-3).largest == "surrogate"
+        assert found.evaluate(0.0, 1.5e-3).moved >= 1.5e-3
+        assert found.evaluate(0.0, 1.5e-3).prior == pytest.approx(2.5e-3)
+        assert found.evaluate(0.0, 9e-3).largest == "surrogate"
 
     def test_the_template_ships_with_that_of_its_scenes(self):
         from scenes.play.deformers import open_theatre
 
         template = open_theatre(device="cpu")
-        known = [name for name in SCENES if template.uncertainty(find_scene(name))]
+        known = [name for name in SCENES if template.estimate_uncertainty(find_scene(name))]
         assert known == sorted(template.uncertainties, key=SCENES.index)
         assert known == [name for name in SCENES if find_scene(name).sight is None]
 
@@ -328,7 +328,7 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     assert main(["check", *words, "--deformer", "fem", "--every", "3", "--json"]) == 0
     (checked,) = json.loads(capsys.readouterr().out)["scenes"]
     assert checked["model_error_mm"] is None
-    assert checked["tumour_error_mm"] == pytest.approx(1e3 * max(stored.at(0.1 * one).prior for one in range(3)))
+    assert checked["tumour_error_mm"] == pytest.approx(1e3 * max(stored.evaluate(0.1 * one).prior for one in range(3)))
     assert main(["check", *words, "--deformer", "linear", "--every", "3"]) == 0
     said = capsys.readouterr().out
     assert "model: within " in said and "tumour: within " in said
@@ -346,7 +346,7 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
 def test_other_tissues_are_refused(theatre, tmp_path, monkeypatch, capsys):
     from sim.material import MATERIALS
 
-    scene = short().made_of(MATERIALS["minutes"].tissue, None)
+    scene = short().replace_tissue(MATERIALS["minutes"].tissue, None)
     with pytest.raises(InputError, match="Young's modulus"):
         apply_sample(scene, SAME)
     monkeypatch.setattr("scenes.analysis.uncertainty.solve_nominal", None)  # before anything is solved

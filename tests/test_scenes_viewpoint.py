@@ -10,9 +10,9 @@ from sim.errors import InputError
 
 
 def test_eyes_of_a_microscope_meet_at_the_site(site):
-    left, right = (replace(USUAL, eye=eye).camera(site) for eye in ("left", "right"))
+    left, right = (replace(USUAL, eye=eye).build_camera(site) for eye in ("left", "right"))
     for one in (left, right):
-        assert one.project(USUAL.target(site))[0] == pytest.approx([319.5, 239.5])
+        assert one.project(USUAL.find_target(site))[0] == pytest.approx([319.5, 239.5])
     assert left.to_camera_frame(right.centre)[0] > 0.023
     with pytest.raises(InputError, match="choose left or right"):
         Viewpoint(eye="third")  # type: ignore[arg-type]
@@ -21,5 +21,5 @@ def test_eyes_of_a_microscope_meet_at_the_site(site):
 def test_a_calibration_of_another_size_is_refused():
     with pytest.raises(InputError, match="480 x 360, not 640 x 480: calibrate with that size, or ask"):
         Viewpoint(calibration=REAL)
-    view = Viewpoint().calibrated(REAL)
+    view = Viewpoint().calibrate(REAL)
     assert (view.width, view.height) == (480, 360)

@@ -8,13 +8,13 @@ from scenes.play.waiting_notice import NOTICED, Busy
 def test_a_long_wait_is_reported_and_a_short_one_is_not():
     said: list[str] = []
     busy = Busy(said.append)
-    busy.on("a quick load")
-    busy.off()
+    busy.begin_work("a quick load")
+    busy.end_work()
     time.sleep(NOTICED + 0.3)
     assert said == []
-    busy.on("solving the first half")
-    busy.on("solving the second half")
+    busy.begin_work("solving the first half")
+    busy.begin_work("solving the second half")
     time.sleep(NOTICED + 0.3)
-    busy.off()
+    busy.end_work()
     busy.close()
     assert said[0].startswith("solving the second half") and said[-1] == "" and "" not in said[:-1]

@@ -37,14 +37,14 @@ def test_windows_have_the_frames_that_they_say_in_one_order(folder):
         with pytest.raises(IndexError):
             found[beyond]
     with pytest.raises(InputError, match="begin at 1"):
-        found.at(2, 1)
+        found.get_window(2, 1)
     assert len(read_episodes(folder, ["time"], window=20)) == 0 and len(read_episodes(folder, ["time"], stride=3)) == 8
 
 
 def test_pictures_are_decoded_to_what_was_drawn(folder, box):
     names = ("colour", "depth", "segmentation", "tumour_mask")
-    window = read_episodes(folder, names, window=4).at(2, 0)
-    at = read_episodes(folder, ["tumour_predicted"], window=4).at(2, 0)["tumour_predicted"]
+    window = read_episodes(folder, names, window=4).get_window(2, 0)
+    at = read_episodes(folder, ["tumour_predicted"], window=4).get_window(2, 0)["tumour_predicted"]
     drawn = read_images(box, Wanted(4, seed=2), at)
     assert window["colour"].shape == (4, HEIGHT, WIDTH, 3) and window["colour"].dtype == np.uint8
     assert np.abs(window["colour"].astype(int) - drawn["colour"]).max() < 6  # red is red
@@ -54,27 +54,27 @@ def test_pictures_are_decoded_to_what_was_drawn(folder, box):
 
 
 def test_what_was_not_solved_is_nan(folder):
-    window = read_episodes(folder, ["tumour_fem", "outcome_fem", "tumour_predicted"], window=5).at(1, 2)
+    window = read_episodes(folder, ["tumour_fem", "outcome_fem", "tumour_predicted"], window=5).get_window(1, 2)
     assert window["fem_known"].tolist() == [False, True, False, False, True]
     off = np.linalg.norm(window["tumour_fem"] - window["tumour_predicted"], axis=2)
     assert np.allclose(off[[1, 4]], 1e-4) and np.isnan(off[[0, 2, 3]]).all()
     assert window["outcome_fem"] == ["", "CONVERGED", "", "", "CONVERGED"]
-    assert read_episodes(folder, ["tumour_fem"], window=2).at(1, 1)["fem_known"].tolist() == [False, False]
-    assert read_episodes(folder, ["tumour_fem"], window=7).at(0, 0)["fem_known"].all()
-    apart = read_episodes(folder, ["tumour_fem", "tumour_predicted"], window=2, step=6).at(1, 0)
+    assert read_episodes(folder, ["tumour_fem"], window=2).get_window(1, 1)["fem_known"].tolist() == [False, False]
+    assert read_episodes(folder, ["tumour_fem"], window=7).get_window(0, 0)["fem_known"].all()
+    apart = read_episodes(folder, ["tumour_fem", "tumour_predicted"], window=2, step=6).get_window(1, 0)
     assert np.allclose(apart["tumour_fem"] - apart["tumour_predicted"], [0.0, 0.0, 1e-4])
 
 
 def test_batches_are_stacked_and_shuffled_by_a_seed(folder, box, tmp_path):
     found = read_episodes(folder, ["tip"], window=2)
-    plain, shuffled, again = (list(found.batches(4, seed)) for seed in (None, 3, 3))
+    plain, shuffled, again = (list(found.iterate_batches(4, seed)) for seed in (None, 3, 3))
     assert [len(one["episode"]) for one in plain] == [4, 4, 4, 4, 1] and plain[0]["tip"].shape == (4, 2, 3)
     assert np.array_equal(plain[1]["frame"][:, 0], [4, 5, 0, 1])
     assert all(np.array_equal(one["frame"], other["frame"]) for one, other in zip(shuffled, again, strict=True))
     assert any(not np.array_equal(one["frame"], other["frame"]) for one, other in zip(plain, shuffled, strict=True))
     wide = write_episode(tmp_path / "wide.h5", box, Wanted(4, width=48))
     with pytest.raises(InputError, match="'colour' has shapes"):
-        next(read_episodes([folder, wide], ["colour"], stride=7).batches(9))
+        next(read_episodes([folder, wide], ["colour"], stride=7).iterate_batches(9))
 
 
 def test_files_are_opened_when_they_are_read_and_not_too_many(folder):
@@ -94,7 +94,7 @@ def test_files_are_opened_when_they_are_read_and_not_too_many(folder):
 @pytest.mark.parametrize("start", ["fork", "spawn"])
 def test_workers_read_what_one_process_reads(folder, start):
     data = EpisodeDataset(folder, ["colour", "tumour_predicted"], window=2, stride=2)
-    assert isinstance(data[0]["colour"], torch.Tensor) and data.at(1, 3)["frame"].tolist() == [3, 4]
+    assert isinstance(data[0]["colour"], torch.Tensor) and data.get_window(1, 3)["frame"].tolist() == [3, 4]
     alone = [data[index] for index in range(len(data))]
     loader = DataLoader(data, batch_size=1, num_workers=2, multiprocessing_context=start)
     together = list(loader)

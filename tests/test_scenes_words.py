@@ -49,16 +49,16 @@ def theatre():
 @cache
 def answered(name, touch, number):
     """What the best model answers in a scene, whatever the picture's size."""
-    play = Player(theatre().player("series-gp", find_scene(name)).stage, theatre().models["series-gp"])
-    loads = play.loads(number, touch)
-    return loads, play.answer(loads)
+    play = Player(theatre().build_player("series-gp", find_scene(name)).stage, theatre().models["series-gp"])
+    loads = play.build_loads(number, touch)
+    return loads, play.compute_deformation(loads)
 
 
 def seen(monkeypatch, name, size, touch=None, number=51, style="window"):
     """A player, a frame of it, and the lines of text that are written into the frame's picture on the page."""
     scene = find_scene(name)
     scene = replace(scene, viewpoint=replace(scene.viewpoint, width=size[0], height=size[1]))
-    play = replace(theatre().player("series-gp", scene), style=style)
+    play = replace(theatre().build_player("series-gp", scene), style=style)
     found, write = [], cv2.putText
 
     def heard(colour, text, at, font, scale, ink, *more):
@@ -68,7 +68,7 @@ def seen(monkeypatch, name, size, touch=None, number=51, style="window"):
         return write(colour, text, at, font, scale, ink, *more)
 
     monkeypatch.setattr(ar.overlay.hud.cv2, "putText", heard)
-    frame = play.drawn(number, touch or play.touch(number), *answered(name, touch, number), 0.0)
+    frame = play.draw_frame(number, touch or play.get_touch(number), *answered(name, touch, number), 0.0)
     picture = render_page_image(frame)
     monkeypatch.undo()
     assert picture.shape == (size[1], size[0], 3)

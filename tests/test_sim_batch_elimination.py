@@ -10,7 +10,7 @@ import warp as wp
 from openings import EFFECTS, FINE, LAWS_AND_ELEMENTS, TOTAL, begun, body, descent_of, equilibria, loads_of
 from oracle import tissue
 
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.accuracy import TRAIN, Accuracy
 from sim.bodies.meshfile import read_anatomy
 from sim.compile import compile_part, compile_problem
@@ -33,7 +33,7 @@ STEP = "_corrected"
 
 
 def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
-    anatomy = read_anatomy(template_path())
+    anatomy = read_anatomy(get_template_path())
     effects = (Elasticity(), Held(), Slide(), ToolForce())
     fem, loads = Fem(anatomy, effects, TRAIN, "cpu", element="p1"), draw("spatula", anatomy, 3, 1)
     near = build_batch_elimination(fem.problem, build_rest_solver(fem.problem), effects, fem.space)

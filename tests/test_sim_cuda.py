@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from oracle import EVERY_LAW, tissue
 
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.bodies.meshfile import read_anatomy
 from sim.effects import (
@@ -191,7 +191,7 @@ def test_block_jacobi_reaches_what_the_inverse_reaches(box):
 
 def test_local_part_is_solved_alone_with_same_result():
     """More columns than one room has, so that rooms change."""
-    anatomy = read_anatomy(template_path())
+    anatomy = read_anatomy(get_template_path())
     effects, loads = (Elasticity(), Held(), Slide(), ToolForce()), draw("mixed", anatomy, 150, 3)
     fem = Fem(anatomy, effects, replace(TRAIN, limit_strain=False), "cuda", element="p1")
     found = fem.deform(loads)

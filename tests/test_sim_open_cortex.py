@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
@@ -15,7 +15,7 @@ from sim.geometry.closest_point import find_closest_points
 
 @pytest.fixture(scope="module")
 def template():
-    return read_anatomy(template_path())
+    return read_anatomy(get_template_path())
 
 
 def test_closest_points_are_those_of_trimesh(template):

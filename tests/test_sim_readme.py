@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_house import DOCS, HOUSE
 
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Outcome
 
@@ -21,7 +21,7 @@ def example():
 
 @pytest.mark.parametrize("body", ["box", "template"])
 def test_the_example_runs_as_it_stands(body, box, tmp_path, monkeypatch, capsys):
-    anatomy = box if body == "box" else read_anatomy(template_path())
+    anatomy = box if body == "box" else read_anatomy(get_template_path())
     write_anatomy(tmp_path / "patient.vtu", anatomy)
     monkeypatch.chdir(tmp_path)
     names = {}

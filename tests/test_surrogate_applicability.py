@@ -36,7 +36,7 @@ class TestLearnt:
     def test_it_refuses_causes_that_it_does_not_know(self, theatre):
         model, scene = theatre.models["linear"], sinking()
         with pytest.raises(InputError, match="causes Posture"):
-            model.deform(scene.loads(theatre.site, Touch(), 0.0))
+            model.deform(scene.build_loads(theatre.site, Touch(), 0.0))
         with pytest.raises(InputError, match="causes none"):
             model.deform(Loads((), np.zeros(2)))
 
@@ -85,11 +85,11 @@ class TestLearnt:
         with pytest.raises(InputError, match=reason):
             other.deformer("linear", short())
         tissue, element = (Material("neo-hookean", 9000.0, 0.3), None) if "tissue" in training else (None, "p1")
-        assert other.deformer("linear", short().made_of(tissue, element)) is model
+        assert other.deformer("linear", short().replace_tissue(tissue, element)) is model
 
     def test_another_tissue_goes_on_relaxing(self):
-        scene = find_scene("retract").made_of(Material("neo-hookean", 9000.0, 0.3), "p2")
+        scene = find_scene("retract").replace_tissue(Material("neo-hookean", 9000.0, 0.3), "p2")
         (effect,) = (each for each in scene.effects if isinstance(each, Elasticity))
         assert scene.element == "p2" and effect.default == Material("neo-hookean", 9000.0, 0.3, RELAXING.prony)
         with pytest.raises(InputError, match="cannot relax"):
-            find_scene("retract").made_of(Material("linear", 9000.0, 0.3), None)
+            find_scene("retract").replace_tissue(Material("linear", 9000.0, 0.3), None)

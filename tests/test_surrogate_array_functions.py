@@ -12,20 +12,20 @@ TABLE = np.random.default_rng(0).normal(size=(50, 4)) * [1.0, 10.0, 1e-3, 0.0]
 
 @pytest.mark.parametrize("step", [0.01, np.array([0.01, 0.1, 1e-5, 1.0])])
 def test_rounded_table_is_within_half_a_step(step):
-    rounded = Rounded.of(TABLE, step)
+    rounded = Rounded.round_table(TABLE, step)
     assert rounded.whole.dtype == np.int16 and rounded.values.flags.c_contiguous
     assert (np.abs(rounded.values - TABLE) <= 0.5001 * np.asarray(step)).all()
 
 
 def test_step_grows_where_whole_numbers_would_overflow():
-    rounded = Rounded.of(TABLE, 1e-6)
+    rounded = Rounded.round_table(TABLE, 1e-6)
     largest = np.abs(TABLE).max(axis=0)
     assert rounded.step == pytest.approx(np.maximum(1e-6, largest / 32767))
     np.testing.assert_allclose(rounded.values, TABLE, atol=largest.max() / 32767)
 
 
 def test_rows_and_products_are_those_of_the_values():
-    rounded, rows = Rounded.of(TABLE, 0.01), np.array([3, 1, 3])
+    rounded, rows = Rounded.round_table(TABLE, 0.01), np.array([3, 1, 3])
     np.testing.assert_array_equal(take_rows_of(rows, rounded), rounded.values[rows])
     np.testing.assert_array_equal(multiply_rows(np.ones((1, 3)), rounded, rows)[0], rounded.values[rows].sum(axis=0))
 

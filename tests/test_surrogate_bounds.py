@@ -34,7 +34,7 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(pretender, tmp_
     data = read_dataset(tmp_path / "data.h5")
     trained = train(data, ["linear"])
     model, good = trained.models["linear"], data.loads.rows(np.flatnonzero(data.good))
-    truth = data.displacement(data.anatomy.tumour_nodes)[data.good]
+    truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good]
 
     apart = np.arange(len(good))[-trained.calibrated :]
     answer = model.deform(good.rows(apart), at=data.anatomy.tumour_nodes).displacement
@@ -53,4 +53,4 @@ def test_a_correction_that_does_not_help_is_left_out(box, pretender, tmp_path):
     loads = draw("palpation", box, 20, 5)
     answer, gauge = linear.deform(loads), build_tip_gauge(box)
     truth = gauge.distances(loads, answer.displacement, answer.nodes)
-    assert np.abs(model.distance(loads).value - truth).max() < 2e-5
+    assert np.abs(model.predict_distance(loads).value - truth).max() < 2e-5

@@ -37,7 +37,7 @@ def test_each_skull_has_soft_and_stiff_tumours(body):
             for name, (low, high) in (("ratio", FEW.stiffness), ("exponent", FEW.exponent)):
                 share = [np.log(getattr(group, name) / low) / np.log(high / low) for group in some]
                 assert np.floor(3.0 * np.sort(share)).tolist() == [0.0, 1.0, 2.0], (seed, skull, name)
-    elasticity = some[0].effects(FEW.swellings)[0]
+    elasticity = some[0].build_effects(FEW.swellings)[0]
     (mu, lam), (hard, _) = elasticity.default.lame, elasticity.regions[2].lame
     assert lam / (2.0 * (lam + mu)) == pytest.approx(0.45) and hard / mu == pytest.approx(some[0].ratio)
     assert elasticity.default.terms[0][1] == -some[0].exponent

@@ -85,7 +85,7 @@ def test_bounds_that_grow_with_the_distance_hold_near_and_far():
     near = np.flatnonzero(away < 2e-3)
     known = features[near], force[near], error[near]
     bound = fit_bound((features, error), *known, away=away[near], growth=800.0)
-    stated = bound.of(features, force, Outside(away, 0.0 * away, 0.0 * away))[0]
+    stated = bound.evaluate(features, force, Outside(away, 0.0 * away, 0.0 * away))[0]
     held = error <= stated
     assert abs(held[near].mean() - 0.95) < 0.02 and abs(held[away > 4e-3].mean() - 0.95) < 0.03
 
@@ -100,7 +100,7 @@ def test_loads_of_one_force_are_one_class():
     features, _, error = drawn(500, 4)
     bound = fit_bound((features, error), features, np.full(500, 0.2), error)
     assert not len(bound.edges) and bound.quantile.shape == (2, 1)
-    stated = bound.of(features, np.full(500, 0.2), lying(500))
+    stated = bound.evaluate(features, np.full(500, 0.2), lying(500))
     assert np.mean(error <= stated[0]) >= 0.95
 
 
@@ -120,7 +120,7 @@ def test_scale_from_few_discs_stays_bounded_between_them(curved):
     features, _, error = placed(400, 5, discs)
     bound = fit_bound((features, error), *placed(1000, 6), curved=curved)
     features, force, error = placed(5000, 7)
-    stated = bound.of(features, force, lying(len(force)))
+    stated = bound.evaluate(features, force, lying(len(force)))
     assert abs(np.mean(error <= stated[0]) - 0.95) < 0.02
     # The 95th percentile of an exponential distribution is three times its mean.
     ideal = 3e-4 * np.exp(1.2 * features[:, 0] - 0.8 * features[:, 1])
@@ -132,5 +132,5 @@ def test_a_scale_is_of_the_load_and_the_same_everywhere(curved):
     features, _, error = placed(400, 5)
     bound = fit_bound((features, error), *placed(1000, 6), curved=curved)
     elsewhere = features + [0.0, 0.0, 0.0, 0.0, 9.0, -9.0, 30.0]
-    at = [bound.of(some, np.full(400, 0.2), lying(400)) for some in (features, elsewhere)]
+    at = [bound.evaluate(some, np.full(400, 0.2), lying(400)) for some in (features, elsewhere)]
     np.testing.assert_array_equal(*at)

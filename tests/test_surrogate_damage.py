@@ -136,7 +136,9 @@ class TestFinished:
         group = name.split("/")[0]
         with pytest.raises(InputError, match=rf"row {row} of `{group}` are damaged"):
             data = read_dataset(path)
-            (data.displacement if group == "answers" else data.compute_unit_response)(pretender.anatomy.tumour_nodes)
+            (data.read_displacement if group == "answers" else data.compute_unit_response)(
+                pretender.anatomy.tumour_nodes
+            )
         with pytest.warns(DamageWarning, match=rf"row {row} of `{group}`: damaged"):
             solved = simulate(path, pretender, loads, SAID, 8)
         assert solved.rows == (4 if row == 17 else 8)
@@ -192,7 +194,7 @@ class TestFinished:
                 del file[f"{group}/checksum"]
                 file[f"{group}/done"] = np.ones(len(file[f"{group}/residual"]), bool)
         some = np.arange(5)
-        assert np.array_equal(read_dataset(path).displacement(some), read_dataset(whole).displacement(some))
+        assert np.array_equal(read_dataset(path).read_displacement(some), read_dataset(whole).read_displacement(some))
         with pytest.raises(InputError, match="of an earlier version"):
             simulate(path, pretender, loads, SAID, 8)
         with h5py.File(path, "r+") as file:

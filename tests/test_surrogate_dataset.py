@@ -37,9 +37,11 @@ def test_what_is_written_is_read(tmp_path, box, pretender, loads):
     assert data.anatomy.digest == box.digest and data.provenance["preset"] == "palpation"
     assert np.array_equal(data.loads.of(Pushed).force, loads.of(Pushed).force)
     whole = pretender.deform(loads).displacement
-    assert np.allclose(data.displacement(np.arange(len(box.mesh.nodes))), whole, rtol=0, atol=1e-7 * whole.max())
-    assert np.array_equal(data.displacement(box.tumour_nodes), data.displacement(slice(None))[:, box.tumour_nodes])
-    assert data.displacement(box.tumour_nodes).dtype == np.float32
+    assert np.allclose(data.read_displacement(np.arange(len(box.mesh.nodes))), whole, rtol=0, atol=1e-7 * whole.max())
+    assert np.array_equal(
+        data.read_displacement(box.tumour_nodes), data.read_displacement(slice(None))[:, box.tumour_nodes]
+    )
+    assert data.read_displacement(box.tumour_nodes).dtype == np.float32
     assert data.good.all() and (data.iterations == 4).all() and (data.residual == 1e-5).all()
 
 
@@ -81,7 +83,7 @@ def test_failed_cases_stay_marked(tmp_path, pretender, loads):
     data = read_dataset(tmp_path / "data.h5")
     assert np.array_equal(data.good, size <= limit) and 0 < data.good.sum() < len(loads)
     assert data.outcome[int(size.argmax())] is Outcome.BUDGET and data.iterations.max() == 60
-    assert (np.abs(data.displacement(slice(None))).max(axis=(1, 2)) > 0).all()
+    assert (np.abs(data.read_displacement(slice(None))).max(axis=(1, 2)) > 0).all()
 
 
 def unfinished(folder, pretender, loads, path="data.h5"):
@@ -152,7 +154,7 @@ def test_killed_run_resumes_to_the_same_bytes(tmp_path, pretender, loads):
         read_dataset(killed)
     assert [path.name.startswith(".sulcus-") for path in sorted(tmp_path.iterdir())] == [True, False, False]
     assert simulate(killed, pretender, loads, SAID, 8).rows == 0
-    assert read_dataset(killed).seconds("unit response", 3) is None  # none was solved by the run that ended
+    assert read_dataset(killed).estimate_seconds("unit response", 3) is None  # none was solved by the run that ended
     assert sorted(tmp_path.iterdir()) == [killed, whole] and undated(killed) == undated(whole)
 
 
@@ -165,7 +167,10 @@ def test_a_finished_file_is_left_alone_and_extended(tmp_path, box, pretender, lo
     assert simulate(path, pretender, more, SAID, 8).rows == 30 - 16  # the last, short batch is solved again
     simulate(direct, pretender, more, SAID, 8)
     assert undated(path) == undated(direct)
-    assert read_dataset(path).seconds("load", 30) > 0.0 and read_dataset(path).seconds("unit response", 1) > 0.0
+    assert (
+        read_dataset(path).estimate_seconds("load", 30) > 0.0
+        and read_dataset(path).estimate_seconds("unit response", 1) > 0.0
+    )
     after = path.read_bytes()
     assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == after
 

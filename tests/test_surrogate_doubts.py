@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.studies.locate_study import PointsSeen, observed
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.effects import SKULLS
@@ -27,7 +27,7 @@ NAMED, CLOUD = PointsSeen(100, 44, 1), PointsSeen(100, 44, 1, named=False)
 
 @pytest.fixture(scope="module")
 def locator():
-    return load_locator(to_locator_path(template_path()), read_anatomy(template_path()))
+    return load_locator(to_locator_path(get_template_path()), read_anatomy(get_template_path()))
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_dent_of_error_size_is_seen_by_its_form(locator):
 
 def test_locator_without_patch_sizes_is_rejected(locator, tmp_path):
     """Its format says so, before its arrays are looked at."""
-    with np.load(to_locator_path(template_path())) as file:
+    with np.load(to_locator_path(get_template_path())) as file:
         arrays = {name: file[name] for name in file.files}
     header = json.loads(str(arrays["header"])) | {"format": "sulcus locator 3"}
     path = tmp_path / "old.npz"
@@ -184,7 +184,7 @@ def test_locator_without_patch_sizes_is_rejected(locator, tmp_path):
 
 @pytest.mark.parametrize("name", ["header", "tried", "shape", "kind", "place", "centre", "nodes"])
 def test_locator_of_another_content_than_sealed_is_rejected(locator, tmp_path, name):
-    with np.load(to_locator_path(template_path())) as file:
+    with np.load(to_locator_path(get_template_path())) as file:
         arrays = {name: file[name] for name in file.files}
     if name == "header":
         region = {"name": "tumour", "ratio": 3.0}

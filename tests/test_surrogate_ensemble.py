@@ -57,7 +57,7 @@ def test_members_of_one_group_share_one_factor(body, monkeypatch):
     motion, kind = solve_members(body, group, 0, "cpu", FEW)
     assert len(made) == 1
     marked, labels = round_tumour(body, group.reach[0])
-    apart = fem.Fem(marked, group.effects(FEW.oedema, labels), ACCURACY, "cpu").deform(
+    apart = fem.Fem(marked, group.build_effects(FEW.oedema, labels), ACCURACY, "cpu").deform(
         build_swellings(marked, FEW.oedema)
     )
     largest = np.abs(apart.displacement).max()

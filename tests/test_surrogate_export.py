@@ -11,7 +11,7 @@ import pytest
 from conftest import make_box
 
 from scenes.cli import main
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Outcome
@@ -27,7 +27,7 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.model.conformal import LEVELS
 from surrogate.model.store import load, save
-from surrogate.onnx_export.export import onnx_model
+from surrogate.onnx_export.export import build_onnx_model
 from surrogate.regressors.baselines import Ann
 from surrogate.regressors.force_series import Series
 from surrogate.training.expansion import EXPANDED, Expansion
@@ -107,7 +107,7 @@ def assert_alike(answer, wanted):
 @pytest.mark.parametrize("name", LEARNERS)
 def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
     model, patch = models[name], open_patch(block)
-    session = opened(onnx_model(name, model, cortex))
+    session = opened(build_onnx_model(name, model, cortex))
     answer, heard = asked(session, loads, patch)
     wanted = model.deform(heard, at=None if cortex else block.tumour_nodes)
     assert np.array_equal(answer["nodes"], wanted.nodes)
@@ -127,14 +127,16 @@ def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
 
 def test_a_graph_is_the_formula_that_numpy_runs(models, block, loads, monkeypatch):
     monkeypatch.setattr("surrogate.regressors.gp.compute_matern", lambda distance: np.exp(-distance))
-    answer, heard = asked(opened(onnx_model("gp", models["gp"])), loads, open_patch(block))
+    answer, heard = asked(opened(build_onnx_model("gp", models["gp"])), loads, open_patch(block))
     assert_alike(answer, models["gp"].deform(heard, at=block.tumour_nodes))
 
 
 def test_a_curved_cortex_and_the_model_that_ships():
-    anatomy = read_anatomy(template_path())
-    for name, model in load(template_path().with_suffix(".model.npz"), anatomy).items():
-        answer, heard = asked(opened(onnx_model(name, model)), draw("palpation", anatomy, 40, 7), open_patch(anatomy))
+    anatomy = read_anatomy(get_template_path())
+    for name, model in load(get_template_path().with_suffix(".model.npz"), anatomy).items():
+        answer, heard = asked(
+            opened(build_onnx_model(name, model)), draw("palpation", anatomy, 40, 7), open_patch(anatomy)
+        )
         assert_alike(answer, model.deform(heard, at=anatomy.tumour_nodes))
 
 
@@ -143,7 +145,7 @@ def test_bounds_have_classes_of_force_or_are_none(models, block, loads):
     classes = replace(model.bounds, edges=np.array([0.11, 0.21]), quantile=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
     for bounds in (classes, None):
         other = replace(model, bounds=bounds)
-        answer, heard = asked(opened(onnx_model("svr", other)), loads, patch)
+        answer, heard = asked(opened(build_onnx_model("svr", other)), loads, patch)
         assert_alike(answer, other.deform(heard, at=block.tumour_nodes))
         assert np.isnan(answer["bound"]).all() == (bounds is None)
 
@@ -168,7 +170,7 @@ def test_a_series_has_one_radius_or_many(models, block, loads, taken):
     parts = [*model.parts]
     parts[number] = replace(part, regressor=kept)
     other = replace(model, parts=tuple(parts))
-    answer, heard = asked(opened(onnx_model("series", other)), loads, open_patch(block))
+    answer, heard = asked(opened(build_onnx_model("series", other)), loads, open_patch(block))
     assert_alike(answer, other.deform(heard, at=block.tumour_nodes))
 
 
@@ -223,7 +225,7 @@ def test_what_cannot_be_exported_is_a_sentence(folder, models, capsys, monkeypat
         assert said in capsys.readouterr().err
     strange = replace(models["ann"].parts[0], regressor=Foreign())
     with pytest.raises(InputError, match="Foreign, which has no ONNX graph"):
-        onnx_model("ann", replace(models["ann"], parts=(strange,)))
+        build_onnx_model("ann", replace(models["ann"], parts=(strange,)))
     monkeypatch.setitem(sys.modules, "onnx", None)
     assert main(["export", model, "--out", out]) == 2
     assert "pip install -e '.[onnx]'" in capsys.readouterr().err and not (folder / "model.onnx").exists()

@@ -114,7 +114,7 @@ def test_how_stiff_tissue_is_does_not_matter(box, pressed):
     soft = pressed[0]
     stiff = condense_contact(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
     X = features(box, draw_poses("palpation", box, 10, 3))
-    force, more = soft.force(X), stiff.force(X)
+    force, more = soft.force(X), stiff.compute_nodal_forces(X)
     np.testing.assert_allclose(2.5 * force, more, atol=1e-3 * np.abs(more).max())
     moved, again = force @ soft.compliance.T, more @ stiff.compliance.T
     np.testing.assert_allclose(moved, again, atol=2e-6)
@@ -145,13 +145,13 @@ class Stiffening:
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         X = features(self.anatomy, loads)
-        answered = self.contact.linear(X) * X[:, 6:7]
+        answered = self.contact.compute_linear(X) * X[:, 6:7]
         answered *= (LINE[0] + LINE[1] * X[:, 6:7] / X[:, 7:8]) * (1.0 + 0.1 * np.sin(100.0 * X[:, :1]))
         split, displacement = len(self.bases[0].modes), np.zeros((len(loads), len(self.anatomy.mesh.nodes), 3))
         for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
             displacement[:, basis.nodes] = basis.decode(coefficients)
         count, depth = len(loads), X[:, 6:7] / X[:, 7:8]
-        force = self.contact.force(X).reshape(count, -1, 3).sum(axis=1)
+        force = self.contact.compute_nodal_forces(X).reshape(count, -1, 3).sum(axis=1)
         force *= (GRIP[0] + GRIP[1] * depth) * (1.0 + 0.1 * np.sin(100.0 * X[:, :1]))
         answer = Deformation(
             displacement,
@@ -244,8 +244,8 @@ def test_without_reactions_the_force_is_not_answered(tmp_path, data, box):
         del file["answers/reaction"]
         file["answers/checksum"][:] = compute_row_checksums(rows)
     read = read_dataset(older)
-    assert read.reaction() is None and data.reaction() is not None
-    np.testing.assert_array_equal(read.displacement(box.tumour_nodes), data.displacement(box.tumour_nodes))
+    assert read.read_reaction() is None and data.reaction() is not None
+    np.testing.assert_array_equal(read.read_displacement(box.tumour_nodes), data.displacement(box.tumour_nodes))
     found = train(read, ["contact"])
     assert found.force == {}
     answer = found.models["contact"].deform(draw_poses("palpation", box, 2, 1))

@@ -84,7 +84,9 @@ def test_points_that_hardly_move_leave_the_prior(body, locator, drained):
 def test_a_force_that_is_read_gives_the_modulus(body):
     tip = find_foot(body, Tool(tuple(body.mesh.nodes[np.unique(body.open_surface)].mean(axis=0).tolist())))
     loads = build_force_loads(body, tip[None], np.array([6e-3]), np.array([[0.0, 0.02, -0.12]]))
-    motion = Fem(body, Group(1, "slide", 0.47, 1.0, 14.0).effects((0.01,)), device="cpu").deform(loads).displacement[0]
+    motion = (
+        Fem(body, Group(1, "slide", 0.47, 1.0, 14.0).build_effects((0.01,)), device="cpu").deform(loads).displacement[0]
+    )
     tool = Tool(tuple(tip.tolist()), 6e-3, force=2.0 * float(np.hypot(0.02, 0.12)), sigma=0.005)
     frame = replace(build_tool_frame(body, motion), tools=(tool,))
     pressed = solve_responses(body, build_force_loads(body, tip[None], np.array([6e-3])), "cpu")

@@ -44,16 +44,16 @@ def test_the_process_knows_how_wrong_it_is():
     covariance = compute_matern(cdist(x / [0.8, 1.5], x / [0.8, 1.5])) + 1e-6 * np.eye(300)
     y = 5.0 * np.linalg.cholesky(covariance) @ np.random.default_rng(9).normal(size=(300, 60))
     model = Gp().fit(x[:150], y[:150])
-    stated = 5.0 * model.deviation(x[150:])
+    stated = 5.0 * model.predict_deviation(x[150:])
     share = (model.predict(x[150:]) - y[150:]) / stated[:, None]
     deep = stated < np.median(stated)
     assert 0.8 < share[deep].std() < 1.25 and 0.8 < share[~deep].std() < 1.25
-    assert np.allclose(model.deviation(1e3 * x), 1.0, atol=1e-2)
+    assert np.allclose(model.predict_deviation(1e3 * x), 1.0, atol=1e-2)
     again = Gp.restored(model.state())
-    assert np.allclose(again.deviation(x), model.deviation(x), rtol=1e-12)
+    assert np.allclose(again.predict_deviation(x), model.predict_deviation(x), rtol=1e-12)
     twice = Gp().fit(x[:40], y[:40])
-    twice.deviation(x)
-    assert np.array_equal(twice.fit(x[:150], y[:150]).deviation(x), model.deviation(x))
+    twice.predict_deviation(x)
+    assert np.array_equal(twice.fit(x[:150], y[:150]).predict_deviation(x), model.predict_deviation(x))
 
 
 def test_a_subset_stands_for_too_many_rows():

@@ -108,10 +108,10 @@ def test_a_frame_says_who_answered(theatre, limit):
 
 def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
     cast = SceneSolvers(theatre, small(), GUARDED, threading.Lock())
-    play = cast.player(GUARDED)
+    play = cast.get_player(GUARDED)
     cast.players[GUARDED, ALL] = replace(play, deformer=replace(play.deformer, limit=0.0))
     question = (0, Touch(force=0.1))
-    first, again = (cast.predicted(GUARDED, question).deformation for _ in range(2))
+    first, again = (cast.predict(GUARDED, question).deformation for _ in range(2))
     assert first.iterations[0] > again.iterations[0] == 0
     assert again.displacement == pytest.approx(first.displacement, abs=1e-6)
 

@@ -19,7 +19,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import APART
 from surrogate.data.tool_loads import draw
-from surrogate.evaluation.coverage import coverage, measure_covered, measure_held
+from surrogate.evaluation.coverage import compute_coverage, measure_covered, measure_held
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
@@ -180,7 +180,7 @@ def test_held_out_coverage_is_reported(trained, scored, data):
             answer = bounded.deform(asked, at=data.anatomy.tumour_nodes)
             held.append(seen(here).error <= answer.bound)
             off, moved = np.linalg.norm([answer.displacement - truth[here], truth[here]], axis=3).mean(axis=2)
-            alone.append([off / moved, Guarded(bounded, bounded, stated.limit).unsure(answer)])
+            alone.append([off / moved, Guarded(bounded, bounded, stated.limit).find_unreliable(answer)])
         share, solved = np.concatenate(alone, axis=1)
         assert (stated.mean, stated.solved) == pytest.approx((share.mean(), solved.mean())) and solved.any()
         assert stated.guarded == pytest.approx((share * (1.0 - solved)).mean())
@@ -235,7 +235,7 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
     miss = np.resize([0.9, 1.1, 1.9, 2.1], len(fresh)) * answer.bound[0]
     truth = answer.displacement.copy()
     truth[:, -1, 1] -= miss  # one vertex alone
-    found = coverage(model, fresh, truth)
+    found = compute_coverage(model, fresh, truth)
     assert found.held == (0.25, 0.75) and str(found).startswith("25.0 % at 95 %, 75.0 % at 99 %;")
     assert found.bound_mm == pytest.approx(1e3 * np.median(answer.bound[0]))
     assert found.error_mm == pytest.approx(1e3 * np.median(miss), rel=1e-4)

@@ -52,7 +52,7 @@ def test_unit_responses_inside_the_discs_are_given_and_counted(trained, data, bo
     for node in np.flatnonzero(trained.split.covers(patch.points))[:3]:
         force = np.zeros(3 * len(patch.points))
         force[3 * node + 2] = 1.0
-        found = model.parts[0].response(force[None])[0]
+        found = model.parts[0].compute_response(force[None])[0]
         np.testing.assert_allclose(found, unit[node, 2], atol=2e-3 * np.abs(unit[node, 2]).max())
 
 

@@ -15,9 +15,9 @@ def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path):
     with (tmp_path / "m.npz").open("rb") as raw:
         for most, name, count in ((1000, "few", 10), (8200, "many", 1000)):  # less than both with their heads
             archive = Archive(raw, largest=most)
-            assert len(archive.arrays([name])[name]) == count
+            assert len(archive.read_arrays([name])[name]) == count
             with pytest.raises(InputError, match="MB are the most"):
-                archive.arrays(["few", "many"])
+                archive.read_arrays(["few", "many"])
 
 
 def test_oversized_array_is_rejected_before_allocation(tmp_path):
@@ -30,7 +30,7 @@ def test_oversized_array_is_rejected_before_allocation(tmp_path):
     tracemalloc.start()
     try:
         with (tmp_path / "n.npz").open("rb") as file, pytest.raises(InputError, match="is not what it says"):
-            Archive(file).arrays(["many"])
+            Archive(file).read_arrays(["many"])
         assert tracemalloc.get_traced_memory()[1] < 2**20
     finally:
         tracemalloc.stop()

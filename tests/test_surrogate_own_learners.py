@@ -21,7 +21,7 @@ from sim.runtime.user_script import run_script
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model.own_learners import OWN, PLAYERS, RESERVED, find_own, learner
+from surrogate.model.own_learners import OWN, PLAYERS, RESERVED, find_own, register_learner
 from surrogate.model.store import FITTED, load, save
 from surrogate.training.train import LEARNERS, OF_POSES, train
 
@@ -127,7 +127,7 @@ def test_package_tool_is_imported_only_when_named(tmp_path, monkeypatch, clean):
 
 def test_ones_own_features(box, clean):
     own = run_script(NEAREST)
-    learner("along", lambda patch, pushed: pushed.force)(type("Along", (own.Nearest,), {}))
+    register_learner("along", lambda patch, pushed: pushed.force)(type("Along", (own.Nearest,), {}))
     assert find_own("along").encoder == "along"
 
 
@@ -148,12 +148,12 @@ def test_all_names_of_what_comes_with_sulcus_are_reserved():
 def test_names_that_cannot_be_are_sentences(name, encoder, words, clean):
     own = run_script(NEAREST)
     with pytest.raises(InputError, match=words):
-        learner(name, encoder)(own.Nearest)
+        register_learner(name, encoder)(own.Nearest)
 
 
 def test_a_class_that_lacks_something_is_a_sentence(clean):
     with pytest.raises(InputError, match="the learner empty has no fit, predict, state, restored"):
-        learner("empty")(type("Empty", (), {}))  # pyright: ignore[reportArgumentType]
+        register_learner("empty")(type("Empty", (), {}))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_a_state_that_would_be_pickled_is_not_stored(folder, tmp_path, clean):
         def state(self):
             return {"thing": np.array([object()])}
 
-    learner("sly")(Sly)
+    register_learner("sly")(Sly)
     model = train(read_dataset(folder / "data.h5"), ["linear"]).models["linear"]
     part = replace(model.parts[0], regressor=Sly())
     with pytest.raises(InputError, match="a learner's state holds a ndarray that is no array of numbers"):

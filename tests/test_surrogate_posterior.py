@@ -58,7 +58,7 @@ def drawn(prior, random, number=0):
     unknown[hypothesis.places[:1]] = 3.0 * random.standard_normal(3)
     unknown[-6:] = hypothesis.rigid * RIGID * random.standard_normal(6)
     evidence = seen(prior, np.tensordot(unknown[:-6], prior.shape, 1))
-    noise = np.linalg.cholesky(evidence.noise()) @ random.standard_normal(len(evidence))
+    noise = np.linalg.cholesky(evidence.compute_noise()) @ random.standard_normal(len(evidence))
     return unknown, replace(evidence, value=evidence.value + evidence.rigid @ unknown[-6:] + noise)
 
 
@@ -112,12 +112,12 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
     Of whole motions, and of one with a row less, so that axes are not alike. A skull has fewer shapes of swelling.
     """
     _, evidence = drawn(prior, np.random.default_rng(1), 3)
-    evidence = evidence.rows(np.arange(len(evidence) - single))
+    evidence = evidence.select(np.arange(len(evidence) - single))
     kept = np.ones(len(prior.kind), bool)
     kept[np.flatnonzero((prior.kind == SWELLING) & (prior.skull == 1))[1:]] = False
     prior = replace(prior, **{name: getattr(prior, name)[kept] for name in ("shape", "kind", "skull", "place")})
     sight = build_observed_prior(prior, evidence)
-    noise = evidence.noise(np.sqrt((evidence.value**2).sum() / POINTS))
+    noise = evidence.compute_noise(np.sqrt((evidence.value**2).sum() / POINTS))
     unknown = seen_unknowns(prior, evidence).T
     logs, density = [], []
     for hypothesis, found in zip(prior.hypotheses, sight.logs, strict=True):
@@ -125,7 +125,7 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
         assert np.isfinite(found[: 1 + pressed]).all() and (found[1 + pressed :] == -np.inf).all()
         for number, log in enumerate(found[: 1 + pressed]):
             place = hypothesis.places[number - 1] if number else np.zeros(0, int)
-            answer = sight.answer(hypothesis, place, 1.0)
+            answer = sight.compute_posterior(hypothesis, place, 1.0)
             size = np.concatenate([sight.scale * hypothesis.size, np.full(6, rigid), np.full(len(place), sight.scale)])
             some = unknown[answer.rows]
             spread = np.linalg.inv(some @ np.linalg.solve(noise, some.T) + np.diag(size**-2.0))
@@ -140,18 +140,18 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
 def test_axes_that_are_alike_are_whitened_as_all_rows_together(prior):
     """The short way for whole motions gives what the long one gives, which single rows take."""
     _, evidence = drawn(prior, np.random.default_rng(2))
-    short = evidence.whitening(1e-3)
-    turned = evidence.rows(np.random.default_rng(0).permutation(len(evidence)))
-    long = turned.whitening(1e-3)
+    short = evidence.build_whitening(1e-3)
+    turned = evidence.select(np.random.default_rng(0).permutation(len(evidence)))
+    long = turned.build_whitening(1e-3)
     assert (short.copies, long.copies) == (3, 1)
     for one, other in ((short, evidence), (long, turned)):
-        inverse = np.linalg.inv(other.noise(1e-3))
+        inverse = np.linalg.inv(other.compute_noise(1e-3))
         rows = np.random.default_rng(1).standard_normal((len(other), 2))
-        white = one.white(rows)
+        white = one.whiten(rows)
         assert white.T @ white == pytest.approx(rows.T @ inverse @ rows)
-        assert one.back(white) == pytest.approx(inverse @ rows)
+        assert one.transform_back(white) == pytest.approx(inverse @ rows)
         table = np.arange(len(other)).reshape(-1, 3)
-        assert one.precision(table) == pytest.approx(
+        assert one.compute_precision(table) == pytest.approx(
             inverse[table[:, :, None], table[:, None]], abs=1e-6 * inverse.max()
         )
 
@@ -164,14 +164,14 @@ def test_block_rows_match_products_of_all_points(prior, count):
     place = Located(box.mesh.tets[some[:, 0]], random.dirichlet(np.ones(4), count))
     at = np.einsum("nc,nci->ni", place.weights, box.mesh.nodes[place.vertices])
     whole = build_motion_evidence(place, at, 1e-3 * random.standard_normal((count, 3)), np.full(count, SIGMA))
-    for evidence in (whole, whole.rows(random.permutation(len(whole)))):
+    for evidence in (whole, whole.select(random.permutation(len(whole)))):
         found, unknown = whiten(prior, evidence, 1e-3), seen_unknowns(prior, evidence)
         rows = np.column_stack([unknown, evidence.value])
-        precise = np.linalg.solve(evidence.noise(1e-3), rows)
+        precise = np.linalg.solve(evidence.compute_noise(1e-3), rows)
         assert found.products == pytest.approx(rows.T @ precise, abs=1e-9 * np.abs(rows.T @ precise).max())
         columns = random.permutation(rows.shape[1])[:9]
         for some in (columns, np.append(columns, rows.shape[1] - 1)):
-            assert found.precise(some) == pytest.approx(precise[:, some], abs=1e-9 * np.abs(precise).max())
+            assert found.apply_precision(some) == pytest.approx(precise[:, some], abs=1e-9 * np.abs(precise).max())
 
 
 def test_ellipsoids_hold_what_is_drawn(prior):
@@ -180,7 +180,7 @@ def test_ellipsoids_hold_what_is_drawn(prior):
         truth, evidence = drawn(prior, random, 3)
         # What shapes lack is no part of these draws, and their size is known.
         sight = ObservedPrior(prior, 3.0, whiten(prior, evidence, 0.0), np.zeros(3))
-        answer = sight.answer(hypothesis, hypothesis.places[0], 1.0)
+        answer = sight.compute_posterior(hypothesis, hypothesis.places[0], 1.0)
         scale = np.append(np.ones(len(prior.kind)), RIGID)
         off = answer.mean - (truth / scale)[answer.rows]
         square.append(off @ np.linalg.solve(answer.root.T @ answer.root, off))
@@ -192,7 +192,7 @@ def test_a_mixture_lies_between_its_hypotheses(prior):
     _, evidence = drawn(prior, np.random.default_rng(4))
     found = condition_prior(prior, evidence)
     assert not len(found.outliers) and 0.2 < found.surprise < 1.6
-    answers = build_observed_prior(prior, evidence).answers()
+    answers = build_observed_prior(prior, evidence).compute_posteriors()
     assert len(answers) == MIXED and sum(answer.share for answer in answers) == pytest.approx(1.0)
     means = np.zeros((len(answers), len(prior.kind) + 6))
     spreads = np.zeros((len(answers), *2 * means.shape[1:]))
@@ -206,8 +206,10 @@ def test_a_mixture_lies_between_its_hypotheses(prior):
     spread = np.tensordot(share, spreads + (means - mean)[:, :, None] * (means - mean)[:, None], 1)[:-6, :-6]
     some = prior.shape[:, ::40].astype(float)
     covariance = np.einsum("rvi,rs,svj->vij", some, spread, some)
-    assert found.covariance(some) == pytest.approx(covariance, abs=1e-9 * covariance.max())
-    assert replace(found, factor=2.5).covariance(some) == pytest.approx(2.5 * covariance, abs=1e-9 * covariance.max())
+    assert found.compute_covariance(some) == pytest.approx(covariance, abs=1e-9 * covariance.max())
+    assert replace(found, factor=2.5).compute_covariance(some) == pytest.approx(
+        2.5 * covariance, abs=1e-9 * covariance.max()
+    )
 
 
 def test_gross_errors_are_left_out_and_named(prior):
@@ -232,7 +234,7 @@ def test_point_is_left_out_once_one_in_ten_thousand_is_so_far(prior, deviations,
 def test_points_with_one_row_are_left_out_too(prior):
     """Motions along one axis only, as those of a cloud."""
     _, evidence = drawn(prior, np.random.default_rng(6))
-    single = replace(evidence.rows(np.arange(0, len(evidence), 3)), point=np.arange(POINTS))
+    single = replace(evidence.select(np.arange(0, len(evidence), 3)), point=np.arange(POINTS))
     assert not len(condition_prior(prior, single).outliers)
     wrong = np.arange(POINTS) == 7
     found = condition_prior(prior, replace(single, value=single.value + np.where(wrong, 0.05, 0.0)))

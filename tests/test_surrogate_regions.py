@@ -73,7 +73,7 @@ def test_a_region_is_in_every_group_and_beside_every_force(body):
     """Its stiffness goes with the brain's; its Poisson's ratio is its own where it is given."""
     known = (replace(STIFF, poisson=0.3),)
     for group in build_groups(body, causes=replace(FEW, regions=known)):
-        tissue = group.effects(FEW.swellings)[0]
+        tissue = group.build_effects(FEW.swellings)[0]
         assert isinstance(tissue, Elasticity)
         slab, brain = tissue.regions[OEDEMA], tissue.default
         assert isinstance(slab, Ogden) and isinstance(brain, Ogden)

@@ -30,7 +30,7 @@ from surrogate.model.guarded import Guarded, describe_error
 from surrogate.model.relaxation import MEMORY, Relaxed, follow_relaxation
 from surrogate.model.store import load, save
 from surrogate.model.tool_contact import compute_wrench
-from surrogate.onnx_export.export import onnx_model
+from surrogate.onnx_export.export import build_onnx_model
 from surrogate.training.fem_tables import condense_contact
 from surrogate.training.train import train
 
@@ -106,11 +106,11 @@ class Fading:
         pushed = to_indentation(loads, BALL, self.patch)
         share = follow_relaxation(SERIES, pushed, loads.times, start, 1e-4).share[:, None]
         X, count = compute_tool_features(self.patch, pushed), len(loads)
-        answered = self.contact.linear(X) * X[:, 6:7] * (1.0 - 0.3 * share)
+        answered = self.contact.compute_linear(X) * X[:, 6:7] * (1.0 - 0.3 * share)
         split, moved = len(self.bases[0].modes), np.zeros((count, len(self.anatomy.mesh.nodes), 3))
         for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
             moved[:, basis.nodes] = basis.decode(coefficients)
-        force = self.contact.force(X).reshape(count, -1, 3).sum(axis=1) * (1.0 - share)
+        force = self.contact.compute_nodal_forces(X).reshape(count, -1, 3).sum(axis=1) * (1.0 - share)
         reaction, nodes = compute_wrench(force, get_poses(loads, BALL), BALL), np.arange(moved.shape[1])
         outcome = (Outcome.CONVERGED,) * count
         answer = Deformation(moved, nodes, outcome, np.zeros(count, int), np.zeros(count), loads.times, reaction)
@@ -198,22 +198,22 @@ def test_it_plays_alone_frame_by_frame(model, box):
     scene = replace(find_scene("palpate"), effects=EFFECTS, tool=Probe(BALL.radius))
     theatre = Theatre(box, None, {"contact": model}, "cpu")
     scene = replace(scene, element="p1")
-    assert theatre.names(scene) == ("contact", "fem") and theatre.usual(scene) == "contact"
+    assert theatre.list_deformers(scene) == ("contact", "fem") and theatre.select_default(scene) == "contact"
     assert describe_error(replace(model, bound=1e-3)).endswith(
         "1 mm in 95 % of loads (limit 0.2 mm): it plays alone nevertheless, as its tissue relaxes"
     )
     with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to solve"):
-        theatre.deformer(GUARDED, scene)
+        theatre.build_deformer(GUARDED, scene)
     with pytest.raises(InputError, match="would need every earlier frame"):
         Guarded(model, Fading(box))
     with pytest.raises(InputError, match="contact follows tissue that relaxes in time"):
-        onnx_model("contact", model)
-    player = theatre.player("contact", scene)
+        build_onnx_model("contact", model)
+    player = theatre.build_player("contact", scene)
     assert player.follows and player.remembers
     last = None
     for number in range(0, 40, 4):
-        last = player.answer(player.loads(number), last)
+        last = player.compute_deformation(player.build_loads(number), last)
     assert last is not None and last.memory[MEMORY].shape == (1, 4 + len(SERIES))
-    held_there = player.loads(40)
-    going_on, alone = (player.answer(held_there, start).memory[MEMORY] for start in (last, None))
+    held_there = player.build_loads(40)
+    going_on, alone = (player.compute_deformation(held_there, start).memory[MEMORY] for start in (last, None))
     assert np.abs(going_on[0, 4:]).min() > 0.0 and not np.allclose(going_on, alone, atol=1e-5)

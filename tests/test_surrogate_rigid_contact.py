@@ -83,8 +83,8 @@ def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box):
     for name in ("point", "force", "footprint"):
         np.testing.assert_allclose(getattr(rod, name), getattr(round_, name), atol=1e-9)
     patch = open_patch(box)
-    force = condensed_box(box, ROD_OF_4)[0].force(compute_core_features(patch, rod))
-    alike = condensed_box(box, ball)[0].force(compute_tool_features(patch, round_))
+    force = condensed_box(box, ROD_OF_4)[0].compute_nodal_forces(compute_core_features(patch, rod))
+    alike = condensed_box(box, ball)[0].compute_nodal_forces(compute_tool_features(patch, round_))
     np.testing.assert_allclose(force, alike, atol=0.02 * np.abs(alike).max())
     turned = loads.of(Touching)
     assert turned is not None
@@ -123,7 +123,7 @@ def test_no_facet_is_entered_and_finite_elements_answer_so(box, preset):
     contact, bases = condensed_box(box, tool)
     loads = draw_poses(preset, box, 5, 5, tool)
     X = compute_core_features(patch, asked(box, loads, tool))
-    force = contact.force(X)
+    force = contact.compute_nodal_forces(X)
     moved = contact.points + (force @ contact.compliance.astype(np.float64).T).reshape(len(X), -1, 3)
     for row, pose in enumerate(get_poses(loads, tool)):
         facets = np.einsum("qc,sci->sqi", build_barycentric_lattice(12), moved[row][contact.triangles]).reshape(-1, 3)
@@ -150,11 +150,11 @@ class Stiffening:
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         X = compute_core_features(open_patch(self.anatomy), asked(self.anatomy, loads, ROD_OF_4))
         grown = 1.0 + 0.2 * X[:, 6:7] / X[:, 7:8]
-        answered = self.contact.linear(X) * X[:, 6:7] * grown
+        answered = self.contact.compute_linear(X) * X[:, 6:7] * grown
         split, displacement = len(self.bases[0].modes), np.zeros((len(loads), len(self.anatomy.mesh.nodes), 3))
         for basis, coefficients in zip(self.bases, (answered[:, :split], answered[:, split:]), strict=True):
             displacement[:, basis.nodes] = basis.decode(coefficients)
-        force = self.contact.force(X).reshape(len(loads), -1, 3).sum(axis=1) * grown
+        force = self.contact.compute_nodal_forces(X).reshape(len(loads), -1, 3).sum(axis=1) * grown
         nodes, count = np.arange(len(self.anatomy.mesh.nodes)), len(loads)
         reaction = np.nan_to_num(compute_wrench(force, get_poses(loads, ROD_OF_4), ROD_OF_4))
         outcome = (Outcome.CONVERGED,) * count

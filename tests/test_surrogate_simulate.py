@@ -57,7 +57,7 @@ def test_displacements_are_those_of_the_finite_elements(folder, small_box):
 
     data = read_dataset(folder / "data.h5")
     truth = Fem(small_box, (Elasticity(), Held(), ToolForce()), device="cpu").deform(data.loads.rows(np.arange(3)))
-    stored = data.displacement(slice(None))[:3]
+    stored = data.read_displacement(slice(None))[:3]
     assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
 
 
@@ -163,7 +163,7 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, small_box,
     said = json.loads(capsys.readouterr().out)
     answers = read_dataset(fresh)
     guess = load(model, small_box)["linear"].deform(answers.loads, at=small_box.tumour_nodes)
-    miss = np.linalg.norm(guess.displacement - answers.displacement(small_box.tumour_nodes), axis=2)
+    miss = np.linalg.norm(guess.displacement - answers.read_displacement(small_box.tumour_nodes), axis=2)
     assert said["scores"][0]["mean_mm"] == pytest.approx(1e3 * miss.mean(), rel=1e-6)
     found = said["coverage"]["linear"]
     assert found["held"] == [np.mean(miss.max(axis=1) <= guess.bound[0]), None] and np.isinf(guess.bound[1]).all()

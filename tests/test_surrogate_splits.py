@@ -32,7 +32,7 @@ def test_whole_sectors_are_left_out(box, pushed):
     assert split.share == 0.25 and set(split.disc) == {-1, 0, 1} and split.train.sum() + split.test.sum() == 400
     side = pushed.force[split.test] @ split.centres[0] > 0.0
     assert np.array_equal(split.disc[split.test], np.where(side, 0, 1))
-    assert "2 sectors of 45 degrees" in split.summary() and f"{split.test.sum()} loads to test" in split.summary()
+    assert "2 sectors of 45 degrees" in split.summarise() and f"{split.test.sum()} loads to test" in split.summarise()
 
 
 def test_upright_loads_cannot_be_split(box, pushed):

@@ -214,7 +214,7 @@ def test_bounds_of_older_files_grow_beyond_the_reach_alone(stored, models, box, 
         assert (float(bound.growth), float(bound.near)) == (1e3 * GROWTH, reach)
     away = np.array([0.0, reach, reach + 1e-3])
     outside = Outside(away, 0.0 * away, 0.0 * away)
-    stated = found.bounds.of(np.tile(found.bounds.mean, (3, 1)), np.full(3, 0.2), outside)[0]
+    stated = found.bounds.evaluate(np.tile(found.bounds.mean, (3, 1)), np.full(3, 0.2), outside)[0]
     assert stated[0] == stated[1] and stated[2] == pytest.approx((1.0 + GROWTH) * stated[0])
 
 

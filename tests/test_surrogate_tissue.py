@@ -12,7 +12,7 @@ def test_what_is_drawn_is_what_was_fitted():
     share = np.zeros((3, 13, 33))
     share[0, 3, 20], share[1, 3, 20], share[1, 9, 30] = 0.25, 0.25, 0.5
     tissue = FittedTissue("", 4, share, np.array([1500.0]))
-    names, poisson, ratio = tissue.drawn(400, 1)
+    names, poisson, ratio = tissue.sample(400, 1)
     assert names.count("bonded") == 100 and (ratio == FINE_RATIOS[30]).sum() == 200
     assert ((poisson == FINE_POISSONS[9]) == (ratio == FINE_RATIOS[30])).all()
     draws = sample_from_fit(tissue, 3000.0, ("slide", "contact"), 30, 2)

@@ -60,7 +60,7 @@ def test_places_are_uniform_within_a_triangle_too():
     beside = large[:, :2] / 3.0  # of the corners beside the right angle
     share = np.column_stack([1.0 - beside.sum(axis=1), beside])
     assert (share > 0.5).mean(axis=0) == pytest.approx([0.25] * 3, abs=0.015)
-    assert two.covered(np.array([[-0.5, -0.5, 0.0]]), 0.71) == pytest.approx(0.1, abs=0.02)
+    assert two.compute_covered(np.array([[-0.5, -0.5, 0.0]]), 0.71) == pytest.approx(0.1, abs=0.02)
 
 
 def test_a_load_depends_on_its_number_alone(box):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Deformation, Deformer, Outcome
@@ -117,7 +117,7 @@ def test_a_stored_model_knows_its_tool(tmp_path, trained, box):
 
 def test_poses_sharing_nearest_corner_stay_distinct():
     """A data set to judge by is told apart from the training's own by what is not a vertex of the cortex."""
-    template = read_anatomy(template_path())
+    template = read_anatomy(get_template_path())
     patch, corners = open_patch(template), template.mesh.nodes
     first, same, other = (
         to_indentation(draw_poses("palpation", template, 900, seed), choose_ball("palpation"), patch)
@@ -125,8 +125,8 @@ def test_poses_sharing_nearest_corner_stay_distinct():
     )
     known = compute_training_range(patch, first)
     shared = (known.points[:, None] == other.point.astype(np.float32)).all(axis=2).any(axis=1)
-    assert shared.sum() > 3 and not known.repeats(other.point, corners)
-    assert known.repeats(same.point, corners)
+    assert shared.sum() > 3 and not known.is_training_point(other.point, corners)
+    assert known.is_training_point(same.point, corners)
 
 
 def test_pose_and_force_models_reject_each_others_loads(trained, box):
@@ -176,9 +176,9 @@ def test_the_command_makes_poses_that_finite_elements_answer(tmp_path, box, caps
     assert "NodalForce" not in data.provenance["effects"]
     fem = Fem(read_anatomy(mesh), (Elasticity(), Held(), ToolContact((ball,))), device="cpu", batch=1)
     truth = fem.deform(data.loads)
-    stored = data.displacement(np.arange(len(box.mesh.nodes)))
+    stored = data.read_displacement(np.arange(len(box.mesh.nodes)))
     assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
-    reaction = data.reaction()
+    reaction = data.read_reaction()
     assert reaction is not None
     np.testing.assert_allclose(reaction, truth.reaction, atol=2e-3 * np.abs(truth.reaction).max())
     force = truth.reaction[:, 0, :3]

@@ -21,7 +21,7 @@ def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
     assert found.overhang == pytest.approx(overhang.max()) and found.angle == pytest.approx(0.0, abs=1e-7)
     assert (found.force, found.footprint) == ((0.1, 0.2), (5e-3, 6e-3))
     assert found.line_force == pytest.approx(0.2 / 6e-3)
-    assert not found.holds(patch, held).any() and found.holds(patch, training).all()
+    assert not found.is_inside(patch, held).any() and found.is_inside(patch, training).all()
 
 
 @pytest.mark.parametrize(
@@ -40,5 +40,5 @@ def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
 def test_envelope_measures_how_far_a_load_is_outside(force, angle, overhang, radius, away, beyond, excess):
     envelope = Envelope(np.zeros((1, 3)), 1e-3, 2e-3, 0.5, (0.1, 0.3), (4e-3, 8e-3), 50.0)
     pushed = Pushed(np.array([[away, 0.0, 0.0]]), np.array([[0.0, 0.0, force]]), np.array([radius]))
-    found = envelope.outside(pushed, Measured(*(np.array([each]) for each in (force, angle, overhang))))
+    found = envelope.locate_outside(pushed, Measured(*(np.array([each]) for each in (force, angle, overhang))))
     assert np.concatenate(found) == pytest.approx([away, beyond, excess], abs=1e-2)

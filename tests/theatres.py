@@ -15,8 +15,8 @@ from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.script.head_posture import build_drained_turn
 from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
-from scenes.script.shipped_files import template_path
-from scenes.script.tool_paths import idle, press
+from scenes.script.shipped_files import get_template_path
+from scenes.script.tool_paths import keep_idle, press
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity, read_intensity, to_intensity_path, write_intensity
@@ -100,7 +100,7 @@ def coarse_brain() -> Anatomy:
 @cache
 def template_theatre() -> Theatre:
     """The anatomy that ships, and finite elements that every scene on it shares."""
-    path = template_path()
+    path = get_template_path()
     return Theatre(read_anatomy(path), read_intensity(to_intensity_path(path)), {}, "cpu")
 
 
@@ -138,12 +138,12 @@ def sinking() -> Scene:
     """Seven small frames without a tool: the fluid drains, and the head turns on its side."""
     lying = build_drained_turn(0.1, 0.0, 0.1, np.radians(60.0))
     effects = (Elasticity(), Held(), Slide(), Gravity())
-    return replace(small(path=idle, duration=0.2, effects=effects, tool=None, lying=lying), name="sinking")
+    return replace(small(path=keep_idle, duration=0.2, effects=effects, tool=None, lying=lying), name="sinking")
 
 
 def player(theatre: Theatre, scene: Scene, deformer: str) -> Player:
     """As the commands make it."""
-    return theatre.player(deformer, scene)
+    return theatre.build_player(deformer, scene)
 
 
 class Silent:

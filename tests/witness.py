@@ -75,12 +75,12 @@ def played(scene: Scene) -> dict[str, list[str]]:
     """Three frames of the scene's middle on a tiny box; the last is watched."""
     box = make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3)
     theatre = Theatre(slippery(box), None, {}, "cpu")
-    player = Player(Stage(scene, theatre.site), theatre.deformer("fem", scene))
+    player = Player(Stage(scene, theatre.site), theatre.build_deformer("fem", scene))
     last = None
     for number in range(3):
         LAUNCHED.clear()
         time = 0.35 * scene.duration + 0.4 * number
-        loads = scene.loads(theatre.site, scene.path(time) if scene.tool else Touch(), time)
+        loads = scene.build_loads(theatre.site, scene.path(time) if scene.tool else Touch(), time)
         last = player.deformer.deform(loads, start=last)
         assert last.outcome[0].good, last.outcome
     things = gc.get_objects()

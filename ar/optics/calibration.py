@@ -83,7 +83,7 @@ class Calibration:
         (fx, fy), (cx, cy) = self.focal, self.principal
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
-    def camera(self, T_camera_world: np.ndarray) -> Camera:
+    def build_camera(self, T_camera_world: np.ndarray) -> Camera:
         """Return the camera at a pose, (4, 4) as in `Camera`; errors as there."""
         return Camera(self.K, T_camera_world, self.width, self.height, self.lens)
 
@@ -100,7 +100,7 @@ class Calibration:
         here = f"the camera was calibrated with images of {self.width} x {self.height}, not {width} x {height}"
         if not scale:
             raise ValueError(f"{here}: calibrate with that size, or ask for the calibration to be scaled.")
-        larger = self.camera(np.eye(4)).scaled(width / self.width)
+        larger = self.build_camera(np.eye(4)).scale(width / self.width)
         if (larger.width, larger.height) != (width, height):
             raise ValueError(f"{here}, which have another shape: choose a size of the same shape.")
         (fx, _, cx), (_, fy, cy) = larger.K[:2].tolist()

@@ -91,7 +91,7 @@ class Camera:
         if self.lens is not None:
             depth = in_camera[..., 2]
             places = in_camera[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None]
-            return to_pixels(self.K, self.lens.bent(places)), depth
+            return to_pixels(self.K, self.lens.distort(places)), depth
         homogeneous = in_camera @ self.K.T
         depth = homogeneous[..., 2]
         return homogeneous[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None], depth
@@ -102,7 +102,7 @@ class Camera:
         NaN at pixels where the lens sees nothing.
         """
         if self.lens is not None:
-            pixels = to_pixels(self.K, self.lens.straight(to_normalised(self.K, np.asarray(pixels, np.float64))))
+            pixels = to_pixels(self.K, self.lens.undistort(to_normalised(self.K, np.asarray(pixels, np.float64))))
         homogeneous = np.concatenate([pixels, np.ones((*np.shape(pixels)[:-1], 1))], axis=-1)
         in_camera = homogeneous @ np.linalg.inv(self.K).T * np.asarray(depth)[..., None]
         return (in_camera - self.T_camera_world[:3, 3]) @ self.T_camera_world[:3, :3]
@@ -125,13 +125,13 @@ class Camera:
         turn[:3, :3] = cv2.Rodrigues(np.radians(degrees) * direction)[0]
         return replace(self, T_camera_world=turn @ self.T_camera_world)
 
-    def moved(self, shift: np.ndarray) -> Camera:
+    def move(self, shift: np.ndarray) -> Camera:
         """Return the same camera moved by `shift` (3,) [m] in its own frame, right, down and forward."""
         T = self.T_camera_world.copy()
         T[:3, 3] -= shift
         return replace(self, T_camera_world=T)
 
-    def zoomed(self, factor: float) -> Camera:
+    def zoom(self, factor: float) -> Camera:
         """Return the same camera with `factor` times the focal length, about its principal point, with the same lens.
 
         Raises
@@ -167,9 +167,9 @@ class Camera:
                 f"a lens of {focal_length:g} m forms no image of an object {min(before, now):g} m away: focus farther."
             )
         behind = [distance / (distance - focal_length) for distance in (now, before)]
-        return self.zoomed(behind[0] / behind[1])
+        return self.zoom(behind[0] / behind[1])
 
-    def scaled(self, factor: float) -> Camera:
+    def scale(self, factor: float) -> Camera:
         """Return the same view on `factor` times as many pixels along each side."""
         width, height = round(self.width * factor), round(self.height * factor)
         resize = np.array(
@@ -190,7 +190,7 @@ class Camera:
             part.__dict__["straight"] = self.straight[rows, columns] - shift[:2, 2]
         return part
 
-    def padded(self, aspect: float) -> Camera:
+    def pad(self, aspect: float) -> Camera:
         """Return the camera of the image centred on the smallest canvas of width / height = `aspect` that holds it."""
         width = max(self.width, round(self.height * aspect))
         height = max(self.height, round(self.width / aspect))
@@ -237,7 +237,7 @@ BASELINE = 24e-3
 """Distance between the two optical paths of an operating microscope [m]."""
 
 
-def stereo_pair(
+def build_stereo_pair(
     camera: Camera, baseline: float = BASELINE, working_distance: float | None = None
 ) -> tuple[Camera, Camera]:
     """Build the left and the right camera about a central one, `baseline` [m] apart along its rows.
@@ -256,7 +256,7 @@ def stereo_pair(
         raise ValueError(f"a baseline of {baseline} m, a distance of {working_distance} m: give numbers above 0.")
     inwards = 0.0 if working_distance is None else float(np.degrees(np.arctan2(0.5 * baseline, working_distance)))
     half = np.array([0.5 * baseline, 0.0, 0.0])
-    return camera.moved(-half).perturb(-inwards), camera.moved(half).perturb(inwards)
+    return camera.move(-half).perturb(-inwards), camera.move(half).perturb(inwards)
 
 
 # Largest motion of points during a band of rows [pixel]: the error of a row is then at most half of it.

@@ -75,7 +75,7 @@ class Lens:
         folds = np.flatnonzero(~good.all(axis=1))
         return float(radii[-1] if not len(folds) else radii[max(folds[0] - 1, 0)])
 
-    def bent(self, places: np.ndarray) -> np.ndarray:
+    def distort(self, places: np.ndarray) -> np.ndarray:
         """Distort positions (..., 2); NaN beyond `reach`."""
         x, y = places[..., 0], places[..., 1]
         with np.errstate(invalid="ignore"):
@@ -83,7 +83,7 @@ class Lens:
         x, y = np.where(seen, x, np.nan), np.where(seen, y, np.nan)
         return np.stack(self._moved(x, y), axis=-1)
 
-    def straight(self, places: np.ndarray) -> np.ndarray:
+    def undistort(self, places: np.ndarray) -> np.ndarray:
         """Undistort positions (..., 2), the inverse of `bent`, by Newton's method; NaN without solution in `reach`."""
         places = np.asarray(places, np.float64)
         wanted = places.reshape(-1, 2).T
@@ -158,7 +158,7 @@ def undistort_pixels(lens: Lens, K: tuple[float, ...], width: int, height: int) 
     """Undistort each pixel, (H, W, 2) [pixel]; NaN where nothing is seen. K (9,): row by row."""
     matrix = np.reshape(K, (3, 3))
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
-    places = lens.straight(to_normalised(matrix, np.stack([columns, rows], axis=-1)))
+    places = lens.undistort(to_normalised(matrix, np.stack([columns, rows], axis=-1)))
     return to_pixels(matrix, places)
 
 

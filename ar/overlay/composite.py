@@ -194,7 +194,7 @@ def _sketched(
         draw_dashes(under, find_outlines(wider), get_margin_ink(hidden), DASHED, 1)
         faint[around] = bare & (under[..., 3] > 0)
     if opening is not None:
-        role = measure.roles.of(picture.segmentation, around)
+        role = measure.roles.read_roles(picture.segmentation, around)
         ground = find_ground(picture.segmentation[around], role, found, opening)
     for trace in marks.traces:
         draw_trace(under, part, trace)
@@ -238,7 +238,7 @@ def _written(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overl
 def _explained(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Sequence[Entry]) -> Overlaid:
     """Write the number next to the tip, the label of closed ground, the text of the style, and the legend."""
     out, taken = drawn.colour, drawn.taken
-    whole = measure.roles.of(measure.picture.segmentation)
+    whole = measure.roles.read_roles(measure.picture.segmentation)
     front = (whole == FRONT).view(np.uint8)
     apart = np.zeros_like(taken)
     if measure.gauge is not None:
@@ -276,7 +276,7 @@ def find_ground(segmentation: np.ndarray, role: np.ndarray, found: RasterisedSur
     mask = found.mask
     counts = np.bincount(segmentation[mask & (role != FRONT)], minlength=256)
     layers = np.flatnonzero(counts).tolist()
-    return Ground(mask, role == SHUT, opening.said({layer: int(counts[layer]) for layer in layers}))
+    return Ground(mask, role == SHUT, opening.describe({layer: int(counts[layer]) for layer in layers}))
 
 
 def draw_broken(

@@ -47,11 +47,11 @@ class CutPlane:
     across: np.ndarray
     along: np.ndarray
 
-    def coordinates(self, points: np.ndarray) -> np.ndarray:
+    def to_plane(self, points: np.ndarray) -> np.ndarray:
         """Convert points (..., 3) [m] of the plane to (..., 2) [m]: across, and along the line of sight."""
         return (points - self.middle) @ np.stack([self.across, self.along], axis=1)
 
-    def points(self, coordinates: np.ndarray) -> np.ndarray:
+    def to_world(self, coordinates: np.ndarray) -> np.ndarray:
         """Convert plane coordinates (..., 2) [m] back to points (..., 3) [m]."""
         return self.middle + coordinates @ np.stack([self.across, self.along])
 
@@ -80,12 +80,12 @@ def compute_profile(
     the half width of the search across.
     """
     steps = np.linspace(-reach, reach, 4 * max(camera.width, 1))
-    pixels, _ = camera.project(plane.points(np.stack([steps, 0.0 * steps], axis=1)))
+    pixels, _ = camera.project(plane.to_world(np.stack([steps, 0.0 * steps], axis=1)))
     pixels = np.unique(pixels[np.isfinite(pixels).all(axis=1)].round().astype(int), axis=0)
     pixels = pixels[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)]
     far, role = depth[pixels[:, 1], pixels[:, 0]], roles[pixels[:, 1], pixels[:, 0]]
     kept = (far > 0.0) & (role != FRONT)
-    places = plane.coordinates(camera.unproject(pixels[kept], far[kept]))
+    places = plane.to_plane(camera.unproject(pixels[kept], far[kept]))
     order = np.argsort(places[:, 0], kind="stable")
     return places[order], role[kept][order]
 
@@ -118,7 +118,7 @@ def draw_section(
     columns, rows = np.meshgrid(np.arange(wide), np.arange(tall))
     places = low + np.stack([columns, rows], axis=2) / scale
     distance = compute_signed_distance(
-        build_tree(hidden.vertices, hidden.triangles), plane.points(places).reshape(-1, 3), FAR
+        build_tree(hidden.vertices, hidden.triangles), plane.to_world(places).reshape(-1, 3), FAR
     ).reshape(tall, wide)
     tone = np.nan_to_num(distance / BAND, nan=len(TONES)).clip(0, len(TONES) - 1).astype(int)
     out = TONES[tone]
@@ -132,7 +132,7 @@ def draw_section(
     for (column, row), role in zip(at.tolist(), seen[1].tolist(), strict=True):
         cv2.circle(out, (column, row), 1, (*(CLOSED if role == SHUT else WHITE), 255), -1)
     if tip is not None:
-        column, row = np.rint((plane.coordinates(tip) - low) * scale).astype(int).tolist()
+        column, row = np.rint((plane.to_plane(tip) - low) * scale).astype(int).tolist()
         cv2.circle(out, (column, row), 5, (10, 12, 12, 255), -1, cv2.LINE_AA)
         cv2.circle(out, (column, row), 3, (*WHITE, 255), -1, cv2.LINE_AA)
     _write_bands(out, distance, places, seen[0])
@@ -158,11 +158,11 @@ def _frame(
     plane: CutPlane, hidden: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
 ) -> tuple[np.ndarray, float]:
     """Compute the position (2,) [m] of the inset's upper left corner, and pixels per metre."""
-    places = plane.coordinates(hidden.vertices)
+    places = plane.to_plane(hidden.vertices)
     held = [places.min(axis=0) - ROUND, places.max(axis=0) + ROUND]
     near = surface[(surface[:, 0] > held[0][0]) & (surface[:, 0] < held[1][0])]
     held += [near.min(axis=0) - OVER] if len(near) else []
-    held += [] if tip is None else [plane.coordinates(tip) - OVER, plane.coordinates(tip) + OVER]
+    held += [] if tip is None else [plane.to_plane(tip) - OVER, plane.to_plane(tip) + OVER]
     low, high = np.min(held, axis=0), np.max(held, axis=0)
     scale = float((np.array(size) / (high - low)).min())
     return 0.5 * (low + high) - 0.5 * np.array(size) / scale, scale

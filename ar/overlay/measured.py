@@ -82,7 +82,7 @@ class Measure:
         Letters go on the sheet `above` all lines.
         """
         if self.style == "rings":
-            free = self.roles.of(self.picture.segmentation, box) == 0
+            free = self.roles.read_roles(self.picture.segmentation, box) == 0
             tree = build_tree(self.hidden.vertices, self.hidden.triangles, str(self.picture.drawn.depth.device))
             reach = RINGS[-1] + BEYOND
             draw_rings(
@@ -92,16 +92,16 @@ class Measure:
             )
         if self.style == "cut":
             plane, part = self.plane, self.camera.crop_to(*box)
-            far = 1.45 * float(np.abs(plane.coordinates(self.hidden.vertices)[:, 0]).max())
+            far = 1.45 * float(np.abs(plane.to_plane(self.hidden.vertices)[:, 0]).max())
             steps = np.linspace(-far, far, 2 * part.width)
-            pixels, _ = part.project(plane.points(np.stack([steps, 0.0 * steps], axis=1)))
+            pixels, _ = part.project(plane.to_world(np.stack([steps, 0.0 * steps], axis=1)))
             line = pixels[np.isfinite(pixels).all(axis=1)].round().astype(np.int32)
             line = line[np.diff(line, axis=0, append=-1).any(axis=1)]
             lines = np.ascontiguousarray(sheet[..., 3] > 0).astype(np.uint8)
             draw_dashes(sheet, [line[:, None]], RING, CUT_STROKES, 1)
             line = line[((line >= EDGE) & (line < (part.width - EDGE, part.height - EDGE))).all(axis=1)]
             # Letters are outside of tools, where the line is visible.
-            front = (self.roles.of(self.picture.segmentation, box) == FRONT).astype(np.uint8)
+            front = (self.roles.read_roles(self.picture.segmentation, box) == FRONT).astype(np.uint8)
             line = line[cv2.dilate(front, np.ones((2 * EDGE + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] == 0]
             if len(line):
                 # Next to the line: there may be another on it, from the tip.
@@ -139,9 +139,9 @@ class Measure:
             self._lay_cut(colour, taken, sights, needed)
 
     def _lay_cut(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
-        roles = self.roles.of(self.picture.segmentation)
+        roles = self.roles.read_roles(self.picture.segmentation)
         plane = self.plane
-        reach = ACROSS * float(np.abs(plane.coordinates(self.hidden.vertices)[:, 0]).max())
+        reach = ACROSS * float(np.abs(plane.to_plane(self.hidden.vertices)[:, 0]).max())
         seen = compute_profile(self.camera, plane, self.picture.depth, roles, reach)
         tip = None if self.gauge is None else self.gauge.tip
         ink = to_key(compute_ink(self.hidden.colour))

@@ -44,7 +44,7 @@ class Opening:
     under: tuple[tuple[int, str], ...] = ()
     otherwise: str = "not in the open"
 
-    def said(self, counts: Mapping[int, int]) -> str:
+    def describe(self, counts: Mapping[int, int]) -> str:
         """Return the label of the ground in an image; empty if too little of the silhouette is under other layers.
 
         counts: pixels of the silhouette by the id of the layer over it, without those in front of the overlay.

@@ -124,7 +124,7 @@ class Roles:
     open: tuple[int, ...] | None = None
     covered: np.ndarray | None = None
 
-    def of(self, segmentation: np.ndarray, box: tuple[slice, slice] = np.s_[:, :]) -> np.ndarray:
+    def read_roles(self, segmentation: np.ndarray, box: tuple[slice, slice] = np.s_[:, :]) -> np.ndarray:
         """Return the roles (h, w) uint8, `FRONT`, `SHUT` or 0, in a box of an image's segmentation (H, W) uint8."""
         found = cv2.LUT(segmentation[box], build_role_table(self.front, self.open))
         if self.covered is not None:

@@ -253,12 +253,12 @@ class Browser:
         mesh = self.meshes[name]
         self.note(f"colour {name}", lambda: setattr(mesh, "color", tuple(round(255 * part) for part in colour)))
 
-    def status(self, words: str) -> None:
+    def show_status(self, words: str) -> None:
         """Show a line (HTML) over the image; empty: none."""
         said = build_element(STATUS, f"<span>{words}</span>") if words else ""
         self.note("status", lambda: setattr(self.line, "content", said))
 
-    def plays(self, playing: bool) -> None:
+    def show_playback(self, playing: bool) -> None:
         """Set the button's label to the playback state."""
         button, self.playing = self.button, playing
 
@@ -330,12 +330,12 @@ class Browser:
         self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0, visible=seekable)
 
         def toggle(_: viser.ClientHandle | None = None) -> None:
-            self.plays(not self.playing)
+            self.show_playback(not self.playing)
             playback.played(self.playing)
 
         def step(by: int) -> None:
             number = min(max(self.shown[0] + by, 0), playback.frames - 1)
-            self.plays(False)
+            self.show_playback(False)
             playback.played(False)
             playback.sought(number)
             self.controls.assign(self.frame, number)
@@ -343,10 +343,10 @@ class Browser:
         self.controls.press(self.button, toggle)
         # A slider needs a length, so that of a single frame has two positions.
         self.controls.receive_input(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
-        self.controls.command(SPACE, toggle)
+        self.controls.bind_key(SPACE, toggle)
         if seekable:
-            self.controls.command(BACK, lambda _: step(-1))
-            self.controls.command(ON, lambda _: step(1))
+            self.controls.bind_key(BACK, lambda _: step(-1))
+            self.controls.bind_key(ON, lambda _: step(1))
 
     def add_savers(self) -> None:
         """Add buttons that download the shown image (every client) and a video (client with control)."""
@@ -364,7 +364,7 @@ class Browser:
             self.recorder.toggle(client, self.coded)
 
         self.controls.press(self.recorder.add_button(name), record)
-        self.controls.command(RECORD, record)
+        self.controls.bind_key(RECORD, record)
 
 
 def build_element(name: str, words: str) -> str:

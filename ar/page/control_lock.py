@@ -54,7 +54,7 @@ class ControlLock:
         self.leader, self.acted = visitor, now
         self.asking = tuple(other for other in self.asking if other != visitor)
 
-    def words(self, visitor: int, here: Collection[int]) -> str:
+    def describe_control(self, visitor: int, here: Collection[int]) -> str:
         """Return the status line of a client in Markdown; empty with a single client."""
         if len(here) < 2:
             return ""
@@ -89,7 +89,7 @@ class Clients:
         """Numbers of the connected clients."""
         return {identifier + 1 for identifier in self.server.get_clients()}
 
-    def heard(self, client: viser.ClientHandle) -> bool:
+    def record_activity(self, client: viser.ClientHandle) -> bool:
         """Record that a client acts on the page; return True if it has control."""
         now = clock.monotonic()
         self.lead.see(self.here | {client.client_id + 1}, now)
@@ -105,7 +105,7 @@ class Clients:
             visitor = identifier + 1
             row = self.rows.get(identifier) or self.add_row(client)
             self.rows[identifier] = row
-            words = "  \n".join(part for part in (line(visitor), self.lead.words(visitor, here)) if part)
+            words = "  \n".join(part for part in (line(visitor), self.lead.describe_control(visitor, here)) if part)
             leads = visitor == self.lead.leader
             _set(row.line, "content", words)
             _set(row.ask, "visible", not leads and visitor not in self.lead.asking)
@@ -185,18 +185,18 @@ class Inputs:
 
         @button.on_click
         async def pressed(event: viser.GuiEvent) -> None:
-            if event.client is not None and self.crowd.heard(event.client):
+            if event.client is not None and self.crowd.record_activity(event.client):
                 self.deed = LastChange(event.client.client_id + 1, button.label)
                 act(event.client)
 
-    def command(self, key: Key, act: Callable[[viser.ClientHandle], None]) -> None:
+    def bind_key(self, key: Key, act: Callable[[viser.ClientHandle], None]) -> None:
         """Bind a key of the keyboard to an action of the client with control."""
         handle = self.server.gui.add_command(key.does.capitalize(), hotkey=key.hotkey)
         self.commands.append(handle)
 
         @handle.on_trigger
         async def hit(event: viser.CommandEvent) -> None:
-            if event.client is not None and self.crowd.heard(event.client):
+            if event.client is not None and self.crowd.record_activity(event.client):
                 self.deed = LastChange(event.client.client_id + 1, key.does)
                 act(event.client)
 
@@ -223,9 +223,9 @@ class Inputs:
         self.handles[control.label] = handle
         self.receive_input(handle, control.changed)
         if isinstance(control, Dropdown) and control.key is not None:
-            self.command(control.key, partial(self.next, handle, control))
+            self.bind_key(control.key, partial(self.select_next, handle, control))
 
-    def next(self, handle: viser.GuiInputHandle, choice: Dropdown, _: viser.ClientHandle) -> None:
+    def select_next(self, handle: viser.GuiInputHandle, choice: Dropdown, _: viser.ClientHandle) -> None:
         """Select the next of several names."""
         options = choice.options
         name = options[(options.index(str(handle.value)) + 1) % len(options)]
@@ -241,7 +241,7 @@ class Inputs:
             # The page's own updates arrive here too, without a client.
             if event.client is None:
                 return
-            if not self.crowd.heard(event.client):
+            if not self.crowd.record_activity(event.client):
                 control.value = self.kept[id(control)]
                 return
             self.kept[id(control)] = control.value

@@ -83,7 +83,7 @@ class AccessPolicy:
     origins: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, host: str, origins: tuple[str, ...] = ()) -> AccessPolicy:
+    def create(cls, host: str, origins: tuple[str, ...] = ()) -> AccessPolicy:
         """Build a policy with a fresh token, unless only this machine reaches the host and no proxy leads there.
 
         Raises
@@ -95,7 +95,7 @@ class AccessPolicy:
         near = all(ipaddress.ip_address(str(address).split("%")[0]).is_loopback for address in addresses)
         return cls(host, None if near and not origins else secrets.token_urlsafe(24), origins)
 
-    def refusal(self, request: Request, address: str, port: int) -> str | None:
+    def find_rejection(self, request: Request, address: str, port: int) -> str | None:
         """Return the reason to reject a request received at an address and a port; None to accept it."""
         names = {"localhost", "127.0.0.1", "[::1]", to_bracketed(self.host), to_bracketed(address)}
         if self.token is not None:
@@ -112,7 +112,7 @@ class AccessPolicy:
             )
         if origins and (len(origins) > 1 or origins[0].lower() not in allowed):
             return "Another page may not use this one.\n"
-        if self.token is not None and not any(map(self.is_token, self.tokens(request, port))):
+        if self.token is not None and not any(map(self.is_token, self.read_tokens(request, port))):
             return "This page asks for a token: open the address that was printed, with its ?token=...\n"
         return None
 
@@ -127,7 +127,7 @@ class AccessPolicy:
         """Return True if a text is the token; compares in constant time."""
         return self.token is not None and hmac.compare_digest(text.encode(), self.token.encode())
 
-    def tokens(self, request: Request, port: int) -> Iterator[str]:
+    def read_tokens(self, request: Request, port: int) -> Iterator[str]:
         """Yield the tokens of a request, from its address and its cookies."""
         yield from parse_qs(urlsplit(to_plain_text(request.path)).query).get("token", [])
         for header in request.headers.get_all("Cookie"):
@@ -228,7 +228,7 @@ def open_server(
     """
     if not viser.__version__.startswith(KNOWN):
         raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}*.")
-    door, controls = AccessPolicy.of(host, origins), Controls()
+    door, controls = AccessPolicy.create(host, origins), Controls()
     with guard_server(door, controls, limits) as opened:
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     try:
@@ -273,7 +273,7 @@ def handle_request(
 ) -> Response | None:
     """Respond to a request as viser does, if it is accepted; None opens a WebSocket connection."""
     address, port = connection.local_address[:2]
-    refusal = door.refusal(request, address, port)
+    refusal = door.find_rejection(request, address, port)
     if refusal is not None:
         return connection.respond(HTTPStatus.FORBIDDEN, refusal)
     if request.headers.get_all("Upgrade"):
@@ -297,7 +297,7 @@ def handle_request(
     return response
 
 
-def origin_of(address: str) -> str:
+def format_origin(address: str) -> str:
     """Write an address of a page as browsers do: scheme and name in lower case, no port that its scheme implies.
 
     Raises

@@ -55,7 +55,7 @@ class History:
         unknown = (None,) * len(self.lines)
         self.add(Sample(time, unknown, unknown))
 
-    def chart(self) -> str:
+    def draw_chart(self) -> str:
         """Draw all lines, one below the other, as an SVG element."""
         kept = list(self.samples)
         step = max(1, math.ceil(len(kept) / DRAWN))

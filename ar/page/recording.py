@@ -34,15 +34,15 @@ class PageRecording:
 
     def take(self, code: str, now: float) -> None:
         """Keep an image, unless it equals the last one, or the recording is full."""
-        if (not self.taken or self.taken[-1][1] is not code) and not self.full(now):
+        if (not self.taken or self.taken[-1][1] is not code) and not self.is_full(now):
             self.taken.append((now, code))
             self.size += len(code)
 
-    def full(self, now: float) -> bool:
+    def is_full(self, now: float) -> bool:
         """Return True if the recording is full."""
         return now - self.began >= LONGEST or self.size >= LARGEST
 
-    def film(self, ended: float) -> bytes:
+    def encode_video(self, ended: float) -> bytes:
         """Return an MP4 video of the recording up to `ended` [s], in real time; all frames have the size of the first.
 
         Raises
@@ -102,7 +102,7 @@ class Recorder:
             self.server.gui.add_button(RECORDS, hint=hint, icon=viser.Icon.PLAYER_RECORD, color="gray"),
             name,
         )
-        self.say()
+        self.update_label()
         return self.button
 
     def toggle(self, client: viser.ClientHandle, code: str) -> None:
@@ -113,7 +113,7 @@ class Recorder:
             if self.recording is None:
                 self.recording, self.client = PageRecording(clock.monotonic()), client
                 self.recording.take(code, clock.monotonic())
-                self.say()
+                self.update_label()
                 return
         self.end()
 
@@ -125,10 +125,10 @@ class Recorder:
                 return
             if client.client_id not in self.server.get_clients():
                 self.recording = self.client = None
-                self.say()
+                self.update_label()
                 return
             recording.take(code, clock.monotonic())
-        if recording.full(clock.monotonic()):
+        if recording.is_full(clock.monotonic()):
             self.end()
 
     def end(self) -> None:
@@ -139,7 +139,7 @@ class Recorder:
             if recording is None or client is None:
                 return
             self.making = True
-            self.say()
+            self.update_label()
         threading.Thread(
             target=self.send, args=(recording, client, clock.monotonic()), name="film", daemon=True
         ).start()
@@ -147,15 +147,15 @@ class Recorder:
     def send(self, recording: PageRecording, client: viser.ClientHandle, ended: float) -> None:
         """Send the video of the recording; if that fails, report the reason."""
         try:
-            client.send_file_download(f"{self.name}.mp4", recording.film(ended), save_immediately=True)
+            client.send_file_download(f"{self.name}.mp4", recording.encode_video(ended), save_immediately=True)
         except (OSError, ValueError) as error:
             client.add_notification("The video could not be written.", str(error), color="red")
         finally:
             with self.lock:
                 self.making = False
-                self.say()
+                self.update_label()
 
-    def say(self) -> None:
+    def update_label(self) -> None:
         """Set the button's label to its next action."""
         words = MAKES if self.making else RECORDS if self.recording is None else STOPS
         button = self.button

@@ -46,12 +46,12 @@ class SliceView:
         """(3,): away from the viewer."""
         return np.cross(self.right, self.down)
 
-    def points(self, middle: np.ndarray, count: int) -> np.ndarray:
+    def compute_points(self, middle: np.ndarray, count: int) -> np.ndarray:
         """Compute positions (count, count, 3) [m] of a square pixel grid round a centre (3,) [m], row by row."""
         steps = REACH * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
         return middle + steps[:, None, None] * np.asarray(self.down) + steps[None, :, None] * np.asarray(self.right)
 
-    def pixels(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    def project_points(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
         """Project positions (n, 3) [m] to columns and rows (n, 2) of a view; whole numbers are pixel centres."""
         off = (np.asarray(points) - middle) @ np.stack([self.right, self.down], axis=1)
         return (off / REACH + 1.0) * (0.5 * SIDE) - 0.5
@@ -138,7 +138,7 @@ def resample_view(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarr
     """Resample the scan in a view, (SIDE, SIDE) uint8; `NOWHERE` outside it."""
     count = round(2.0 * REACH / GRAIN)
     matrix = scan.T_index_world
-    index = plane.points(middle, count) @ matrix[:3, :3].T + matrix[:3, 3]
+    index = plane.compute_points(middle, count) @ matrix[:3, :3].T + matrix[:3, 3]
     held = ((index >= -0.5) & (index <= np.array(scan.values.shape) - 0.5)).all(axis=-1)
     read = np.zeros((count, count), np.float32)
     map_coordinates(scan.values, np.moveaxis(index, -1, 0), order=1, mode="nearest", output=read)
@@ -156,7 +156,7 @@ def find_pixels_within(plane: SliceView, middle: np.ndarray, layer: Layer, error
     halves = 0.5 * (corners + np.roll(corners, 1, axis=1))
     samples = np.concatenate([layer.vertices, halves.reshape(-1, 3), corners.mean(axis=1)])
     far = error + 4.0 * REACH / count
-    away = KDTree(samples).query(plane.points(middle, count).reshape(-1, 3), distance_upper_bound=far)[0]
+    away = KDTree(samples).query(plane.compute_points(middle, count).reshape(-1, 3), distance_upper_bound=far)[0]
     grid = np.minimum(away, far).reshape(count, count)
     return cv2.resize(grid, (SIDE, SIDE), interpolation=cv2.INTER_LINEAR) <= error
 
@@ -203,7 +203,7 @@ def join_segments(segments: np.ndarray) -> list[list[int]]:
 def cut_by_plane(plane: SliceView, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
     """Cut a surface by a view's plane; return lines, each (n, 2) as columns and rows."""
     found = cut_surface(layer.vertices, layer.triangles, middle, plane.normal)
-    return [plane.pixels(line, middle) for line in found]
+    return [plane.project_points(line, middle) for line in found]
 
 
 def draw_strokes(colour: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], width: int = 1) -> None:
@@ -222,7 +222,7 @@ def to_pixel_line(line: np.ndarray) -> np.ndarray:
 
 def mark(colour: np.ndarray, plane: SliceView, tip: np.ndarray, middle: np.ndarray) -> None:
     """Mark a tip (3,) [m], in place: a dot if it is in the plane, else a ring."""
-    ((column, row),) = np.clip(plane.pixels(tip[None], middle), -1e4, 1e4).round().astype(int).tolist()
+    ((column, row),) = np.clip(plane.project_points(tip[None], middle), -1e4, 1e4).round().astype(int).tolist()
     beside = abs(float((tip - middle) @ plane.normal)) > BESIDE
     cv2.circle(colour, (column, row), 5, (12, 14, 16), 1 if beside else -1, cv2.LINE_AA)
     cv2.circle(colour, (column, row), 4, WHITE, 1 if beside else -1, cv2.LINE_AA)

@@ -107,7 +107,7 @@ class RasterisedSurface:
     def mask(self) -> np.ndarray:
         """(H, W) bool: mask of the pixels whose centres the surface covers."""
         mask = wp.empty(self.nearest.size, dtype=wp.uint8, device=self.nearest.device)
-        launch_in_bands(cover, [self.nearest.flatten()], [mask], self.nearest.size, str(self.nearest.device))
+        launch_in_bands(mark_covered, [self.nearest.flatten()], [mask], self.nearest.size, str(self.nearest.device))
         return mask.numpy().reshape(self.nearest.shape[1:]).view(bool)
 
 
@@ -294,7 +294,7 @@ def keep_nearest(
 
 
 @forward_kernel
-def cover(
+def mark_covered(
     begin: wp.int32,
     end: wp.int32,
     run: wp.int32,

@@ -89,7 +89,7 @@ class Lamp:
     strength: float = 1.0
     ambient: float = 0.16
 
-    def camera(self) -> Camera:
+    def build_camera(self) -> Camera:
         """Return the camera at the lamp, for the shadow map."""
         axis = np.asarray(self.target) - self.position
         angle = np.arctan(self.radius / np.linalg.norm(axis))
@@ -97,7 +97,7 @@ class Lamp:
         return look_at(np.asarray(self.position), self.target, side, 2.0 * angle, SHADOW_PIXELS, SHADOW_PIXELS)
 
 
-def lamp_beside(camera: Camera, target: np.ndarray, radius: float = 0.06) -> Lamp:
+def build_lamp(camera: Camera, target: np.ndarray, radius: float = 0.06) -> Lamp:
     """Build a lamp above the camera's left shoulder, aimed at `target` (3,) [m]: shadows fall next to the tool."""
     distance = np.linalg.norm(np.asarray(target) - camera.centre)
     right, down = camera.T_camera_world[0, :3], camera.T_camera_world[1, :3]
@@ -112,7 +112,7 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
     ValueError
         Two layers with one id.
     """
-    return Renderer(layers, lamp, device).picture(camera, [layer.vertices for layer in layers if not layer.still])
+    return Renderer(layers, lamp, device).render(camera, [layer.vertices for layer in layers if not layer.still])
 
 
 class Renderer:
@@ -126,14 +126,14 @@ class Renderer:
         """Copy the layers to a Warp device; ValueError if two have one id."""
         load(device, shade.module, place.module)
         self.device, self.stack = device, Stack(layers, device)
-        self.light, self.lamp_camera = as_light(lamp), lamp.camera()
+        self.light, self.lamp_camera = as_light(lamp), lamp.build_camera()
         self.curve = wp.array(build_tone_curve(), dtype=wp.uint8, device=device)
         self.unshaded = wp.empty(0, dtype=wp.vec3i, device=device)
         self.nowhere = wp.empty(0, dtype=wp.vec3f, device=device)
         self.seen_by: Camera | None = None
         self.backdrop: Backdrop | None = None
 
-    def picture(self, camera: Camera, vertices: Sequence[np.ndarray]) -> Picture:
+    def render(self, camera: Camera, vertices: Sequence[np.ndarray]) -> Picture:
         """Render the image of a camera; vertices (V, 3) [m]: of each moving layer, in order.
 
         Raises
@@ -141,12 +141,12 @@ class Renderer:
         ValueError
             Vertices of other shapes than the layers'.
         """
-        moved = self.stack.moved(np.concatenate([np.zeros((0, 3)), *vertices])[None])
+        moved = self.stack.copy_vertices(np.concatenate([np.zeros((0, 3)), *vertices])[None])
         stays, self.seen_by = camera is self.seen_by, camera
         backdrop = self._backdrop(camera, moved) if stays and self.stack.still_faces else None
         return Picture(self._drawn([camera], moved, backdrop))
 
-    def pictures(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
+    def render_batch(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
         """Render images of cameras of one size; nothing leaves the device.
 
         Parameters
@@ -162,7 +162,7 @@ class Renderer:
         ValueError
             Other shapes, another number of cameras, or cameras of several sizes.
         """
-        moved = self.stack.moved(vertices)
+        moved = self.stack.copy_vertices(vertices)
         count = moved.shape[0]
         if len(cameras) not in (1, count):
             raise ValueError(f"{len(cameras)} cameras for {count} images: give one for each, or one for all.")
@@ -289,7 +289,7 @@ def compute_projection(camera: Camera) -> np.ndarray:
 
 def as_light(lamp: Lamp) -> Light:
     """Convert the lamp for the kernel."""
-    camera = lamp.camera()
+    camera = lamp.build_camera()
     axis = np.asarray(lamp.target) - lamp.position
     light = Light()
     light.position, light.axis = wp.vec3f(lamp.position), wp.vec3f(axis / np.linalg.norm(axis))

@@ -217,7 +217,7 @@ class Stack:
         self.surfaces.rest = vectors(np.concatenate([np.zeros((0, 3)), *rest]))
         self.surfaces.texels = texels
 
-    def moved(self, vertices: np.ndarray | wp.array) -> wp.array:
+    def copy_vertices(self, vertices: np.ndarray | wp.array) -> wp.array:
         """Copy the moving vertices, (B, n, 3) [m] or a Warp array (B, n) of vec3d, to the device.
 
         Raises

@@ -90,7 +90,7 @@ class StereoView:
         slope = cv2.Sobel(self.left, cv2.CV_32F, 1, 0, scale=0.125)
         return cv2.boxFilter(slope * slope, -1, (SIDE, SIDE), normalize=False)
 
-    def at(self, pixels: np.ndarray, field: np.ndarray) -> np.ndarray:
+    def sample(self, pixels: np.ndarray, field: np.ndarray) -> np.ndarray:
         """Return values (n,) of a field (size, size) at the pixels nearest to (n, 2); NaN or True beyond its border."""
         here = np.nan_to_num(np.round(pixels).clip(-1.0, self.geometry.size), nan=-1.0).astype(int)
         inside = np.all((here >= 0) & (here < self.geometry.size), axis=1)
@@ -128,14 +128,14 @@ def compute_stereo_view(
     ValueError
         An eye without light.
     """
-    windows = geometry.windows(left, right)
+    windows = geometry.rectify(left, right)
     greys = [cv2.cvtColor(window, cv2.COLOR_RGB2GRAY) for window in windows]
     for grey, name in zip(greys, ("left", "right"), strict=True):
         if grey.mean() < BLACK:
             raise ValueError(f"the {name} eye sees nothing: check its light and its cable.")
     covers = [find_glare(window) for window in windows]
     if tool is not None:
-        shadows = geometry.windows(*(mask.astype(np.uint8) for mask in tool))
+        shadows = geometry.rectify(*(mask.astype(np.uint8) for mask in tool))
         covers = [cover | (shadow > 0) for cover, shadow in zip(covers, shadows, strict=True)]
     square = 2 * int(0.5 * SQUARE * geometry.focal / geometry.depth) + 1
     hidden = [grow_mask(cover, RIM) for cover in covers]
@@ -177,7 +177,7 @@ def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
     ValueError
         Rows of both eyes that do not correspond: cameras other than the calibrated ones.
     """
-    rough = view.at(pixels, view.disparity)
+    rough = view.sample(pixels, view.disparity)
     which = np.flatnonzero(np.isfinite(rough))
     if not len(which):
         return Cloud(which, np.zeros((0, 3)), np.zeros(0))
@@ -192,14 +192,14 @@ def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
     rows = float(np.median(np.abs(down[matched]))) if matched.any() else 0.0
     if rows > ROWS_APART:
         raise ValueError(f"rows of the eyes are {rows:.1f} pixels apart: calibrate the pair again.")
-    matched &= (np.abs(down) < OFF_ROW) & ~view.at(there, view.hidden_right)
-    steep = view.at(here, view.slope)
+    matched &= (np.abs(down) < OFF_ROW) & ~view.sample(there, view.hidden_right)
+    steep = view.sample(here, view.slope)
     apart = np.where(found.ravel() > 0, apart.ravel(), np.inf)  # not set where nothing was found
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = np.hypot(ALIKE * MEAN_SIZE * apart / np.sqrt(steep), LEAST_SIGMA)
-    depth = view.geometry.depths(disparity)
+    depth = view.geometry.compute_depths(disparity)
     deviation = depth**2 / view.geometry.gauge * sigma
-    points = view.geometry.points(here.astype(float), disparity)
+    points = view.geometry.compute_points(here.astype(float), disparity)
     return Cloud(which[matched], points[matched], deviation[matched])
 
 
@@ -229,7 +229,7 @@ def follow_pixels(before: StereoView, now: StereoView, pixels: np.ndarray) -> tu
     there, found = _matched(before.left, now.left, start, guess[which].astype(np.float32))
     back, found_back = _matched(now.left, before.left, there, start)
     kept = found & found_back & (np.linalg.norm(back - start, axis=1) < BACK)
-    kept &= ~now.at(there, now.hidden)
+    kept &= ~now.sample(there, now.hidden)
     return which[kept], there[kept].astype(float)
 
 

@@ -43,7 +43,7 @@ class Rectified:
     size: int
     maps: tuple[Maps, Maps]
 
-    def windows(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rectify(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rectify images (H, W, ...) uint8 of both eyes to windows (size, size, ...), black beyond their borders."""
         one, other = self.maps
         return cv2.remap(left, *one, cv2.INTER_LINEAR), cv2.remap(right, *other, cv2.INTER_LINEAR)
@@ -53,22 +53,22 @@ class Rectified:
         """Disparity [pixel] times depth [m], both without the target's offset."""
         return self.focal * self.baseline
 
-    def disparity(self, depth: np.ndarray) -> np.ndarray:
+    def compute_disparity(self, depth: np.ndarray) -> np.ndarray:
         """Compute the disparity [pixel] of a depth [m]: shift to the left in the right window, 0 at the target."""
         return self.gauge / depth - self.gauge / self.depth
 
     def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project world points (n, 3) [m] to pixels (n, 2) of the left window, and disparities (n,)."""
         at = points @ self.T_window_world[:3, :3].T + self.T_window_world[:3, 3]
-        return self.focal * at[:, :2] / at[:, 2:] + self.principal, self.disparity(at[:, 2])
+        return self.focal * at[:, :2] / at[:, 2:] + self.principal, self.compute_disparity(at[:, 2])
 
-    def points(self, pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    def compute_points(self, pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """Compute world points (n, 3) [m] at pixels (n, 2) of the left window with disparities (n,)."""
-        depth = self.depths(disparity)
+        depth = self.compute_depths(disparity)
         ray = np.column_stack([(pixels - self.principal) / self.focal, np.ones(len(pixels))])
         return (depth[:, None] * ray - self.T_window_world[:3, 3]) @ self.T_window_world[:3, :3]
 
-    def depths(self, disparity: np.ndarray) -> np.ndarray:
+    def compute_depths(self, disparity: np.ndarray) -> np.ndarray:
         """Compute depths [m] from disparities [pixel]."""
         return self.gauge / (disparity + self.gauge / self.depth)
 

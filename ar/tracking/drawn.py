@@ -74,7 +74,7 @@ def render_targets(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[
 
 @lru_cache(maxsize=16)
 def _printed(face: Face) -> np.ndarray:
-    return face.picture(TEXTURE)
+    return face.draw(TEXTURE)
 
 
 def _wider(side: slice, size: int) -> slice:

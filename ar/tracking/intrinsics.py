@@ -59,7 +59,7 @@ def find_board(detector: Detector, name: str, grey: np.ndarray) -> BoardView | N
     None if too few of its corners are visible, or all are in one or two rows.
     """
     (board,) = detector.targets
-    seen = detector.seen(grey).get(board.name)
+    seen = detector.detect(grey).get(board.name)
     if seen is None or len(seen.points) < FEWEST_CORNERS:
         return None
     lines = np.rint(seen.points[:, :2] / board.faces[0].square)

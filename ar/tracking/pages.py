@@ -239,7 +239,7 @@ def _blank(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.ImageDraw]
 
 
 def _print(page: Image.Image, placed: PlacedFace) -> None:
-    picture = np.rot90(placed.face.picture(_px(_mm(placed.face.square))), -placed.turns)
+    picture = np.rot90(placed.face.draw(_px(_mm(placed.face.square))), -placed.turns)
     page.paste(Image.fromarray(np.ascontiguousarray(picture)), (_px(placed.left), _px(placed.top)))
 
 

@@ -52,7 +52,7 @@ class Pose:
     residual: float
     corners: int
 
-    def seen_from(self, other: Pose) -> Pose:
+    def transform_to(self, other: Pose) -> Pose:
         """Transform this pose to the frame of another target in the same image; the covariance includes both errors."""
         into, away = other.T_camera_target[:3, :3].T, self.T_camera_target[:3, 3] - other.T_camera_target[:3, 3]
         none = np.zeros((3, 3))
@@ -255,7 +255,7 @@ class Tracker:
         missing = [target.name for target in self.targets if target.name not in found]
         just_left = any(last.get(name, (None, -2))[1] == number - 1 for name in missing)
         if missing and (just_left or number % SEARCHED == 0):
-            found |= self._detector.seen(grey, missing)
+            found |= self._detector.detect(grey, missing)
         return found
 
 

@@ -56,7 +56,7 @@ class PoseStream:
     covariances: np.ndarray
     daily: bool = False
 
-    def at(self, time: float) -> Pose | None:
+    def interpolate(self, time: float) -> Pose | None:
         """Interpolate the pose at a time [s], with constant velocity between two samples; None if there is none.
 
         Gaps longer than `LONGEST` are not interpolated. After a sample without a successor, the last motion is
@@ -78,7 +78,7 @@ class PoseStream:
             return None
         return self._between(first, second, time)
 
-    def age(self, time: float) -> float:
+    def compute_age(self, time: float) -> float:
         """Return the time [s] since the last sample before `time`; infinite before the first."""
         time = self.to_stream_day(time)
         first = int(np.searchsorted(self.times, time, side="right")) - 1

@@ -46,7 +46,7 @@ class Scanned:
     bounds: np.ndarray
     target: np.ndarray
 
-    def apart(self, other: Scanned) -> float:
+    def compute_distance(self, other: Scanned) -> float:
         """Compute the largest distance between two bodies' bounds and targets [m]."""
         return float(max(np.abs(self.bounds - other.bounds).max(), np.linalg.norm(self.target - other.target)))
 
@@ -109,7 +109,7 @@ def register_points(scan: np.ndarray, patient: np.ndarray) -> Registration:
     return Registration(T, _widened(J.T @ J, freedom), centre, _rms(off), len(scan))
 
 
-def refined(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Nearest) -> Registration:
+def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Nearest) -> Registration:
     """Fit like `register_points`, with additional points `seen` (m, 3) [m] of the surface, in the reference's frame.
 
     Pairs (n, 3) and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by registration

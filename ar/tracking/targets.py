@@ -78,7 +78,7 @@ class Face:
         own = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
         return (own * [*self.size, 1.0]) @ self.T_target_face[:3, :3].T + self.T_target_face[:3, 3]
 
-    def picture(self, pixels: int) -> np.ndarray:
+    def draw(self, pixels: int) -> np.ndarray:
         """Draw the print (H, W) uint8, `pixels` along each side of a square, which are a multiple of 8."""
         return np.asarray(self.board.generateImage((pixels * self.columns, pixels * self.rows), marginSize=0))
 
@@ -201,7 +201,7 @@ class Detector:
         object.__setattr__(self, "_quick", quick)
         object.__setattr__(self, "_boards", boards)
 
-    def seen(self, grey: np.ndarray, names: Sequence[str] = ()) -> dict[str, DetectedCorners]:
+    def detect(self, grey: np.ndarray, names: Sequence[str] = ()) -> dict[str, DetectedCorners]:
         """Detect corners in an image (H, W) uint8, by the target's name; targets without visible corners are left out.
 
         Only targets of these `names` are detected; without any, all.

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from scenes.commands.interrupt import INTERRUPTED, interrupt_on_termination
 from scenes.options.outputs import add_force, check_output_path
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.errors import InputError
 
 from ..figures.figure_record import read_record
@@ -99,7 +99,7 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
     if not args.quick:
         out = check_output_path(out, ".json", inputs=[args.anatomy, args.against, *args.tables], resumed=True)
         found = {entry.name: entry for entry in _begun(out, args.force)}
-    body = read_anatomy(args.anatomy or template_path()).digest
+    body = read_anatomy(args.anatomy or get_template_path()).digest
     run = Run(version_here(), body, args.anatomy, args.quick)
     with tqdm(total=len(args.only), unit="figure", file=sys.stderr) as bar:
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from scenes.options.shared_options import add_anatomy, add_device, add_json, to_json_line
 from scenes.options.tissue_options import add_tissue_arguments, parse_tissue
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     if min(*args.depths, args.ball) <= 0.0:
         raise InputError("--depths and --ball are lengths in mm: give numbers above 0.")
     table, where = sys.stderr if args.json else sys.stdout, describe_machine(args.device)
-    anatomy, found = read_anatomy(args.anatomy or template_path()), []
+    anatomy, found = read_anatomy(args.anatomy or get_template_path()), []
     print(f"{where}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", file=table)
     depths = [depth / 1e3 for depth in args.depths]
     for row in rows(anatomy, args.elements, depths, args.ball / 1e3, parse_tissue(args), args.device):

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure; 1 if of some patient no equilibrium was found."""
-    from scenes.script.shipped_files import template_path
+    from scenes.script.shipped_files import get_template_path
     from sim.bodies.meshfile import read_anatomy
 
     from ..studies.fit_study import fitted_to, library_of, row
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     for name, least in (("twins", 1), ("presses", 1), ("drained", 0), ("forces", 0), ("points", 6), ("cover", 1)):
         check_at_least(f"--{name}", getattr(args, name), least)
     check_finer(args)
-    body, finer = read_anatomy(args.anatomy or template_path()), finer_of(args)
+    body, finer = read_anatomy(args.anatomy or get_template_path()), finer_of(args)
     with bar("patients") as heard:
         every = list(
             patients(body, finer, args.twins, args.presses, args.drained, args.seed, args.device, args.folder, heard)

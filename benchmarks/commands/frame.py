@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     scene = build_requested_scene(args, args.scene, theatre)
     scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
     name = choose_deformer(args, theatre, scene)
-    player = theatre.player(name, scene)
+    player = theatre.build_player(name, scene)
     where = f"{describe_machine(args.device)}; {scene.name} by {name}, {width} x {height}"
     with redirect_stdout(sys.stderr):  # viser says there where it serves
         frames = frames_of(player, args.frames)

@@ -82,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if of some twin no equilibrium was found."""
     from scenes.analysis.measurement import describe_machine
-    from scenes.script.shipped_files import template_path
+    from scenes.script.shipped_files import get_template_path
     from sim.bodies.meshfile import read_anatomy
 
     from ..studies.locate_rivals import rivals
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     from ..studies.locate_twins import twins
 
     _check(args)
-    body = read_anatomy(args.anatomy or template_path())
+    body = read_anatomy(args.anatomy or get_template_path())
     finer = finer_of(args)
     with bar("twins") as heard:
         found = list(twins(body, finer, args.twins, args.seed, args.device, args.element, args.folder, heard))

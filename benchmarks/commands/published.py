@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     data = read_dataset(args.data)
     good = np.flatnonzero(data.good)[: args.count]
     loads, nodes = data.loads.rows(good), published_nodes(data.anatomy)
-    truth = data.displacement(nodes)[good]
+    truth = data.read_displacement(nodes)[good]
     sites, scores, seconds = positions_of(loads), [], []
     for name in args.learners:
         begun = time.perf_counter()

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from scenes.options.outputs import add_force, check_output_path
 from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
 from scenes.options.tissue_options import add_tissue_arguments, parse_elasticity
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.bodies.meshfile import read_anatomy
 from sim.effects import pushed_effects
 from sim.elements import ELEMENTS, RECOMMENDED
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.count < 2 or args.batch < 1:
         raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")
-    anatomy = read_anatomy(args.anatomy or template_path())
+    anatomy = read_anatomy(args.anatomy or get_template_path())
     effects = pushed_effects(anatomy, parse_elasticity(args, anatomy.mesh))
     trial = Trial(anatomy, effects, args.element, args.device, args.batch)
     stated = {"anatomy": anatomy.digest, "effects": repr(effects), "element": args.element}

@@ -8,7 +8,7 @@ import sys
 from dataclasses import asdict
 
 from scenes.options.shared_options import add_anatomy, add_device, add_json
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.accuracy import LIVE
 from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
@@ -25,13 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from scenes.analysis.measurement import describe_machine
-    from scenes.script.site import site_of
+    from scenes.script.site import build_site
     from sim.runtime.device import find_device
 
     from ..studies.shortcuts import measure, works
 
     check_at_least("--runs", args.runs, 1)
-    site = site_of(read_anatomy(args.anatomy or template_path()))
+    site = build_site(read_anatomy(args.anatomy or get_template_path()))
     table, where = sys.stderr if args.json else sys.stdout, describe_machine(args.device)
     print(f"{where}\n\n| shortcut | work | runs | with: median, p95 [ms] | without | ratio | of totals |", file=table)
     print(f"|{'---|' * 7}", file=table)

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from scenes.options.shared_options import add_json, add_seed, to_json_line
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     find_device(args.device, "float64")
     asked = () if args.peers is None else args.peers or NAMES
     engines = [engine.on(args.device) for engine in (OWN, *(peer for peer in PEERS if peer.name in asked))]
-    cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [template_path()]]
+    cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [get_template_path()]]
     table = sys.stderr if args.json else sys.stdout
     where = describe_machine(args.device)
     print(

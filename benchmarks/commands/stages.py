@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         )
         raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
     name = choose_deformer(args, theatre, scene)
-    player = theatre.player(name, scene)
+    player = theatre.build_player(name, scene)
     found, solvers = [], []
     where = describe_machine(args.device)
     table = sys.stderr if args.json else sys.stdout

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from scenes.options.shared_options import add_anatomy, add_devices, add_json
-from scenes.script.shipped_files import template_path
+from scenes.script.shipped_files import get_template_path
 from sim.accuracy import TRAIN
 from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     for name, value in (("--count", count), ("--batch", batch), ("--repeats", args.repeats)):
         check_at_least(name, value, 1)
     materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
-    anatomy = read_anatomy(args.anatomy or template_path())
+    anatomy = read_anatomy(args.anatomy or get_template_path())
     trial = Trial(anatomy, (), args.element, devices[0], batch)
     sets = drawn(anatomy, args.presets or (ROUND if args.poses else PRESETS), count, args.poses)
     groups: list[tuple[dict[str, Drawn], tuple[Effect, ...]]] = [(sets, ())]

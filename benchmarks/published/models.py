@@ -78,7 +78,7 @@ class Published:
         features = thirteen(*self._sites, pushed)
         angular = [machine.predict(X) for machine, X in zip(self.machines, features, strict=True)]
         displacement = from_angles(np.stack(angular, axis=1).astype(np.float64))
-        outside = ~self.envelope.holds(self._patch, pushed)
+        outside = ~self.envelope.is_inside(self._patch, pushed)
         answer = build_prediction(
             displacement, self.nodes, loads, outside, begun, np.array(np.nan), "published protocol"
         )

@@ -58,19 +58,19 @@ def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
         for done in range(-WARM_UP, count):
             number = (done + WARM_UP) % len(player.scene.times)
             begun = clock.perf_counter()
-            touch = player.touch(number)
-            loads = player.loads(number, touch)
+            touch = player.get_touch(number)
+            loads = player.build_loads(number, touch)
             loaded = clock.perf_counter()
-            last = player.answer(loads, last)
+            last = player.compute_deformation(loads, last)
             deformed = clock.perf_counter()
-            frame = player.drawn(number, touch, loads, last, deformed - loaded)
+            frame = player.draw_frame(number, touch, loads, last, deformed - loaded)
             picture = render_page_image(frame)
             drawn = clock.perf_counter()
             code = to_data_url(picture)
             encoded = clock.perf_counter()
-            positions = player.positions(last)
-            stage = player.stage.at(loads)
-            for layer in (stage.cortex(positions), stage.tumour(positions)):
+            positions = player.compute_positions(last)
+            stage = player.stage.select_stage(loads)
+            for layer in (stage.build_cortex(positions), stage.build_tumour(positions)):
                 page.move(layer.name, layer.vertices, layer.triangles)
             page.put_sight(code, f"frame {number}")
             sent = clock.perf_counter()
@@ -92,19 +92,19 @@ def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
     stage, scene = player.stage, player.scene
     scenes = []
     for number in np.linspace(0, len(scene.times) - 1, count).astype(int).tolist():
-        touch = player.touch(number)
-        positions = player.positions(player.answer(player.loads(number, touch)))
-        held = None if scene.tool is None else player.tool(scene.tool, touch, positions)
-        scenes.append(stage.layers(positions, None if held is None else held.pose))
+        touch = player.get_touch(number)
+        positions = player.compute_positions(player.compute_deformation(player.build_loads(number, touch)))
+        held = None if scene.tool is None else player.place_tool(scene.tool, touch, positions)
+        scenes.append(stage.build_layers(positions, None if held is None else held.pose))
     moved = np.stack([np.concatenate([layer.vertices for layer in each if not layer.still]) for each in scenes])
     # All within half a degree.
     cameras = [player.camera.perturb(0.5 * (row - 0.5 * count) / count) for row in range(count)]
     renderer = Renderer(scenes[0], stage.lamp, stage.device)
-    renderer.pictures(moved, cameras)
+    renderer.render_batch(moved, cameras)
     wp.synchronize()
     done, begun = 0, clock.perf_counter()
     while clock.perf_counter() - begun < seconds:
-        renderer.pictures(moved, cameras)
+        renderer.render_batch(moved, cameras)
         wp.synchronize()
         done += count
     return done / (clock.perf_counter() - begun)
@@ -116,8 +116,8 @@ def open_page(player: Player) -> Browser:
     bodies = [
         SceneSurface(layer.name, layer.vertices, layer.triangles, colour)
         for layer, colour in (
-            (player.stage.cortex(positions), CORTEX_COLOUR),
-            (player.stage.tumour(positions), TUMOUR_COLOUR),
+            (player.stage.build_cortex(positions), CORTEX_COLOUR),
+            (player.stage.build_tumour(positions), TUMOUR_COLOUR),
         )
     ]
     view = SceneViewpoint(site.origin - 0.1 * site.axis, site.origin, site.up)

@@ -46,13 +46,13 @@ class Moved:
         """A strip of triangles between points at random."""
         self._points = 0.05 * np.random.default_rng(0).normal(size=(points, 3))
         corners = np.arange(2 * points)[:, None] + np.arange(3)
-        self._mesh = SentMesh.of(corners % points)
+        self._mesh = SentMesh.from_triangles(corners % points)
 
     def answer(
         self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
     ) -> PoseResult:
         """The pose's shift, as the motion of a brain that is known."""
-        body = heard.beside(heard.names.tool, now)
+        body = heard.find_relative(heard.names.tool, now)
         if isinstance(body, str):
             return PoseResult(0, TrackingResult(moment, TumourState.NO_TOOL, body, NOT_SEEN, BrainMotion(self._points)))
         motion = BrainMotion(self._points + body.T[:3, 3], True)

@@ -12,7 +12,7 @@ from scenes.analysis.measurement import time_work
 from scenes.script.scene import Scene
 from scenes.script.site import Site
 from scenes.script.tool import Probe
-from scenes.script.tool_paths import wander
+from scenes.script.tool_paths import stroke_cortex
 from sim.accuracy import LIVE, Accuracy
 from sim.deformation import Deformation
 from sim.errors import InputError
@@ -78,9 +78,9 @@ def loads_of(ride: Ride, scene: Scene, site: Site, frames: int) -> list[Loads]:
             f"a {ride.name} tool of {1e3 * ride.radius:g} mm radius cannot move in an opening that is clear for "
             f"{1e3 * site.clearance:.3g} mm: choose a body with a larger craniotomy."
         )
-    wandering = replace(scene, tool=Probe(radius=ride.radius), path=wander(ride.force, room, SPEED))
+    wandering = replace(scene, tool=Probe(radius=ride.radius), path=stroke_cortex(ride.force, room, SPEED))
     times = np.arange(WARM_UP + frames) / scene.frames_per_second
-    return [wandering.loads(site, wandering.path(time), time) for time in times.tolist()]
+    return [wandering.build_loads(site, wandering.path(time), time) for time in times.tolist()]
 
 
 def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:

@@ -175,6 +175,6 @@ def oracle(prior: MotionPrior, motion: np.ndarray) -> np.ndarray:
     anatomy = prior.anatomy
     cortex, tumour = np.unique(anatomy.open_surface), anatomy.tumour_nodes
     nodes = np.concatenate([cortex, tumour])
-    shape = prior.at(nodes).astype(float).reshape(len(prior.shape), -1)
+    shape = prior.restrict_shapes(nodes).astype(float).reshape(len(prior.shape), -1)
     weight = np.linalg.lstsq(shape.T, motion[nodes].ravel(), rcond=None)[0]
-    return np.tensordot(weight, prior.at(tumour), 1)
+    return np.tensordot(weight, prior.restrict_shapes(tumour), 1)

@@ -251,7 +251,7 @@ def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
     off = found.centroid - compute_middle(body, motion[None])[0]
     square = float(off @ np.linalg.solve(found.centroid_covariance, off))
     doubts = {"doubted": found.slipped, "warned": found.is_registration_suspect}
-    return estimate(found.at(body.tumour_nodes), true, square, found.seconds, **doubts)
+    return estimate(found.compute_motion(body.tumour_nodes), true, square, found.seconds, **doubts)
 
 
 def _rivalling(body: Anatomy, twin: Twin, rival: Rival, seen: Observation) -> Estimate:

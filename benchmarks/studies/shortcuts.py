@@ -106,7 +106,8 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
         played = find_scene(scene)
         effects, first = played.get_effects_on(anatomy), len(played.times) // 3  # the tool has arrived
         frames = [
-            played.loads(site, played.path(time), time) for time in played.times[first : first + runs + 1].tolist()
+            played.build_loads(site, played.path(time), time)
+            for time in played.times[first : first + runs + 1].tolist()
         ]
         name = f"frames of `{scene}`, smoothed"
         yield Work(shortcut, name, step, frames, effects, LIVE, live=True, follows=True)

@@ -54,7 +54,7 @@ def rows(
     loads = draw("palpation", theatre.anatomy, solves, seed=20)
     single = [loads.rows(np.array([row])) for row in range(len(loads))]
 
-    fem, seconds = time_work(theatre.fem, scene, TRAIN, batch)
+    fem, seconds = time_work(theatre.build_fem, scene, TRAIN, batch)
     seconds += time_work(fem.deform, single[0])[1]
     made(fem)
     yield Row("FEM set-up", seconds, None, "s", 1, f"compile or load kernels, factorise; {size}")
@@ -68,8 +68,8 @@ def rows(
         "FEM, a single load", "ms", 1e3, runs, f"from rest, to {TRAIN.tolerance:g}", lambda i: fem.deform(single[i])
     )
 
-    live = Player(player.stage, theatre.fem(scene, LIVE, live=True))
-    frames = [frame.seconds["deform"] for frame in live.frames()][WARM_UP:]
+    live = Player(player.stage, theatre.build_fem(scene, LIVE, live=True))
+    frames = [frame.seconds["deform"] for frame in live.play_frames()][WARM_UP:]
     yield Row(
         "FEM, live", 1e3 * float(np.median(frames)), 1e3 * float(np.percentile(frames, 95)), "ms", len(frames),
         f"scene {scene.name}, warm start, to {LIVE.tolerance:g}",

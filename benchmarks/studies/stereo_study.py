@@ -69,19 +69,19 @@ def rows(
     """
     if not isinstance(scene.sight, StereoSight):
         raise InputError(f"no pair of eyes sees the scene {scene.name}: choose one with a StereoSight, as microscope.")
-    player, numbers = theatre.player("fem", scene), range(0, len(scene.times), every)
+    player, numbers = theatre.build_player("fem", scene), range(0, len(scene.times), every)
     seen, last, total, done = [], None, len(numbers) * (1 + len(seeds)), 0
     for number in numbers:
-        touch = player.touch(number)
-        last = player.answer(player.loads(number), last)
-        positions = player.positions(last)
-        held = None if scene.tool is None else player.tool(scene.tool, touch, positions)
-        seen.append((number, positions, player.stage.corners(None if held is None else held.pose)))
+        touch = player.get_touch(number)
+        last = player.compute_deformation(player.build_loads(number), last)
+        positions = player.compute_positions(last)
+        held = None if scene.tool is None else player.place_tool(scene.tool, touch, positions)
+        seen.append((number, positions, player.stage.compute_corners(None if held is None else held.pose)))
         done += 1
         progress(done, total)
     found: list[TumourEstimate] = []
     for seed in seeds:
-        observer = theatre.stage(replace(scene, sight=replace(scene.sight, seed=seed))).observer
+        observer = theatre.build_stage(replace(scene, sight=replace(scene.sight, seed=seed))).observer
         assert observer is not None
         own = []
         for number, positions, tool in seen:

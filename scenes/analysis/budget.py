@@ -23,9 +23,9 @@ def time_offers(theatre: Theatre, scene: Scene) -> list[Offer]:
     """One offer for each deformer that states an error, timed on moments of the scene, as they are played."""
     made = []
     times = scene.times[np.linspace(0, len(scene.times) - 1, TIMED + 1).astype(int)]
-    loads = [scene.loads(theatre.site, scene.path(float(time)), float(time)) for time in times]
-    for name in theatre.names(scene):
-        deformer = theatre.deformer(name, scene)
+    loads = [scene.build_loads(theatre.site, scene.path(float(time)), float(time)) for time in times]
+    for name in theatre.list_deformers(scene):
+        deformer = theatre.build_deformer(name, scene)
         forgets = isinstance(deformer, Learned) and not deformer.series
         seconds, last = [], None
         error_mm = 1e3 * _stated(deformer)

@@ -176,7 +176,7 @@ def _samples(
         motion = filmed.field + (filmed.off[body] if PARAMETERS in contributors else 0.0)
         surface = filmed.rest + (1.0 + mesh) * motion
         true, then = _cameras(filmed, time, late, readout, surface.mean(axis=0))
-        believed = taken.camera(then.T_camera_world)
+        believed = taken.build_camera(then.T_camera_world)
         if taken is not filmed.calibration or off.any() or readout:
             found = project_corners(then, target, filmed.T_scan_patient, off)
             if readout:
@@ -186,7 +186,7 @@ def _samples(
             _, pose = find_pose(believed, target, found, known)
             if pose is None:
                 raise InputError("the camera does not see the patient's reference: take a path that keeps it in sight.")
-            believed = taken.camera(pose.T_camera_target @ np.linalg.inv(filmed.T_scan_patient))
+            believed = taken.build_camera(pose.T_camera_target @ np.linalg.inv(filmed.T_scan_patient))
         shown = filmed.rest + filmed.field - late * filmed.velocity + aside + wide * filmed.normals
         yield true, believed, surface, shown + _registered(filmed, shift, shown)
 
@@ -209,7 +209,7 @@ def _cameras(filmed: Filmed, time: float, late: float, readout: float, middle: n
 
 def _camera_after(filmed: Filmed, time: float, seconds: float) -> Camera:
     """Return the true camera at a delay after a time [s]."""
-    return filmed.viewpoint.camera(filmed.site, time + seconds)
+    return filmed.viewpoint.build_camera(filmed.site, time + seconds)
 
 
 def _shift(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
@@ -264,7 +264,7 @@ class ErrorBudget:
         """With a probability of 95 % no point of the tumour's surface is farther off [m]."""
         return float(np.quantile(self.clinical.worst, LEVEL))
 
-    def largest(self, what: Literal["middle", "worst"]) -> str:
+    def find_largest(self, what: Literal["middle", "worst"]) -> str:
         """Return the contributor that alone puts the middle, or the worst point, off the most in 95 of 100 samples."""
         return max(self.alone, key=lambda name: float(np.quantile(getattr(self.alone[name], what), LEVEL)))
 

@@ -55,11 +55,11 @@ def solve_cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto"
         places = [cortex.place(*place) for place in PLACES]
         forces = stacked([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])
         study = SensitivityStudy(anatomy, forces, _body(DEFAULT), device=device)
-        default = study.fem(study.body).deform(forces)
+        default = study.build_fem(study.body).deform(forces)
         motions = match_motion(anatomy, forces, default)
         for combination in product(*(levels[name] for name in DEFAULT)):
             chosen = dict(zip(DEFAULT, combination, strict=True))
-            fem = study.fem(_body(chosen))
+            fem = study.build_fem(_body(chosen))
             moved = [_motion(fem, anatomy, loads) for loads in (forces, motions)]
             yield Cell({"opening [mm]": opening, "depth [mm]": depth, **chosen}, *moved)
 

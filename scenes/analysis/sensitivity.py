@@ -156,7 +156,7 @@ class SensitivityStudy:
     accuracy: Accuracy = STRAINED
     device: str = "auto"
 
-    def fem(self, body: BodyVariant) -> Fem:
+    def build_fem(self, body: BodyVariant) -> Fem:
         """Return the finite elements of a body, for tools of either kind."""
         tissue = body.tissue
         _, *others = pushed_effects(self.anatomy, tissue, body.skull)
@@ -179,7 +179,7 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
     nodes, patch = study.anatomy.tumour_nodes, open_patch(study.anatomy)
     if not len(nodes):
         raise InputError("the anatomy has no tumour whose motion could change: make one with `sulcus anatomy`.")
-    body, fem = study.body, study.fem(study.body)
+    body, fem = study.body, study.build_fem(study.body)
     pushed = fem.deform(study.loads)
     known = match_motion(study.anatomy, study.loads, pushed)
     defaults = ((study.loads, pushed), (known, fem.deform(known, guess(pushed.displacement))))
@@ -188,7 +188,7 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
     yield SensitivityRow(Variant("motion itself", "", "", body), *whole)
     for variant in changed:
         if variant.body != body:
-            body, fem = variant.body, study.fem(variant.body)
+            body, fem = variant.body, study.build_fem(variant.body)
         found = []
         for loads, default in defaults:
             asked = apply_aim(loads, variant.aim, patch)

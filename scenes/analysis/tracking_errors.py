@@ -27,7 +27,7 @@ def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarr
     """
     random, board = np.random.default_rng(seed), build_calibration_board().faces[0]
     points = board.corners - np.array([*(0.5 * board.size), 0.0])
-    camera, views, poses = calibration.camera(np.eye(4)), [], []
+    camera, views, poses = calibration.build_camera(np.eye(4)), [], []
     for number in range(VIEWS):
         way = 2.0 * np.pi * number / VIEWS
         turn = TILT * random.uniform(0.5, 1.0) * np.array([np.cos(way), np.sin(way), 0.3 * random.standard_normal()])

@@ -201,8 +201,8 @@ def solve_nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
     if answer is None:
         raise InputError(f"of the scene {scene.name} itself no equilibrium was found.")
     for time in list_moments(scene):
-        loads = scene.loads(theatre.site, scene.path(time), time)
-        tumour = Stage(scene, theatre.site).at(loads).tumour(theatre.anatomy.mesh.nodes)
+        loads = scene.build_loads(theatre.site, scene.path(time), time)
+        tumour = Stage(scene, theatre.site).select_stage(loads).build_tumour(theatre.anatomy.mesh.nodes)
         normals.append(compute_vertex_normals(tumour.vertices, tumour.triangles))
     return SurfaceMotions(list_moments(scene), answer.motions, tuple(normals))
 
@@ -212,12 +212,18 @@ def solve_scene(theatre: Theatre, scene: Scene) -> Answer:
 
     A moment that has none from the one before is gone to by way of times between.
     """
-    fem, last, found, stage, before = theatre.fem(scene, ACCURACY, batch=1), None, [], Stage(scene, theatre.site), 0.0
+    fem, last, found, stage, before = (
+        theatre.build_fem(scene, ACCURACY, batch=1),
+        None,
+        [],
+        Stage(scene, theatre.site),
+        0.0,
+    )
     inverted = 0
 
     def gone_to(times: Sequence[float], start: Deformation | None) -> Deformation | None:
         for time in times:
-            start = fem.deform(scene.loads(theatre.site, scene.path(time), time), start=start)
+            start = fem.deform(scene.build_loads(theatre.site, scene.path(time), time), start=start)
             if not start.outcome[0].good:
                 return None
         return start
@@ -229,7 +235,7 @@ def solve_scene(theatre: Theatre, scene: Scene) -> Answer:
         if answer is None:
             return None
         last, before, inverted = answer, time, max(inverted, int(answer.inverted[0]))
-        found.append(_surface(stage.at(scene.loads(theatre.site, scene.path(time), time)), last))
+        found.append(_surface(stage.select_stage(scene.build_loads(theatre.site, scene.path(time), time)), last))
     return SolvedMotions(tuple(found), inverted)
 
 
@@ -363,7 +369,7 @@ def compute_field_size(field: np.ndarray) -> float:
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 
 
-def coverage(
+def measure_coverage(
     scene: Scene,
     still: SurfaceMotions,
     stated: Uncertainty,

@@ -21,7 +21,7 @@ TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)
 PRESS = press(force=0.15, rise=0.8, hold=0.4, at=(-0.004, 0.008))
 
 
-def late(time: float) -> Touch:
+def press_late(time: float) -> Touch:
     """Return the tool input at a time [s]."""
     return PRESS(time - 2.0)
 
@@ -29,7 +29,7 @@ def late(time: float) -> Touch:
 SCENE = Scene(
     "microscope",
     __doc__ or "",
-    late,
+    press_late,
     tool=Probe(radius=7e-3),
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),

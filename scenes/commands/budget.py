@@ -17,7 +17,7 @@ from sim.arguments import check_at_least
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-from ..options.camera_options import add_camera, film_with_targets
+from ..options.camera_options import add_camera, add_targets
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
 from ..options.theatre_options import add_bodies, build_requested_scene
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
@@ -135,8 +135,8 @@ def run(args: argparse.Namespace) -> int:
     own_bodies, meshes, own_mesh = _at(scene, bodies, number)
     filmed = Filmed(
         site=site, viewpoint=scene.viewpoint, duration=scene.duration, covariance=known, time=time,
-        T_scan_patient=place_reference(site, scene.viewpoint.camera(site)),
-        rest=Stage(scene, site).at(scene.loads(site, scene.path(time), time)).tumour_at_rest.vertices,
+        T_scan_patient=place_reference(site, scene.viewpoint.build_camera(site)),
+        rest=Stage(scene, site).select_stage(scene.build_loads(site, scene.path(time), time)).tumour_at_rest.vertices,
         field=still.fields[number], normals=still.normals[number], velocity=compute_velocity(still, number),
         bodies=own_bodies, meshes=meshes, own_mesh=own_mesh, surrogate=_promised(theatre, scene, time),
         registration=registration, corner=args.corner_px, latency=1e-3 * args.latency_ms, clock=1e-3 * args.clock_ms,
@@ -168,7 +168,7 @@ def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
             f"the scene {scene.name} finds its tumour by what is seen, and says its error: choose another."
         )
     get_tissue(scene)
-    filmed = film_with_targets(args, scene)
+    filmed = add_targets(args, scene)
     calibration = filmed.viewpoint.calibration
     if args.readout_ms is None or calibration is None:
         return filmed
@@ -234,7 +234,7 @@ def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarr
 
 def _promised(theatre: Theatre, scene: Scene, time: float) -> float:
     """Return the bound [m] of the model that plays a scene, at a time [s]; 0 where finite elements do."""
-    player = theatre.player(theatre.usual(scene), scene)
+    player = theatre.build_player(theatre.select_default(scene), scene)
     number = int(np.abs(scene.times - time).argmin())
     return player.draw(number, time, scene.path(time)).model_error or 0.0
 
@@ -256,7 +256,7 @@ def _flat(args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: d
         "readout_ms": 1e3 * calibration.readout,
         "samples": args.samples, "bodies": len(filmed.bodies), "seed": args.seed,
         "parts": {name: _figures(errors) for name, errors in rows.items()},
-        "inside": {PARAMETERS: inside}, "largest": {"middle": found.largest("middle"), "worst": found.largest("worst")},
+        "inside": {PARAMETERS: inside}, "largest": {"middle": found.find_largest("middle"), "worst": found.find_largest("worst")},
         "band_mm": 1e3 * found.band, "held_twins": None if found.held is None else found.held[0],
         "held_twins_off": None if found.held is None else found.held[1],
         "published_mm": list(PUBLISHED),

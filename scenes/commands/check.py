@@ -65,20 +65,20 @@ def run(args: argparse.Namespace) -> int:
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
         name = choose_deformer(args, theatre, scene)
-        player = replace(theatre.player(name, scene), style=args.style)
-        print(f"{scene.name} by {theatre.described(name, scene)}", file=table)
+        player = replace(theatre.build_player(name, scene), style=args.style)
+        print(f"{scene.name} by {theatre.describe_deformer(name, scene)}", file=table)
         total = len(scene.times[:: args.every])
         with tqdm(total=2 * total, unit="frame", desc=scene.name, leave=False, file=sys.stderr) as bar:
             frames = []
-            for frame in player.frames(args.every):
+            for frame in player.play_frames(args.every):
                 frames.append(frame)
                 bar.update()
             truth = solve_reference_frames(theatre, scene, [frame.loads for frame in frames], bar.update)
-        figures = measure(player, player.camera_at, frames, truth)
-        broken = figures.broken(scene.bounds)
-        played = {"scene": scene.name, "deformer": name, "solver": theatre.described(name, scene)}
+        figures = measure(player, player.get_camera, frames, truth)
+        broken = figures.find_violations(scene.bounds)
+        played = {"scene": scene.name, "deformer": name, "solver": theatre.describe_deformer(name, scene)}
         promised, error = _errors(frames)
-        rows.append({**played, "frames": len(frames), **figures.row(), "broken": broken})
+        rows.append({**played, "frames": len(frames), **figures.to_row(), "broken": broken})
         against = list_objections(frames)
         rows[-1] |= {
             "model_error_mm": _mm(promised),
@@ -113,7 +113,7 @@ def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict
 
     film = build_synthetic_video(theatre)
     figures = measure_tracking(film, *build_default_pipeline(film, args.style))
-    broken = figures.broken()
+    broken = figures.find_violations()
     print(
         f"{TRACKING:11s} {'FAILS' if broken else 'passes'}  markers covered, pictures repeated, late and missing: "
         f"{figures.confident} of {figures.pictures} pictures draw a lost or old place as known, {figures.unsaid} do "
@@ -122,7 +122,7 @@ def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict
     )
     for sentence in broken:
         print(f"{'':11s} {sentence}", file=table)
-    return {**figures.row(), "broken": broken}
+    return {**figures.to_row(), "broken": broken}
 
 
 def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:

@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     theatre = build_requested_theatre(args, args.scene)
     scene = apply_camera_options(args, build_requested_scene(args, args.scene, theatre))
     name = choose_deformer(args, theatre, scene)
-    player = replace(theatre.player(name, scene), style=args.style)
+    player = replace(theatre.build_player(name, scene), style=args.style)
     total = len(scene.times)
     with tqdm(total=2 * total, unit="frame", desc="drawn", file=sys.stderr) as bar:
 

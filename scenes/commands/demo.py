@@ -92,10 +92,10 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
     closing.callback(demo.close)
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
     print_addresses(demo.browser)
-    print(f"{scene.name} by {theatre.described(name, scene)}")
-    demo.busy.on("compiling; the next start finds it done")
+    print(f"{scene.name} by {theatre.describe_deformer(name, scene)}")
+    demo.busy.begin_work("compiling; the next start finds it done")
     if name != "fem":
-        kernels.submit(demo.cast.predicted, name, (0, None))
+        kernels.submit(demo.cast.predict, name, (0, None))
     kernels.shutdown()
     demo.run(args.seconds)
     return 0

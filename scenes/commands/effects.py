@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     theatre = open_theatre(args.anatomy, device=args.device, scenes=[args.scene])
     scene = build_requested_scene(args, args.scene, theatre)
     table = sys.stderr if args.json else sys.stdout
-    who = theatre.described("fem", scene)
+    who = theatre.describe_deformer("fem", scene)
     print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
     print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}", file=table)
     found = []

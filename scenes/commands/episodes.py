@@ -191,7 +191,7 @@ def _progress(
             written(kind, outcome)
             if kind == BODY:
                 return
-            done = done.plus(outcome)
+            done = done.add(outcome)
             rate = done.frames / (time.perf_counter() - begun)
             bar.set_postfix_str(f"{rate:.3g} frames/s, {done.failed + done.lost} failed", refresh=False)
             bar.update()

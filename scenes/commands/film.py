@@ -16,7 +16,7 @@ from sim.arguments import check_at_least
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, explain_error
 
-from ..options.camera_options import add_camera, film_with_targets
+from ..options.camera_options import add_camera, add_targets
 from ..options.outputs import add_force, check_output_folder, check_output_frames, check_output_path
 from ..options.shared_options import add_json, add_seed, to_json_line
 from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre
@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     assert calibration is not None
     folder = check_output_folder(args.out, "film and its truth")
     paths = {name: check_output_path(folder / name, Path(name).suffix, args.force) for name in FILES}
-    player = theatre.player(args.deformer or "fem", scene)
+    player = theatre.build_player(args.deformer or "fem", scene)
     mounts = mount_targets(player)
     shots: list[VideoFrame] = []
     film = _write_film(args, render_shots(player, mounts, taking, args.every), shots, player)
@@ -152,7 +152,7 @@ def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
 
 def _scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
     """Return the scene as the camera sees it, and no longer than is asked for."""
-    scene = film_with_targets(args, build_requested_scene(args, args.scene, theatre))
+    scene = add_targets(args, build_requested_scene(args, args.scene, theatre))
     if args.readout is not None:
         view = scene.viewpoint
         assert view.calibration is not None

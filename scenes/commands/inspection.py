@@ -81,7 +81,7 @@ class Inspection:
     mirrored: bool
     warnings: tuple[str, ...]
 
-    def lines(self) -> list[str]:
+    def format_lines(self) -> list[str]:
         """Return the same in a few lines of text."""
         error = max(self.voxel)
         pieces = [
@@ -107,7 +107,7 @@ class Inspection:
         around = "tumour" if part == NECROSIS else "brain"
         return f"a region of its own, {self.regions[part]}" if part in self.regions else f"{around} like the rest"
 
-    def figures(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """The same as JSON, with units in the names: volumes to a microlitre, lengths to 0.1 mm, voxels to 1 um."""
         pieces = [{"ml": round(volume, 3), "side": place} for volume, place in self.pieces]
         return {

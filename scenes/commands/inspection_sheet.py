@@ -69,12 +69,12 @@ class InspectionView:
     middle: np.ndarray
     reach: float
 
-    def points(self) -> np.ndarray:
+    def compute_points(self) -> np.ndarray:
         """Places (SIDE, SIDE, 3) [m] of the pixels."""
         steps = self.reach * ((2.0 * np.arange(SIDE) + 1.0) / SIDE - 1.0)
         return self.middle + steps[:, None, None] * self.down + steps[None, :, None] * self.right
 
-    def letters(self) -> dict[str, str]:
+    def find_letters(self) -> dict[str, str]:
         """Return the patient's sides at the left, right, upper and lower edge, by the axis that lies most along it."""
         found = {}
         for edge, direction in (
@@ -115,7 +115,7 @@ def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject,
 
 def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> tuple[np.ndarray, set[str]]:
     """Labels in colours, over the scan where there is one, and the opened cortex; and the names of what is drawn."""
-    points = view.points().reshape(-1, 3)
+    points = view.compute_points().reshape(-1, 3)
     inverse = np.linalg.inv(masks.affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(int)
     there = ((index >= 0) & (index < masks.brain.shape)).all(axis=1)
@@ -215,7 +215,7 @@ def _framed(colour: np.ndarray, view: InspectionView) -> np.ndarray:
     ink = ImageDraw.Draw(picture)
     ink.rectangle([0, 0, SIDE - 1, SIDE - 1], outline=(60, 60, 64))
     font = ImageFont.load_default(SIZE)
-    letters = view.letters()
+    letters = view.find_letters()
     half = SIDE // 2
     for edge, at, anchor in (
         ("left", (8, half), "lm"), ("right", (SIDE - 8, half), "rm"),
@@ -233,7 +233,7 @@ def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> Non
     """The numbers, the warnings and the colours, in the column on the right."""
     left, top = 2 * SIDE + PAD, PAD
     rows: list[tuple[str, Colour]] = [("What would be made", TEXT)]
-    for text in found.lines():
+    for text in found.format_lines():
         rows += [(part, TEXT) for part in textwrap.wrap(text, WIDTH, subsequent_indent="    ")]
     rows += [("", TEXT), ("Warnings" if found.warnings else "No warnings", WARNING if found.warnings else TEXT)]
     for text in found.warnings:

@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from sim.bodies.tip_distance import build_tip_gauge
     from surrogate.data.dataset import read_dataset
     from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
-    from surrogate.evaluation.coverage import coverage, measure_distance_coverage
+    from surrogate.evaluation.coverage import compute_coverage, measure_distance_coverage
     from surrogate.evaluation.score import compare_forces, format_scores, score
     from surrogate.model.store import load
 
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     models = load(args.model, data.anatomy)
     loads = data.loads.rows(np.flatnonzero(data.good))
     nodes = data.anatomy.tumour_nodes
-    truth = data.displacement(nodes)[data.good]
+    truth = data.read_displacement(nodes)[data.good]
     for name, model in models.items():
         trained, here = _physics(model.training), _physics(data.provenance)
         for what in here:
@@ -52,20 +52,22 @@ def run(args: argparse.Namespace) -> int:
                     "judge the difference of two bodies. Simulate with the model's own."
                 )
     for name, model in models.items():
-        if model.envelope.repeats(model.asked(loads).point, data.anatomy.mesh.nodes):
+        if model.envelope.is_training_point(model.to_input(loads).point, data.anatomy.mesh.nodes):
             raise InputError(
                 f"{args.data}: holds loads at places where {name} was trained: simulate others, with another --seed."
             )
     scores = [score(name, model, loads, truth, nodes) for name, model in models.items()]
-    promised = {name: coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None}
+    promised = {
+        name: compute_coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None
+    }
     gauge = build_tip_gauge(data.anatomy)
-    distance = gauge.distances(loads, data.displacement(gauge.nodes)[data.good], gauge.nodes, data.tool)
+    distance = gauge.distances(loads, data.read_displacement(gauge.nodes)[data.good], gauge.nodes, data.tool)
     ranged = {
         name: measure_distance_coverage(model, loads, distance)
         for name, model in models.items()
         if model.tip is not None and model.tip.bound is not None
     }
-    reaction = data.reaction()
+    reaction = data.read_reaction()
     forces = {
         name: compare_forces(model, loads, reaction[data.good, 0, :3])
         for name, model in models.items()

@@ -264,7 +264,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
     tool = tool or _tool_of(theatre, args.anatomy)
     scene = apply_tissue_options(args, build_tracked_scene(args, tool.shape), theatre)
     deformer, who = build_mover(args, theatre, scene, True)
-    stage, tracking = theatre.stage(scene), 1e-3 * args.tracking_mm
+    stage, tracking = theatre.build_stage(scene), 1e-3 * args.tracking_mm
     eye = None
     if calibration is not None:
         device = find_device(args.device, LIVE.precision).name

@@ -82,9 +82,9 @@ def run(args: argparse.Namespace) -> int:
     found = locator.locate(observation)
     if out is not None:
         every = np.arange(len(anatomy.mesh.nodes))
-        covariance = found.covariance(every)
+        covariance = found.compute_covariance(every)
         fields = {
-            "displacement": found.at(every),
+            "displacement": found.compute_motion(every),
             "deviation": np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0)),
             "covariance": covariance[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
         }

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
     locator = make_with_progress(path, anatomy, args.seed, args.device, list_regions_known(args, anatomy))
-    save_locator(path, locator.small() if args.small else locator)
+    save_locator(path, locator.restrict() if args.small else locator)
     forget_parts(path)
     size = path.stat().st_size
     written = {"out": str(path), "shapes": len(locator.prior.shape), "bytes": size, "whole": not args.small}

@@ -262,7 +262,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     if said:
         print(f"sulcus overlay: {said}", file=sys.stderr)
     scene = apply_tissue_options(args, build_tracked_scene(args, None if tool is None else tool.shape), theatre)
-    stage = theatre.stage(scene)
+    stage = theatre.build_stage(scene)
     deformer, who = build_mover(args, theatre, scene, tool is not None)
     motion = ToolMotion(stage, deformer)
     device = find_device(args.device, LIVE.precision).name

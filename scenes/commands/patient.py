@@ -174,10 +174,10 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
         write_png(partial, draw_inspection_sheet(found, masks, subject, find_opened_cortex(subject, plan.craniotomy)))
     took = round(time.perf_counter() - began, 2)
     if args.json:
-        print(json.dumps({**found.figures(), "picture": str(picture), "seconds": took}))
+        print(json.dumps({**found.to_json(), "picture": str(picture), "seconds": took}))
     else:
         warnings = [f"  - {warning}" for warning in found.warnings]
-        print("\n".join([*found.lines(), *(["warnings:", *warnings] if warnings else ["no warnings"])]))
+        print("\n".join([*found.format_lines(), *(["warnings:", *warnings] if warnings else ["no warnings"])]))
         print(f"drawn to {picture} in {took} s; without --inspect the models are made")
     return 0
 

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files that cannot be read or written, a surface without anatomy, or points that determine no registration.
     """
-    from ar.tracking.registration import compute_pair_residuals, refined, register_points
+    from ar.tracking.registration import compute_pair_residuals, refine_registration, register_points
     from sim import read_anatomy
     from surrogate.locating.observed_files import read_columns
 
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             traced = read_columns(args.surface, {("px", "py", "pz")})
             seen = 1e-3 * np.column_stack([traced[name] for name in ("px", "py", "pz")])
-            found = refined(scan, patient, seen, _nearest_on(anatomy))
+            found = refine_registration(scan, patient, seen, _nearest_on(anatomy))
         fits = compute_pair_residuals(scan, patient)
     except ValueError as error:
         raise InputError(f"{source}: {error}") from error

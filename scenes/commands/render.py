@@ -48,14 +48,14 @@ def run(args: argparse.Namespace) -> int:
     theatre = build_requested_theatre(args, args.scene)
     scene = apply_camera_options(args, build_requested_scene(args, args.scene, theatre))
     name = choose_deformer(args, theatre, scene)
-    player = replace(theatre.player(name, scene), style=args.style)
+    player = replace(theatre.build_player(name, scene), style=args.style)
     others = check_output_frames(args.out, args.force)
     written, bad = [], 0
     try:
         for path in others:
             path.unlink()
         film = Film(args.out)
-        for frame in tqdm(player.frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
+        for frame in tqdm(player.play_frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
             film.show(frame.number, frame.shown if args.plain else add_cost_label(frame, name))
             written.append(args.out / f"frame_{frame.number:04d}.png")
             bad += not frame.deformation.outcome[0].good
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
             write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
     except OSError as error:
         raise InputError(f"{args.out}: the frames cannot be written ({explain_error(error)}). {REMEDY}") from error
-    film, who = None if args.film is None else str(args.film), theatre.described(name, scene)
+    film, who = None if args.film is None else str(args.film), theatre.describe_deformer(name, scene)
     report = {"scene": scene.name, "deformer": name, "solver": who, "frames": len(written), "not_good": bad}
     report |= {"out": str(args.out), "film": film}
     beside = "" if film is None else f", film {film}"

@@ -150,7 +150,7 @@ def _about(study: ReportStudy) -> tuple[str, ...]:
     good = int(truth.good.sum())
     return (
         f"Data: {len(study.converged)} {said.get('preset', '')} loads on {len(study.anatomy.mesh.nodes)} vertices, "
-        f"{study.element} elements, {study.tissue}; {study.discs.summary()}.",
+        f"{study.element} elements, {study.tissue}; {study.discs.summarise()}.",
         f"Reference: quadratic tetrahedra (p2) on {mesh}, the data's tissue, to 1e-8 in double precision, read at the "
         f"same material points. {good} of {len(truth.good)} loads of the left-out discs converged, "
         f"{truth.seconds.mean():.2g} s each. Beyond the training range, in equal parts: {', '.join(KINDS)}.",

@@ -50,14 +50,19 @@ def run(args: argparse.Namespace) -> int:
     with drawing as bar:
         for name, scene in scenes.items():
             names = [type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy)]
-            known = {"scene": name, "title": scene.title, "effects": names, "deformers": list(theatre.names(scene))}
-            players = ", ".join(theatre.names(scene))
-            known["solver"] = solver = theatre.described("fem", scene)
+            known = {
+                "scene": name,
+                "title": scene.title,
+                "effects": names,
+                "deformers": list(theatre.list_deformers(scene)),
+            }
+            players = ", ".join(theatre.list_deformers(scene))
+            known["solver"] = solver = theatre.describe_deformer("fem", scene)
             bar.write(f"{name}: {scene.title}\n  acting: {', '.join(names)}", file=lines)
             bar.write(f"  can be played by: {players}\n  fem: {solver}", file=lines)
             if name in drawn:
-                usual = theatre.usual(scene)
-                found = render_thumbnail(theatre.player(usual, scene), usual)
+                usual = theatre.select_default(scene)
+                found = render_thumbnail(theatre.build_player(usual, scene), usual)
                 pictures[name] = found.colour
                 known |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": usual}
                 cost = f"{found.total:.0f} ms a frame by {usual}"

@@ -44,7 +44,7 @@ from ..options.tissue_options import (
     parse_elasticity,
     parse_tissue,
 )
-from ..script.shipped_files import template_path
+from ..script.shipped_files import get_template_path
 from .interrupt import INTERRUPTED, interrupt_on_termination
 
 # Sizes [mm] of tools that press on a brain.
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     """Return 0: the file is complete, whether or not every case converged; it says which did."""
     out = check_output_path(args.out, ".h5", args.force, resumed="anatomy" in read_statements(Path(args.out)))
     with time_stage("draw"):
-        anatomy = read_anatomy(template_path() if args.anatomy is None else args.anatomy)
+        anatomy = read_anatomy(get_template_path() if args.anatomy is None else args.anatomy)
         if not len(anatomy.tumour_nodes):
             print(f"{args.anatomy}: has no tumour: `sulcus train` will reject the data.", file=sys.stderr)
         elasticity = parse_elasticity(args, anatomy.mesh)

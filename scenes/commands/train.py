@@ -109,7 +109,7 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
     return "\n".join(
         [
             *notes,
-            trained.split.summary(),
+            trained.split.summarise(),
             "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
             format_scores(trained.scores, 1e3 * trained.motion),
             f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}; scenes play that of the least",

@@ -67,18 +67,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve an ensemble of each scene, and keep what it says."""
     from ..analysis.uncertainty import (
-        coverage,
         estimate_uncertainty,
         get_tissue,
         get_tumour_tissue,
         list_skulls,
+        measure_coverage,
         solve_ensemble,
         solve_nominal,
     )
     from ..play.deformers import open_theatre
     from ..script.priors import sample_from_fit, sample_priors
     from ..script.scene import SCENES
-    from ..script.shipped_files import template_path
+    from ..script.shipped_files import get_template_path
     from ..script.uncertainty import read_uncertainties, to_uncertainty_path, write_uncertainties
 
     check_at_least("--draws", args.draws, FEWEST)
@@ -86,13 +86,13 @@ def run(args: argparse.Namespace) -> int:
     names = args.scenes or SCENES
     theatre = open_theatre(args.anatomy, args.model, args.device, names)
     scenes = [build_requested_scene(args, name, theatre) for name in names]
-    out = args.out or to_uncertainty_path(args.anatomy or template_path())
+    out = args.out or to_uncertainty_path(args.anatomy or get_template_path())
     # Before hours are spent: tissue must be one that is drawn. A file that is there is read, and scenes are added.
     for scene in scenes:
         get_tissue(scene)
     check_output_path(out, ".json", resumed=True)
     read_uncertainties(out)
-    fitted = find_fitted_tissue(args.tissue, args.anatomy or template_path(), theatre.anatomy.digest)
+    fitted = find_fitted_tissue(args.tissue, args.anatomy or get_template_path(), theatre.anatomy.digest)
 
     def draws_of(scene: Scene, count: int, seed: int) -> list[PatientSample]:
         if fitted is None:
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
         if twins:
             write_uncertainties(out, [found])
             tried = bar(solve_ensemble(theatre, scene, twins), total=len(twins))
-            found = coverage(scene, still, found, twins, tried, args.seed + 1)
+            found = measure_coverage(scene, still, found, twins, tried, args.seed + 1)
         write_uncertainties(out, [found])
         rows.append(_flat(theatre, scene, found))
         print("\n".join(_lines(rows[-1])), file=lines, flush=True)
@@ -127,10 +127,10 @@ def _flat(theatre: Theatre, scene: Scene, found: Uncertainty) -> dict[str, Any]:
     """Figures of a scene, at the moment when the tumour may be farthest off [mm]."""
     from ..play.frame_text import format_errors
 
-    model = theatre.models.get(theatre.best(scene))
+    model = theatre.models.get(theatre.select_best(scene))
     promised = None if model is None or not np.isfinite(model.bound) else float(model.bound)
     moment = int(np.argmax(found.worst))
-    error = found.at(found.times[moment], promised or 0.0)
+    error = found.evaluate(found.times[moment], promised or 0.0)
     parts = {name: 1e3 * values[moment] for name, values in found.parts.items()}
     ranked = dict(sorted(parts.items(), key=lambda part: -part[1]))
     return {

@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..play.deformers import open_theatre
     from ..script.scene import check_scene_exists
-    from ..script.shipped_files import template_path
+    from ..script.shipped_files import get_template_path
     from ..warp.export import WarpSettings, write_warp
     from ..warp.images import read_picture
     from ..warp.places import count_steps
@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
             for warning in picture.warnings:
                 print(f"{picture.path}: {warning}", file=sys.stderr)
         moment, sequence = select_moments(args, theatre, scene)
-        source = (args.anatomy or template_path()).name
+        source = (args.anatomy or get_template_path()).name
         spacing = None if args.spacing is None else 1e-3 * args.spacing
         total = count_steps(spacing) + 2 + len(pictures) + bool(sequence)
         with tqdm(total=total, unit="part", desc="fields, files", file=sys.stderr) as bar:
@@ -217,7 +217,7 @@ def select_moments(
     frames = sorted({wanted, *many})
     with tqdm(total=frames[-1] + 1, unit="frame", desc="finite elements", file=sys.stderr) as bar:
         found = dict(
-            zip(frames, Played(theatre, scene, args.load is not None).moments(frames, bar.update), strict=True)
+            zip(frames, Played(theatre, scene, args.load is not None).list_moments(frames, bar.update), strict=True)
         )
     return found[wanted], [(float(scene.times[number]), found[number]) for number in many]
 

@@ -32,7 +32,7 @@ from surrogate.training.expansion import Expansion
 from surrogate.training.train import train
 
 from ..play.deformers import Theatre, open_theatre, to_model_path
-from ..script.shipped_files import template_path
+from ..script.shipped_files import get_template_path
 from .draws import build_generator, sample_value
 from .half_made import DATA, TABLE, check_resumed, forget
 from .plan import NO_LEARNER, Bodies, EpisodePlan, compute_anatomy_digest, list_fields, to_ratio_key
@@ -63,14 +63,14 @@ class EpisodeBody:
         """Tissue of the body."""
         return get_tissue(self.drawn)
 
-    def effects(self, *more: Effect, lets_go: bool = False) -> tuple[Effect, ...]:
+    def build_effects(self, *more: Effect, lets_go: bool = False) -> tuple[Effect, ...]:
         """Return the effects: constraints, skull and others.
 
         With `lets_go`, the skull separates whatever was sampled.
         """
         return (self.tissue, Held(), SKULLS["contact" if lets_go else self.drawn["bodies.tissue.skull"]], *more)
 
-    def theatre(self, device: str) -> Theatre:
+    def open_theatre(self, device: str) -> Theatre:
         """Open the body with its models, as its files have them.
 
         Raises
@@ -79,7 +79,7 @@ class EpisodeBody:
             As `open_theatre`.
         """
         shipped = self.drawn["bodies.anatomies"] == "template" and not to_model_path(self.anatomy).is_file()
-        return open_theatre(self.anatomy, to_model_path(template_path()) if shipped else None, device)
+        return open_theatre(self.anatomy, to_model_path(get_template_path()) if shipped else None, device)
 
 
 def get_tissue(values: Mapping[str, Any]) -> Elasticity:
@@ -168,7 +168,7 @@ def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intens
     values = sample_body(bodies, seed, number)
     kind = str(values["bodies.anatomies"])
     if kind != "drawn":
-        path = template_path() if kind == "template" else plan.folder / kind
+        path = get_template_path() if kind == "template" else plan.folder / kind
         scan = to_intensity_path(path)
         if kind in plan.own and compute_anatomy_digest(plan, kind) != plan.own[kind]:
             raise InputError(f"{path}: has changed since the plan was read. Begin another folder with it.")
@@ -195,7 +195,7 @@ def _shipped(body: EpisodeBody, anatomy: Anatomy) -> bool:
     """Return True if the shipped model applies to this body."""
     if body.drawn["bodies.anatomies"] != "template":
         return False
-    models = load(to_model_path(template_path()), anatomy)
+    models = load(to_model_path(get_template_path()), anatomy)
     effects = pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"])
     return any(find_rejection(model, effects, recommend_element(anatomy.mesh)) is None for model in models.values())
 

@@ -57,7 +57,7 @@ class RunStatistics:
     frames: int = 0
     bytes: int = 0
 
-    def plus(self, outcome: TaskOutcome) -> RunStatistics:
+    def add(self, outcome: TaskOutcome) -> RunStatistics:
         """With one more episode."""
         if outcome.failed:
             return replace(self, lost=self.lost + 1) if outcome.lost else replace(self, failed=self.failed + 1)
@@ -134,7 +134,7 @@ def make_all(
         heard(kind, outcome, count)
         if kind == BODY:
             return
-        tally = tally.plus(outcome)
+        tally = tally.add(outcome)
         if outcome.failed:
             mark_failed(folder, Failure(outcome.number, outcome.failed, outcome.lost))
         elif outcome.number in failed_before:

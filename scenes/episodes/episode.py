@@ -165,7 +165,7 @@ def collect(
         pictures = file.create_group("pictures")
         stores: dict[str, h5py.Dataset] = {}
         rows, loads = [], []  # a frame itself holds seven megabytes
-        for frame in progress(player.frames(together=1 if recording.dated else TOGETHER)):
+        for frame in progress(player.play_frames(together=1 if recording.dated else TOGETHER)):
             for name, code in encode_frame(frame, player, recording, right).items():
                 if name not in stores:
                     stores[name] = pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
@@ -189,14 +189,16 @@ def encode_frame(
 ) -> dict[str, np.ndarray]:
     """Encode the frame's images, by name; `right` renders the right eye, if there is one."""
     picture = frame.picture
-    tumour = player.stage.at(frame.loads).tumour(player.believed(frame))
+    tumour = player.stage.select_stage(frame.loads).build_tumour(player.estimate_positions(frame))
     mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles, player.stage.device)
     depth = np.minimum(np.rint(picture.depth / DEPTH_SCALE), np.iinfo(np.uint16).max).astype(np.uint16)
     found = {"colour": _jpeg(recording.grain(2 * frame.number, picture.colour))}
     if recording.overlay:
         found["overlay"] = _jpeg(frame.shown)
     if right is not None:
-        seen = right.at(frame.loads).picture(_right(player, frame), player.positions(frame.deformation), frame.pose)
+        seen = right.select_stage(frame.loads).render(
+            _right(player, frame), player.compute_positions(frame.deformation), frame.pose
+        )
         found["colour_right"] = _jpeg(recording.grain(2 * frame.number + 1, seen.colour))
     return found | {
         "depth": encode_png(depth),
@@ -212,7 +214,7 @@ def _jpeg(colour: np.ndarray) -> np.ndarray:
 
 def _right(player: Player, frame: Frame) -> Camera:
     """Return the camera of the right eye."""
-    return replace(player.scene.viewpoint, eye="right").camera(player.site, frame.time)
+    return replace(player.scene.viewpoint, eye="right").build_camera(player.site, frame.time)
 
 
 def collect_numbers_of_frame(frame: Frame, player: Player, dated: bool = True) -> dict[str, np.ndarray | float | str]:
@@ -226,10 +228,10 @@ def collect_numbers_of_frame(frame: Frame, player: Player, dated: bool = True) -
         **({} if frame.pose is None or frame.tip is None else collect_tool(frame, frame.pose, frame.tip)),
         **collect_causes(frame.loads),
         **(collect_reactions(frame.deformation) if player.scene.posed else {}),
-        "tumour_predicted": player.believed(frame)[nodes],
-        "cortex_predicted": player.positions(frame.deformation)[cortex],
+        "tumour_predicted": player.estimate_positions(frame)[nodes],
+        "cortex_predicted": player.compute_positions(frame.deformation)[cortex],
         **({"T_camera_world_right": _right(player, frame).T_camera_world} if right else {}),
-        "tumour_left": ~player.stage.at(frame.loads).anatomy.orphaned[nodes],
+        "tumour_left": ~player.stage.select_stage(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],
         "model_error": to_number(frame.model_error),
@@ -342,8 +344,8 @@ def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, r
             "scene": scene.name,
             "deformer": deformer,
             "effects": repr(scene.get_effects_on(player.site.anatomy)),
-            "finite_elements": theatre.described("fem", scene),
-            "answered_by": theatre.described(deformer, scene),
+            "finite_elements": theatre.describe_deformer("fem", scene),
+            "answered_by": theatre.describe_deformer(deformer, scene),
             "element": theatre.choose_element(scene),
             "tissue": "none",
             **describe_tissue_source(scene.elasticity),

@@ -16,7 +16,7 @@ from ..script.camera_paths import sample_wandering
 from ..script.debulking import Debulking
 from ..script.head_posture import Lie, build_drained_turn, get_supine_pose
 from ..script.tool import Blade, Instrument, Probe
-from ..script.tool_paths import Path, Touch, draw, idle, lay, palpate, press, slide, smooth
+from ..script.tool_paths import Path, Touch, draw, keep_idle, lay, palpate, press, slide, smooth
 from .draws import Number, ValueLimits
 
 PRONY = RELAXING.prony
@@ -136,7 +136,7 @@ class Scenario:
         Whether the brain may separate from the skull, whatever the body's skull does otherwise.
     """
 
-    path: Path = idle
+    path: Path = keep_idle
     tool: Instrument | None = None
     effects: tuple[Effect, ...] = (ToolForce(),)
     lying: Lie = get_supine_pose

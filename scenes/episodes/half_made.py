@@ -68,7 +68,7 @@ def is_begun(folder: Path) -> bool:
     return any(path.exists() for path in _files(folder / DATA)[1:])
 
 
-def empty_folder(folder: Path) -> None:
+def clear_folder(folder: Path) -> None:
     """Make a folder, or empty it of all but what was solved for a body."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in set(folder.iterdir()) - set(_files(folder / DATA)):

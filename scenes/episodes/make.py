@@ -26,7 +26,7 @@ from ..script.scene import Scene
 from .bodies import ABOUT, EpisodeBody, read_body, write_body
 from .draws import build_generator
 from .episode import EpisodeRecording, collect
-from .half_made import empty_folder, is_begun
+from .half_made import clear_folder, is_begun
 from .plan import NO_LEARNER, EpisodePlan
 from .run_folder import BODIES, to_episode_name
 from .scripted import build_scene, sample_body_number, sample_episode
@@ -109,7 +109,7 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
     resumed = False
     try:
         with write_folder_atomically(path, kept=is_begun) as partial:
-            empty_folder(partial)
+            clear_folder(partial)
             resumed = write_body(partial, plan, seed, number, device, list_partials(path))
     except InputError as error:
         whole = (path / ABOUT).is_file()  # another process was faster
@@ -147,7 +147,7 @@ class Opened:
     theatre: Theatre
     made: dict[str, Fem | OperatedFem] = field(default_factory=dict)
 
-    def fem(self, scene: Scene) -> Fem | OperatedFem:
+    def get_fem(self, scene: Scene) -> Fem | OperatedFem:
         """Those of a scene; the last few are kept, for to make them takes as long as some frames."""
         asked = repr(scene.get_effects_on(self.theatre.anatomy))
         if asked not in self.made:
@@ -161,7 +161,7 @@ class Opened:
 def open_body(place: Path, device: str) -> Opened:
     """Return a body that was made, read once for many episodes; InputError as `read_body`."""
     body = read_body(place)
-    return Opened(body, body.theatre(device))
+    return Opened(body, body.open_theatre(device))
 
 
 def _collected(path: Path, plan: EpisodePlan, seed: int, number: int, place: Path, device: str) -> Mapping[str, Any]:
@@ -170,8 +170,8 @@ def _collected(path: Path, plan: EpisodePlan, seed: int, number: int, place: Pat
     opened, asked = open_body(place, device), sample_episode(contents, seed, number)
     body, theatre = opened.body, opened.theatre
     scene = build_scene(plan, body, theatre.site, asked, seed, number)
-    name = "fem" if contents.bodies.learner.name == NO_LEARNER else theatre.best(scene)
-    player = replace(theatre.player(name, scene), composed=contents.overlay)
+    name = "fem" if contents.bodies.learner.name == NO_LEARNER else theatre.select_best(scene)
+    player = replace(theatre.build_player(name, scene), composed=contents.overlay)
     noise = asked.group("noise")
 
     def grain(picture: int, colour: np.ndarray) -> np.ndarray:
@@ -185,6 +185,6 @@ def _collected(path: Path, plan: EpisodePlan, seed: int, number: int, place: Pat
             "family": asked.family, "body": asked.body,
             "parameters": json.dumps({**asked.values, **body.drawn}, sort_keys=True),
         },
-        None if name == "fem" else opened.fem(scene),
+        None if name == "fem" else opened.get_fem(scene),
     )  # fmt: skip
     return collect(path, theatre, player, name, lambda frames: frames, recording=recording)

@@ -84,7 +84,7 @@ def build_scene(
     """
     contents, seconds = plan.contents, asked.values["seconds"]
     chance = ScenarioInputs(
-        asked.group(f"motion.{asked.family}"), build_generator(seed, number, "motion"), seconds, site.reach
+        asked.group(f"motion.{asked.family}"), build_generator(seed, number, "motion"), seconds, site.compute_reach
     )
     act = FAMILIES[asked.family](chance)
     hand = asked.group("hand")
@@ -92,7 +92,7 @@ def build_scene(
     if act.tool is not None and (hand["tremor_mm"] > 0.0 or hand["tremor_n"] > 0.0):
         first = int(build_generator(seed, number, "hand").integers(2**31))
         path = add_tremor(path, first, 1e-3 * hand["tremor_mm"], hand["tremor_n"])
-    effects = body.effects(*act.effects, lets_go=act.lets_go)
+    effects = body.build_effects(*act.effects, lets_go=act.lets_go)
     if act.relaxes:
         effects = tuple(make_relaxing(each) if isinstance(each, Elasticity) else each for each in effects)
     title = f"{FAMILIES[asked.family].__doc__ or ''} Episode {number} of the plan {plan.name}, seed {seed}."
@@ -131,7 +131,7 @@ def _viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, numbe
     middle = 0.5 * (width - 1), 0.5 * (height - 1)
     try:
         lens = Lens(k1=0.3 * bent, k2=0.3 * SECOND * bent / corner)
-        return view.calibrated(Calibration((focal, focal), middle, width, height, lens))
+        return view.calibrate(Calibration((focal, focal), middle, width, height, lens))
     except ValueError as error:
         raise InputError(f"look.bent {look['bent']:g}: {error}") from error
 

@@ -97,7 +97,7 @@ class Operation(gymnasium.Env):
         super().reset(seed=seed)
         if options:
             raise InputError(f"options are {options!r:.80}: there are none; give them to gymnasium.make.")
-        (touched,) = self.setting.answers.answer([self.episode.begin(self.np_random)])
+        (touched,) = self.setting.answers.compute_responses([self.episode.begin(self.np_random)])
         step = self.episode.take(touched)
         return self._observed(step), step.info
 
@@ -109,7 +109,7 @@ class Operation(gymnasium.Env):
         InputError
             As `Episode.ask`.
         """
-        (touched,) = self.setting.answers.answer([self.episode.ask(action)])
+        (touched,) = self.setting.answers.compute_responses([self.episode.ask(action)])
         step = self.episode.take(touched)
         return self._observed(step), step.reward, step.terminated, False, step.info
 
@@ -121,12 +121,12 @@ class Operation(gymnasium.Env):
         InputError
             No episode has begun.
         """
-        return None if self.render_mode is None else self.pictures.drawn([self.episode.seen])[0][0]
+        return None if self.render_mode is None else self.pictures.render([self.episode.seen])[0][0]
 
     def _observed(self, step: EpisodeStep) -> Any:
         if self.observation == "states":
             return step.states
-        colour, depth = self.pictures.drawn([self.episode.seen])
+        colour, depth = self.pictures.render([self.episode.seen])
         return {"rgb": colour[0], "depth": depth[0], "states": step.states}
 
 
@@ -232,17 +232,17 @@ class Operations(VectorEnv):
         """Return the image (H, W, 3) uint8 of each camera; None without a render mode."""
         if self.render_mode is None:
             return None
-        return tuple(self.pictures.drawn([episode.seen for episode in self.episodes])[0])
+        return tuple(self.pictures.render([episode.seen for episode in self.episodes])[0])
 
     def _taken(self, asked: list[TissueRequest]) -> list[EpisodeStep]:
-        answers = self.setting.answers.answer(asked)
+        answers = self.setting.answers.compute_responses(asked)
         return [episode.take(touched) for episode, touched in zip(self.episodes, answers, strict=True)]
 
     def _observed(self, steps: Sequence[EpisodeStep]) -> Any:
         states = np.stack([step.states for step in steps])
         if self.observation == "states":
             return states
-        colour, depth = self.pictures.drawn([episode.seen for episode in self.episodes])
+        colour, depth = self.pictures.render([episode.seen for episode in self.episodes])
         return {"rgb": colour, "depth": depth, "states": states}
 
     def _infos(self, steps: Sequence[EpisodeStep]) -> dict[str, Any]:

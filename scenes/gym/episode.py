@@ -87,12 +87,12 @@ class ResetSample:
 
 def draw(setting: TaskSetting, random: np.random.Generator) -> ResetSample:
     """Draw an episode."""
-    goal, site, tool = setting.goal(random), setting.site, setting.task.tool
+    goal, site, tool = setting.sample_goal(random), setting.site, setting.task.tool
     high, far, angle, size = random.random(4)
     aside = ASIDE[0] + far * (ASIDE[1] - ASIDE[0])
     x, y = ((goal.place - site.origin) @ axis for axis in (site.right, site.up))
     x, y = x + aside * np.cos(2.0 * np.pi * angle), y + aside * np.sin(2.0 * np.pi * angle)
-    under = site.contact(float(x), float(y), tool.radius).point
+    under = site.find_contact(float(x), float(y), tool.radius).point
     tip = under - (ABOVE[0] + high * (ABOVE[1] - ABOVE[0])) * site.axis
     return ResetSample(goal, lay_tool(site, tool, tip), int(random.integers(2**31)), TREMOR * float(size))
 
@@ -117,7 +117,7 @@ class Episode:
         self.random, self.drawn = random, draw(self.setting, random)
         self.hand, self.touched, self.judged = self.drawn.hand, None, None
         self.step, self.held, self.violations, self.cut, self.over = 0, 0, 0, 0, False
-        self.patch = self.setting.near(self.drawn.goal.place)
+        self.patch = self.setting.find_near(self.drawn.goal.place)
         return self._asked(self.drawn)
 
     def ask(self, action: np.ndarray) -> TissueRequest:
@@ -144,7 +144,7 @@ class Episode:
         offset = drawn.tremor * self.frame @ sample_wandering(drawn.seed, SECONDS * self.step)[:3]
         self.actual = shift_pose(self.hand, offset)
         fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth(self.step / DRAINS)
-        return TissueRequest(self.actual.pose(task.tool), self.touched, fluid, self.done)
+        return TissueRequest(self.actual.compute_pose(task.tool), self.touched, fluid, self.done)
 
     @property
     def done(self) -> int:
@@ -162,7 +162,7 @@ class Episode:
         """
         if self.touched is None:
             raise InputError("no episode has begun: call reset() before render().")
-        return self.touched, self.actual.pose(self.setting.task.tool), self.shown
+        return self.touched, self.actual.compute_pose(self.setting.task.tool), self.shown
 
     def take(self, touched: Touched) -> EpisodeStep:
         """Return the result of a step from the tissue's response."""
@@ -241,9 +241,9 @@ class Episode:
         setting = self.setting
         tumour = setting.site.anatomy.tumour_nodes
         now = setting.site.anatomy.mesh.nodes[tumour] + touched.motion[np.searchsorted(touched.nodes, tumour)]
-        left = np.isin(tumour, setting.after(self.shown).anatomy.tumour_nodes)
+        left = np.isin(tumour, setting.get_stage(self.shown).anatomy.tumour_nodes)
         return {
-            "pose": self.actual.pose(setting.task.tool), "force": touched.force.copy(), "pressure": touched.pressure,
+            "pose": self.actual.compute_pose(setting.task.tool), "force": touched.force.copy(), "pressure": touched.pressure,
             "tumour_nodes": now, "tumour_middle": now[left].mean(axis=0), "model_error": touched.error,
             "target": target.copy(), "away": self.judged.away, "asked": float(self.drawn.goal.amount),
             "reached": self._reached(touched), "load": self.judged.load, "violations": self.violations,

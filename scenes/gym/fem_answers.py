@@ -43,7 +43,7 @@ class PosedElements:
     ball: Hertz | None
     together: bool = False
 
-    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Solve as `TissueModel.answer`; environments at the start of an episode form a separate batch."""
         found: dict[int, Touched] = {}
         begin = [row for row, each in enumerate(asked) if each.last is None]
@@ -60,7 +60,7 @@ class PosedElements:
         force = answer.reaction[:, 0, :3]
         size = np.linalg.norm(force, axis=1)
         if self.ball is not None:
-            highest = [self.ball.pressure(float(each)) for each in size]
+            highest = [self.ball.compute_pressure(float(each)) for each in size]
         else:
             highest = pressure(self.fem, loads, answer).max(axis=1).tolist()
         rows = [answer]
@@ -111,7 +111,7 @@ class CutElements:
     _solved: dict[tuple[int, int], Deformation] = field(default_factory=dict)
     _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
 
-    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Solve as `TissueModel.answer`; earlier requests have no influence, because levels are solved in one order."""
         return [self._touched(each) for each in asked]
 
@@ -125,7 +125,7 @@ class CutElements:
         force = self._force(asked.pose, asked.done, motion)
         size = float(np.linalg.norm(force))
         good = all(self._at(low + more, asked.done).outcome[0].good for more in range(2 if share > 0.0 else 1))
-        return Touched(motion, np.arange(len(motion)), force, self.ball.pressure(size), good)
+        return Touched(motion, np.arange(len(motion)), force, self.ball.compute_pressure(size), good)
 
     def _at(self, level: int, done: int) -> Deformation:
         """Return the solution at a fluid level, started from the level above.
@@ -139,7 +139,7 @@ class CutElements:
                 start = self._at(level, done - 1)
             elif level > 0:
                 start = self._at(level - 1, done)
-            posture = Lying(fluid=1.0 - APART * level).posture(self.site.anatomy.mesh.nodes)
+            posture = Lying(fluid=1.0 - APART * level).build_posture(self.site.anatomy.mesh.nodes)
             self._solved[key] = self.fem.deform(Loads((posture, Resected(np.array([float(done)])))), start)
         return self._solved[key]
 
@@ -154,7 +154,7 @@ class CutElements:
         outward /= np.linalg.norm(outward)
         away = middle - near.point[0]
         distance = float(np.copysign(np.linalg.norm(away), away @ outward))
-        return -float(self.ball.force(np.array(radius - distance))) * outward
+        return -float(self.ball.compute_force(np.array(radius - distance))) * outward
 
     def _healthy(self, done: int) -> HealthySurface:
         """Return the remaining body after a number of steps."""

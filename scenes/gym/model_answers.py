@@ -48,24 +48,24 @@ class Hertz:
         mu, lame = self.tissue.lame
         return 2.0 * mu / (1.0 - 0.5 * lame / (lame + mu))
 
-    def force(self, depth: np.ndarray) -> np.ndarray:
+    def compute_force(self, depth: np.ndarray) -> np.ndarray:
         """Return forces [N] at depths [m]: F = 4/3 E' sqrt(r) d^1.5; none above the surface."""
         return 4.0 / 3.0 * self.modulus * np.sqrt(self.radius) * np.maximum(depth, 0.0) ** 1.5
 
-    def contact(self, force: np.ndarray) -> np.ndarray:
+    def compute_contact_radius(self, force: np.ndarray) -> np.ndarray:
         """Radii of contact [m] under forces [N]: a^3 = 3 F r / (4 E')."""
         return np.cbrt(0.75 * force * self.radius / self.modulus)
 
-    def pressure(self, force: float) -> float:
+    def compute_pressure(self, force: float) -> float:
         """Return the pressure [Pa] in the middle of the contact under a force [N]: 3 F / (2 pi a^2)."""
-        return 1.5 * force / (np.pi * float(self.contact(np.array(force))) ** 2) if force > 0.0 else 0.0
+        return 1.5 * force / (np.pi * float(self.compute_contact_radius(np.array(force))) ** 2) if force > 0.0 else 0.0
 
-    def deeper(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+    def compute_extra_depth(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
         """Return the extra depth [m] of the ball's centre compared with a wider footprint (k,) [m] at equal forces.
 
         The middle of a footprint sqrt(1 - (s/a)^2) sinks by 3 F / (4 E' a).
         """
-        own = np.where(force > 0.0, self.contact(force), 1.0)
+        own = np.where(force > 0.0, self.compute_contact_radius(force), 1.0)
         return 0.75 * force / self.modulus * (1.0 / own - 1.0 / footprint)
 
 
@@ -98,7 +98,7 @@ class PressedModel:
     def _patch(self) -> Patch:
         return open_patch(self.site.anatomy)
 
-    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Predict as `TissueModel.answer`."""
         poses = np.stack([each.pose for each in asked])
         parts = [poses] if self.together else np.split(poses, len(poses))
@@ -120,7 +120,7 @@ class PressedModel:
         for number, row in enumerate(rows.tolist()):
             answers[row] = Touched(
                 answer.displacement[number], answer.nodes, size[number] * inward[number],
-                self.ball.pressure(float(size[number])), bool(found[number]), float(stated[number]),
+                self.ball.compute_pressure(float(size[number])), bool(found[number]), float(stated[number]),
             )  # fmt: skip
         return answers
 
@@ -129,7 +129,7 @@ class PressedModel:
         return Loads((Pushed(point, size[:, None] * inward, self._footprint(size)),))
 
     def _footprint(self, size: np.ndarray) -> np.ndarray:
-        return np.clip(self.ball.contact(size), *self.model.envelope.footprint)
+        return np.clip(self.ball.compute_contact_radius(size), *self.model.envelope.footprint)
 
     def _forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find forces (k,) [N] at points (k, 3) by the secant method, and whether each reaches its depth (k,) [m]."""
@@ -141,10 +141,10 @@ class PressedModel:
             """Return the signed depth error (k,) [m] of the ball under each trial force."""
             moved = self.model.deform(self._loads(point, inward, size), at=patch.nodes).displacement
             there = np.einsum("kc,kci,ki->k", place.weights, moved[rows[:, None], corners], inward)
-            return there + self.ball.deeper(size, self._footprint(size)) - depth
+            return there + self.ball.compute_extra_depth(size, self._footprint(size)) - depth
 
         before, short = np.zeros(len(depth)), -depth
-        size = np.minimum(self.ball.force(depth), most)
+        size = np.minimum(self.ball.compute_force(depth), most)
         for _ in range(TRIES):
             now = off(size)
             near = np.abs(now) < NEAR
@@ -174,7 +174,7 @@ class PosedModel:
     model: Learned
     ball: Hertz | None
 
-    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Predict as `TissueModel.answer`, one by one.
 
         If the model rejects a pose, the tissue stays and is marked unreliable.
@@ -193,7 +193,7 @@ class PosedModel:
         if self.ball is None:
             highest = float(compute_tool_pressure(self.model, loads, answer).max())
         else:
-            highest = self.ball.pressure(float(np.linalg.norm(force)))
+            highest = self.ball.compute_pressure(float(np.linalg.norm(force)))
         error = float(answer.bound[0, 0])
         if not np.isfinite(error):
             error = self.model.bound

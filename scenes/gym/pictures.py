@@ -27,20 +27,22 @@ class ObservationCamera:
     @cached_property
     def camera(self) -> Camera:
         """It stays where it is."""
-        return self.setting.scene.viewpoint.camera(self.setting.site)
+        return self.setting.scene.viewpoint.build_camera(self.setting.site)
 
-    def drawn(self, seen: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
+    def render(self, seen: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
         """Colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 where nothing is."""
         shape = len(seen), self.camera.height, self.camera.width
         colour, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
         for done in sorted({each[2] for each in seen}):
             rows = [row for row, each in enumerate(seen) if each[2] == done]
-            stage = self.setting.after(done)
-            scenes = [stage.layers(self._positions(touched), pose) for touched, pose, _ in (seen[row] for row in rows)]
+            stage = self.setting.get_stage(done)
+            scenes = [
+                stage.build_layers(self._positions(touched), pose) for touched, pose, _ in (seen[row] for row in rows)
+            ]
             if done not in self._renderers:
                 self._renderers[done] = Renderer(scenes[0], stage.lamp, stage.device)
             moved = [np.concatenate([each.vertices for each in layers if not each.still]) for layers in scenes]
-            pictures = self._renderers[done].pictures(np.stack(moved), [self.camera])
+            pictures = self._renderers[done].render_batch(np.stack(moved), [self.camera])
             colour[rows], depth[rows] = pictures.colour.numpy(), pictures.depth.numpy()
         return colour, depth
 

@@ -72,11 +72,11 @@ class TaskSetting:
     @cached_property
     def stage(self) -> Stage:
         """Renderer of the body."""
-        return self.theatre.stage(self.scene)
+        return self.theatre.build_stage(self.scene)
 
-    def after(self, done: int) -> Stage:
+    def get_stage(self, done: int) -> Stage:
         """Return the rendered body after a number of resection steps."""
-        return self.stage.at(Loads((Resected(np.array([float(done)])),))) if self.task.cuts else self.stage
+        return self.stage.select_stage(Loads((Resected(np.array([float(done)])),))) if self.task.cuts else self.stage
 
     @cached_property
     def cortex(self) -> np.ndarray:
@@ -97,18 +97,20 @@ class TaskSetting:
         mesh = self.site.anatomy.mesh
         return tuple(mesh.tets[list(step)].ravel() for step in surgery.build_resection(self.site.anatomy).steps[1:])
 
-    def near(self, place: np.ndarray) -> np.ndarray:
+    def find_near(self, place: np.ndarray) -> np.ndarray:
         """Vertices (n,) of the open cortex within `PATCH` of a place (3,) [m], or the nearest one."""
         away = np.linalg.norm(self.site.anatomy.mesh.nodes[self.cortex] - place, axis=1)
         return self.cortex[away <= max(PATCH, away.min())]
 
-    def goal(self, random: np.random.Generator) -> Goal:
+    def sample_goal(self, random: np.random.Generator) -> Goal:
         """Draw a goal; every task takes as many numbers."""
         far, angle, turn, amount, more = random.random(5)
         task, site = self.task, self.site
         arm = self.middle - site.origin
         offset = SPREAD * np.sqrt(far) * np.array([np.cos(2.0 * np.pi * angle), np.sin(2.0 * np.pi * angle)])
-        place = site.contact(float(arm @ site.right + offset[0]), float(arm @ site.up + offset[1]), task.tool.radius)
+        place = site.find_contact(
+            float(arm @ site.right + offset[0]), float(arm @ site.up + offset[1]), task.tool.radius
+        )
         size = task.amount[0] + amount * (task.amount[1] - task.amount[0])
         if task.cuts:
             return Goal(self.middle, site.axis, size, LOWEST + more * (HIGHEST - LOWEST))
@@ -157,7 +159,7 @@ def open_setting(
     theatre = _theatre(anatomy, _shipped(task) if model is None and anatomy == TEMPLATE else model, device)
     if not theatre.anatomy.in_tumour.any():
         raise InputError(f"{anatomy}: has no tumour, which these tasks aim at: mesh one with region {TUMOUR_LABEL}.")
-    scene, tool = task.scene(size), task.tool
+    scene, tool = task.build_scene(size), task.tool
     scene = scene.replace_regions(find_learned_regions(scene.elasticity, theatre.learned_tissue))
     card = find_device(device, LIVE.precision).name != "cpu"
     at_once = card if together is None else together
@@ -172,7 +174,7 @@ def open_setting(
                 task, scene, theatre, PressedModel(theatre.site, min(known, key=TIGHTEST), ball, at_once)
             )
         _say_none(task, anatomy, physics, model, next(iter(refused.values()), None))
-    fem = theatre.fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
+    fem = theatre.build_fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
     if isinstance(fem, Fem):
         return TaskSetting(task, scene, theatre, PosedElements(fem, ball, at_once))
     assert ball is not None
@@ -186,7 +188,7 @@ def _touched(task: GymTask, scene: Scene, site: Site) -> Tissue:
     """
     mesh, elasticity = site.anatomy.mesh, scene.elasticity
     arm = mesh.nodes[site.anatomy.tumour_nodes].mean(axis=0) - site.origin
-    place = site.contact(float(arm @ site.right), float(arm @ site.up), task.tool.radius).point
+    place = site.find_contact(float(arm @ site.right), float(arm @ site.up), task.tool.radius).point
     near = np.linalg.norm(mesh.nodes[mesh.tets].mean(axis=1) - place, axis=1) < task.tool.radius
     labels = [] if task.cuts else np.unique(mesh.region[near]).tolist()
     most = max(labels, key=lambda label: mesh.volumes[near & (mesh.region == label)].sum(), default=None)

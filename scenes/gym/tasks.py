@@ -97,7 +97,7 @@ class GymTask:
         """Return the resection: the corridor, then share after share; the last remains."""
         return Debulking(tuple(float(each) for each in range(int(self.amount[1]) + 1))) if self.cuts else None
 
-    def scene(self, size: tuple[int, int]) -> Scene:
+    def build_scene(self, size: tuple[int, int]) -> Scene:
         """Return the scene of the task, with images of a width and height [pixel]."""
         view = Viewpoint(width=size[0], height=size[1])
         if self.cuts:

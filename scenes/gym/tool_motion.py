@@ -29,7 +29,7 @@ class RobotTool:
     place: np.ndarray
     turned: np.ndarray
 
-    def pose(self, tool: Instrument) -> np.ndarray:
+    def compute_pose(self, tool: Instrument) -> np.ndarray:
         """T_world_tool (4, 4)."""
         T = np.eye(4)
         T[:3, :3] = self.turned
@@ -49,7 +49,7 @@ def build_tool_frame(site: Site) -> np.ndarray:
 
 def lay_tool(site: Site, tool: Instrument, tip: np.ndarray) -> RobotTool:
     """Return a tool in its first posture, its lowest point at `tip` (3,) [m]."""
-    turned = tool.pose(tip, site.axis, site.right)[:3, :3]
+    turned = tool.compute_pose(tip, site.axis, site.right)[:3, :3]
     return RobotTool(tip - compute_lever(tool) * site.axis, turned)
 
 
@@ -62,11 +62,11 @@ def move_tool(
     leans by no more than `tilt` [rad] from its first posture: a turn beyond that is left out.
     """
     frame = build_tool_frame(site)
-    place = site.within(hand.place + frame @ twist[:3], tool.radius)
+    place = site.clip_to_opening(hand.place + frame @ twist[:3], tool.radius)
     along = float((place - site.origin) @ site.axis) + compute_lever(tool)
     place = place + (np.clip(along, -HIGHEST, deepest) - along) * site.axis
     turned = Rotation.from_rotvec(frame @ twist[3:]).as_matrix() @ hand.turned
-    first = tool.pose(site.origin, site.axis, site.right)[:3, 2]
+    first = tool.compute_pose(site.origin, site.axis, site.right)[:3, 2]
     if turned[:, 2] @ first < np.cos(tilt):
         turned = hand.turned
     return RobotTool(place, np.asarray(turned))

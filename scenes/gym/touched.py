@@ -69,6 +69,6 @@ class TissueModel(Protocol):
     for byte for any number of requests.
     """
 
-    def answer(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Compute the responses to requests, in their order."""
         ...

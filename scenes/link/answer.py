@@ -63,7 +63,7 @@ def place_camera(
     time = to_time(stamp) if stamped else now
     poses = np.stack([sent.T for sent in course])
     if stamped and len(course) >= EVEN and np.ptp(times[-EVEN:]) <= LONGEST * EVEN:
-        between = PoseStream(times, poses, np.zeros((len(course), 6, 6))).at(time)
+        between = PoseStream(times, poses, np.zeros((len(course), 6, 6))).interpolate(time)
         if between is not None:
             arm = float(np.linalg.norm(place - between.T_camera_target[:3, 3]))
             shift, turn = np.sqrt(np.diag(between.covariance)[[0, 3]])
@@ -130,21 +130,21 @@ class PoseResponder:
     tracking: float
     registration: Registration | None = None
 
-    def answer(
+    def compute_result(
         self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
     ) -> PoseResult:
         """Compute the result at a time `now` [s], from the result `before`; `moment` is now, in seconds since 1970."""
         registration = self._registration(heard)
         if isinstance(registration, str):
             return self._nothing(registration, moment, before)
-        body = heard.beside(heard.names.tool, now)
+        body = heard.find_relative(heard.names.tool, now)
         if isinstance(body, str):
             return self._nothing(body, moment, before)
         stamp = body.stamp or to_stamp(moment)
         beside = Pose(body.T, np.diag(np.repeat([self.tracking**2, 0.0], 3)), 0.0, 0)
         pose = np.linalg.inv(registration.T_patient_scan) @ body.T @ self.tool.T_cube_tool
         spread = compute_tip_covariance(registration, self.tool, beside)
-        motion = self.motion.under(pose, spread, None if before is None else before.motion)
+        motion = self.motion.compute_motion(pose, spread, None if before is None else before.motion)
         known = TrackingResult(
             to_time(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "",
             NOT_SEEN, motion, None, pose, spread,
@@ -156,26 +156,26 @@ class PoseResponder:
         if known.relied and registration.scanned is None:
             known = replace(known, state=TumourState.UNSURE, words=UNCHECKED)
         stage = self.motion.stage
-        gauge = Painter(stage, self.tool).gauge(known, stage.tumour(motion.positions))
+        gauge = Painter(stage, self.tool).measure_tip(known, stage.build_tumour(motion.positions))
         return PoseResult(stamp, known, gauge)
 
     def measure(self) -> float:
         """Measure the time of one solution [s]: the tool 2 mm deep at the craniotomy, with kernels loaded before."""
         site, pose = self.motion.stage.site, np.eye(4)
         pose[:3] = np.column_stack([site.right, site.up, -site.axis, site.origin + PRESSED * site.axis])
-        self.motion.under(pose, self.tracking**2 * np.eye(3))
+        self.motion.compute_motion(pose, self.tracking**2 * np.eye(3))
         begun = clock.perf_counter()
-        self.motion.under(pose, self.tracking**2 * np.eye(3))
+        self.motion.compute_motion(pose, self.tracking**2 * np.eye(3))
         return clock.perf_counter() - begun
 
-    def camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
+    def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
         """Return the scan's pose in the camera's frame for an image's time stamp, or why it is unknown at `now` [s]."""
         name = heard.names.camera
-        registration, body = self._registration(heard), heard.beside(name, now)
+        registration, body = self._registration(heard), heard.find_relative(name, now)
         if isinstance(registration, str) or isinstance(body, str):
             return registration if isinstance(registration, str) else str(body)
         middle = registration.T_patient_scan @ np.append(self.motion.stage.tumour_at_rest.vertices.mean(axis=0), 1.0)
-        placed = place_camera(heard.course(name), now, stamp, middle[:3], heard.stale)
+        placed = place_camera(heard.list_transforms(name), now, stamp, middle[:3], heard.stale)
         if isinstance(placed, str):
             return placed.format(name=name)
         return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)

@@ -105,7 +105,7 @@ class LinkClients:
             if not client.asks:
                 client.offer(key, self._newest[key])
 
-    def refuse(self, number: int, code: Code, why: str, text: str) -> None:
+    def reject(self, number: int, code: Code, why: str, text: str) -> None:
         """Count a rejected message, and send a STATUS to one client; of many at once it gets the newest."""
         self._count(why, text)
         client = self._clients.get(number)
@@ -203,9 +203,9 @@ class LinkClients:
                     await self._hear(client, reader, header)
                 await asyncio.sleep(0)  # a client that sends without pause blocks no other
         except TimeoutError:
-            self.refuse(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: reconnect")
+            self.reject(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: reconnect")
         except BadMessageError as error:
-            self.refuse(client.number, Code.OVERFLOW, "no message", f"{error}: reconnect")
+            self.reject(client.number, Code.OVERFLOW, "no message", f"{error}: reconnect")
         except asyncio.IncompleteReadError as error:
             if error.partial:
                 self._count("message that breaks off")
@@ -223,7 +223,7 @@ class LinkClients:
         if header.size > longest:
             await _pass_over(reader, header.size)
             why, code = ("too long", Code.OVERFLOW) if longest else ("type not used", Code.UNKNOWN_INSTRUCTION)
-            self.refuse(client.number, code, why, f"{_named(header)} is passed over: {why}")
+            self.reject(client.number, code, why, f"{_named(header)} is passed over: {why}")
             return
         body = await reader.readexactly(header.size)
         try:
@@ -232,7 +232,7 @@ class LinkClients:
         except BadMessageError as error:
             code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
             # # The text after a colon differs from message to message.
-            self.refuse(client.number, code, str(error).partition(":")[0], f"{_named(header)} is rejected: {error}")
+            self.reject(client.number, code, str(error).partition(":")[0], f"{_named(header)} is rejected: {error}")
 
     def _ask(self, client: Client, header: Header) -> None:
         """A client that asks, or wants no stream, is sent what it asks for and nothing else."""

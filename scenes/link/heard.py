@@ -100,7 +100,7 @@ class ReceivedTransforms:
         newest = {**self.sent, name: Sent(T, stamp, now, sender)}
         return replace(self, sent=newest, earlier={**self.earlier, name: kept})
 
-    def beside(self, name: str, now: float) -> Sent | str:
+    def find_relative(self, name: str, now: float) -> Sent | str:
         """Return a body relative to the patient's reference, with its own time stamp; or why it is unknown."""
         needed = (name, self.names.reference) if self.names.is_tracker_transform(name) else (name,)
         for each in needed:
@@ -111,7 +111,7 @@ class ReceivedTransforms:
                 return f"no new {each} for {age:.1f} s"
         return self._in_reference(name, self.sent[name])
 
-    def course(self, name: str) -> tuple[Sent, ...]:
+    def list_transforms(self, name: str) -> tuple[Sent, ...]:
         """Return a body's transforms by one sender, oldest first, relative to the current reference."""
         newest = self.sent[name]
         every = (*self.earlier.get(name, ()), newest)

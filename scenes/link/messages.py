@@ -51,7 +51,7 @@ class SentMesh:
     cells: bytes
 
     @staticmethod
-    def of(triangles: np.ndarray) -> SentMesh:
+    def from_triangles(triangles: np.ndarray) -> SentMesh:
         """From vertex numbers (m, 3)."""
         rows = np.full((len(triangles), 4), 3, WHOLES)
         rows[:, 1:] = triangles

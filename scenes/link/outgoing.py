@@ -67,16 +67,20 @@ class Outgoing:
     def _surfaces(self) -> tuple[tuple[str, np.ndarray, SentMesh], ...]:
         """Name, vertices and triangles of the tumour, and of the open cortex."""
         cortex, faces = np.unique(self.stage.anatomy.open_surface, return_inverse=True)
-        tumour = SentMesh.of(self.stage.tumour_at_rest.triangles)
-        return ("Tumour", self.stage.tumour_vertices, tumour), ("Cortex", cortex, SentMesh.of(faces.reshape(-1, 3)))
+        tumour = SentMesh.from_triangles(self.stage.tumour_at_rest.triangles)
+        return ("Tumour", self.stage.tumour_vertices, tumour), (
+            "Cortex",
+            cortex,
+            SentMesh.from_triangles(faces.reshape(-1, 3)),
+        )
 
-    def scan(self, stamp: int) -> bytes:
+    def build_scan(self, stamp: int) -> bytes:
         """Return the tumour as the scan has it."""
         _, vertices, mesh = self._surfaces[0]
         at = self.stage.anatomy.mesh.nodes[vertices]
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
 
-    def messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
+    def build_messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """Build all messages of a result, with its stamp: unknown surfaces are sent without points."""
         known, stamp = answer.known, answer.stamp
         none = encode_polydata(np.empty((0, 3)), NOTHING)
@@ -97,14 +101,14 @@ class Outgoing:
                 out.append(pack_message("POINT", f"Points{word}", body if shown else b"", stamp))
         return tuple(out)
 
-    def status(self, answer: PoseResult, refused: str) -> bytes:
+    def build_status(self, answer: PoseResult, refused: str) -> bytes:
         """Build the STATUS of a result, with the number of rejected messages by reason."""
         known = answer.known
         code = Code.OK if known.relied else Code.NOT_READY
         words = known.words or f"the tumour is known, {known.state.value}"
         return pack_message("STATUS", "Sulcus", encode_status(code, f"{words}{refused}"), answer.stamp)
 
-    def placed(self, names: list[str], at: np.ndarray) -> SentPlaces:
+    def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """Attach points of the scan (n, 3) [m]: to the tumour's volume if inside, else to the nearest surface.
 
         Raises

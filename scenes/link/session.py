@@ -52,13 +52,13 @@ Picture = tuple[np.ndarray, int]
 class PoseResponderLike(Protocol):
     """Interface of a solver for poses."""
 
-    def answer(
+    def compute_result(
         self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
     ) -> PoseResult:
         """Compute the result, as `PoseResponder.answer`."""
         ...
 
-    def camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
+    def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
         """Return the scan's pose, as `PoseResponder.camera`."""
         ...
 
@@ -66,19 +66,19 @@ class PoseResponderLike(Protocol):
 class MessageWriter(Protocol):
     """Interface of an encoder of results."""
 
-    def scan(self, stamp: int) -> bytes:
+    def build_scan(self, stamp: int) -> bytes:
         """Build the scan's message, as `Outgoing.scan`."""
         ...
 
-    def messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
+    def build_messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """Build the messages, as `Outgoing.messages`."""
         ...
 
-    def status(self, answer: PoseResult, refused: str) -> bytes:
+    def build_status(self, answer: PoseResult, refused: str) -> bytes:
         """Build the STATUS, as `Outgoing.status`."""
         ...
 
-    def placed(self, names: list[str], at: np.ndarray) -> SentPlaces:
+    def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """Attach points, as `Outgoing.placed`."""
         ...
 
@@ -91,7 +91,7 @@ class OverlayCamera:
     painter: Painter
     tracking: float
 
-    def painted(self, colour: np.ndarray, known: TrackingResult, seen: CameraView | str) -> np.ndarray:
+    def draw(self, colour: np.ndarray, known: TrackingResult, seen: CameraView | str) -> np.ndarray:
         """Draw a result on an image (H, W, 3) uint8.
 
         If the scan's pose in the camera's frame is unknown, only the reason is drawn.
@@ -105,7 +105,7 @@ class OverlayCamera:
             placed = compute_radius_across(self.tracking**2 * np.eye(3), T[:3, :3] @ middle + T[:3, 3])
             parts = {**known.parts, "camera": placed, "time": seen.moved}
             known = add_bound(known, float(np.linalg.norm([known.band, placed, seen.moved])), parts)
-        return self.painter.paint(colour, replace(known, camera=self.calibration.camera(T))).colour
+        return self.painter.paint(colour, replace(known, camera=self.calibration.build_camera(T))).colour
 
 
 class LinkSession:
@@ -143,7 +143,7 @@ class LinkSession:
         self._places: SentPlaces | None = None
         self._states: set[TumourState] = set()
         self._loop = asyncio.get_running_loop()
-        self._solved = self._shown = answers.answer(heard, self._loop.time(), clock.time())
+        self._solved = self._shown = answers.compute_result(heard, self._loop.time(), clock.time())
         # Arrival of the pose that was solved last, and start of the solution that is being computed [s].
         self._arrived = self._begun = np.inf
         self._posed, self._pictured = asyncio.Event(), asyncio.Event()
@@ -195,8 +195,8 @@ class LinkSession:
             await asyncio.sleep(AGAIN)
 
     async def _work(self, seconds: float) -> None:
-        self.clients.publish("scan", (self._speaks.scan(0),))
-        self._show(self._solved, self._speaks.messages(self._solved))
+        self.clients.publish("scan", (self._speaks.build_scan(0),))
+        self._show(self._solved, self._speaks.build_messages(self._solved))
         with ThreadPoolExecutor(1, "answer") as answering, ThreadPoolExecutor(1, "draw") as drawing:
             work = [self._reporting(), self._answering(answering)]
             work += [] if self._eye is None else [self._drawing(self._eye, drawing)]
@@ -220,13 +220,13 @@ class LinkSession:
             await self._posed.wait()
             self._posed.clear()
             heard, places, self._begun = self._heard, self._places, self._loop.time()
-            body = heard.beside(heard.names.tool, self._begun)
+            body = heard.find_relative(heard.names.tool, self._begun)
             answer, messages = await self._loop.run_in_executor(thread, self._computed, heard, places, self._begun)
             self._solved, self._begun = answer, np.inf
             self._arrived = np.inf if isinstance(body, str) else body.arrived
             current = self._current(self._loop.time())
             # A pose may have grown old while its solution was computed.
-            self._show(current, messages if current is answer else self._speaks.messages(current, places))
+            self._show(current, messages if current is answer else self._speaks.build_messages(current, places))
 
     async def _reporting(self) -> None:
         """Publish, every tick and whatever the solver does, that a pose or its solution is too old, and a STATUS."""
@@ -235,19 +235,19 @@ class LinkSession:
         while True:
             now, kinds = self._loop.time(), frozenset(self.clients.refused)
             if (answer := self._current(now)) is not self._shown:
-                self._show(answer, self._speaks.messages(answer, self._places))
+                self._show(answer, self._speaks.build_messages(answer, self._places))
             known = answer.known
             # A number that grows is no news.
             saying = known.state, re.sub(r"[\d.]+", "", known.words), kinds, tuple(self._others)
             if saying != said or now - beat >= BEAT:
                 said, beat = saying, now
-                self.clients.publish("status", (self._speaks.status(answer, self._refused_words(known)),))
+                self.clients.publish("status", (self._speaks.build_status(answer, self._refused_words(known)),))
             await asyncio.sleep(TICK)
 
     def _current(self, now: float) -> PoseResult:
         """Return the last solution, or the reason why none holds at a time [s]; the solver is not called."""
-        if isinstance(self._heard.beside(self._heard.names.tool, now), str):
-            return self._answers.answer(self._heard, now, clock.time(), self._shown.known)
+        if isinstance(self._heard.find_relative(self._heard.names.tool, now), str):
+            return self._answers.compute_result(self._heard, now, clock.time(), self._shown.known)
         answer, waited = add_lateness(self._solved, now - self._arrived, self._heard.stale), now - self._begun
         if answer is self._solved and answer.known.state in (TumourState.NO_TOOL, TumourState.STALE) and waited > BEAT:
             return replace(answer, known=replace(answer.known, words=f"no solution yet, computing for {waited:.0f} s"))
@@ -257,8 +257,8 @@ class LinkSession:
         self, heard: ReceivedTransforms, places: SentPlaces | None, now: float
     ) -> tuple[PoseResult, tuple[bytes, ...]]:
         """Compute a result and its messages, in the solver's thread."""
-        answer = self._answers.answer(heard, now, clock.time(), self._shown.known)
-        return answer, self._speaks.messages(answer, places)
+        answer = self._answers.compute_result(heard, now, clock.time(), self._shown.known)
+        return answer, self._speaks.build_messages(answer, places)
 
     def _show(self, answer: PoseResult, messages: tuple[bytes, ...]) -> None:
         self._shown = answer
@@ -283,8 +283,8 @@ class LinkSession:
             if self._picture is None:
                 continue
             (colour, stamp), heard = self._picture, self._heard
-            camera = self._answers.camera(heard, self._loop.time(), stamp)
-            drawn = await self._loop.run_in_executor(thread, eye.painted, colour, self._shown.known, camera)
+            camera = self._answers.find_camera(heard, self._loop.time(), stamp)
+            drawn = await self._loop.run_in_executor(thread, eye.draw, colour, self._shown.known, camera)
             self.clients.publish("picture", (pack_message("IMAGE", "Overlay", encode_image(drawn), stamp),))
 
     def _longest(self, kind: str) -> int:
@@ -311,11 +311,11 @@ class LinkSession:
                 self._pictured.set()
             case "POINT":
                 names, places = read_points(content)
-                self._places = self._speaks.placed(names, 1e-3 * places)
+                self._places = self._speaks.attach_points(names, 1e-3 * places)
                 self._posed.set()
                 if self._places.strange:
                     words = f"{STRANGE}: {self._places.strange}; the others are followed"
-                    self.clients.refuse(number, Code.CONFIGURATION, STRANGE, words)
+                    self.clients.reject(number, Code.CONFIGURATION, STRANGE, words)
 
     def _hear_transform(self, number: int, header: Header, content: bytes) -> None:
         names = self._heard.names

@@ -61,7 +61,7 @@ def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
                 calibration = calibration.resize_calibration(*args.size, scale=True)
             except ValueError as error:
                 raise InputError(f"{args.camera}: {error}") from error
-        view = view.calibrated(calibration)
+        view = view.calibrate(calibration)
     elif args.size is not None:
         raise InputError("--size scales the calibration of --camera: give both, or neither.")
     if args.path is not None:
@@ -71,7 +71,7 @@ def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
     return scene if view is scene.viewpoint else replace(scene, viewpoint=view)
 
 
-def film_with_targets(args: argparse.Namespace, scene: Scene) -> Scene:
+def add_targets(args: argparse.Namespace, scene: Scene) -> Scene:
     """Return the scene with a tracked camera that sees the craniotomy, the reference and the tool's cube.
 
     Raises

@@ -99,7 +99,7 @@ def read_statements(path: Path) -> dict[str, str]:
     try:
         if path.suffix == ".npz":
             with path.open("rb") as raw:
-                return {name: str(value) for name, value in json.loads(Archive(raw).text("header")).items()}
+                return {name: str(value) for name, value in json.loads(Archive(raw).read_text("header")).items()}
         if h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
                 return {name: str(value) for name, value in file.attrs.items()}

@@ -105,7 +105,7 @@ def _say_apart(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
     from ..tracked.run import read_timed
 
     first = next(read_timed(read_video(Path(args.pictures), args.rate))).picture.time
-    outside = elsewhere.outside(first)
+    outside = elsewhere.describe_mismatch(first)
     if not outside:
         return
     when = [

@@ -91,10 +91,10 @@ def list_addresses(args: argparse.Namespace) -> tuple[str, ...]:
     InputError
         A text that is no such address.
     """
-    from ar.page.guard import origin_of
+    from ar.page.guard import format_origin
 
     try:
-        return tuple(map(origin_of, args.address))
+        return tuple(map(format_origin, args.address))
     except ValueError as error:
         raise InputError(f"--address {error}") from error
 

@@ -110,16 +110,16 @@ def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
     from sim.bodies.markups import read_markup
 
     from ..script.approach import approach_of
-    from ..script.tool_paths import idle
+    from ..script.tool_paths import keep_idle
 
     approach = approach_of(read_markup(args.trajectory), site)
     if scene.tool is None:
         print(f"{args.program}: {scene.name} has no tool that could follow {args.trajectory}", file=sys.stderr)
         return scene
-    stopped = scene.stopped(site, approach.followed(idle)(0.0))
+    stopped = scene.describe_stop(site, approach.follow(keep_idle)(0.0))
     if stopped:
         print(f"{args.program}: where {args.trajectory} enters, {stopped}", file=sys.stderr)
-    return replace(scene, path=approach.followed(scene.path), tool=approach.held(scene.tool))
+    return replace(scene, path=approach.follow(scene.path), tool=approach.align_tool(scene.tool))
 
 
 def list_playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:
@@ -142,20 +142,20 @@ def choose_deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene) ->
     """
     budget = args.within_mm, args.within_ms
     if args.deformer != "auto" and budget == (None, None):
-        if args.deformer is None and not theatre.knowing(scene):
+        if args.deformer is None and not theatre.select_models(scene):
             from ..play.deformers import TRUTH
 
             none = "none lies beside this anatomy; `sulcus train` makes them" if scene.sight is None else TRUTH
             why = next(iter(theatre.list_rejections(scene).values()), none)
             print(f"{args.program}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
-        best = theatre.best(scene)
+        best = theatre.select_best(scene)
         if args.deformer is None and best in theatre.models:
             from surrogate.model.guarded import describe_error, get_held_out_error
 
             model = theatre.models[best]
             if get_held_out_error(model).weak:
                 print(f"{args.program}: on left-out cortex {best} is {describe_error(model)}", file=sys.stderr)
-        return args.deformer or theatre.usual(scene)
+        return args.deformer or theatre.select_default(scene)
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
     from surrogate.evaluation.choose import choose

@@ -137,7 +137,7 @@ def _elastic(args: argparse.Namespace) -> Material | Ogden:
     known = MATERIALS[args.material].tissue if args.material in MATERIALS else None
     ours = {"--ogden": args.ogden, "--bulk": args.bulk}
     if args.material == Ogden.law or isinstance(known, Ogden):
-        refuse({"--young": args.young, "--poisson": args.poisson}, args.material, f"the laws {', '.join(LAWS)}")
+        reject_option({"--young": args.young, "--poisson": args.poisson}, args.material, f"the laws {', '.join(LAWS)}")
     if args.material == Ogden.law:
         missing = [name for name, value in ours.items() if value is None]
         if missing:
@@ -149,7 +149,7 @@ def _elastic(args: argparse.Namespace) -> Material | Ogden:
                 f'--ogden {args.ogden}: write pairs C,M with ; between, as in "1340,-19;200,2".'
             ) from error
         return Ogden(terms, args.bulk)
-    refuse(ours, args.material, "--material ogden")
+    reject_option(ours, args.material, "--material ogden")
     if isinstance(known, Ogden):
         return known
     base = known or BRAIN
@@ -179,7 +179,7 @@ def parse_optional_tissue(args: argparse.Namespace) -> Tissue | None:
     return parse_tissue(args) if given else None
 
 
-def refuse(given: Mapping[str, object], material: str, owner: str) -> None:
+def reject_option(given: Mapping[str, object], material: str, owner: str) -> None:
     """Raise InputError for an option that is given but that only `owner` has."""
     for name, value in given.items():
         if value is not None:
@@ -200,7 +200,7 @@ def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: Theatr
     """
     from ..play.learned_regions import find_learned_regions
 
-    made = scene.made_of(parse_optional_tissue(args), args.element)
+    made = scene.replace_tissue(parse_optional_tissue(args), args.element)
     here = made.elasticity
     own = parse_region_tissues(args.region, here.default or BRAIN, theatre.anatomy.mesh)
     kept = find_learned_regions(here, theatre.learned_tissue, own)

@@ -56,14 +56,14 @@ def get_tool_force(loads: Loads, answer: Deformation) -> tuple[float | None, flo
 
 def render_slices(frame: Frame, player: Player, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 through the tumour's middle, or through the tool's tip where there is one."""
-    stage, positions = player.stage.at(frame.loads), player.believed(frame)
+    stage, positions = player.stage.select_stage(frame.loads), player.estimate_positions(frame)
     others, tool = [], player.scene.tool
     if tool is not None and frame.pose is not None:
         corners = np.asarray(tool.mesh.vertices) @ frame.pose[:3, :3].T + frame.pose[:3, 3]
         others.append(Layer("tool", TOOL, corners, np.asarray(tool.mesh.faces), TOOL_COLOUR))
     if frame.estimate is not None:
-        others.append(replace(stage.truth(player.positions(frame.deformation)), name="truth"))
-    now, before = stage.tumour(positions), stage.tumour_at_rest
+        others.append(replace(stage.build_reference(player.compute_positions(frame.deformation)), name="truth"))
+    now, before = stage.build_tumour(positions), stage.tumour_at_rest
     cut = Cut(now, before, frame.tumour_error.bound, bool(frame.doubt), others, frame.tip)
     return draw_slices_through(player.stage, cut, through)
 

@@ -38,7 +38,7 @@ class SceneSolvers:
         """
         self.theatre, self.turn = theatre, turn
         # Not on a card: there, what is drawn while a solver's thread records a CUDA graph would be recorded with it.
-        self.stages = {ALL: replace(theatre.stage(scene), device="cpu")}
+        self.stages = {ALL: replace(theatre.build_stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
         self.filmed: dict[tuple[frozenset[str], str], Stage] = {}
         self.last: dict[str, Deformation] = {}
@@ -48,9 +48,9 @@ class SceneSolvers:
         self.seeking: tuple[FemWorker, Question] | None = None
         self.playable = deformer != "fem"
         if self.playable:
-            self.player(deformer)
+            self.get_player(deformer)
 
-    def stage(self, off: frozenset[str] = ALL) -> Stage:
+    def get_stage(self, off: frozenset[str] = ALL) -> Stage:
         """Return the stage of the scene without some effects, of the tissue that it has with them."""
         if off not in self.stages:
             scene = self.stages[ALL].scene
@@ -59,29 +59,29 @@ class SceneSolvers:
             self.stages[off] = replace(self.stages[ALL], scene=scene)
         return self.stages[off]
 
-    def solver(self, off: frozenset[str] = ALL) -> FemWorker:
+    def get_worker(self, off: frozenset[str] = ALL) -> FemWorker:
         """Return the finite elements of the scene without some effects."""
         if off not in self.solvers:
-            self.solvers[off] = FemWorker(self.theatre, self.stage(off).scene, self.turn)
+            self.solvers[off] = FemWorker(self.theatre, self.get_stage(off).scene, self.turn)
         return self.solvers[off]
 
-    def player(self, name: str, off: frozenset[str] = ALL) -> Player:
+    def get_player(self, name: str, off: frozenset[str] = ALL) -> Player:
         """Return the player of the scene without some effects: a trained model, or FEM with a solution."""
         if (name, off) not in self.players:
-            stage = self.stage(off)
+            stage = self.get_stage(off)
             if name == "fem":
-                solved = self.solver(off).player
+                solved = self.get_worker(off).player
                 assert solved is not None
                 deformer = solved.deformer
             else:
                 deformer = self._trained(name, stage.scene)
-            uncertainty = self.theatre.uncertainty(stage.scene)
+            uncertainty = self.theatre.estimate_uncertainty(stage.scene)
             self.players[name, off] = Player(stage, deformer, uncertainty=uncertainty)
         return self.players[name, off]
 
-    def seen(self, name: str, off: frozenset[str], path: str) -> Player:
+    def get_player_on_path(self, name: str, off: frozenset[str], path: str) -> Player:
         """Return the same, with the camera on a path of that name; "" as the scene has it."""
-        player = self.player(name, off)
+        player = self.get_player(name, off)
         if not path:
             return player
         if (off, path) not in self.filmed:
@@ -92,25 +92,25 @@ class SceneSolvers:
     def _trained(self, name: str, scene: Scene) -> Deformer:
         """Return a trained model. Its FEM fallback is built under `turn`, on the CPU like the stages."""
         with self.turn if name == GUARDED else nullcontext():
-            return replace(self.theatre, device="cpu").deformer(name, scene)
+            return replace(self.theatre, device="cpu").build_deformer(name, scene)
 
-    def predicted(self, name: str, question: Question) -> FemResult:
+    def predict(self, name: str, question: Question) -> FemResult:
         """Compute a trained model's solution; its FEM fallback starts from the last one.
 
         A model that integrates its tissue in time computes the previous frames first.
         """
-        begun, player = clock.perf_counter(), self.player(name)
+        begun, player = clock.perf_counter(), self.get_player(name)
         if player.follows:
             session = self.sessions.setdefault(name, ReplaySession(player))
-            number, answer = session.towards(*question)
+            number, answer = session.approach_frame(*question)
             while number != question[0]:
-                number, answer = session.towards(*question)
-            return FemResult(number, player.loads(*question), answer, clock.perf_counter() - begun, question)
-        loads = player.loads(*question)
-        answer = self.last[name] = player.answer(loads, self.last.get(name))
+                number, answer = session.approach_frame(*question)
+            return FemResult(number, player.build_loads(*question), answer, clock.perf_counter() - begun, question)
+        loads = player.build_loads(*question)
+        answer = self.last[name] = player.compute_deformation(loads, self.last.get(name))
         return FemResult(question[0], loads, answer, clock.perf_counter() - begun, question)
 
-    def solved(
+    def solve(
         self, off: frozenset[str], question: Question, seen: FemResult | None, patience: float
     ) -> FemResult | None:
         """Return the FEM solution of a frame, or of one on the way to it. The solver is started if necessary.
@@ -127,7 +127,7 @@ class SceneSolvers:
         Exception
             Any exception of the solver's thread.
         """
-        solver = self.solver(off)
+        solver = self.get_worker(off)
         if self.seeking != (solver, question):
             self._seek(solver, question)
         if solver.failure is not None and (solver.refused == question or not solver.thread.is_alive()):
@@ -135,7 +135,7 @@ class SceneSolvers:
             if not solver.thread.is_alive():
                 del self.solvers[off]
             raise solver.failure
-        truth = solver.newer(question, seen, patience)
+        truth = solver.wait_newer(question, seen, patience)
         self.playable = self.playable or solver.player is not None
         return truth
 
@@ -146,7 +146,7 @@ class SceneSolvers:
         self.seeking = solver, question
         solver.ask(*question)
 
-    def rest(self) -> None:
+    def stop_all(self) -> None:
         """Nothing more is wanted: what is under way ends with the step in hand."""
         if self.seeking is not None:
             self.seeking[0].drop()

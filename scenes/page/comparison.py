@@ -45,7 +45,7 @@ def compare_with_fem(truth: FemResult, player: Player, own: bool, shown: Deforma
 
     `shown` is the deformer's solution of these loads, if it depends on previous ones.
     """
-    nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
+    nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
     right = truth.deformation.at(nodes).displacement[0]
     error = None
     if not own:
@@ -83,7 +83,7 @@ def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: s
 
 def describe_change(truth: FemResult, player: Player, shown: Deformation, off: Sequence[str]) -> str:
     """Describe the tumour's distance from its position under all effects, for a solution without some."""
-    nodes = player.stage.at(truth.loads).anatomy.tumour_nodes
+    nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
     apart = truth.deformation.at(nodes).displacement[0] - shown.at(nodes).displacement[0]
     mean = 1e3 * float(np.linalg.norm(apart, axis=1).mean())
     return (
@@ -136,11 +136,11 @@ class AccuracyTimeTable:
         self._took: dict[str, dict[str, float]] = {}
         self._missed: dict[str, dict[str, float]] = {}
 
-    def took(self, name: str, load: str, seconds: float) -> None:
+    def record_time(self, name: str, load: str, seconds: float) -> None:
         """Record the time of a deformer for a load, named by its stamp."""
         _keep(self._took.setdefault(name, {}), load, 1e3 * seconds)
 
-    def missed(self, name: str, load: str, metres: float) -> None:
+    def record_error(self, name: str, load: str, metres: float) -> None:
         """Record the error of a deformer for a load, relative to the converged FEM solution."""
         _keep(self._missed.setdefault(name, {}), load, 1e3 * metres)
 

@@ -114,7 +114,7 @@ def build_tool_controls(
     """Build the controls of the tool: who holds it, and its position within the opening, in patient directions."""
     assert scene.tool is not None
     room = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
-    sides = name_bearings(scene.viewpoint.camera(site).T_camera_world[:3, :3])
+    sides = name_bearings(scene.viewpoint.build_camera(site).T_camera_world[:3, :3])
     stops = "limited by the edge of the craniotomy"
     against = "direction of the push: tilt from the surface normal"
     ways = (("right", "x", sides["right"]), ("up", "y", sides["top"]))

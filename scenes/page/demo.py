@@ -80,9 +80,9 @@ class Demo:
             signs=list_orientation_labels(site),
             origins=origins,
         )
-        self.busy = Busy(lambda line: self.browser.status(escape(line)))
+        self.busy = Busy(lambda line: self.browser.show_status(escape(line)))
         self.dismissed: list[FemWorker] = []
-        self.asked, self.drawn = self.wish.now(), 0
+        self.asked, self.drawn = self.wish.read_current(), 0
 
     def run(self, seconds: float = float("inf")) -> int:
         """Play for the given time; return the number of frames drawn. Failures are reported on the page and skipped.
@@ -104,7 +104,7 @@ class Demo:
 
     def _leave_out(self, error: Exception, end: float) -> None:
         """Say why a frame is not shown, until there is time to read it or a visitor asks for another; then go on."""
-        self.busy.off()
+        self.busy.end_work()
         said = str(error)
         if not isinstance(error, InputError):
             place = traceback.extract_tb(error.__traceback__)[-1]
@@ -113,7 +113,7 @@ class Demo:
         self.browser.report(f'<p class="warn">error: this frame is left out ({escape(said)})</p>')
         self._tell()
         until = min(end, clock.perf_counter() + READING)
-        while self.wish.now() == self.asked and self.wish.scene == self.stage.scene.name:
+        while self.wish.read_current() == self.asked and self.wish.scene == self.stage.scene.name:
             if clock.perf_counter() >= (until if self.wish.plays else end):
                 break
             clock.sleep(1.0 / self.stage.scene.frames_per_second)
@@ -127,8 +127,8 @@ class Demo:
             if self.wish.scene != self.stage.scene.name:
                 self._change(self.wish.scene)
                 now = PageState()
-            self.drawn += self.answer(now)
-            self.browser.plays(self.wish.plays)
+            self.drawn += self.update_page(now)
+            self.browser.show_playback(self.wish.plays)
             self._tell()
             if now.frame is None:
                 continue
@@ -151,12 +151,12 @@ class Demo:
     @property
     def stage(self) -> Stage:
         """Drawn stage, with all effects."""
-        return self.cast.stage()
+        return self.cast.get_stage()
 
     @property
     def referee(self) -> FemWorker:
         """The finite elements under all effects, which judge the models."""
-        return self.cast.solver()
+        return self.cast.get_worker()
 
     def _cast(self, scene: Scene, deformer: str) -> None:
         """Have a deformer play a scene."""
@@ -169,10 +169,10 @@ class Demo:
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
         old = self.cast, self.tally, self.wish, self.history
-        self.busy.on(f"preparing the scene {name}")
+        self.busy.begin_work(f"preparing the scene {name}")
         try:
             scene = self.first if name == self.first.name else self.find(name)
-            deformer = self.theatre.usual(scene)
+            deformer = self.theatre.select_default(scene)
             self._cast(scene, deformer)
             self.wish.set(style=old[2].style, path=old[2].path, through=old[2].through)
             parts = self._parts(deformer)
@@ -183,13 +183,13 @@ class Demo:
             self.browser.report(f'<p class="warn">{escape(str(error))}</p>')
             return
         finally:
-            self.busy.off()
+            self.busy.end_work()
         self.browser.fill(*parts)
         self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].stop_soon()
 
-    def answer(self, now: PageState) -> int:
+    def update_page(self, now: PageState) -> int:
         """Bring the page nearer to what is wished; returns how many frames were drawn, 0 or 1."""
-        self.asked = self.wish.now()
+        self.asked = self.wish.read_current()
         if self.asked == now.asked:
             self._arrive()
         elif (found := self._found(now)) is not None:
@@ -201,8 +201,8 @@ class Demo:
 
     def _arrive(self) -> None:
         """Mark the request as shown: nothing is pending, and playback continues."""
-        self.busy.off()
-        self.cast.rest()
+        self.busy.end_work()
+        self.cast.stop_all()
         self.wish.go_on(self.asked[0], len(self.stage.scene.times))
 
     def _found(self, now: PageState) -> FemResult | None:
@@ -210,27 +210,27 @@ class Demo:
         number, name, touch, off = self.asked
         question, scene = (number, touch), self.stage.scene
         if name != "fem" and not off:  # no model was trained without
-            self.busy.on(describe_work(scene, name, *question))
-            return self.cast.predicted(name, question)
-        found = self.cast.solved(off, question, now.shown, 0.0)
+            self.busy.begin_work(describe_work(scene, name, *question))
+            return self.cast.predict(name, question)
+        found = self.cast.solve(off, question, now.shown, 0.0)
         if found is not None:
             return found
-        if self.cast.solver(off).player is None:
-            self.busy.on("preparing the finite elements")
+        if self.cast.get_worker(off).player is None:
+            self.busy.begin_work("preparing the finite elements")
             if now.frame is None and not now.rests:
                 self._rest(now)
         elif now.goal == self.asked and now.frame is not None:
-            self.busy.on(f"on the way to frame {number}: frame {now.frame.number} is solved")
+            self.busy.begin_work(f"on the way to frame {number}: frame {now.frame.number} is solved")
         else:
-            self.busy.on(describe_work(scene, "fem", *question))
-        return self.cast.solved(off, question, now.shown, 1.0 / scene.frames_per_second)
+            self.busy.begin_work(describe_work(scene, "fem", *question))
+        return self.cast.solve(off, question, now.shown, 1.0 / scene.frames_per_second)
 
     def _rest(self, now: PageState) -> None:
         """Show the body at rest while nothing else can be shown."""
         number, _, touch, _ = self.asked
         stage = replace(self.stage, observer=None)  # there is no truth yet to be seen
         player = Player(stage, AtRest(stage.site.anatomy), self.wish.style)
-        frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.touch(number))
+        frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.get_touch(number))
         move_bodies(self.browser, frame, player)
         self.browser.show(number, render_page_image(frame), RESTS)
         self._beside(frame, player)
@@ -242,11 +242,11 @@ class Demo:
         fem = name == "fem" or bool(off)
         look = self.wish.look
         player = self._seen(self.asked, look)
-        hand = touch or player.touch(found.number)
+        hand = touch or player.get_touch(found.number)
         self.reached, now.goal, now.asked = found.number, self.asked, (found.number, name, touch, off)
         now.look, now.shown, now.own = look, found, None
         now.load = compute_loads_digest(self._whole(found.number, touch) if off else found.loads)
-        now.frame = frame = player.drawn(found.number, hand, found.loads, found.deformation, found.seconds)
+        now.frame = frame = player.draw_frame(found.number, hand, found.loads, found.deformation, found.seconds)
         self.history.add(sample_of(frame, self.stage.scene, clock.monotonic()))
         if found.number == number:
             self._arrive()
@@ -255,7 +255,7 @@ class Demo:
         elif found.number == number:
             self.referee.ask(number, touch)
         if not off:
-            self.tally.took(name, now.load, found.deformation.cost.total)
+            self.tally.record_time(name, now.load, found.deformation.cost.total)
         now.picture = render_page_image(frame)
         move_bodies(self.browser, frame, player)
         self._beside(frame, player)
@@ -273,7 +273,7 @@ class Demo:
         assert now.frame is not None and now.asked is not None
         frame, now.look = now.frame, self.wish.look
         player, seconds = self._seen(now.asked, now.look), frame.seconds["deform"]
-        now.frame = player.drawn(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
+        now.frame = player.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
         now.picture = render_page_image(now.frame)
         self._beside(now.frame, player)
 
@@ -281,12 +281,12 @@ class Demo:
         """Return the player of a request, in the given style."""
         _, name, _, off = asked
         style, path, _ = look
-        return replace(self.cast.seen("fem" if off else name, off, path), style=style)
+        return replace(self.cast.get_player_on_path("fem" if off else name, off, path), style=style)
 
     def _beside(self, frame: Frame, player: Player) -> None:
         """Show slices of a frame, and what was read lately, when there is time for it."""
         through, history = self.wish.through, self.history
-        self.browser.show_beside(lambda: (render_slices(frame, player, through), history.chart()))
+        self.browser.show_beside(lambda: (render_slices(frame, player, through), history.draw_chart()))
 
     def _check(self, now: PageState) -> None:
         """Show what the finite elements say of what is shown, and whether it is of the same load."""
@@ -296,7 +296,7 @@ class Demo:
         truth = now.own or self.referee.truth
         fresh = truth is not None and compute_loads_digest(truth.loads) == now.load
         if truth is not None and (truth is not now.truth or now.by != (name, off)):
-            whole = self.cast.player(name)
+            whole = self.cast.get_player(name)
             move_wire(self.browser, self.stage, truth, whole)
             if whole.follows and not fresh:
                 now.judged = None
@@ -304,7 +304,7 @@ class Demo:
                 shown = now.frame.deformation if whole.follows else None
                 now.judged = compare_with_fem(truth, whole, name == "fem", shown)
                 if now.judged.mean is not None:
-                    self.tally.missed(name, compute_loads_digest(truth.loads), now.judged.mean)
+                    self.tally.record_error(name, compute_loads_digest(truth.loads), now.judged.mean)
             now.truth, now.by = truth, (name, off)
         if now.stale is not (not fresh):
             now.stale = not fresh
@@ -315,12 +315,12 @@ class Demo:
             why = escape(str(self.referee.failure))
             verdict = f'<p class="warn">error: the finite elements do not solve {what} ({why})</p>'
         elif off and truth is not None:
-            shown, whole = now.frame.deformation, self.cast.player(name)
+            shown, whole = now.frame.deformation, self.cast.get_player(name)
             verdict = describe_change(truth, whole, shown, gone) if fresh else format_comparison(None, True, WAITS)
         else:
             own = OWN if now.frame.estimate is None else TRUTH
             verdict = format_comparison(now.judged if truth is not None else None, not fresh, WAITS, own)
-        plan = self.cast.solver(off).plan or self.referee.plan
+        plan = self.cast.get_worker(off).plan or self.referee.plan
         if plan != now.plan:
             now.plan = plan
             self.browser.write(PLAN, plan_words(plan))
@@ -334,12 +334,12 @@ class Demo:
     def _whole(self, number: int, touch: Touch | None) -> Loads:
         """Return the loads of a frame under all effects of the scene."""
         scene, time = self.stage.scene, float(self.stage.scene.times[number])
-        return scene.loads(self.stage.site, touch or scene.path(time), time)
+        return scene.build_loads(self.stage.site, touch or scene.path(time), time)
 
     def _parts(self, deformer: str) -> tuple:
         """Build the contents of the page: bodies, playback, controls, title, text."""
         scene, site = self.stage.scene, self.stage.site
-        wish, names = self.wish, self.theatre.names(scene)
+        wish, names = self.wish, self.theatre.list_deformers(scene)
         playback = Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number))
         given = build_controls(scene, site, names, wish, self._give, self._take)
         return (
@@ -372,7 +372,7 @@ class Demo:
         """A slider was moved: the tool is in the visitor's hand."""
         self._start_hand()
         self.wish.set(holder=self._visitor())
-        self.wish.hand(**values)
+        self.wish.take_over(**values)
         self._show_touch(self.wish.touch, lambda: True)
         self.browser.put("tool", HAND)
 

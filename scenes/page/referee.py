@@ -74,7 +74,7 @@ class FemWorker:
         with self.wake:
             self.newest = None
 
-    def newer(self, question: Question, seen: FemResult | None, seconds: float) -> FemResult | None:
+    def wait_newer(self, question: Question, seen: FemResult | None, seconds: float) -> FemResult | None:
         """Wait up to `seconds` for a solution of a question, or on the way to it, other than `seen`; None after it."""
 
         def found() -> FemResult | None:
@@ -111,8 +111,8 @@ class FemWorker:
                 continue
             begun, (asked, touch) = clock.perf_counter(), question
             try:
-                number, answer = session.towards(asked, touch)
-                loads, took = session.player.loads(number, touch), clock.perf_counter() - begun
+                number, answer = session.approach_frame(asked, touch)
+                loads, took = session.player.build_loads(number, touch), clock.perf_counter() - begun
                 self.truth = FemResult(number, loads, answer, took, question)
                 self.failure = self.refused = None
             except InputError as error:
@@ -133,6 +133,6 @@ class FemWorker:
         with self.turn:
             if self.closed.is_set() or self.newest is None:
                 return None
-            session = ReplaySession(theatre.player("fem", scene))
+            session = ReplaySession(theatre.build_player("fem", scene))
         self.player, self.plan = session.player, plan_of(session.player.deformer)
         return session

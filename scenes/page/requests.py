@@ -41,7 +41,7 @@ class Requests:
             for name, value in values.items():
                 setattr(self, name, value)
 
-    def hand(self, right: float | None = None, up: float | None = None, **values: float) -> None:
+    def take_over(self, right: float | None = None, up: float | None = None, **values: float) -> None:
         """Take the tool over with some numbers of its touch changed; `right` and `up` tilt its force [rad]."""
         with self.lock:
             tilt = self.touch.tilt[0] if right is None else right, self.touch.tilt[1] if up is None else up
@@ -66,7 +66,7 @@ class Requests:
         with self.lock:
             return self.style, self.path, self.through
 
-    def now(self) -> tuple[int, str, Touch | None, frozenset[str]]:
+    def read_current(self) -> tuple[int, str, Touch | None, frozenset[str]]:
         """Frame number, deformer, hand-set touch (None: the script's) and effects that are off."""
         with self.lock:
             return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off

@@ -220,7 +220,7 @@ def report(
     without: Sequence[str] = (),
 ) -> str:
     """Build the report of a solution: distance first, then reliability, loads, comparison and table."""
-    left = stage.at(frame.loads).left
+    left = stage.select_stage(frame.loads).left
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     if frame.estimate is not None or not is_undeformed(frame.deformation):
         facts += [format_motion(frame)]

@@ -25,14 +25,14 @@ BESIDE = 12e-3
 
 def build_page_bodies(stage: Stage) -> list[SceneSurface]:
     """Brain, open cortex, tumour, the finite elements' tumour, an estimate's ellipsoid and the tool, at rest."""
-    tool, site, tumour = stage.scene.tool, stage.site, stage.tumour(stage.site.anatomy.mesh.nodes)
+    tool, site, tumour = stage.scene.tool, stage.site, stage.build_tumour(stage.site.anatomy.mesh.nodes)
     wire = SceneSurface("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
     bodies = [*build_brain(stage), wire]
     if stage.observer is not None:
         middle = tumour.vertices.mean(axis=0)
         bodies.append(SceneSurface("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
     if tool is not None:
-        pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
+        pose = tool.compute_pose(site.origin - 0.02 * site.axis, site.axis, site.right)
         at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
         bodies.append(SceneSurface("tool", at, tool.mesh.faces, TOOL_COLOUR))
     return bodies
@@ -41,7 +41,7 @@ def build_page_bodies(stage: Stage) -> list[SceneSurface]:
 def build_brain(stage: Stage) -> list[SceneSurface]:
     """Brain, open cortex and tumour, at rest."""
     positions = stage.site.anatomy.mesh.nodes
-    brain, cortex, tumour = stage.brain, stage.cortex(positions), stage.tumour(positions)
+    brain, cortex, tumour = stage.brain, stage.build_cortex(positions), stage.build_tumour(positions)
     return [
         SceneSurface("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
         SceneSurface("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
@@ -65,11 +65,11 @@ def choose_viewpoint(site: Site) -> SceneViewpoint:
 
 def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
     """Put the bodies of the 3-D view where a frame has them."""
-    positions, tool = player.believed(frame), player.scene.tool
-    stage = player.stage.at(frame.loads)
-    for layer in (stage.cortex(positions), stage.tumour(positions)):
+    positions, tool = player.estimate_positions(frame), player.scene.tool
+    stage = player.stage.select_stage(frame.loads)
+    for layer in (stage.build_cortex(positions), stage.build_tumour(positions)):
         browser.move(layer.name, layer.vertices, layer.triangles)
-    ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
+    ellipsoid = None if frame.estimate is None else frame.estimate.build_ellipsoid()
     if ellipsoid is not None:
         browser.move(ellipsoid.name, ellipsoid.vertices)
     if tool is not None and frame.pose is not None:
@@ -78,7 +78,7 @@ def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
 
 def move_wire(browser: Browser, stage: Stage, truth: FemResult, player: Player) -> None:
     """Show where the finite elements, under all effects, have the tumour."""
-    seen = stage.at(truth.loads).tumour(player.positions(truth.deformation))
+    seen = stage.select_stage(truth.loads).build_tumour(player.compute_positions(truth.deformation))
     browser.move("finite elements", seen.vertices, seen.triangles)
 
 

@@ -85,7 +85,7 @@ class SceneFigures:
     removed: float = np.nan
     doubt: str = ""
 
-    def broken(self, bounds: Bounds) -> list[str]:
+    def find_violations(self, bounds: Bounds) -> list[str]:
         """Return a sentence for each bound that is not kept."""
         rules = {
             f"overlap {self.overlap:.4f} is below {bounds.overlap}": self.overlap >= bounds.overlap,
@@ -107,7 +107,7 @@ class SceneFigures:
         }
         return [sentence for sentence, kept in rules.items() if not kept]
 
-    def row(self) -> dict[str, float | bool | str | None]:
+    def to_row(self) -> dict[str, float | bool | str | None]:
         """For machines: JSON knows no infinity, so None is a figure that could not be measured."""
         figures = asdict(self)
         return {name: value if name == "doubt" or np.isfinite(value) else None for name, value in figures.items()}
@@ -122,7 +122,9 @@ def measure(
     """
     doubts = _doubts(frames, truth)
     moved = [
-        np.linalg.norm(truth.at(player.stage.at(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1).mean()
+        np.linalg.norm(
+            truth.at(player.stage.select_stage(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1
+        ).mean()
         for row, frame in enumerate(frames)
     ]
     finite = [_finite(frame) for frame in frames]
@@ -160,8 +162,8 @@ def _covered(player: Player, frames: Sequence[Frame], truth: Deformation) -> flo
         return np.nan
     anatomy, held = player.site.anatomy, []
     for row, frame in enumerate(frames):
-        ellipsoid = None if frame.estimate is None else frame.estimate.ellipsoid()
-        middle = compute_middle(anatomy, player.positions(truth, row)[None])[0]
+        ellipsoid = None if frame.estimate is None else frame.estimate.build_ellipsoid()
+        middle = compute_middle(anatomy, player.compute_positions(truth, row)[None])[0]
         held.append(ellipsoid is not None and is_within_surface(ellipsoid, middle))
     return float(np.mean(held))
 
@@ -177,8 +179,8 @@ def _removed(player: Player, frames: Sequence[Frame], truth: Deformation) -> flo
     if not any(frame.estimate for frame in frames):
         return np.nan
     nodes, rest = player.site.anatomy.tumour_nodes, player.site.anatomy.mesh.nodes
-    true = np.stack([player.positions(truth, row)[nodes] for row in range(len(frames))])
-    believed = np.stack([player.believed(frame)[nodes] for frame in frames])
+    true = np.stack([player.compute_positions(truth, row)[nodes] for row in range(len(frames))])
+    believed = np.stack([player.estimate_positions(frame)[nodes] for frame in frames])
     left, moved = (np.linalg.norm(apart, axis=2).sum() for apart in (believed - true, true - rest[nodes]))
     return float(1.0 - left / moved) if moved > 0.0 else np.nan
 
@@ -225,14 +227,14 @@ def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row:
 
     The last value is true if parts that are not seen through cortex are drawn as occluded.
     """
-    stage = player.stage.at(frame.loads)
-    believed = player.believed(frame)
-    shown = stage.tumour(believed)
-    true = stage.tumour(player.positions(truth, row))
+    stage = player.stage.select_stage(frame.loads)
+    believed = player.estimate_positions(frame)
+    shown = stage.build_tumour(believed)
+    true = stage.build_tumour(player.compute_positions(truth, row))
     drawn = compute_silhouette(frame.camera, shown.vertices, shown.triangles)
     overlap = compute_iou(drawn, compute_silhouette(camera, true.vertices, true.triangles))
     nodes = stage.anatomy.tumour_nodes
-    off = (believed - player.positions(truth, row))[nodes]
+    off = (believed - player.compute_positions(truth, row))[nodes]
     ours = frame.camera.project(shown.vertices)[0]
     pixels = np.linalg.norm(ours - project_cv2(camera, shown.vertices), axis=1).max()
     mean = float(np.linalg.norm(off, axis=1).mean())

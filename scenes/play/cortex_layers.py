@@ -101,7 +101,7 @@ class Squares:
     triangles: np.ndarray
     lift: np.ndarray
 
-    def at(self, positions: np.ndarray) -> Layer:
+    def build_layer(self, positions: np.ndarray) -> Layer:
         """Return the layer for mesh vertices at positions (V, 3) [m]."""
         carried = np.einsum("nk,nkd->nd", self.weights, positions[self.vertices])
         return Layer("cotton", COTTON, carried + self.lift, self.triangles, COTTON_COLOUR, gloss=0.1)

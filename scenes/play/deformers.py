@@ -32,9 +32,9 @@ from surrogate.model.left_out import LIMIT
 from surrogate.model.store import load
 
 from ..script.scene import Scene, check_scene_exists
-from ..script.shipped_files import template_path
+from ..script.shipped_files import get_template_path
 from ..script.sight import Sight, StereoSight
-from ..script.site import Site, site_of
+from ..script.site import Site, build_site
 from ..script.uncertainty import Uncertainty, mark_of, read_uncertainties, to_uncertainty_path
 from .observer import Observer
 from .player import Player
@@ -65,7 +65,7 @@ class Theatre:
     @cached_property
     def site(self) -> Site:
         """The open cortex."""
-        return site_of(self.anatomy)
+        return build_site(self.anatomy)
 
     @cached_property
     def locator(self) -> Locator:
@@ -100,7 +100,7 @@ class Theatre:
         """Return True if a scene has an observation model and this anatomy has no locator file."""
         return scene.sight is not None and (self.locator_file is None or not self.locator_file.is_file())
 
-    def stage(self, scene: Scene) -> Stage:
+    def build_stage(self, scene: Scene) -> Stage:
         """Return a scene's stage on this anatomy, drawn on this theatre's device.
 
         Raises
@@ -136,33 +136,33 @@ class Theatre:
         effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
         return {name: find_rejection(model, effects, element) for name, model in self.models.items()}
 
-    def knowing(self, scene: Scene) -> dict[str, Learned]:
+    def select_models(self, scene: Scene) -> dict[str, Learned]:
         """Select the trained models that support a scene, by name."""
         return {name: self.models[name] for name, why in self.list_rejections(scene).items() if why is None}
 
-    def names(self, scene: Scene) -> tuple[str, ...]:
+    def list_deformers(self, scene: Scene) -> tuple[str, ...]:
         """List all deformers available for a scene: trained models that support it, the best one guarded, FEM."""
-        knowing = tuple(self.knowing(scene))
+        knowing = tuple(self.select_models(scene))
         return (*knowing, *([GUARDED] if self._guardable(scene) else []), "fem")
 
-    def best(self, scene: Scene) -> str:
+    def select_best(self, scene: Scene) -> str:
         """Select the trained model with the smallest error bound; FEM if none supports the scene."""
-        knowing = self.knowing(scene)
+        knowing = self.select_models(scene)
         return min(knowing, key=lambda name: knowing[name].bound, default="fem")
 
     def limit_of(self, scene: Scene) -> float:
         """Return the predicted error [m] above which FEM replaces the best model of a scene."""
-        stated = self.models[self.best(scene)].left_out
+        stated = self.models[self.select_best(scene)].left_out
         if self.limit is not None:
             return self.limit
         return LIMIT if stated is None else stated.limit
 
-    def usual(self, scene: Scene) -> str:
+    def select_default(self, scene: Scene) -> str:
         """Select the default deformer of a scene: the best model, guarded if its bound is weak.
 
         A model of tissue that relaxes is used without guard, with its bound: see `_guardable`.
         """
-        name = self.best(scene)
+        name = self.select_best(scene)
         return GUARDED if self._guardable(scene) and get_held_out_error(self.models[name]).weak else name
 
     def _guardable(self, scene: Scene) -> bool:
@@ -170,18 +170,18 @@ class Theatre:
 
         With relaxing tissue it cannot: an FEM frame depends on all previous frames, which the model computed.
         """
-        name = self.best(scene)
+        name = self.select_best(scene)
         return name in self.models and not self.models[name].series
 
-    def described(self, name: str, scene: Scene) -> str:
+    def describe_deformer(self, name: str, scene: Scene) -> str:
         """Return a deformer by name, in words: what solves, or what it learned from."""
         solver = describe_solver(self.choose_element(scene), scene.effects)
         if name == GUARDED:
-            model, limit = self.models[self.best(scene)], 1e3 * self.limit_of(scene)
+            model, limit = self.models[self.select_best(scene)], 1e3 * self.limit_of(scene)
             return f"{model.source}; where its error may exceed {limit:g} mm, {solver}"
         return solver if name == "fem" else self.models[name].source
 
-    def fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | OperatedFem:
+    def build_fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | OperatedFem:
         """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
         effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
         return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)
@@ -190,7 +190,7 @@ class Theatre:
         """Return the element of a scene, or the one that is recommended for the mesh."""
         return scene.element or recommend_element(self.anatomy.mesh)
 
-    def deformer(self, name: str, scene: Scene) -> Deformer:
+    def build_deformer(self, name: str, scene: Scene) -> Deformer:
         """Return a deformer by name; finite elements are made for the scene's accuracy.
 
         Raises
@@ -199,16 +199,16 @@ class Theatre:
             A name that this theatre does not know; a model that learned from other effects, tissue or element.
         """
         if name == "fem":
-            return self.fem(scene, scene.accuracy, live=True)
-        allowed = ", ".join(self.names(scene))
-        if name == GUARDED and self.knowing(scene) and not self._guardable(scene):
+            return self.build_fem(scene, scene.accuracy, live=True)
+        allowed = ", ".join(self.list_deformers(scene))
+        if name == GUARDED and self.select_models(scene) and not self._guardable(scene):
             raise InputError(
-                f"{self.best(scene)} cannot be {GUARDED} in the scene {scene.name}: its tissue relaxes, so that finite "
+                f"{self.select_best(scene)} cannot be {GUARDED} in the scene {scene.name}: its tissue relaxes, so that finite "
                 f"elements would have to solve from the first frame on. Choose one of {allowed}."
             )
         if name == GUARDED and self._guardable(scene):
-            model, limit = self.models[self.best(scene)], self.limit_of(scene)
-            return Guarded(model, self.fem(scene, scene.accuracy, live=True), limit)
+            model, limit = self.models[self.select_best(scene)], self.limit_of(scene)
+            return Guarded(model, self.build_fem(scene, scene.accuracy, live=True), limit)
         if name == GUARDED and self.models:
             why = next(iter(self.list_rejections(scene).values()))
             raise InputError(
@@ -223,7 +223,7 @@ class Theatre:
             raise InputError(f"{name} does not know the scene {scene.name}: {why}. Choose one of {allowed}.")
         return self.models[name]
 
-    def player(self, name: str, scene: Scene) -> Player:
+    def build_player(self, name: str, scene: Scene) -> Player:
         """Return a scene on this anatomy's open cortex with a deformer by name.
 
         Raises
@@ -231,9 +231,11 @@ class Theatre:
         InputError
             As `deformer`; an anatomy without open cortex.
         """
-        return Player(self.stage(scene), self.deformer(name, scene), uncertainty=self.uncertainty(scene))
+        return Player(
+            self.build_stage(scene), self.build_deformer(name, scene), uncertainty=self.estimate_uncertainty(scene)
+        )
 
-    def uncertainty(self, scene: Scene) -> Uncertainty | None:
+    def estimate_uncertainty(self, scene: Scene) -> Uncertainty | None:
         """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""
         found = self.uncertainties.get(scene.name)
         return found if found and found.mark == mark_of(scene, self.site, self.choose_element(scene)) else None
@@ -278,7 +280,7 @@ def open_theatre(
         check_scene_exists(name)
     # # Trained models alone would not detect this, and the FEM fallback would fail too late.
     find_device(device, LIVE.precision)
-    path = template_path() if anatomy is None else Path(anatomy)
+    path = get_template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)
     scan = to_intensity_path(path)
     learnt = to_model_path(path) if model is None else Path(model)

@@ -93,7 +93,7 @@ def run(theatre: Theatre, scene: Scene, every: int) -> AblationRun:
         A body without fixed nodes, or a frame without a good solution.
     """
     before = list_device_arrays()  # freed meanwhile or not, they are not the scene's
-    fem = theatre.fem(scene, scene.accuracy, live=True)
+    fem = theatre.build_fem(scene, scene.accuracy, live=True)
     times = scene.times[::every].tolist()
     found, seconds = _solved(fem, scene, theatre.site, times)
     wp.synchronize()
@@ -106,12 +106,12 @@ def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tupl
     """Displacements (V, 3) [m], NaN of what was cut out, and seconds of each frame."""
     last, found, seconds, stage = None, [], [], Stage(scene, site)
     for time in times:
-        loads = scene.loads(site, scene.path(time), time)
+        loads = scene.build_loads(site, scene.path(time), time)
         wp.synchronize()
         begun = clock.perf_counter()
         last = fem.deform(loads, start=last)
         seconds.append(clock.perf_counter() - begun)
-        found.append(np.where(stage.at(loads).anatomy.orphaned[:, None], np.nan, last.displacement[0]))
+        found.append(np.where(stage.select_stage(loads).anatomy.orphaned[:, None], np.nan, last.displacement[0]))
         if not last.outcome[0].good:
             raise InputError(f"the frame at {time:.2f} s is not solved: {last.outcome[0].value}")
     return found, seconds

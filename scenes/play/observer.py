@@ -82,7 +82,7 @@ class TumourEstimate:
         """95 % bound on the error of the least certain tumour vertex [m]; None if the observation is rejected."""
         if self.location is None:
             return None
-        largest = np.linalg.eigvalsh(self.location.covariance(self.anatomy.tumour_nodes))[:, -1].max()
+        largest = np.linalg.eigvalsh(self.location.compute_covariance(self.anatomy.tumour_nodes))[:, -1].max()
         return float(np.sqrt(RADIUS_SQUARED * largest))
 
     @property
@@ -127,15 +127,15 @@ class TumourEstimate:
         tip = ", and where the tool touches" if len(self.observation.tips) else ""
         return f"{len(self.observation.now)} points of the cortex{tip}; no force, no stiffness"
 
-    def carried(self, positions: np.ndarray) -> np.ndarray:
+    def place_tumour(self, positions: np.ndarray) -> np.ndarray:
         """Positions (V, 3) [m] with the tumour's vertices where they are believed to be."""
         nodes, believed = self.anatomy.tumour_nodes, positions.copy()
         believed[nodes] = self.anatomy.mesh.nodes[nodes]
         if self.location is not None:
-            believed[nodes] += self.location.at(nodes)
+            believed[nodes] += self.location.compute_motion(nodes)
         return believed
 
-    def ellipsoid(self) -> Layer | None:
+    def build_ellipsoid(self) -> Layer | None:
         """Return the surface that contains the tumour centroid with a probability of 95 %; None after a rejection."""
         if self.location is None:
             return None
@@ -170,10 +170,10 @@ class Observer:
         """
         begun = clock.perf_counter()
         return locate_tumour(
-            self.site.anatomy, self.locator, lambda: self.seen(number, positions, tool), positions, begun
+            self.site.anatomy, self.locator, lambda: self.observe(number, positions, tool), positions, begun
         )
 
-    def seen(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
+    def observe(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
         """Sample the observation of a frame; arguments as of `estimate`."""
         sight, random = self.sight, np.random.default_rng([self.sight.seed, 1 + number])
         now = self._at(positions)
@@ -197,7 +197,7 @@ class Observer:
 
     def _as_a_whole(self, points: np.ndarray) -> np.ndarray:
         """Points (n, 3) [m] with the rigid error."""
-        return self._rigid.moved(points, self._at(self._rest).mean(axis=0))
+        return self._rigid.apply(points, self._at(self._rest).mean(axis=0))
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +228,7 @@ class RigidError:
     turn: np.ndarray
     shift: np.ndarray
 
-    def moved(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    def apply(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
         """Points (n, 3) [m] as they are seen, turned about a middle (3,) [m]."""
         return middle + Rotation.from_rotvec(self.turn).apply(points - middle) + self.shift
 

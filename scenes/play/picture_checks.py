@@ -94,7 +94,7 @@ def _said(frame: Frame, mask: np.ndarray) -> bool:
     share = float(np.isin(seen, OPENING.ids, invert=True).mean()) if len(seen) else 0.0
     if share < NOTICED + SLACK:
         return True
-    words = OPENING.said(dict(zip(layers, counts, strict=True))).removeprefix("partly ")
+    words = OPENING.describe(dict(zip(layers, counts, strict=True))).removeprefix("partly ")
     allowed = [words] * (share > WHOLE - SLACK) + [f"partly {words}"] * (share < WHOLE + SLACK)
     return any(all(has_text(frame.shown, line, FINE) for line in format_ground(said)) for said in allowed)
 
@@ -140,7 +140,7 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
         return True
     anatomy, rest = player.site.anatomy, player.site.anatomy.mesh.nodes
     true, moved = compute_middle(
-        anatomy, np.stack([player.positions(frame.deformation) - rest, player.believed(frame) - rest])
+        anatomy, np.stack([player.compute_positions(frame.deformation) - rest, player.estimate_positions(frame) - rest])
     )
     off, length = float(np.linalg.norm(moved - true)), float(np.linalg.norm(moved))
     said = [
@@ -155,7 +155,7 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
 
 def _corners(player: Player, frame: Frame) -> np.ndarray:
     """Corners (S, 3, 3) [m] of the tumour's triangles as they are drawn."""
-    return player.believed(frame)[player.stage.at(frame.loads).anatomy.tumour_surface]
+    return player.estimate_positions(frame)[player.stage.select_stage(frame.loads).anatomy.tumour_surface]
 
 
 def _distance(player: Player, frame: Frame, corners: np.ndarray, tip: np.ndarray) -> float:
@@ -164,4 +164,4 @@ def _distance(player: Player, frame: Frame, corners: np.ndarray, tip: np.ndarray
     model = find_first_model(player.deformer, frame.deformation)
     if model is None:
         return apart
-    return float(model.distance(frame.loads, frame.deformation, np.array([apart])).value[0])
+    return float(model.predict_distance(frame.loads, frame.deformation, np.array([apart])).value[0])

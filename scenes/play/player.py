@@ -172,12 +172,12 @@ class Player:
     @cached_property
     def camera(self) -> Camera:
         """The scene's camera as it starts."""
-        return self.scene.viewpoint.camera(self.site)
+        return self.scene.viewpoint.build_camera(self.site)
 
-    def camera_at(self, time: float) -> Camera:
+    def get_camera(self, time: float) -> Camera:
         """Return the scene's camera at a time [s]: one that stays is the same, whose backdrop is kept."""
         view = self.scene.viewpoint
-        return self.camera if view.path is None else view.camera(self.site, time)
+        return self.camera if view.path is None else view.build_camera(self.site, time)
 
     @cached_property
     def remembers(self) -> bool:
@@ -190,15 +190,15 @@ class Player:
         """True if the deformer is a trained model that integrates its tissue in time."""
         return isinstance(self.deformer, Learned) and bool(self.deformer.series)
 
-    def touch(self, number: int) -> Touch:
+    def get_touch(self, number: int) -> Touch:
         """Return the tool input of the script in a frame."""
         return self.scene.path(float(self.scene.times[number]))
 
-    def loads(self, number: int, touch: Touch | None = None) -> Loads:
+    def build_loads(self, number: int, touch: Touch | None = None) -> Loads:
         """Return the loads of a frame; `touch` replaces the script's."""
-        return self.scene.loads(self.site, touch or self.touch(number), float(self.scene.times[number]))
+        return self.scene.build_loads(self.site, touch or self.get_touch(number), float(self.scene.times[number]))
 
-    def answer(self, loads: Loads, last: Deformation | None = None) -> Deformation:
+    def compute_deformation(self, loads: Loads, last: Deformation | None = None) -> Deformation:
         """Compute the deformation from the last one; a trained model returns the drawn vertices only."""
         if isinstance(self.deformer, Learned):
             return self.deformer.deform(loads, start=last if self.follows else None, at=self.stage.nodes)
@@ -207,24 +207,24 @@ class Player:
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
         """Draw the frame of a touch at a time [s]; the deformer starts from the last solution."""
         begun = clock.perf_counter()
-        loads = self.scene.loads(self.site, touch, time)
-        deformation = self.answer(loads, last)
-        return self.drawn(number, touch, loads, deformation, clock.perf_counter() - begun)
+        loads = self.scene.build_loads(self.site, touch, time)
+        deformation = self.compute_deformation(loads, last)
+        return self.draw_frame(number, touch, loads, deformation, clock.perf_counter() - begun)
 
-    def drawn(self, number: int, touch: Touch, loads: Loads, deformation: Deformation, seconds: float) -> Frame:
+    def draw_frame(self, number: int, touch: Touch, loads: Loads, deformation: Deformation, seconds: float) -> Frame:
         """Draw the frame of a solution of loads, which took `seconds`."""
         begun = clock.perf_counter()
-        positions = self.positions(deformation)
-        held = None if self.scene.tool is None else self.tool(self.scene.tool, touch, positions)
-        stage, camera = self.stage.at(loads), self.camera_at(float(loads.times[0]))
-        picture = stage.picture(camera, positions, None if held is None else held.pose)
+        positions = self.compute_positions(deformation)
+        held = None if self.scene.tool is None else self.place_tool(self.scene.tool, touch, positions)
+        stage, camera = self.stage.select_stage(loads), self.get_camera(float(loads.times[0]))
+        picture = stage.render(camera, positions, None if held is None else held.pose)
         field = self.scene.viewpoint.field
         picture = picture if field is None else add_vignette(picture, field)
-        corners = stage.corners(None if held is None else held.pose)
+        corners = stage.compute_corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
         # # The observer's rendering time is not part of the estimate.
         seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds
-        tumour, rest = stage.tumour(_believed(positions, estimate)), stage.tumour_at_rest
+        tumour, rest = stage.build_tumour(_believed(positions, estimate)), stage.tumour_at_rest
         doubt = describe_outcome(deformation.outcome[0]) or (
             IN_BONE if held is not None and held.beyond > BLOCKED else ""
         )
@@ -233,7 +233,7 @@ class Player:
         promised = None if doubt else self._promised(deformation)
         error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, promised or 0.0, estimate)
         shown = None if gauge is None else replace(gauge, error=error.bound)
-        traces = () if estimate is None else list_traces(estimate, stage.truth(positions))
+        traces = () if estimate is None else list_traces(estimate, stage.build_reference(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
         motion = float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean())
         if estimate is None and error.moved is not None and not is_undeformed(deformation):
@@ -242,7 +242,7 @@ class Player:
         trained = find_first_model(self.deformer, deformation) is not None
         lines = format_errors(promised, error, trained, doubt, camera.width < FEW)
         head = format_head_lines(lines, picture.segmentation == TOOL)
-        remarks = self.scene.stopped(self.site, touch), "" if estimate is None else estimate.words
+        remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
             marks = Marks(band, shown, rest, traces)
@@ -292,14 +292,14 @@ class Player:
         """Return the error of the tumour position: known on the script's tool path; an estimate replaces its bound."""
         time = float(loads.times[0])
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
-        error = self.uncertainty.at(time, promised) if self.uncertainty is not None and scripted else NOT_KNOWN
+        error = self.uncertainty.evaluate(time, promised) if self.uncertainty is not None and scripted else NOT_KNOWN
         return (
             error
             if estimate is None
             else replace(error, observed=estimate.worst, registration=estimate.observation.rigid)
         )
 
-    def frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
+    def play_frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
         """Yield the frames of the scene, or each `every`-th.
 
         A model whose solutions are independent computes `together` frames in one batch. It takes a quarter of the time,
@@ -310,44 +310,44 @@ class Player:
         if together == 1 or self.remembers or not isinstance(self.deformer, Learned):
             last = None
             for number in numbers:
-                frame = self.draw(number, float(self.scene.times[number]), self.touch(number), last)
+                frame = self.draw(number, float(self.scene.times[number]), self.get_touch(number), last)
                 last = frame.deformation
                 yield frame
             return
         for first in range(0, len(numbers), together):
             some = numbers[first : first + together]
-            begun, asked = clock.perf_counter(), [self.loads(number) for number in some]
-            answers = self.answer(stacked(asked))
+            begun, asked = clock.perf_counter(), [self.build_loads(number) for number in some]
+            answers = self.compute_deformation(stacked(asked))
             seconds = (clock.perf_counter() - begun) / len(some)
             for row, (number, loads) in enumerate(zip(some, asked, strict=True)):
-                yield self.drawn(number, self.touch(number), loads, answers.rows(np.array([row])), seconds)
+                yield self.draw_frame(number, self.get_touch(number), loads, answers.rows(np.array([row])), seconds)
 
-    def positions(self, deformation: Deformation, row: int = 0) -> np.ndarray:
+    def compute_positions(self, deformation: Deformation, row: int = 0) -> np.ndarray:
         """Return positions (V, 3) [m] of all mesh vertices in one load case; vertices without result are undeformed."""
         positions = self.site.anatomy.mesh.nodes.copy()
         positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
-    def believed(self, frame: Frame) -> np.ndarray:
+    def estimate_positions(self, frame: Frame) -> np.ndarray:
         """Return the drawn positions (V, 3) [m] of all mesh vertices: the tumour's by the estimate, if there is one."""
-        return _believed(self.positions(frame.deformation), frame.estimate)
+        return _believed(self.compute_positions(frame.deformation), frame.estimate)
 
-    def tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> HeldTool:
+    def place_tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> HeldTool:
         """Compute the tool position: a pushing tool rests on the deformed cortex from outside.
 
         An idle tool is lifted off. Displaced tissue may carry it to the craniotomy edge, which stops it.
         """
         if self.scene.posed:
-            return HeldTool(self.scene.tip(self.site, touch), self.scene.pose(self.site, touch), 0.0)
+            return HeldTool(self.scene.compute_tip(self.site, touch), self.scene.compute_pose(self.site, touch), 0.0)
         inward = self.site.axis
-        carried = self.scene.contact(self.site, touch).carried(positions)
-        inside = self.site.within(carried, tool.radius)
+        carried = self.scene.find_contact(self.site, touch).carried(positions)
+        inside = self.site.clip_to_opening(carried, tool.radius)
         beyond = float(np.linalg.norm(inside - carried))
         tip = through = inside if beyond > CARRIED else carried
         if isinstance(tool, Probe):
             tip = find_resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
         tip = tip - compute_lift(touch.force) * inward
-        pose = tool.pose(tip, inward, self.site.right)
+        pose = tool.compute_pose(tip, inward, self.site.right)
         return HeldTool(tip, pose, beyond)
 
 
@@ -357,12 +357,12 @@ def is_undeformed(deformation: Deformation) -> bool:
 
 
 def _believed(positions: np.ndarray, estimate: TumourEstimate | None) -> np.ndarray:
-    return positions if estimate is None else estimate.carried(positions)
+    return positions if estimate is None else estimate.place_tumour(positions)
 
 
 def list_traces(estimate: TumourEstimate, truth: Layer) -> tuple[Trace, ...]:
     """Build the traces of an estimate: its ellipsoid, and the true tumour surface with its centroid."""
-    ellipsoid, true = estimate.ellipsoid(), Trace(truth, TRUE_STROKES, estimate.middle + estimate.true)
+    ellipsoid, true = estimate.build_ellipsoid(), Trace(truth, TRUE_STROKES, estimate.middle + estimate.true)
     if ellipsoid is None:
         return (true,)
     return Trace(ellipsoid, ELLIPSOID_STROKES, estimate.middle + estimate.motion), true

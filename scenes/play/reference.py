@@ -25,8 +25,8 @@ def build_reference_fem(theatre: Theatre, scene: Scene) -> Fem | OperatedFem:
     A frame that starts from the last one takes a quarter of the time of one that is solved apart.
     """
     if find_device(theatre.device, TRAIN.precision).name != "cpu":
-        return theatre.fem(scene, TRAIN, TOGETHER)
-    return theatre.fem(scene, TRAIN, 1, live=True)
+        return theatre.build_fem(scene, TRAIN, TOGETHER)
+    return theatre.build_fem(scene, TRAIN, 1, live=True)
 
 
 def is_history_dependent(fem: Deformer) -> bool:
@@ -49,7 +49,7 @@ def solve_reference_frames(
     `progress` hears how many more frames are solved, whenever some are. `fem` are finite elements that are at hand, as
     `build_reference_fem` makes them.
     """
-    fem = fem or theatre.fem(scene, TRAIN, TOGETHER)
+    fem = fem or theatre.build_fem(scene, TRAIN, TOGETHER)
     apart = not is_history_dependent(fem) and not (isinstance(fem, Fem) and fem.batch == 1)
     size = TOGETHER if apart else 1
     answers: list[Deformation] = []

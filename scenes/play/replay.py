@@ -64,7 +64,7 @@ class FrameCache(Generic[T]):
         """Frames that are not run again, by number."""
         self._last: dict[int, T] = {}
 
-    def towards(self, number: int) -> tuple[int, T]:
+    def approach_frame(self, number: int) -> tuple[int, T]:
         """Return the frame, or one nearer to it, and its number: a call takes one step at most."""
         known = self.kept | self._last
         starts = known if self._course.back else [other for other in known if other <= number]
@@ -101,20 +101,22 @@ class ReplaySession:
         self._reel: FrameCache[Deformation] | None = None
         if course is not None:
             self._reel = FrameCache(
-                len(scene.times), lambda number, last: player.answer(player.loads(number), last), course
+                len(scene.times),
+                lambda number, last: player.compute_deformation(player.build_loads(number), last),
+                course,
             )
         self._last: Deformation | None = None
 
-    def towards(self, number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
+    def approach_frame(self, number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
         """Return number and solution of a frame, or of one on the way to it; `touch` under manual control."""
         player, last = self.player, self._last
         if self._reel is not None and touch is None:
-            number, self._last = self._reel.towards(number)
+            number, self._last = self._reel.approach_frame(number)
             return number, self._last
-        loads = player.loads(number, touch)
+        loads = player.build_loads(number, touch)
         if player.remembers and last is not None:
             last = replace(last, time=loads.times - 1.0 / player.scene.frames_per_second)
-        self._last = player.answer(loads, last)
+        self._last = player.compute_deformation(loads, last)
         return number, self._last
 
 

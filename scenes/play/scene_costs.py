@@ -67,7 +67,7 @@ class Thumbnail:
 def render_thumbnail(player: Player, name: str) -> Thumbnail:
     """Return the frame of a deformer `name` in which the tumour has moved most, of those after the last cut, small."""
     every = max(1, (len(player.scene.times) - 1) // (DRAWN - 1))
-    frames = list(player.frames(every))
+    frames = list(player.play_frames(every))
     best = max(frames, key=lambda frame: (_cuts(player, frame), frame.moved))
     said = add_cost_label(best, name)
     taken = best.taken | (said != best.shown).any(axis=2).view(np.uint8)
@@ -78,7 +78,7 @@ def render_thumbnail(player: Player, name: str) -> Thumbnail:
 
 
 def _cuts(player: Player, frame: Frame) -> int:
-    left = player.stage.at(frame.loads).left
+    left = player.stage.select_stage(frame.loads).left
     return 0 if left is None else left.done
 
 

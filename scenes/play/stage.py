@@ -12,7 +12,7 @@ from ar.optics.camera import Camera
 from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
-from ar.rendering.renderer import Lamp, Picture, Renderer, lamp_beside
+from ar.rendering.renderer import Lamp, Picture, Renderer, build_lamp
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
 from sim.discretisation.resected_body import RemainingBody, list_remaining_bodies
@@ -63,7 +63,7 @@ class Cortex:
     solid: Solid | None
     colour: np.ndarray | tuple[float, float, float] = CORTEX_COLOUR
 
-    def at(self, positions: np.ndarray) -> Layer:
+    def build_layer(self, positions: np.ndarray) -> Layer:
         """Return the layer at `positions` (V, 3) [m]."""
         rest = None if self.solid is None else self.rest
         return Layer(
@@ -90,7 +90,7 @@ class Stage:
         """The body, as far as it is left."""
         return self.site.anatomy if self.left is None else self.left.anatomy
 
-    def at(self, loads: Loads) -> Stage:
+    def select_stage(self, loads: Loads) -> Stage:
         """Return the stage as the first load case has it: after the steps of a resection that are done."""
         cause = loads.of(Resected)
         return self if cause is None else self._after[int(cause.done[0])]
@@ -112,22 +112,22 @@ class Stage:
     @cached_property
     def lamp(self) -> Lamp:
         """A lamp over the surgeon's shoulder."""
-        camera, site, look = self.scene.viewpoint.camera(self.site), self.site, self.scene.look
-        lamp = lamp_beside(camera, site.origin, radius=1.6 * site.radius)
+        camera, site, look = self.scene.viewpoint.build_camera(self.site), self.site, self.scene.look
+        lamp = build_lamp(camera, site.origin, radius=1.6 * site.radius)
         turned = Rotation.from_rotvec(look.turn * site.axis).apply(lamp.position - site.origin)
         return replace(lamp, position=site.origin + turned, strength=look.lamp, ambient=look.ambient)
 
-    def cortex(self, positions: np.ndarray) -> Layer:
+    def build_cortex(self, positions: np.ndarray) -> Layer:
         """Return the open cortex at `positions` (V, 3) [m]."""
-        return self._cortex.at(positions)
+        return self._cortex.build_layer(positions)
 
-    def visible(self, positions: np.ndarray) -> Layer:
+    def build_visible(self, positions: np.ndarray) -> Layer:
         """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts.
 
         Where the brain comes off the skull, what is beyond the drape's hole is drawn below it. The drape lies on the
         scan, and a bump that slides by millimetres would come through where there was none.
         """
-        layer = self._visible.at(positions)
+        layer = self._visible.build_layer(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
             return layer
         beyond = self.site.across(layer.vertices) - HOLE * self.site.clearance
@@ -141,11 +141,11 @@ class Stage:
         vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
         return Layer("brain", CORTEX, mesh.nodes[vertices], triangles, CORTEX_COLOUR)
 
-    def layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
+    def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
-        return self._layers(positions, self.corners(pose))
+        return self._layers(positions, self.compute_corners(pose))
 
-    def corners(self, pose: np.ndarray | None) -> np.ndarray | None:
+    def compute_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
         """Corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
         if self.scene.tool is None or pose is None:
             return None
@@ -153,25 +153,25 @@ class Stage:
 
     def _layers(self, positions: np.ndarray, corners: np.ndarray | None) -> list[Layer]:
         look = self.scene.look
-        seen = [self.visible(positions), self._drape]
+        seen = [self.build_visible(positions), self._drape]
         seen += [] if look.finger is None else [self._finger]
-        seen += [self._squares.at(positions)] if look.cottonoids else []
+        seen += [self._squares.build_layer(positions)] if look.cottonoids else []
         if self.scene.tool is None or corners is None:
             return seen
         faces = self.scene.tool.mesh.faces
         return [*seen, Layer("tool", TOOL, corners, faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)]
 
-    def picture(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None) -> Picture:
+    def render(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None) -> Picture:
         """Render the image of `layers` by a camera."""
-        return self.shown(camera, positions, self.corners(pose))
+        return self.render_tool_corners(camera, positions, self.compute_corners(pose))
 
-    def shown(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
+    def render_tool_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
         """Return the same, of a tool by its corners (t, 3) [m]."""
         layers = self._layers(positions, corners)
         count = len(layers)
         if count not in self._renderers:
             self._renderers[count] = Renderer(layers, self.lamp, self.device)
-        return self._renderers[count].picture(camera, [layer.vertices for layer in layers if not layer.still])
+        return self._renderers[count].render(camera, [layer.vertices for layer in layers if not layer.still])
 
     @cached_property
     def _squares(self) -> Squares:
@@ -186,19 +186,19 @@ class Stage:
         """Renderers by the number of layers: with a tool and without."""
         return {}
 
-    def tumour(self, positions: np.ndarray) -> Layer:
+    def build_tumour(self, positions: np.ndarray) -> Layer:
         """Return the tumour's surface at `positions` (V, 3) [m]."""
         vertices, triangles = self._tumour
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
-    def truth(self, positions: np.ndarray) -> Layer:
+    def build_reference(self, positions: np.ndarray) -> Layer:
         """Return the tumour surface computed by FEM, drawn for comparison with an estimate."""
-        return replace(self.tumour(positions), name="truth", colour=np.array(TRUTH_COLOUR))
+        return replace(self.build_tumour(positions), name="truth", colour=np.array(TRUTH_COLOUR))
 
     @cached_property
     def tumour_at_rest(self) -> Layer:
         """The tumour's surface in the scan."""
-        return self.tumour(self.site.anatomy.mesh.nodes)
+        return self.build_tumour(self.site.anatomy.mesh.nodes)
 
     @property
     def tumour_vertices(self) -> np.ndarray:

@@ -30,13 +30,13 @@ class StereoObserver:
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
-        shot, anatomy = self.shot(number, positions, tool), self.stage.site.anatomy
+        shot, anatomy = self.render_pair(number, positions, tool), self.stage.site.anatomy
         tips = NOTHING.now if tool is None else find_touched(anatomy, positions, tool)
         _ = self._first_shot  # to draw it takes long
         begun = clock.perf_counter()
-        return locate_tumour(anatomy, self.locator, lambda: self.seen(shot, tips), positions, begun)
+        return locate_tumour(anatomy, self.locator, lambda: self.observe(shot, tips), positions, begun)
 
-    def seen(self, shot: StereoPair, tips: np.ndarray) -> Observation:
+    def observe(self, shot: StereoPair, tips: np.ndarray) -> Observation:
         """Extract the observation from a stereo pair, with contact points of a tool, `tips` (k, 3) [m].
 
         Raises
@@ -49,16 +49,18 @@ class StereoObserver:
             return observe_point_cloud(site, shot, sight.points, self._tracked(0), tips)
         return observe_points(site, self.first, shot, self._tracked(1), tips)
 
-    def shot(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> StereoPair:
+    def render_pair(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> StereoPair:
         """Render both eyes' images of a frame, for positions (V, 3) [m] and a tool's corners (t, 3) [m].
 
         Number -1 is before the first frame.
         """
         scene = self.stage.scene
         time = float(scene.times[min(max(number, 0), len(scene.times) - 1)])
-        left, right = (replace(scene.viewpoint, eye=eye).camera(self.stage.site, time) for eye in ("left", "right"))
+        left, right = (
+            replace(scene.viewpoint, eye=eye).build_camera(self.stage.site, time) for eye in ("left", "right")
+        )
         pictures = [
-            self._noisy(stage.shown(camera, positions, tool).colour, number, eye)
+            self._noisy(stage.render_tool_corners(camera, positions, tool).colour, number, eye)
             for eye, (stage, camera) in enumerate(zip(self._stages, (left, right), strict=True))
         ]
         seen = None if tool is None or scene.tool is None else (tool, np.asarray(scene.tool.mesh.faces))
@@ -77,7 +79,7 @@ class StereoObserver:
 
     @cached_property
     def _first_shot(self) -> StereoPair:
-        return self.shot(-1, self.stage.site.anatomy.mesh.nodes)
+        return self.render_pair(-1, self.stage.site.anatomy.mesh.nodes)
 
     @cached_property
     def _stages(self) -> tuple[Stage, Stage]:
@@ -104,4 +106,4 @@ class TrackedMicroscope:
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         """Places (n, 3) [m] as they are seen."""
-        return self.error.moved(places, self.middle)
+        return self.error.apply(places, self.middle)

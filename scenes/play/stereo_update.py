@@ -57,7 +57,7 @@ class StereoPair:
     pictures: tuple[np.ndarray, np.ndarray]
     tool: tuple[np.ndarray, np.ndarray] | None = None
 
-    def seen(self, site: Site) -> StereoView:
+    def rectify(self, site: Site) -> StereoView:
         """Return the windows about an opening.
 
         Raises
@@ -104,7 +104,7 @@ def observe_first(site: Site, shot: StereoPair, count: int, rigid: Rigid) -> Fir
     InputError
         As `StereoPair.seen`; too few points; points off the scan's cortex.
     """
-    view = shot.seen(site)
+    view = shot.rectify(site)
     pixels = build_pixel_grid(site, view, count)
     found = triangulate_seen_points(site, view, pixels)
     points = rigid(found.points)
@@ -115,7 +115,7 @@ def observe_first(site: Site, shot: StereoPair, count: int, rigid: Rigid) -> Fir
             "are not swapped, or calibrate them again."
         )
     good = find_supported(rest, points - rest)
-    demand(int(good.sum()), len(pixels))
+    require_points(int(good.sum()), len(pixels))
     around, still = find_surroundings(site, view)
     return First(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
 
@@ -128,13 +128,13 @@ def observe_points(site: Site, first: First, shot: StereoPair, rigid: Rigid, tip
     InputError
         As `StereoPair.seen`; too few points; surroundings that seem to move; motions larger than are searched for.
     """
-    view = shot.seen(site)
+    view = shot.rectify(site)
     check_no_motion(first, view, rigid)
     which, there = follow_pixels(first.view, view, first.pixels)
     found = triangulate_seen_points(site, view, there)
     now, rest = rigid(found.points), first.rest[which[found.which]]
     good = find_supported(rest, now - rest)
-    demand(int(good.sum()), first.asked, MOVED_FAR)
+    require_points(int(good.sum()), first.asked, MOVED_FAR)
     motion = float(np.median(np.linalg.norm(now - rest, axis=1)))
     if motion > FARTHEST:
         raise InputError(
@@ -149,13 +149,13 @@ def observe_point_cloud(site: Site, shot: StereoPair, count: int, rigid: Rigid, 
 
     Arguments and errors as of `observe_points`.
     """
-    view = shot.seen(site)
+    view = shot.rectify(site)
     pixels = build_pixel_grid(site, view, count)
     found = triangulate_seen_points(site, view, pixels)
     points = rigid(found.points)
     rest, _ = find_on_cortex(site, points)
     good = find_supported(rest, points - rest)
-    demand(int(good.sum()), len(pixels))
+    require_points(int(good.sum()), len(pixels))
     return Observation(points[good], None, compute_deviations(found.sigma[good]), rigid(tips))
 
 
@@ -228,7 +228,7 @@ def compute_deviations(sigma: np.ndarray) -> np.ndarray:
     return sigma * (SIGMA / WHITE)
 
 
-def demand(count: int, asked: int, other_reason: str = "") -> None:
+def require_points(count: int, asked: int, other_reason: str = "") -> None:
     """Raise InputError where too few points are seen of those that were looked for; it may have another reason too."""
     if count < FEWEST * asked:
         raise InputError(

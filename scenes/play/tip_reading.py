@@ -52,7 +52,7 @@ def read_tip_distance(
     model = find_first_model(deformer, answer)
     if model is None:
         return TipDistance(apart, None)
-    found = model.distance(loads, answer, np.array([apart]))
+    found = model.predict_distance(loads, answer, np.array([apart]))
     promised = float(found.bound[0, 0])
     kept = answer.outcome[0].good and promised < float("inf")
     return TipDistance(float(found.value[0]), promised if kept else None)

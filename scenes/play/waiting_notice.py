@@ -24,13 +24,13 @@ class Busy:
         self._thread = threading.Thread(target=self._watch, name="busy", daemon=True)
         self._thread.start()
 
-    def on(self, what: str) -> None:
+    def begin_work(self, what: str) -> None:
         """Mark the start or continuation of work on `what`."""
         with self._lock:
             self._what = what
             self._since = clock.perf_counter() if self._since is None else self._since
 
-    def off(self) -> None:
+    def end_work(self) -> None:
         """The work is done."""
         with self._lock:
             self._since = None

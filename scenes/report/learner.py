@@ -9,7 +9,7 @@ import numpy as np
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
 from surrogate.data.splits import DiscSplit, leave_sectors_out
-from surrogate.evaluation.coverage import TENTHS, coverage
+from surrogate.evaluation.coverage import TENTHS, compute_coverage
 from surrogate.evaluation.score import SolveCounts, time_model_alone, time_single_loads
 from surrogate.training.train import train
 
@@ -100,7 +100,7 @@ def compute_coverage_beyond(
     model, found = trained.models[spec.name], trained.left_out.get(spec.name)
     held = {} if found is None else {"discs": found.held[0]}
     if model.bounds is not None and len(outside) >= TENTHS:
-        held["beyond"] = coverage(model, outside, truth).held[0]
+        held["beyond"] = compute_coverage(model, outside, truth).held[0]
     return {name: share for name, share in held.items() if share is not None}
 
 

@@ -17,8 +17,8 @@ from sim.loads import Pushed
 
 from ..play.stage import TOOL, Stage
 from ..script.scene import find_scene
-from ..script.shipped_files import template_path
-from ..script.site import Site, site_of
+from ..script.shipped_files import get_template_path
+from ..script.site import Site, build_site
 from ..script.tool import Probe
 from ..script.viewpoint import Viewpoint
 from .reference import get_reference
@@ -43,17 +43,17 @@ def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     predicted = there.copy()
     predicted[anatomy.tumour_nodes] = anatomy.mesh.nodes[anatomy.tumour_nodes] + answer[worst]
     (pushed,) = study.played.every(Pushed)
-    site = site_of(anatomy)
-    scan = read_intensity(to_intensity_path(template_path())) if study.of_template else None
+    site = build_site(anatomy)
+    scan = read_intensity(to_intensity_path(get_template_path())) if study.of_template else None
     middle = there[anatomy.tumour_nodes].mean(axis=0)
-    camera = look_at(VIEW.camera(site).centre, middle, site.up, VIEW.fov, VIEW.width, VIEW.height)
+    camera = look_at(VIEW.build_camera(site).centre, middle, site.up, VIEW.fov, VIEW.width, VIEW.height)
     radius = float(pushed.footprint[worst])
     tip = find_rested_tip(site, pushed.point[worst], there, radius)
     tool = Probe(radius)
     stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
-    picture = stage.picture(camera, there, tool.pose(tip, site.axis, site.right))
-    shown = composite(picture, camera, stage.tumour(predicted), style="window", cover=Cover((TOOL,))).colour
-    reference = stage.tumour(there)
+    picture = stage.render(camera, there, tool.compute_pose(tip, site.axis, site.right))
+    shown = composite(picture, camera, stage.build_tumour(predicted), style="window", cover=Cover((TOOL,))).colour
+    reference = stage.build_tumour(there)
     draw_dashes(
         shown, find_outlines(compute_silhouette(camera, reference.vertices, reference.triangles)), YELLOW, DASHED, 1
     )
@@ -68,5 +68,5 @@ def find_rested_tip(site: Site, point: np.ndarray, positions: np.ndarray, radius
     point (3,): at rest [m]; positions (V, 3): of all mesh vertices now [m]; radius of the ball [m].
     """
     place = point - site.origin
-    carried = site.contact(float(place @ site.right), float(place @ site.up), radius).carried(positions)
+    carried = site.find_contact(float(place @ site.right), float(place @ site.up), radius).carried(positions)
     return find_resting_tip(positions, site.anatomy.open_surface, carried, site.axis, radius)

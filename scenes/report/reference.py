@@ -101,7 +101,7 @@ def _read(study: ReportStudy, kind: str, count: int) -> ReferenceSolutions:
             path.open("rb") as raw,
         ):
             names = "displacement", "good", "seconds"
-            arrays = Archive(raw, REMADE).arrays(names)
+            arrays = Archive(raw, REMADE).read_arrays(names)
             kept.append([arrays[name] for name in names])
     return ReferenceSolutions(*(np.stack(part) for part in zip(*kept, strict=True)))
 

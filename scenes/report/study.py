@@ -27,7 +27,7 @@ from surrogate.data.encode import split_forces
 from surrogate.data.splits import DiscSplit, leave_discs_out
 from surrogate.training.expansion import EXPANDED, Expansion
 
-from ..script.shipped_files import template_path
+from ..script.shipped_files import get_template_path
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class ReportStudy:
     @cached_property
     def of_template(self) -> bool:
         """True if the body is the shipped template, of which other meshes can be built."""
-        return self.anatomy.digest == read_anatomy(template_path()).digest
+        return self.anatomy.digest == read_anatomy(get_template_path()).digest
 
     @cached_property
     def tissue(self) -> Elasticity:
@@ -129,7 +129,7 @@ class ReportStudy:
     @cached_property
     def answers(self) -> np.ndarray:
         """The data's own solutions (B, k, 3) [m] of `converged`, at the tumour's vertices."""
-        return self.dataset.displacement(self.anatomy.tumour_nodes)[self.dataset.good]
+        return self.dataset.read_displacement(self.anatomy.tumour_nodes)[self.dataset.good]
 
     @cached_property
     def discs(self) -> DiscSplit:

@@ -32,7 +32,7 @@ class Approach:
     tilt: tuple[float, float] = (0.0, 0.0)
     line: bool = False
 
-    def followed(self, path: Path) -> Path:
+    def follow(self, path: Path) -> Path:
         """Return the same motion of the hand, begun at the entry instead of the middle, and along the trajectory."""
 
         def along(time: float) -> Touch:
@@ -42,7 +42,7 @@ class Approach:
 
         return along
 
-    def held(self, tool: Instrument) -> Instrument:
+    def align_tool(self, tool: Instrument) -> Instrument:
         """Return the same tool with its shaft along the line.
 
         A blade, whose contact depends on its posture, keeps it.

@@ -60,7 +60,7 @@ class HandHeld:
         way = sample_wandering(self.seed, time)
         lifted = np.array([0.0, self.breath * np.sin(2.0 * np.pi * BREATH * time), 0.0])
         turn = self.turn * way[3:]
-        moved = camera.moved(self.shift * way[:3] + lifted)
+        moved = camera.move(self.shift * way[:3] + lifted)
         angle = float(np.linalg.norm(turn))
         return moved.perturb(np.degrees(angle), tuple(turn)) if angle > 0.0 else moved
 
@@ -89,7 +89,7 @@ class Orbit:
         degrees = np.degrees(self.reach * np.sin(2.0 * np.pi * time / self.period))
         to_target = camera.to_camera_frame(np.asarray(target))
         # About the target in place of the camera's own centre.
-        return camera.moved(to_target).perturb(degrees).moved(-to_target)
+        return camera.move(to_target).perturb(degrees).move(-to_target)
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,8 @@ class Microscope:
             distance += share * (setting.distance - distance)
             zoom *= (setting.zoom / zoom) ** share
         first = float(camera.to_camera_frame(np.asarray(target))[2])
-        moved = camera.moved(np.array([0.0, 0.0, first - distance * first]))
-        return moved.refocus(self.focal_length, first, distance * first).zoomed(zoom)
+        moved = camera.move(np.array([0.0, 0.0, first - distance * first]))
+        return moved.refocus(self.focal_length, first, distance * first).zoom(zoom)
 
 
 @lru_cache(maxsize=16)

@@ -10,7 +10,7 @@ from sim.anatomy import Anatomy
 from sim.effects import Resection
 from sim.errors import InputError
 
-from .site import site_of
+from .site import build_site
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Debulking:
     times: tuple[float, ...]
     corridor: float = 5e-3
 
-    def done(self, time: float) -> int:
+    def count_done(self, time: float) -> int:
         """Count the steps done at a time [s]."""
         return int(np.searchsorted(self.times, time, side="right"))
 
@@ -40,7 +40,7 @@ class Debulking:
         InputError
             No open cortex, or a tumour with too few tetrahedra for the shares.
         """
-        mesh, site = anatomy.mesh, site_of(anatomy)
+        mesh, site = anatomy.mesh, build_site(anatomy)
         tumour = np.flatnonzero(anatomy.in_tumour)
         shares = len(self.times)
         if len(tumour) < shares:

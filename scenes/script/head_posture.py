@@ -30,7 +30,7 @@ class Lying:
     direction: tuple[float, float, float] = SUPINE
     fluid: float = 1.0
 
-    def posture(self, nodes: np.ndarray) -> Posture:
+    def build_posture(self, nodes: np.ndarray) -> Posture:
         """One load case for a body of these nodes (V, 3) [m]."""
         down = np.array(self.direction) / np.linalg.norm(self.direction)
         return Posture(down[None], np.array([compute_fluid_level(nodes, down, self.fluid)]), np.ones(1))

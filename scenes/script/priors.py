@@ -47,7 +47,7 @@ class ParameterPrior:
     what: str
     source: str
 
-    def at(self, share: np.ndarray) -> np.ndarray:
+    def compute_quantiles(self, share: np.ndarray) -> np.ndarray:
         """Return the quantiles of the distribution at probabilities `share` (n,) in (0, 1)."""
         low, high = self.range
         match self.law:
@@ -142,7 +142,9 @@ def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
     def shares() -> np.ndarray:
         return (random.permutation(count) + random.uniform(size=count)) / count
 
-    columns = [prior.at(shares()).tolist() for prior in (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, TIP, TIP)]
+    columns = [
+        prior.compute_quantiles(shares()).tolist() for prior in (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, TIP, TIP)
+    ]
     columns.append(ndtri(shares()).tolist())
     rows = zip(*columns, strict=True)
     return [PatientSample(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
@@ -166,7 +168,7 @@ def sample_from_fit(
             f"the fitted tissue has a skull that this scene cannot have ({' or '.join(skulls)}): choose another scene, "
             "or another tissue by --tissue."
         )
-    names, poisson, ratios = tissue.drawn(count, seed, tuple(skulls))
+    names, poisson, ratios = tissue.sample(count, seed, tuple(skulls))
     random, made = np.random.default_rng([seed, 3]), []
     moduli = random.choice(tissue.young, count) if len(tissue.young) else None
     for number, one in enumerate(sample_priors(count, seed)):

@@ -37,7 +37,7 @@ from .head_posture import Lie, get_supine_pose
 from .sight import Sight, StereoSight
 from .site import Site
 from .tool import Instrument, Probe
-from .tool_paths import AIR, Path, Touch, idle
+from .tool_paths import AIR, Path, Touch, keep_idle
 from .viewpoint import PLAIN, USUAL, Appearance, Viewpoint
 
 # # Maximum number of frames of a scene: one hour at 30 frames/s.
@@ -106,7 +106,7 @@ class Scene:
 
     name: str
     title: str
-    path: Path = idle
+    path: Path = keep_idle
     duration: float = 4.0
     effects: tuple[Effect, ...] = (Elasticity(), Held(), Bonded(), ToolForce())
     tool: Instrument | None = PALPATION
@@ -136,7 +136,7 @@ class Scene:
                 f"the scene {self.name} asks for {needs[0]}, but has no tool: give it one, or leave it out."
             )
 
-    def made_of(self, tissue: Tissue | None, element: str | None) -> Scene:
+    def replace_tissue(self, tissue: Tissue | None, element: str | None) -> Scene:
         """Return the scene with another tissue, element, or both; tissue that relaxes keeps its Prony series.
 
         Raises
@@ -181,38 +181,38 @@ class Scene:
         kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
         return kept if self.surgery is None else (*kept, _resection(self.surgery, anatomy))
 
-    def contact(self, site: Site, touch: Touch) -> Place:
+    def find_contact(self, site: Site, touch: Touch) -> Place:
         """Return the material point that the tool touches."""
         assert self.tool is not None
-        return site.contact(touch.x, touch.y, self.tool.radius)
+        return site.find_contact(touch.x, touch.y, self.tool.radius)
 
     @property
     def posed(self) -> bool:
         """True if the tool is moved by its pose, not by a force."""
         return any(isinstance(effect, ToolContact | Retraction) for effect in self.effects)
 
-    def tip(self, site: Site, touch: Touch) -> np.ndarray:
+    def compute_tip(self, site: Site, touch: Touch) -> np.ndarray:
         """Compute the contact point (3,) [m] of a moved tool, limited by the craniotomy edge."""
         assert self.tool is not None
-        asked = self.contact(site, touch).point + touch.depth * site.direction(touch)
-        return site.within(asked, self.tool.radius)
+        asked = self.find_contact(site, touch).point + touch.depth * site.compute_direction(touch)
+        return site.clip_to_opening(asked, self.tool.radius)
 
-    def stopped(self, site: Site, touch: Touch) -> str:
+    def describe_stop(self, site: Site, touch: Touch) -> str:
         """Say that the bone's edge stops the tool short of where a touch asks for it; empty where it does not."""
         if self.tool is None:
             return ""
         asked = site.origin + touch.x * site.right + touch.y * site.up
         if self.posed:
-            asked = asked + touch.depth * site.direction(touch)
-        beyond = float(site.across(asked[None])[0]) - site.reach(self.tool.radius)
+            asked = asked + touch.depth * site.compute_direction(touch)
+        beyond = float(site.across(asked[None])[0]) - site.compute_reach(self.tool.radius)
         return f"the bone's edge stops the tool {1e3 * beyond:.1f} mm short" if beyond > SHORT else ""
 
-    def pose(self, site: Site, touch: Touch) -> np.ndarray:
+    def compute_pose(self, site: Site, touch: Touch) -> np.ndarray:
         """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""
         assert self.tool is not None
-        return self.tool.pose(self.tip(site, touch), site.axis, site.right)
+        return self.tool.compute_pose(self.compute_tip(site, touch), site.axis, site.right)
 
-    def loads(self, site: Site, touch: Touch, time: float) -> Loads:
+    def build_loads(self, site: Site, touch: Touch, time: float) -> Loads:
         """Build one load case: the cause of every effect that has one; without causes, only time advances."""
         causes = (self._cause(effect, site, touch, time) for effect in self.get_effects_on(site.anatomy))
         return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
@@ -224,21 +224,21 @@ class Scene:
                 return self._pushed(site, touch)
             case Resection():
                 assert self.surgery is not None
-                return Resected(np.array([self.surgery.done(time)]))
+                return Resected(np.array([self.surgery.count_done(time)]))
             case ToolContact():
-                return Touching(self.pose(site, touch)[None, None])
+                return Touching(self.compute_pose(site, touch)[None, None])
             case Retraction():
-                laid = self.pose(site, replace(touch, depth=-AIR))
-                return Retracted(laid[None], (self.pose(site, touch) - laid)[None, :3, 3])
+                laid = self.compute_pose(site, replace(touch, depth=-AIR))
+                return Retracted(laid[None], (self.compute_pose(site, touch) - laid)[None, :3, 3])
             case Gravity():
-                return self.lying(time).posture(site.anatomy.mesh.nodes)
+                return self.lying(time).build_posture(site.anatomy.mesh.nodes)
             case _:
                 return None
 
     def _pushed(self, site: Site, touch: Touch) -> Pushed:
         assert self.tool is not None
-        force = touch.force * site.direction(touch)
-        return Pushed(self.contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
+        force = touch.force * site.compute_direction(touch)
+        return Pushed(self.find_contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
 
 
 @lru_cache(8)

@@ -6,11 +6,11 @@ from importlib.resources import files
 from pathlib import Path
 
 
-def template_path() -> Path:
+def get_template_path() -> Path:
     """Return the path of the template anatomy, a .vtu; its scan and its models are next to it."""
     return Path(str(files("scenes"))) / "data" / "template.vtu"
 
 
 def get_spatula_model_path() -> Path:
     """Return a model of a spatula on the template, by its pose, in tissue that does not relax."""
-    return template_path().with_suffix(".spatula.npz")
+    return get_template_path().with_suffix(".spatula.npz")

@@ -19,31 +19,31 @@ HOLE = 0.98
 class Site(OpenCortex):
     """The open cortex, and what a hand asks of it."""
 
-    def reach(self, radius: float) -> float:
+    def compute_reach(self, radius: float) -> float:
         """Return the maximum distance [m] of a tool of this `radius` from the axis, as limited by the bone."""
         return max(0.0, HOLE * self.clearance - radius)
 
-    def within(self, point: np.ndarray, radius: float) -> np.ndarray:
+    def clip_to_opening(self, point: np.ndarray, radius: float) -> np.ndarray:
         """The point (3,) [m], brought back across the axis to where the bone stops a tool of this `radius` [m]."""
         arm = point - self.origin
         aside = arm - (arm @ self.axis) * self.axis
         length = float(np.linalg.norm(aside))
-        return point - max(0.0, 1.0 - self.reach(radius) / max(length, np.finfo(float).tiny)) * aside
+        return point - max(0.0, 1.0 - self.compute_reach(radius) / max(length, np.finfo(float).tiny)) * aside
 
-    def contact(self, x: float, y: float, radius: float) -> Place:
+    def find_contact(self, x: float, y: float, radius: float) -> Place:
         """Return the material point of the open cortex nearest to the place (x, y) [m] of its tangent plane.
 
         A tool of this `radius` [m] stays inside the opening: the place is brought back to where the bone stops it.
         """
-        return self.nearest(self.within(self.origin + x * self.right + y * self.up, radius))
+        return self.nearest(self.clip_to_opening(self.origin + x * self.right + y * self.up, radius))
 
-    def direction(self, touch: Touch) -> np.ndarray:
+    def compute_direction(self, touch: Touch) -> np.ndarray:
         """Return unit direction (3,) of a touch's force: inwards, tilted."""
         along = self.axis + np.tan(touch.tilt[0]) * self.right + np.tan(touch.tilt[1]) * self.up
         return along / np.linalg.norm(along)
 
 
-def site_of(anatomy: Anatomy) -> Site:
+def build_site(anatomy: Anatomy) -> Site:
     """Return the frame of an anatomy's open cortex.
 
     Raises

@@ -57,7 +57,7 @@ def smooth(t: float) -> float:
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t)
 
 
-def idle(time: float) -> Touch:
+def keep_idle(time: float) -> Touch:
     """Return no contact at any time [s]."""
     return Touch()
 
@@ -122,7 +122,7 @@ def _lowered(share: float, depth: float) -> float:
     return share * (AIR + depth) - AIR
 
 
-def wander(force: float, radius: float, speed: float) -> Path:
+def stroke_cortex(force: float, radius: float, speed: float) -> Path:
     """Straight strokes without a pause at `speed` [m/s] from point to point of a circle of `radius` [m].
 
     Each point is the golden angle on from the last: no stroke repeats another, and they cover the circle evenly.

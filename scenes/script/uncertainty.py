@@ -130,7 +130,7 @@ class Uncertainty:
         """True if the bound is only a rough estimate: few draws, or a load beyond the range of the tissue law."""
         return self.few or self.folded > 0
 
-    def at(self, time: float, surrogate: float = 0.0) -> TumourError:
+    def evaluate(self, time: float, surrogate: float = 0.0) -> TumourError:
         """Return the error at a time [s], where a trained model adds its own bound [m]."""
         parts = {name: self.read(values, time) for name, values in self.parts.items()}
         parts[SURROGATE] = surrogate / DEVIATIONS

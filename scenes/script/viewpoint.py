@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ar.optics.calibration import Calibration
-from ar.optics.camera import Camera, look_at, stereo_pair
+from ar.optics.camera import Camera, build_stereo_pair, look_at
 from sim.errors import InputError
 
 from .camera_paths import CameraPath
@@ -119,26 +119,26 @@ class Viewpoint:
             except ValueError as error:
                 raise InputError(str(error)) from error
 
-    def calibrated(self, calibration: Calibration) -> Viewpoint:
+    def calibrate(self, calibration: Calibration) -> Viewpoint:
         """Return this viewpoint with a calibrated camera and its image size."""
         return replace(self, calibration=calibration, width=calibration.width, height=calibration.height)
 
-    def target(self, site: Site) -> np.ndarray:
+    def find_target(self, site: Site) -> np.ndarray:
         """Return the target point of the camera (3,) [m]."""
         return site.origin + UNDER * site.axis
 
-    def camera(self, site: Site, time: float = 0.0) -> Camera:
+    def build_camera(self, site: Site, time: float = 0.0) -> Camera:
         """Return the camera that looks at a site at a time [s]."""
         outward = -np.cos(self.tilt) * site.axis + np.sin(self.tilt) * site.up
-        target = self.target(site)
+        target = self.find_target(site)
         found = look_at(target + self.distance * outward, target, site.up, self.fov, self.width, self.height)
         if self.calibration is not None:
-            found = self.calibration.camera(found.T_camera_world)
+            found = self.calibration.build_camera(found.T_camera_world)
         if self.path is not None:
             found = self.path(found, target, time)
         if self.eye is None:
             return found
-        left, right = stereo_pair(found, working_distance=float(found.to_camera_frame(target)[2]))
+        left, right = build_stereo_pair(found, working_distance=float(found.to_camera_frame(target)[2]))
         return left if self.eye == "left" else right
 
 

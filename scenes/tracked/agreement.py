@@ -40,7 +40,7 @@ class Agreement:
         """Description of the inconsistency of the poses; empty: none."""
         return next(filter(None, self.doubts.values()), "")
 
-    def seen(self, name: str, target: Pose, body: Pose, swapped: Pose | None) -> Agreement:
+    def add_image(self, name: str, target: Pose, body: Pose, swapped: Pose | None) -> Agreement:
         """Add an image: observed target pose, its body's pose, and the body's pose with swapped files.
 
         All are in one frame. A target whose position is too uncertain is skipped.

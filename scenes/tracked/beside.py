@@ -36,11 +36,11 @@ def render_slices(known: TrackingResult, painter: Painter, through: str) -> np.n
 
     Their band is the error of the motion, for tracking and registration do not move the tumour in the scan.
     """
-    stage, tool = painter.stage, painter.held(known, cubed=False)
+    stage, tool = painter.stage, painter.build_tool_layer(known, cubed=False)
     tip = None if known.T_scan_tool is None else known.T_scan_tool[:3, 3]
     others = [] if tool is None else [tool]
     error = known.motion.error if known.relied and known.motion.known else None
-    now = stage.tumour(known.motion.positions)
+    now = stage.build_tumour(known.motion.positions)
     return draw_slices_through(
         stage, Cut(now, stage.tumour_at_rest, error, not known.relied, others, tip, "motion"), through
     )

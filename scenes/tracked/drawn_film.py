@@ -90,7 +90,7 @@ class DrawnFilm:
     shots: tuple[VideoFrame, ...]
     taking: Taking
 
-    def picture(self, shot: VideoFrame) -> Named:
+    def get_image(self, shot: VideoFrame) -> Named:
         """Return an image as a video gives it."""
         return to_named_image(f"{shot.time:.1f} s", shot.colour, shot.time)
 
@@ -103,13 +103,13 @@ def build_synthetic_video(theatre: Theatre) -> DrawnFilm:
     InputError
         An anatomy without open cortex.
     """
-    view = replace(VIEW.calibrated(CAMERA), path=HandHeld(0))
+    view = replace(VIEW.calibrate(CAMERA), path=HandHeld(0))
     whole = find_scene(SCENE)
     scene = replace(
         whole, path=lambda time: whole.path(time + BEGIN), viewpoint=from_where_it_sees_all(view),
         frames_per_second=RATE, duration=LENGTH,
     )  # fmt: skip
-    stage = theatre.stage(scene)
+    stage = theatre.build_stage(scene)
     deformer = Dent(theatre.anatomy, stage.site)
     player = Player(stage, deformer)
     mounts, taking = mount_targets(player), Taking(troubles=TROUBLES)

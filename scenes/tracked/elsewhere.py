@@ -38,14 +38,14 @@ def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame
     """
     targets = {each.name: each for each in list_targets()}
     wanted = [each for each in (body, frame) if each != "camera"]
-    tracker = Tracker(calibration.camera(np.eye(4)), tuple(targets[name] for name in wanted))
+    tracker = Tracker(calibration.build_camera(np.eye(4)), tuple(targets[name] for name in wanted))
     state: TrackedTargets | None = None
     for picture in film:
         begun = time.perf_counter()
         state = tracker.track(picture.grey, state)
         verdict, pose, lacks = _known(state, wanted)
         if pose is not None and body == "camera":
-            pose = AT_REST.seen_from(pose)
+            pose = AT_REST.transform_to(pose)
         yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun, lacks)
 
 
@@ -83,7 +83,7 @@ def _known(state: TrackedTargets, wanted: list[str]) -> tuple[Verdict, Pose | No
         if name not in state.poses:
             return state.verdicts[name], None, name
     pose, *others = (state.poses[name] for name in wanted)
-    return Verdict.GOOD, pose.seen_from(others[0]) if others else pose, ""
+    return Verdict.GOOD, pose.transform_to(others[0]) if others else pose, ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +124,11 @@ class ExternalTracker:
     clock: Clock = field(default_factory=Clock)
     eye: CameraMount | None = None
 
-    def beside(self, time: float) -> Pose | None:
+    def find_tool(self, time: float) -> Pose | None:
         """Return the tool relative to the reference, in the image of a time [s]; None if the poses are missing."""
         return self._at(time, self._beside)
 
-    def reference(self, time: float) -> Pose | None:
+    def find_reference(self, time: float) -> Pose | None:
         """Return the reference in the camera's frame, in the image of a time [s]; None if it is unknown."""
         return self._at(time, self._in_camera)
 
@@ -137,7 +137,7 @@ class ExternalTracker:
         """The same poses with the tool's taken for the reference's."""
         return replace(self, tool=self.patient, patient=self.tool)
 
-    def agreed(self, time: float, seen: Mapping[str, Pose], before: Agreement) -> Agreement:
+    def compare_targets(self, time: float, seen: Mapping[str, Pose], before: Agreement) -> Agreement:
         """Check these poses against the printed targets that are visible in the image of a time [s].
 
         `seen` has the targets in the camera's frame, by name. If images determine the camera relative to the reference,
@@ -146,13 +146,13 @@ class ExternalTracker:
         """
         reference, tool = (seen.get(target().name) for target in (build_patient_reference, build_tool_cube))
         if self.eye is None:
-            body, other = self.beside(time), self.swapped.beside(time)
+            body, other = self.find_tool(time), self.swapped.find_tool(time)
             if tool is None or reference is None or body is None:
                 return before
-            return before.seen(build_tool_cube().name, tool.seen_from(reference), body, other)
-        body, other = self.reference(time), self.swapped.reference(time)
+            return before.add_image(build_tool_cube().name, tool.transform_to(reference), body, other)
+        body, other = self.find_reference(time), self.swapped.find_reference(time)
         for each, target, a, b in (("patient", reference, body, other), ("tool", tool, other, body)):
-            before = before if target is None or a is None else before.seen(each, target, a, b)
+            before = before if target is None or a is None else before.add_image(each, target, a, b)
         return before
 
     @property
@@ -161,7 +161,7 @@ class ExternalTracker:
         camera = {} if self.eye is None or self.eye.body is None else {"camera": self.eye.body}
         return {"tool": self.tool, "patient": self.patient, **camera}
 
-    def outside(self, time: float) -> str:
+    def describe_mismatch(self, time: float) -> str:
         """Describe the body whose poses are all far from the image of a time [s], and by how much; empty: none."""
         for name, stream in self.streams.items():
             at = stream.to_stream_day(time + self.clock.offset)
@@ -172,10 +172,10 @@ class ExternalTracker:
                 return f"the {name}'s poses end {at - last:.1f} s before this image"
         return ""
 
-    def age(self, time: float) -> float | None:
+    def compute_age(self, time: float) -> float | None:
         """Return the age [s] of the poses at an image's time [s]; None if current ones exist."""
         time = time + self.clock.offset
-        missing = [each.age(time) for each in self.streams.values() if each.at(time) is None]
+        missing = [each.compute_age(time) for each in self.streams.values() if each.interpolate(time) is None]
         return max(missing) if missing else None
 
     def _at(self, time: float, pose_at: Callable[[float], Pose | None]) -> Pose | None:
@@ -192,16 +192,16 @@ class ExternalTracker:
         return Pose(T, pose.covariance + np.outer(step, step), pose.residual, pose.corners)
 
     def _beside(self, time: float) -> Pose | None:
-        tool, patient = self.tool.at(time), self.patient.at(time)
-        return None if tool is None or patient is None else tool.seen_from(patient)
+        tool, patient = self.tool.interpolate(time), self.patient.interpolate(time)
+        return None if tool is None or patient is None else tool.transform_to(patient)
 
     def _in_camera(self, time: float) -> Pose | None:
         assert self.eye is not None
-        patient = self.patient.at(time)
-        body = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 0) if self.eye.body is None else self.eye.body.at(time)
+        patient = self.patient.interpolate(time)
+        body = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 0) if self.eye.body is None else self.eye.body.interpolate(time)
         if patient is None or body is None:
             return None
-        beside = patient.seen_from(body)
+        beside = patient.transform_to(body)
         T_camera_body = np.linalg.inv(self.eye.T_body_camera)
         arm = beside.T_camera_target[:3, 3] - self.eye.T_body_camera[:3, 3]
         slope = np.block([[-np.eye(3), build_cross_matrices(arm)], [np.zeros((3, 3)), -np.eye(3)]])
@@ -226,7 +226,7 @@ def estimate_video_clock(
     both = [
         (time, pose)
         for time in tool.times.tolist()
-        if (pose := ExternalTracker(tool, patient).beside(time)) is not None
+        if (pose := ExternalTracker(tool, patient).find_tool(time)) is not None
     ]
     others = [pose.T_camera_target[:3, 3] for _, pose in both]
     if not both:

@@ -43,13 +43,13 @@ def check_video(film: Path, rate: float, calibration: Calibration, camera: str) 
         try:
             for picture in islice(read_video(film, rate), 0, LOOKED, EACH):
                 check_image_size(picture.grey, calibration.width, calibration.height)
-                seen += [(targets[name], corners) for name, corners in detector.seen(picture.grey).items()]
+                seen += [(targets[name], corners) for name, corners in detector.detect(picture.grey).items()]
                 count += 1
         except ValueError as error:
             raise InputError(str(error)) from error
     if not count:
         raise InputError(f"{film}: holds no image. {GIVE}")
-    fit = fit_focal_length(calibration.camera(np.eye(4)), seen)
+    fit = fit_focal_length(calibration.build_camera(np.eye(4)), seen)
     if fit is not None and fit.differs:
         way = "longer" if fit.factor > 1.0 else "shorter"
         raise InputError(

@@ -31,7 +31,7 @@ from .tracked_tool import TrackedTool
 
 USUAL = Calibration((1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
 """Default camera of a video."""
-VIEW = Viewpoint(distance=0.32).calibrated(USUAL)
+VIEW = Viewpoint(distance=0.32).calibrate(USUAL)
 """View from arm's length: it shows the opening, the reference near it and the tool's cube."""
 # The reference's middle from the site, to the right, up and outwards [m]; turned from the line of sight [degree].
 BESIDE, TURNED = (-0.078, 0.010, 0.022), (28.0, -24.0)
@@ -146,8 +146,8 @@ def mount_targets(player: Player) -> Mounted:
         raise InputError(
             f"the scene {scene.name} has no ball, rod or blade that a cube could be put on: choose another."
         )
-    touch = player.touch(0)
-    pose = player.tool(scene.tool, touch, site.anatomy.mesh.nodes).pose
+    touch = player.get_touch(0)
+    pose = player.place_tool(scene.tool, touch, site.anatomy.mesh.nodes).pose
     T_tool_cube = np.eye(4)
     T_tool_cube[2, 3] = MOUNT
     towards = pose[:3, :3].T @ (camera.centre - pose[:3, :3] @ T_tool_cube[:3, 3] - pose[:3, 3])
@@ -181,15 +181,17 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
     readout = 0.0 if calibration is None else calibration.readout
     rest = site.anatomy.mesh.nodes
     for number in range(0, len(player.scene.times), every):
-        time, touch = float(player.scene.times[number]), player.touch(number)
-        last = player.answer(player.loads(number, touch), last)
+        time, touch = float(player.scene.times[number]), player.get_touch(number)
+        last = player.compute_deformation(player.build_loads(number, touch), last)
         wrong = taking.list_disturbances(time)
         if "gap" in wrong:
             continue
-        positions = player.positions(last)
-        pose = player.tool(tool, touch, positions).pose
-        held = Layer("tool", TOOL, *mounts.tool.at(pose), TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)
-        layers = [*stage.layers(positions, None), held]
+        positions = player.compute_positions(last)
+        pose = player.place_tool(tool, touch, positions).pose
+        held = Layer(
+            "tool", TOOL, *mounts.tool.build_surface(pose), TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True
+        )
+        layers = [*stage.build_layers(positions, None), held]
         renderer = renderer or Renderer(layers, stage.lamp, stage.device)
         targets = [
             (build_tool_cube(), pose @ np.linalg.inv(mounts.tool.T_cube_tool)),
@@ -200,7 +202,7 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
         tumour = positions[stage.tumour_vertices]
         places = np.stack([tumour.mean(axis=0), site.origin, *(T[:3, 3] for _, T in targets)])
         shown = (
-            view(player.camera_at(time))
+            view(player.get_camera(time))
             if readout == 0.0
             else np.concatenate([view(camera) for _, camera in split_row_bands(camera_at, readout, places)])
         )
@@ -213,7 +215,7 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
 
 def _later(player: Player, time: float, after: float) -> Camera:
     """Return the camera `after` seconds from an image's time [s]."""
-    return player.camera_at(time + after)
+    return player.get_camera(time + after)
 
 
 def _seen(
@@ -224,7 +226,7 @@ def _seen(
     camera: Camera,
 ) -> np.ndarray:
     """Render a camera's image (H, W, 3) uint8 with targets T_scan_target (4, 4), some of them covered by a hand."""
-    sharp = renderer.picture(camera, moving).colour
+    sharp = renderer.render(camera, moving).colour
     shown = render_targets(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
     for target, T in targets:
         if NAMES[target.name] in wrong:

@@ -144,7 +144,7 @@ class Follower:
     def tracker(self) -> Tracker:
         """Tracker of the required targets."""
         wanted = (build_patient_reference(),) if self.tool is None else (build_patient_reference(), build_tool_cube())
-        return Tracker(self.calibration.camera(np.eye(4)), wanted)
+        return Tracker(self.calibration.build_camera(np.eye(4)), wanted)
 
     def step(self, grey: np.ndarray, time: float, before: TrackingResult | None = None) -> TrackingResult:
         """Compute the tracking result of an image (H, W) uint8 taken at a time [s], from the result `before`.
@@ -166,7 +166,7 @@ class Follower:
         if self.elsewhere is None:
             return known
         agreement = Agreement() if before is None else before.agreement
-        known = replace(known, agreement=self.elsewhere.agreed(known.time, known.tracked.poses, agreement))
+        known = replace(known, agreement=self.elsewhere.compare_targets(known.time, known.tracked.poses, agreement))
         if not known.agreement.doubt or not (known.relied or known.state is TumourState.UNSURE):
             return known
         return replace(known, state=TumourState.UNSURE, words=known.agreement.doubt, band=None, parts={})
@@ -179,11 +179,11 @@ class Follower:
         forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
         tracked = self.tracker.track(grey, None if before is None or forgotten else before.tracked)
         other = self.elsewhere
-        reference = tracked.poses.get(PATIENT) if other is None or other.eye is None else other.reference(time)
+        reference = tracked.poses.get(PATIENT) if other is None or other.eye is None else other.find_reference(time)
         if reference is None:
             return self._without_reference(tracked, time, before)
         T_patient_scan = self.registration.T_patient_scan
-        camera = self.calibration.camera(reference.T_camera_target @ T_patient_scan)
+        camera = self.calibration.build_camera(reference.T_camera_target @ T_patient_scan)
         pace = self._pace(reference, time, None if forgotten else before)
         shutter = SKEW * self.calibration.readout * (pace or 0.0)
         known = self._with_tool(tracked, reference, time, before, shutter)
@@ -260,7 +260,7 @@ class Follower:
         spread = compute_tip_covariance(self.registration, self.tool, beside) + (
             LEVER * shutter / DEVIATIONS
         ) ** 2 * np.eye(3)
-        motion = self.motion.under(pose, spread, last)
+        motion = self.motion.compute_motion(pose, spread, last)
         moved = TumourState.GOOD if motion.moved > 0.0 else TumourState.REST
         state = TumourState.UNSURE if motion.doubt else moved if motion.known else TumourState.UNKNOWN
         words = UNKNOWN if state is TumourState.UNKNOWN else motion.doubt
@@ -269,16 +269,16 @@ class Follower:
     def _beside(self, tracked: TrackedTargets, reference: Pose, time: float) -> Pose | None:
         """Return the tool's cube relative to the reference."""
         if self.elsewhere is not None:
-            return self.elsewhere.beside(time)
+            return self.elsewhere.find_tool(time)
         cube = tracked.poses.get(TOOL)
-        return None if cube is None else cube.seen_from(reference)
+        return None if cube is None else cube.transform_to(reference)
 
     def _late(self, time: float) -> str:
         """Describe the age of an external tracker's poses, if they are missing; else empty."""
-        age = None if self.elsewhere is None else self.elsewhere.age(time)
+        age = None if self.elsewhere is None else self.elsewhere.compute_age(time)
         if self.elsewhere is None or age is None:
             return ""
-        if outside := self.elsewhere.outside(time):
+        if outside := self.elsewhere.describe_mismatch(time):
             return f"not known, {outside} (see --clock)"
         return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
 

@@ -110,7 +110,7 @@ class OverlayPage:
             signs=list_orientation_labels(stage.site),
             origins=self.origins,
         )
-        self.busy = Busy(lambda line: self.browser.status(escape(line)))
+        self.busy = Busy(lambda line: self.browser.show_status(escape(line)))
 
     @property
     def tooled(self) -> bool:
@@ -143,8 +143,8 @@ class OverlayPage:
                     self._restyle()
                     clock.sleep(LOOKS)
                     continue
-                self.busy.on(f"processing image {wanted}")
-                taken = film.at(wanted)
+                self.busy.begin_work(f"processing image {wanted}")
+                taken = film.read_image(wanted)
                 if taken is None:
                     if film.count < 1:
                         raise ValueError(f"{film.path}: holds no image.")
@@ -153,7 +153,7 @@ class OverlayPage:
                     continue
                 before = known if wanted == self.number + 1 else None
                 one = overlay_one(taken, None, before, self.follower, self._painter())
-                self.busy.off()
+                self.busy.end_work()
                 apart = 0.0 if before is None else taken.picture.time - before.time
                 due = now + min(max(apart, 0.0), SLOWEST)
                 self.interval = min(self.interval, one.known.interval)
@@ -195,7 +195,7 @@ class OverlayPage:
                 else:
                     one = overlay_one(Timed(picture, False), 0.0, known, self.follower, self._painter())
                     known, came = one.known, now
-                    self.browser.status("")
+                    self.browser.show_status("")
                     self._show(Timed(picture, False), one, 0, f"live from {self.name}")
         return list(self.shown)
 
@@ -212,7 +212,7 @@ class OverlayPage:
         try:
             yield
         except ValueError as error:
-            self.busy.off()
+            self.busy.end_work()
             self._fade(str(error))
             clock.sleep(min(STAYS, max(0.0, end - clock.perf_counter())))
             raise
@@ -236,7 +236,7 @@ class OverlayPage:
         """From tip to tumour, where both are known."""
         if known.state in IN_GREY:
             return None
-        return self.painter.gauge(known, self.painter.stage.tumour(known.motion.positions))
+        return self.painter.measure_tip(known, self.painter.stage.build_tumour(known.motion.positions))
 
     def _draw(self, one: Shown) -> None:
         """Put an image, its text, bodies, slices and chart on the page."""
@@ -244,15 +244,15 @@ class OverlayPage:
         self.drawn = self.style, self.through
         said = report(one, self._gauge(known), self.tooled, self.place)
         self.browser.show(max(self.number, 0), one.colour, said)
-        self.browser.move("tumour", painter.stage.tumour(known.motion.positions).vertices)
+        self.browser.move("tumour", painter.stage.build_tumour(known.motion.positions).vertices)
         grey = known.state in IN_GREY
         self._tint("tumour", STALE_COLOUR if grey else TUMOUR_COLOUR if known.relied else DOUBTFUL)
-        tool = painter.held(known, cubed=False)
+        tool = painter.build_tool_layer(known, cubed=False)
         if tool is not None:
             self.browser.move("tool", tool.vertices)
         if self.tooled:
             self._tint("tool", STALE_COLOUR if grey or tool is None else TOOL_COLOUR)
-        self.browser.show_beside(lambda: (render_slices(known, painter, look), self.history.chart()))
+        self.browser.show_beside(lambda: (render_slices(known, painter, look), self.history.draw_chart()))
 
     def _tint(self, name: str, colour: tuple[float, float, float]) -> None:
         if self.tints.get(name) != colour:
@@ -273,7 +273,7 @@ class OverlayPage:
         said = f"{why}: what is shown is old"
         if self.drawn == (said, self.style, self.through):
             return
-        self.browser.status(escape(said))
+        self.browser.show_status(escape(said))
         if self.newest is None or self.taken is None:
             self.browser.report(f'<p class="warn">{escape(why)}</p><p>{escape(hint)}</p>')
         else:

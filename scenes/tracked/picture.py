@@ -60,8 +60,8 @@ class Painter:
         """
         if known.state in IN_GREY or known.camera is None:
             return self._grey(colour, known, covered)
-        camera, tumour = known.camera, self.stage.tumour(known.motion.positions)
-        gauge = self.gauge(known, tumour)
+        camera, tumour = known.camera, self.stage.build_tumour(known.motion.positions)
+        gauge = self.measure_tip(known, tumour)
         before = self.stage.tumour_at_rest if known.motion.known and known.motion.moved > 0.0 else None
         doubt = "" if known.relied else known.words
         band = 0.0 if known.band is None else known.band
@@ -89,17 +89,17 @@ class Painter:
 
     def _layers(self, known: TrackingResult) -> list[Layer]:
         """Build the open cortex, under which the tumour is seen, the surrounding drape as in videos, and the tool."""
-        tool = self.held(known)
-        return [*self.stage.layers(known.motion.positions, None), *([] if tool is None else [tool])]
+        tool = self.build_tool_layer(known)
+        return [*self.stage.build_layers(known.motion.positions, None), *([] if tool is None else [tool])]
 
-    def held(self, known: TrackingResult, cubed: bool = True) -> Layer | None:
+    def build_tool_layer(self, known: TrackingResult, cubed: bool = True) -> Layer | None:
         """Return the tool where it is seen, with its cube or without."""
         pose = known.T_scan_tool
         if self.tool is None or pose is None:
             return None
-        return Layer("tool", TOOL, *self.tool.at(pose, cubed), TOOL_COLOUR)
+        return Layer("tool", TOOL, *self.tool.build_surface(pose, cubed), TOOL_COLOUR)
 
-    def gauge(self, known: TrackingResult, tumour: Layer) -> Gauge | None:
+    def measure_tip(self, known: TrackingResult, tumour: Layer) -> Gauge | None:
         """From the tool's tip to the tumour, with the error of both; None where one is not known."""
         if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
             return None
@@ -112,7 +112,7 @@ class Painter:
         """Return the outline in grey, if it has a place, and why."""
         over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
         if known.camera is not None and self.style != "none":
-            self._dot(over, known.camera, self.stage.tumour(known.motion.positions))
+            self._dot(over, known.camera, self.stage.build_tumour(known.motion.positions))
             if covered is not None:
                 over.colour[covered] = colour[covered]
         write_head(over, [])

@@ -39,7 +39,7 @@ class SeekableFilm:
     def _from(self, number: int) -> Iterator[Timed]:
         return read_timed(read_video(self.path, self.rate, colour=True, first=number))
 
-    def at(self, number: int) -> Timed | None:
+    def read_image(self, number: int) -> Timed | None:
         """Return an image by its number; None if the video ends before it, which `count` then gives."""
         if number != self.next:
             # From its start: a video's own leaps do not land on every frame.

@@ -66,7 +66,7 @@ class ToolMotion:
         """The brain as in the scan."""
         return BrainMotion(self.stage.anatomy.mesh.nodes)
 
-    def under(
+    def compute_motion(
         self, T_scan_tool: np.ndarray, tip_covariance: np.ndarray, before: BrainMotion | None = None
     ) -> BrainMotion:
         """Compute the brain under a tool at a pose (4, 4) [m], whose tip has an error covariance (3, 3) [m^2].

@@ -44,15 +44,15 @@ def build_mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled
     if not tooled:
         return None, still
     name = args.deformer
-    if name is None and not theatre.knowing(scene):
+    if name is None and not theatre.select_models(scene):
         refused = next(iter(theatre.list_rejections(scene).values()), "there is none")
         said = f"no model says how the brain moves: {refused}. Give --deformer fem, or a model of the tool's poses"
         print(f"{args.program}: {said}", file=sys.stderr)
         name = REST
     if name == REST:
         return None, still
-    name = name or theatre.usual(scene)
-    names = (*theatre.names(scene), REST)
+    name = name or theatre.select_default(scene)
+    names = (*theatre.list_deformers(scene), REST)
     if name not in (*names, *theatre.models, GUARDED):
         raise InputError(f"no deformer is called {name!r} here: choose one of {', '.join(names)}.")
-    return theatre.deformer(name, scene), theatre.described(name, scene)
+    return theatre.build_deformer(name, scene), theatre.describe_deformer(name, scene)

@@ -67,7 +67,7 @@ class TrackedTool:
         at = box @ T_tool_cube[:3, :3].T + T_tool_cube[:3, 3]
         return np.concatenate([vertices, at]), np.concatenate([triangles, sides + len(vertices)])
 
-    def at(self, T_scan_tool: np.ndarray, cubed: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def build_surface(self, T_scan_tool: np.ndarray, cubed: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Return the surface at a pose (4, 4) [m], with or without its cube: vertices (n, 3) [m], triangles (m, 3)."""
         vertices, triangles = self.mesh if cubed else self.bare
         return vertices @ T_scan_tool[:3, :3].T + T_scan_tool[:3, 3], triangles

@@ -58,7 +58,7 @@ class TrackingFigures:
     back: float
     off: float
 
-    def broken(self) -> list[str]:
+    def find_violations(self) -> list[str]:
         """Return a sentence for each bound that is not kept."""
         rules = {
             f"{self.confident} images draw a lost or old position as if it were known": self.confident == 0,
@@ -68,7 +68,7 @@ class TrackingFigures:
         }
         return [sentence for sentence, kept in rules.items() if not kept]
 
-    def row(self) -> dict[str, float | None]:
+    def to_row(self) -> dict[str, float | None]:
         """For machines: None is a figure that could not be measured."""
         return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
 
@@ -112,7 +112,7 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
     for event in replay_events(film):
         count += 1
         begun = clock.perf_counter() - event.shot.time - event.late if event.late else None
-        shown = overlay_one(Timed(film.picture(event.shot), True), begun, known, follower, painter)
+        shown = overlay_one(Timed(film.get_image(event.shot), True), begun, known, follower, painter)
         known = shown.known
         drawn = bool(np.count_nonzero(find_ink(shown.colour, compute_ink(TUMOUR_COLOUR))) >= NO_LINE)
         if event.words:
@@ -137,8 +137,8 @@ def _says(colour: np.ndarray, words: str, wanted: str) -> bool:
 
 def _off(film: DrawnFilm, shot: VideoFrame, colour: np.ndarray) -> float:
     """Compute the distance between the outline in an image and the true one [pixel]."""
-    camera, rest = film.calibration.camera(shot.T_camera_scan), film.stage.tumour_at_rest
+    camera, rest = film.calibration.build_camera(shot.T_camera_scan), film.stage.tumour_at_rest
     mask = compute_silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
-    tool = compute_silhouette(camera, *film.mounts.tool.at(shot.T_scan_tool))
+    tool = compute_silhouette(camera, *film.mounts.tool.build_surface(shot.T_scan_tool))
     words = find_ink(colour, WHITE, 0)
     return measure_outline_gap(colour, compute_ink(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN[1] + SOFT)

@@ -52,7 +52,7 @@ class VideoGroundTruth:
     T_scan_tool: np.ndarray
     displacement: np.ndarray
 
-    def at(self, time: float) -> int | None:
+    def find_image(self, time: float) -> int | None:
         """Return the number of the image taken at a time [s], to a millisecond; None: none was."""
         near = int(np.abs(self.times - time).argmin())
         return near if abs(self.times[near] - time) < 1e-3 else None
@@ -84,12 +84,12 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LAR
     path = to_path(path)
     with read_as(path, "the ground truth of a video", WANTED), path.open("rb") as raw:
         archive = Archive(raw, WANTED, largest)
-        header = json.loads(archive.text("header"))
+        header = json.loads(archive.read_text("header"))
         if header["format"] != FORMAT:
             raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
         if header["anatomy"] != anatomy:
             raise InputError("is of another anatomy: give the one in the video, by --anatomy.")
-        arrays = archive.arrays(("times", "displacement", *COLUMNS))
+        arrays = archive.read_arrays(("times", "displacement", *COLUMNS))
         times, moved, cameras, tools = (arrays[name].astype(float) for name in ("times", "displacement", *COLUMNS))
     count = len(times)
     shapes = (times.shape, cameras.shape, tools.shape, moved.shape)
@@ -142,10 +142,10 @@ def compute_overlay_error(
     known: TrackingResult, truth: VideoGroundTruth, calibration: Calibration, stage: Stage
 ) -> OverlayError | None:
     """Compute the error of a tracking result; None if no position is drawn, or without ground truth at its time."""
-    row = truth.at(known.time)
+    row = truth.find_image(known.time)
     if row is None or known.camera is None:
         return None
-    camera, triangles = calibration.camera(truth.T_camera_scan[row]), stage.tumour_at_rest.triangles
+    camera, triangles = calibration.build_camera(truth.T_camera_scan[row]), stage.tumour_at_rest.triangles
     true = stage.tumour_at_rest.vertices + truth.displacement[row]
     here = known.motion.positions[stage.tumour_vertices]
     masks = compute_silhouette(camera, true, triangles), compute_silhouette(known.camera, here, triangles)

@@ -122,7 +122,7 @@ def _write_points(place: Path, moment: DeformedAnatomy, marks: Sequence[Landmark
     points = name_points(moment, marks)
     if points:
         write_markups(place / "landmarks.mrk.json", "Fiducial", points)
-    gap = moment.gap()
+    gap = moment.find_gap()
     if gap is not None and moment.tip is not None:
         write_markups(place / "tip_to_tumour.mrk.json", "Line", {"tip": moment.tip, "tumour": gap[0]})
     tumour = moment.left.mesh.tets[moment.left.in_tumour]
@@ -163,9 +163,9 @@ def collect_figures(
     moment: DeformedAnatomy, fields: WarpFields, places: SamplePlaces, warped: Sequence[Warped], frames: int
 ) -> dict[str, Any]:
     """Collect the report of a warp: millimetres, shares, counts of voxels, and warnings."""
-    error = 1e3 * places.errors(fields)
+    error = 1e3 * places.compute_errors(fields)
     moving = np.linalg.norm(places.moved, axis=1) > MOVED
-    gap, largest = moment.gap(), 1e3 * float(np.linalg.norm(moment.displacement, axis=1).max())
+    gap, largest = moment.find_gap(), 1e3 * float(np.linalg.norm(moment.displacement, axis=1).max())
     of_tumour = _errors(error[places.tumour])
     folds = find_folds(moment, fields)
     return {

@@ -40,7 +40,7 @@ class Cause:
     words: str
     record: Mapping[str, Any]
 
-    def by(self, solver: str) -> Cause:
+    def solve_with(self, solver: str) -> Cause:
         """Return the same cause, solved by a solver."""
         return replace(self, words=f"{self.words}, by {solver}")
 
@@ -114,7 +114,7 @@ class DeformedAnatomy:
         """Displaced vertices (V, 3) [m]."""
         return self.anatomy.mesh.nodes + self.displacement
 
-    def gap(self) -> tuple[np.ndarray, float] | None:
+    def find_gap(self) -> tuple[np.ndarray, float] | None:
         """Return the tumour's point (3,) [m] nearest to the tip, and how far it is [m], 0 inside.
 
         None where there is none.
@@ -135,11 +135,11 @@ class Played:
     scene: Scene
     load: bool = False
 
-    def moments(
+    def list_moments(
         self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None
     ) -> list[DeformedAnatomy]:
         """Return the moments of some frames, in rising order."""
-        fem = self.theatre.fem(self.scene, TRAIN, 1, live=True)
+        fem = self.theatre.build_fem(self.scene, TRAIN, 1, live=True)
         needed = range(frames[-1] + 1) if is_history_dependent(fem) else frames
         answers = solve_reference_frames(
             self.theatre, self.scene, [self._loads(number) for number in needed], progress, fem
@@ -149,7 +149,7 @@ class Played:
 
     def _loads(self, number: int):
         scene, time = self.scene, float(self.scene.times[number])
-        return scene.loads(self.theatre.site, scene.path(time), time)
+        return scene.build_loads(self.theatre.site, scene.path(time), time)
 
     def _moment(self, number: int, answer: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
         scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
@@ -158,15 +158,15 @@ class Played:
         stage = Stage(replace(scene, sight=None), site)
         player = Player(stage, AtRest(site.anatomy))
         now = site.anatomy.mesh.nodes + moved
-        tip = None if scene.tool is None else player.tool(scene.tool, scene.path(time), now).tip
-        known = self.theatre.uncertainty(scene)
-        bound = None if known is None else known.at(time).prior
+        tip = None if scene.tool is None else player.place_tool(scene.tool, scene.path(time), now).tip
+        known = self.theatre.estimate_uncertainty(scene)
+        bound = None if known is None else known.evaluate(time).prior
         loads = self._loads(number)
         cause = load_cause(loads) if self.load else play_scene_cause(scene, number)
         said = {} if bound is None else {"bound_words": ENSEMBLE}
-        left = stage.at(loads).anatomy
+        left = stage.select_stage(loads).anatomy
         return DeformedAnatomy(
-            cause.by(answer.source), site.anatomy, left, moved, answer.outcome[0].good, bound, tip=tip, **said
+            cause.solve_with(answer.source), site.anatomy, left, moved, answer.outcome[0].good, bound, tip=tip, **said
         )
 
 

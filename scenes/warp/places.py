@@ -50,7 +50,7 @@ class SamplePlaces:
     landmarks: np.ndarray
     marks: tuple[Landmark, ...]
 
-    def errors(self, fields: WarpFields) -> np.ndarray:
+    def compute_errors(self, fields: WarpFields) -> np.ndarray:
         """Return the distance [m] between fields and FEM at each place (n,): the larger one of the two fields."""
         grid, now = fields.grid, self.rest + self.moved
         forward = grid.read(fields.forward, self.rest) - self.moved
@@ -100,7 +100,7 @@ def find_folds(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...
     sides = np.repeat(np.arange(count), 4), count + bad.ravel()
     graph = coo_matrix((np.ones(4 * count), sides), (count + len(mesh.nodes),) * 2)
     groups = connected_components(graph, directed=False)[1][:count]
-    errors = list_places(moment).errors(fields)
+    errors = list_places(moment).compute_errors(fields)
     off = np.zeros(len(mesh.nodes))
     used = np.unique(mesh.tets)
     off[used] = errors[: len(used)]
@@ -145,7 +145,7 @@ def find_finer_spacing(moment: DeformedAnatomy, fields: WarpFields) -> float | N
     """Return a spacing [m] at which both are exact enough, or as near as size allows; None where no finer one helps."""
     now = fields.grid.spacing
     places = list_places(moment)
-    worst = float(places.errors(fields)[places.tumour | places.landmarks].max(initial=0.0))
+    worst = float(places.compute_errors(fields)[places.tumour | places.landmarks].max(initial=0.0))
     if worst <= ENOUGH:
         return None
     steps = max(math.floor(SPARE * now * ENOUGH / worst / STEP), round(FINEST / STEP))

@@ -33,7 +33,7 @@ class Meaning:
     axes: str
     text: str
 
-    def beside(self, array: h5py.Dataset) -> None:
+    def write_to(self, array: h5py.Dataset) -> None:
         """Write the description to an array's attributes."""
         array.attrs.update(unit=self.unit, axes=self.axes, meaning=self.text)
         if "RAS" in self.axes:
@@ -100,6 +100,6 @@ def explain(file: h5py.File) -> None:
 
     def each(name: str, item: h5py.Group | h5py.Dataset) -> None:
         if isinstance(item, h5py.Dataset) and name in MEANINGS:
-            MEANINGS[name].beside(item)
+            MEANINGS[name].write_to(item)
 
     file.visititems(each)

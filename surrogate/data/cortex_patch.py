@@ -86,7 +86,7 @@ class Patch:
         """Return unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
         return take_rows_of(compute_squared_distances(points, self.points).argmin(axis=1), self.inward)
 
-    def covered(self, centres: np.ndarray, radius: float) -> float:
+    def compute_covered(self, centres: np.ndarray, radius: float) -> float:
         """Compute the area share within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
         share = build_barycentric_lattice(4)
         samples = np.einsum("qc,scx->sqx", share, self.points[self.triangles])

@@ -114,7 +114,7 @@ class Dataset:
         """(n,) bool: the cases that converged."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
-    def seconds(self, each: str, count: int) -> float | None:
+    def estimate_seconds(self, each: str, count: int) -> float | None:
         """Return the time of `count` solves of `each` kind, "load" or "unit response" [s]; None if not recorded."""
         try:
             found = count * float(self.provenance[f"seconds a {each}"])
@@ -122,7 +122,7 @@ class Dataset:
             return None
         return found if 0.0 <= found < np.inf else None
 
-    def displacement(self, nodes: np.ndarray) -> np.ndarray:
+    def read_displacement(self, nodes: np.ndarray) -> np.ndarray:
         """Read displacements (n, k, 3) float32 [m] of the vertices `nodes` (k,).
 
         Raises
@@ -132,7 +132,7 @@ class Dataset:
         """
         return self._rows("answers", nodes, self.good, 1.0)
 
-    def reaction(self) -> np.ndarray | None:
+    def read_reaction(self) -> np.ndarray | None:
         """Read the force [N] and moment [N m] that each tool exerts, (n, tools, 6); None if not available.
 
         They are missing for pushes, in files of earlier versions, and from deformers that do not compute them.

@@ -90,7 +90,7 @@ class SimulationWork:
     nodes: np.ndarray
     batch: int
 
-    def row(self, group: str) -> np.dtype:
+    def get_row_type(self, group: str) -> np.dtype:
         """Return the row type of a group."""
         return get_row_type(len(self.anatomy.mesh.nodes), count_posed_tools(self.loads) if group == "answers" else 0)
 
@@ -104,14 +104,14 @@ class SimulationWork:
         """Group and first row of every batch."""
         return [(name, first) for name, rows in self.counts.items() for first in range(0, rows, self.batch)]
 
-    def rows(self, batch: Batch) -> np.ndarray:
+    def list_rows(self, batch: Batch) -> np.ndarray:
         """Return the numbers of a batch's rows."""
         name, first = batch
         return np.arange(first, min(first + self.batch, self.counts[name]))
 
-    def task(self, batch: Batch) -> LoadBatch:
+    def build_task(self, batch: Batch) -> LoadBatch:
         """Build the task that solves a batch."""
-        rows = self.rows(batch)
+        rows = self.list_rows(batch)
         return LoadBatch(batch, rows, None if batch[0] == "unit" else self.loads.rows(rows))
 
 
@@ -168,7 +168,7 @@ def simulate(
         finished = _whole_batches(path, work)
         if not partial.exists() and not set(work.batches) - finished and _same_body(path, work):
             return SimulatedRows()
-    size = sum(work.row(group).itemsize * rows for group, rows in work.counts.items())
+    size = sum(work.get_row_type(group).itemsize * rows for group, rows in work.counts.items())
     held = partial.stat().st_size if partial.exists() else 0
     check_disk_space(path, max(size - held, 0) + size, size)
     run = {**stated, "number of loads": str(len(work.loads)), "hash of the loads": compute_loads_digest(work.loads)}
@@ -192,14 +192,14 @@ def _fill(
 ) -> dict[str, int]:
     """Solve the batches that are in neither file. A second thread writes a batch while the next is solved."""
     known = [batch for batch in work.batches if batch in finished or batch in journal]
-    total, done = sum(work.counts.values()), sum(len(work.rows(batch)) for batch in known)
+    total, done = sum(work.counts.values()), sum(len(work.list_rows(batch)) for batch in known)
     solved = dict.fromkeys(work.counts, 0)
     progress(done, total)
     with ThreadPoolExecutor(1) as writer:
         for name in work.counts:
             written: Future[None] | None = None
             with time_stage(STAGES[name]):
-                left = [work.task(batch) for batch in work.batches if batch[0] == name and batch not in known]
+                left = [work.build_task(batch) for batch in work.batches if batch[0] == name and batch not in known]
                 for task, rows in solve_batches(deformer, left):
                     if written is not None:
                         written.result()
@@ -248,7 +248,7 @@ def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal:
         write_loads(file, work.loads)
 
         def kinds(group: str) -> list[tuple[str, np.dtype]]:
-            return [(item, work.row(group)[item]) for item in work.row(group).names or ()]
+            return [(item, work.get_row_type(group)[item]) for item in work.get_row_type(group).names or ()]
 
         arrays = {
             (name, item): group.create_dataset(item, (rows, *kind.shape), kind.base)
@@ -260,7 +260,7 @@ def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal:
         explain(file)
 
         def taken(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
-            kind = work.row(batch[0])
+            kind = work.get_row_type(batch[0])
             rows = np.frombuffer(journal.read(batch), kind) if batch in journal else _kept(path, work, batch)
             return rows, compute_row_checksums(rows)
 
@@ -300,7 +300,7 @@ def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
 
 def _batch(file: h5py.File, work: SimulationWork, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
     """Read a batch's rows from a finished file, and the mask of undamaged rows."""
-    rows = work.rows(batch)
+    rows = work.list_rows(batch)
     return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
 
 
@@ -336,7 +336,7 @@ def _whole_batches(path: Path, work: SimulationWork) -> set[Batch]:
     with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
         rows = {name: len(read_stored(file, f"{name}/checksum", "u")) for name in work.counts}
         for batch in work.batches:
-            numbers = work.rows(batch)
+            numbers = work.list_rows(batch)
             if numbers[-1] < rows[batch[0]] and (rows[batch[0]] == work.counts[batch[0]] or len(numbers) == work.batch):
                 good = _batch(file, work, batch)[1]
                 damaged += [f"row {row} of `{batch[0]}`" for row in numbers[~good]]

@@ -52,11 +52,11 @@ class DiscSplit:
         """(B,) bool: mask of the training loads."""
         return self.disc == -1
 
-    def covers(self, points: np.ndarray) -> np.ndarray:
+    def is_covered(self, points: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of points (n, 3) [m] in a disc, where a scored model must not be given any data."""
         return find_nearest(points, self.centres)[1] <= self.radius
 
-    def summary(self) -> str:
+    def summarise(self) -> str:
         """Describe the held-out loads in one line [mm]."""
         return (
             f"{len(self.centres)} discs of {1e3 * self.radius:g} mm radius ({100 * self.share:.0f} % of the open "
@@ -100,7 +100,7 @@ def _discs(points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: flo
 
 def _split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
     which, distance = find_nearest(points, centres)
-    return DiscSplit(centres, radius, np.where(distance <= radius, which, -1), patch.covered(centres, radius))
+    return DiscSplit(centres, radius, np.where(distance <= radius, which, -1), patch.compute_covered(centres, radius))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +111,11 @@ class Sectors(DiscSplit):
     is the number of the sector that a load's force is in, and `share` a part of the circle.
     """
 
-    def covers(self, points: np.ndarray) -> np.ndarray:
+    def is_covered(self, points: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of held-out points: none, as directions are held out."""
         return np.zeros(len(points), bool)
 
-    def summary(self) -> str:
+    def summarise(self) -> str:
         """Describe the held-out loads in one line [degrees]."""
         return (
             f"{len(self.centres)} sectors of {2.0 * np.degrees(self.radius):g} degrees round the cortex's normal left "

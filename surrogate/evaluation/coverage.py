@@ -53,7 +53,7 @@ class Coverage:
         )
 
 
-def coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
+def compute_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
     """Compute the coverage of a model's bounds, by displacements `truth` (B, n, 3) [m] of the tumour's vertices.
 
     Raises
@@ -81,7 +81,7 @@ def measure_distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -
         raise InputError("this model has no calibrated bound of its distance: train it again, with enough loads.")
     _demand_tenths(loads)
     answer = model.deform(loads, at=model.nodes)
-    found = model.distance(loads, answer)
+    found = model.predict_distance(loads, answer)
     return _covered(model, loads, answer, np.abs(found.value - truth), found.bound)
 
 
@@ -122,5 +122,5 @@ def measure_covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, ext
 
 
 def _covered(model: Learned, loads: Loads, answer: Deformation, error: np.ndarray, bound: np.ndarray) -> Coverage:
-    force = split_forces(model.asked(loads))[0]
+    force = split_forces(model.to_input(loads))[0]
     return measure_covered(force, error, bound, answer.outcome.count(Outcome.EXTRAPOLATED))

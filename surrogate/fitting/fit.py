@@ -124,7 +124,7 @@ def _dents(
     loads = build_force_loads(
         anatomy, find_foot(anatomy, tool)[None], np.array([tool.radius]), sizes[:, None] * direction
     )
-    answer = Fem(anatomy, group.effects((0.01,)), ACCURACY, device).deform(loads)
+    answer = Fem(anatomy, group.build_effects((0.01,)), ACCURACY, device).deform(loads)
     good = np.array([outcome.good for outcome in answer.outcome])
     if good.sum() < 3:
         raise InputError(f"a force of {tool.force:g} N cannot be what dents this brain so: check its unit and frame.")

@@ -94,7 +94,7 @@ class FittedTissue:
                 found.append(name)
         return [*found, *(["Young's modulus"] if self.stiffness is None else [])]
 
-    def drawn(
+    def sample(
         self, count: int, seed: int = 0, skulls: tuple[str, ...] = tuple(SKULLS)
     ) -> tuple[list[str], np.ndarray, np.ndarray]:
         """Sample `count` triples of skull, Poisson's ratio and stiffness ratio, restricted to some skulls."""

@@ -35,7 +35,7 @@ def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) ->
     lower, seen = factorise_errors(evidence)
     rows = {name: predict_seen(drained, name, evidence) for name in LINEAR}
     own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
-    lets_go = prior.seen(*evidence.weights)[:, own].T
+    lets_go = prior.project_shapes(*evidence.weights)[:, own].T
     size = np.mean([_size(each) for each in rows.values()])
     found = {name: _weighed(each / size, evidence, lower, seen) for name, each in rows.items()}
     found["contact"] = _weighed((lets_go / _size(lets_go))[None, None], evidence, lower, seen)
@@ -86,7 +86,7 @@ def factorise_errors(evidence: Evidence, believed: np.ndarray | None = None) -> 
     off = LACK * np.maximum(length, LEAST * np.sqrt(3.0) * seen)
     axes = evidence.axis @ evidence.axis.T
     noise = (
-        evidence.noise()
+        evidence.compute_noise()
         + np.outer(off, off)
         * compute_correlation(compute_squared_distances(evidence.at, evidence.at), LACK_LENGTH)
         * axes

@@ -139,7 +139,7 @@ def _trial(
     sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(ERRORS))))
     shift = 0.0 if random.uniform() < UNSHIFTED else float(np.exp(random.uniform(*np.log(SHIFTS))))
     evidence = replace(evidence, sigma=sigma, shift=shift)
-    off = np.linalg.cholesky(evidence.noise()) @ random.standard_normal(len(evidence))
+    off = np.linalg.cholesky(evidence.compute_noise()) @ random.standard_normal(len(evidence))
     way = random.standard_normal((2, 3))
     way *= np.sqrt(3.0) / np.linalg.norm(way, axis=1, keepdims=True)
     shifted, turned = evidence.rigid_scale.reshape(2, 3) * way
@@ -171,4 +171,4 @@ def sample_seen_patch(
 def _square(prior: MotionPrior, found: Posterior, middle: np.ndarray) -> float:
     """Squared Mahalanobis distance of an estimate's error (3,) [m] by its own covariance."""
     off = found.weight @ prior.middle - middle
-    return float(off @ np.linalg.solve(found.covariance(prior.middle[:, None])[0], off))
+    return float(off @ np.linalg.solve(found.compute_covariance(prior.middle[:, None])[0], off))

@@ -119,7 +119,7 @@ class Group:
     regions: tuple[Region, ...] = ()
     reach: tuple[float, ...] = ()
 
-    def effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
+    def build_effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
         """Build the effects of the FEM, with up to these volume changes in these regions (None: all)."""
         swells = Pulsation(Wave(RISE.frequency, max(map(abs, swelling))), RISE, regions)
         tissue = build_tissue(self._tissue, self.poisson, self.ratio, self.regions)

@@ -129,7 +129,7 @@ def solve_members(
     anatomy: Anatomy, group: Group, seed: int = 0, device: str = "auto", causes: Causes = USUAL
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute motions (n, V, 3) float32 [m] and kinds (n,) of one group: converged ones that move the open cortex."""
-    fem = Fem(anatomy, group.effects(causes.swellings), ACCURACY, device)
+    fem = Fem(anatomy, group.build_effects(causes.swellings), ACCURACY, device)
     tumour = tuple(np.unique(anatomy.mesh.region[anatomy.in_tumour]).tolist())
     answers = [
         fem.deform(build_pushes(group, anatomy, seed, causes)),
@@ -159,7 +159,7 @@ def _swollen(
     anatomy: Anatomy, group: Group, shares: tuple[float, ...], regions: tuple[int, ...], device: str, fem: Fem
 ) -> Deformation:
     """Solve for given volume changes of some regions; the stiffness, and so its factor, is that of `fem`."""
-    swells = Fem(anatomy, group.effects(shares, regions), ACCURACY, device, stiff_as=fem)
+    swells = Fem(anatomy, group.build_effects(shares, regions), ACCURACY, device, stiff_as=fem)
     return swells.deform(build_swellings(anatomy, shares))
 
 

@@ -65,7 +65,7 @@ class Evidence:
     def __len__(self) -> int:
         return len(self.value)
 
-    def rows(self, chosen: np.ndarray) -> Evidence:
+    def select(self, chosen: np.ndarray) -> Evidence:
         """Select rows by a mask (m,) or by numbers."""
         place = Located(self.place.vertices[chosen], self.place.weights[chosen])
         arrays = {name: getattr(self, name)[chosen] for name in ("at", "axis", "value", "sigma", "point")}
@@ -101,7 +101,7 @@ class Evidence:
         """Standard deviation of the rigid error of a slipped registration, relative to the reported one."""
         return max(SLIPPED / max(self.shift, LEAST_SHIFT), 1.0)
 
-    def noise(self, scale: float = 0.0) -> np.ndarray:
+    def compute_noise(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of non-rigid errors, and of the shapes' model error for motions of `scale` [m]."""
         share, square = (WHITE / SIGMA) ** 2, compute_squared_distances(self.at, self.at)
         out = compute_correlation(square, LENGTH) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
@@ -137,10 +137,10 @@ class Evidence:
             weights = (weights[:, :, None] * self.axis[:, None]).reshape(len(weights), -1)
         return vertices, weights
 
-    def whitening(self, scale: float) -> Whitening:
+    def build_whitening(self, scale: float) -> Whitening:
         """Build the transform to independent errors of variance 1, for observed motions of `scale` [m]."""
         copies = self.copies
-        lower = cholesky(self.rows(np.arange(0, len(self), copies)).noise(scale), lower=True)
+        lower = cholesky(self.select(np.arange(0, len(self), copies)).compute_noise(scale), lower=True)
         return Whitening(invert_triangular(lower), copies)
 
 
@@ -159,11 +159,11 @@ class Whitening:
     root: np.ndarray
     copies: int
 
-    def white(self, rows: np.ndarray) -> np.ndarray:
+    def whiten(self, rows: np.ndarray) -> np.ndarray:
         """Compute R rows, (m, k) or (m,)."""
         return (self.root @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
-    def back(self, rows: np.ndarray) -> np.ndarray:
+    def transform_back(self, rows: np.ndarray) -> np.ndarray:
         """Compute R^T rows, (m, k) or (m,)."""
         return (self.root.T @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
@@ -172,7 +172,7 @@ class Whitening:
         """Logarithm of the determinant of R."""
         return self.copies * float(np.log(np.diag(self.root)).sum())
 
-    def precision(self, table: np.ndarray) -> np.ndarray:
+    def compute_precision(self, table: np.ndarray) -> np.ndarray:
         """Compute blocks (n, c, c) of the inverse covariance for rows (n, c); all axes of points if `copies` is 3."""
         columns = self.root.T[table[:, :: self.copies] // self.copies]
         alike = columns @ columns.transpose(0, 2, 1)

@@ -94,13 +94,13 @@ class Location:
     calibrated: bool
     seconds: float
 
-    def at(self, nodes: np.ndarray) -> np.ndarray:
+    def compute_motion(self, nodes: np.ndarray) -> np.ndarray:
         """Compute the mean motion (n, 3) [m] of vertices (n,)."""
-        return np.tensordot(self.posterior.weight, self.prior.at(nodes), 1)
+        return np.tensordot(self.posterior.weight, self.prior.restrict_shapes(nodes), 1)
 
-    def covariance(self, nodes: np.ndarray) -> np.ndarray:
+    def compute_covariance(self, nodes: np.ndarray) -> np.ndarray:
         """Compute covariances (n, 3, 3) [m^2] of the motion of vertices (n,)."""
-        return self.posterior.covariance(self.prior.at(nodes))
+        return self.posterior.compute_covariance(self.prior.restrict_shapes(nodes))
 
     @property
     def centroid(self) -> np.ndarray:
@@ -110,7 +110,7 @@ class Location:
     @property
     def centroid_covariance(self) -> np.ndarray:
         """(3, 3) [m^2]: covariance of that motion."""
-        return self.posterior.covariance(self.prior.middle[:, None])[0]
+        return self.posterior.compute_covariance(self.prior.middle[:, None])[0]
 
     @property
     def bias(self) -> np.ndarray:
@@ -126,7 +126,7 @@ class Location:
     def explained(self) -> float:
         """Share of the observed motion, in mean square, that the mean motion and the rigid error explain."""
         evidence, found = self.posterior.evidence, self.posterior
-        left = evidence.value - self.prior.seen(*evidence.weights) @ found.weight
+        left = evidence.value - self.prior.project_shapes(*evidence.weights) @ found.weight
         left -= evidence.rigid @ found.rigid
         whole = float(evidence.value @ evidence.value)
         return max(0.0, 1.0 - float(left @ left) / whole) if whole else 0.0
@@ -241,7 +241,7 @@ class Locator:
         """Anatomy of the prior."""
         return self.prior.anatomy
 
-    def small(self) -> Locator:
+    def restrict(self) -> Locator:
         """Return this locator restricted to vertices at the open cortex and of the tumour: a tenth of the size.
 
         It accepts observations on the open cortex alone, and gives no motion of other tissue.
@@ -274,7 +274,7 @@ class Locator:
         return Location(
             prior=prior,
             posterior=found,
-            p95=compute_radius(found.covariance(prior.middle[:, None])[0]),
+            p95=compute_radius(found.compute_covariance(prior.middle[:, None])[0]),
             outliers=outliers,
             tips_left_out=found.outliers[found.outliers >= count] - count,
             slipped=slipped,

@@ -66,7 +66,7 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
     """
     with read_as(path, "a locator", REMEDY), Path(path).open("rb") as raw:
         archive = Archive(raw, REMEDY)
-        header = json.loads(archive.text("header"))
+        header = json.loads(archive.read_text("header"))
         if header["format"] != FORMAT or tuple(header["kinds"]) != KINDS:
             raise InputError(f"{path}: is no locator of this version. {REMEDY}")
         if header["anatomy"] != anatomy.digest:

@@ -46,8 +46,8 @@ def is_within_errors(posterior: Posterior) -> bool:
     detected that is no larger in all than errors might be.
     """
     evidence = posterior.evidence
-    whitening, scale = evidence.whitening(0.0), evidence.rigid_scale
-    rigid, white = whitening.white(evidence.rigid * scale), whitening.white(evidence.value)
+    whitening, scale = evidence.build_whitening(0.0), evidence.rigid_scale
+    rigid, white = whitening.whiten(evidence.rigid * scale), whitening.whiten(evidence.value)
     precision, gain = rigid.T @ rigid, rigid.T @ white
     whole = np.eye(6) + precision
     found = np.linalg.lstsq(precision, gain, rcond=None)[0]
@@ -134,7 +134,7 @@ class Posterior:
         """Compute the mean rigid error (n, 3) [m] at positions (n, 3) [m]."""
         return self.rigid[:3] + np.cross(self.rigid[3:], places - self.evidence.middle)
 
-    def covariance(self, shape: np.ndarray) -> np.ndarray:
+    def compute_covariance(self, shape: np.ndarray) -> np.ndarray:
         """Compute covariances (q, 3, 3) [m^2] of motions from shapes (r, q, 3) [m]."""
         flat = np.pad(shape.reshape(len(shape), -1), ((0, 6), (0, 0)))  # a rigid error moves no tissue
         mean, found = self.unknown @ flat, np.zeros((shape.shape[1], 3, 3))
@@ -194,7 +194,7 @@ class ObservedPrior:
         """Mask of the hypotheses (h,) with a slipped registration."""
         return np.isinf([hypothesis.rigid for hypothesis in self.prior.hypotheses])
 
-    def answers(self, free: bool = False) -> list[HypothesisResult]:
+    def compute_posteriors(self, free: bool = False) -> list[HypothesisResult]:
         """Compute the posteriors of the most probable hypotheses, the best first; their shares sum to 1.
 
         Hypotheses of a slipped registration are included if it is `free`.
@@ -207,7 +207,7 @@ class ObservedPrior:
         for own, number, place in zip(share, *np.unravel_index(best, logs.shape), strict=True):
             hypothesis = self.prior.hypotheses[number]
             rows = hypothesis.places[place - 1] if place else NO_ROWS
-            found.append(self.answer(hypothesis, rows, float(own)))
+            found.append(self.compute_posterior(hypothesis, rows, float(own)))
         return found
 
     @cached_property
@@ -220,7 +220,7 @@ class ObservedPrior:
         rigid = (
             self._equations()
             .eliminate_unknowns(TOOL)
-            .varied(RIGID, np.minimum(RIGIDS, self.slip))
+            .scale_unknowns(RIGID, np.minimum(RIGIDS, self.slip))
             .eliminate_unknowns(RIGID)
         )
         found: dict[tuple[int, ...], Equations] = {}
@@ -258,7 +258,7 @@ class ObservedPrior:
         """Row numbers (6,) of the rigid error."""
         return np.arange(-7, -1) + len(self.rows.products)
 
-    def answer(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> HypothesisResult:
+    def compute_posterior(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> HypothesisResult:
         """Compute the posterior of a hypothesis with the additional rows (q,) of one place."""
         own = np.concatenate([hypothesis.rows, self._rigid, place])
         size = np.full(len(own), self.scale)
@@ -276,7 +276,9 @@ def build_observed_prior(prior: MotionPrior, evidence: Evidence, tips: np.ndarra
     seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
     # A motion and a rigid error may cancel, so that the observation is small; and noise hides smaller motions.
     scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift)), float(np.median(evidence.sigma)))
-    return ObservedPrior(prior, scale, whiten(prior, evidence, seen), prior.odds(tips), evidence.slip, evidence.named)
+    return ObservedPrior(
+        prior, scale, whiten(prior, evidence, seen), prior.compute_log_odds(tips), evidence.slip, evidence.named
+    )
 
 
 def condition_prior(
@@ -293,9 +295,9 @@ def condition_prior(
     """
     kept, point = np.ones(len(evidence), bool), evidence.point
     while True:
-        some = evidence.rows(kept)
+        some = evidence.select(kept)
         seen = build_observed_prior(prior, some, tips)
-        answers = seen.answers(free)
+        answers = seen.compute_posteriors(free)
         odd = _oddness(seen.rows, answers[0], some.point)
         excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], IMPROBABLE)
         if excess.max() <= 1.0 or len(excess) <= FEWEST:
@@ -316,7 +318,7 @@ def condition_prior(
 def _oddness(rows: WhitenedSystem, answer: HypothesisResult, point: np.ndarray) -> np.ndarray:
     """Compute square Mahalanobis distances (n,) of points from their leave-one-out predictions by one hypothesis."""
     data = len(rows.products) - 1
-    precise = rows.precise(np.append(answer.rows, data))
+    precise = rows.apply_precision(np.append(answer.rows, data))
     known = precise[:, :-1] @ answer.root.T
     gain = precise[:, -1] - precise[:, :-1] @ answer.mean
     number = np.unique(point, return_inverse=True)[1]
@@ -325,7 +327,7 @@ def _oddness(rows: WhitenedSystem, answer: HypothesisResult, point: np.ndarray) 
     for size in np.unique(count):
         some = np.flatnonzero(count == size)
         table = order[first[some][:, None] + np.arange(size)]
-        inverse = rows.whitening.precision(table) - known[table] @ known[table].transpose(0, 2, 1)
+        inverse = rows.whitening.compute_precision(table) - known[table] @ known[table].transpose(0, 2, 1)
         own = gain[table]
         found[some] = np.einsum("ni,ni->n", own, np.linalg.solve(inverse, own[..., None])[..., 0])
     return found

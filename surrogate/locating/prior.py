@@ -119,7 +119,7 @@ class MotionPrior:
     centre: np.ndarray
     nodes: np.ndarray | None = None
 
-    def at(self, nodes: np.ndarray) -> np.ndarray:
+    def restrict_shapes(self, nodes: np.ndarray) -> np.ndarray:
         """Return the shapes (r, k, 3) [m] at some vertices (k,).
 
         Raises
@@ -135,7 +135,7 @@ class MotionPrior:
         Results are unchanged where available. An observation that touches other vertices is rejected.
         """
         some = np.unique(nodes)
-        return replace(self, shape=self.at(some), nodes=some)
+        return replace(self, shape=self.restrict_shapes(some), nodes=some)
 
     def prepare(self) -> None:
         """Compute the tables that all observations share, once."""
@@ -145,12 +145,12 @@ class MotionPrior:
     def middle(self) -> np.ndarray:
         """(r, 3) [m]: motion of the centroid of the tumour's volume by each shape."""
         tumour = self.anatomy.tumour_nodes
-        return np.einsum("v,rvi->ri", compute_tumour_share(self.anatomy)[tumour], self.at(tumour))
+        return np.einsum("v,rvi->ri", compute_tumour_share(self.anatomy)[tumour], self.restrict_shapes(tumour))
 
     @cached_property
     def on_cortex(self) -> np.ndarray:
         """(r, r) [m^2]: inner products of the shapes, summed over the open cortex's vertices."""
-        flat = self.at(np.unique(self.anatomy.open_surface)).reshape(len(self.shape), -1).astype(float)
+        flat = self.restrict_shapes(np.unique(self.anatomy.open_surface)).reshape(len(self.shape), -1).astype(float)
         return flat @ flat.T
 
     def _columns(self, nodes: np.ndarray) -> np.ndarray:
@@ -174,12 +174,12 @@ class MotionPrior:
         """Return the shapes (k, 3, r) float32 [m] at some vertices (k,); it raises InputError as `at` does."""
         return self._by_vertex[self._columns(nodes)]
 
-    def seen(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def project_shapes(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Compute displacements (m, r) [m] of each shape, by vertices and weights as in `Evidence.weights`."""
         shape = self.restrict_to_vertices(vertices)
         return (weights @ shape.reshape(weights.shape[1], -1)).reshape(-1, shape.shape[2])
 
-    def odds(self, tips: np.ndarray) -> np.ndarray:
+    def compute_log_odds(self, tips: np.ndarray) -> np.ndarray:
         """Compute log-odds (1 + p,) of no tool, or one pressing on each place, where tips (k, 3) [m] touch."""
         if not len(tips):
             return np.zeros(1 + len(self.centre))

@@ -33,7 +33,7 @@ def match_and_update(prior: MotionPrior, observation: Observation, free: bool = 
     if observation.rest is None or len(tips):
         cortex, motion = np.unique(anatomy.open_surface), np.zeros_like(anatomy.mesh.nodes)
         for _ in range(ROUNDS):
-            motion[cortex] = np.tensordot(found.weight, prior.at(cortex), 1)
+            motion[cortex] = np.tensordot(found.weight, prior.restrict_shapes(cortex), 1)
             evidence = place_again(anatomy, observation, near, motion, found.compute_bias)
             supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
             before, found = found, condition_prior(prior, evidence, tips[supported], free)

@@ -61,7 +61,7 @@ class Equations:
             table[..., there, first:] += self.table[..., here, end:]
         return Equations(left, table, place, evidence)
 
-    def varied(self, kind: int, sizes: np.ndarray) -> Equations:
+    def scale_unknowns(self, kind: int, sizes: np.ndarray) -> Equations:
         """Return equations (..., b) in which unknowns of one kind have b prior standard deviations, instead of 1."""
         own = np.flatnonzero(self.kind == kind)
         size = np.ones((len(sizes), self.table.shape[-1]))
@@ -113,10 +113,10 @@ class WhitenedSystem:
     shape: np.ndarray
     rest: np.ndarray
 
-    def precise(self, columns: np.ndarray) -> np.ndarray:
+    def apply_precision(self, columns: np.ndarray) -> np.ndarray:
         """Compute the errors' inverse covariance times rows (m, k) of some of the unknowns and of the data (k,)."""
         shapes = columns < self._shapes
-        found, back = np.empty((len(self.rest), len(columns))), self.whitening.back
+        found, back = np.empty((len(self.rest), len(columns))), self.whitening.transform_back
         some = self.shape.reshape(-1, self._shapes)[:, columns[shapes]].reshape(len(self.shape), -1)
         root = self.whitening.root.T
         found[:, shapes] = np.linalg.multi_dot([root, self.weights, some]).reshape(len(found), -1)
@@ -144,8 +144,8 @@ class WhitenedSystem:
 
 def whiten(prior: MotionPrior, evidence: Evidence, seen: float) -> WhitenedSystem:
     """Build whitened rows of a prior's shapes and of evidence, with their model error for motions of `seen` [m]."""
-    whitening = evidence.whitening(seen)
+    whitening = evidence.build_whitening(seen)
     vertices, weights = evidence.weights
     shape = prior.restrict_to_vertices(vertices).reshape(weights.shape[1], -1).astype(float)
     rest = np.column_stack([evidence.rigid * evidence.rigid_scale, evidence.value])
-    return WhitenedSystem(whitening, whitening.root @ weights, shape, whitening.white(rest))
+    return WhitenedSystem(whitening, whitening.root @ weights, shape, whitening.whiten(rest))

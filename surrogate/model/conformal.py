@@ -63,7 +63,7 @@ class Bound:
     growth: np.ndarray
     near: np.ndarray
 
-    def of(self, features: np.ndarray, force: np.ndarray, outside: Outside) -> np.ndarray:
+    def evaluate(self, features: np.ndarray, force: np.ndarray, outside: Outside) -> np.ndarray:
         """Compute bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N], and the loads' `outside`."""
         scale = np.exp(_monomials(_standard(features, self.mean, self.deviation)) @ self.weights)
         away = np.maximum(outside.away - self.near, 0.0)

@@ -69,7 +69,7 @@ class Guarded:
             Loads, or a start, that the model rejects.
         """
         predicted = self.model.deform(loads, start, at)
-        unsure = np.flatnonzero(self.unsure(predicted))
+        unsure = np.flatnonzero(self.find_unreliable(predicted))
         if not len(unsure):
             return predicted
         whole = start is not None and len(start.nodes) == len(self.anatomy.mesh.nodes)
@@ -80,7 +80,7 @@ class Guarded:
         pushed = self.model.tool is None
         return _replaced(predicted, unsure[good], solved.rows(np.flatnonzero(good)), pushed)
 
-    def unsure(self, predicted: Deformation) -> np.ndarray:
+    def find_unreliable(self, predicted: Deformation) -> np.ndarray:
         """Return the mask (B,) of predictions that need FEM."""
         bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
         return find_handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
@@ -156,7 +156,7 @@ def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> 
     assert isinstance(contact, RigidContact)
     held = answer.warm.get(HELD)
     if held is None:
-        held = contact.held(ENCODERS[part.encoder](patch, model.within(model.asked(loads))[1]))
+        held = contact.compute_warm_start(ENCODERS[part.encoder](patch, model.clip_to_range(model.to_input(loads))[1]))
     force = contact.compute_held_force(held).reshape(len(loads), -1, 3)
     whole = np.linalg.norm(force.sum(axis=1), axis=1)
     size = np.linalg.norm(answer.reaction[:, 0, :3], axis=1)

@@ -49,7 +49,7 @@ def keep_arrays(
     """
     if path is not None and path.exists():
         with read_as(path, kind, REMADE), path.open("rb") as raw:
-            found = Archive(raw, REMADE).arrays(names)
+            found = Archive(raw, REMADE).read_arrays(names)
             check(found)
             return found
     made = make()

@@ -60,7 +60,7 @@ class ModelPart:
     regressor: Fitted
     basis: Basis
 
-    def response(self, features: np.ndarray) -> np.ndarray:
+    def compute_response(self, features: np.ndarray) -> np.ndarray:
         """Compute responses (B, n, 3) [m/N] of `basis.nodes` to the encoder's features (B, f)."""
         return self.basis.decode(self.regressor.predict(features))
 
@@ -228,35 +228,37 @@ class Learned:
     ) -> Deformation:  # fmt: skip
         """Sum the parts; the computation began at `begun` [s]."""
         known = measure_loads(self._patch, pushed)
-        outside = self.envelope.outside(pushed, known)
+        outside = self.envelope.locate_outside(pushed, known)
         far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED
         self._demand_answerable(pushed, np.flatnonzero(far | small))
-        promised = self.promised(self.bounds, pushed, known, outside)
+        promised = self.compute_bounds(self.bounds, pushed, known, outside)
         if past is not None:
             far = far | past.strange
-        motion = self.motion(pushed, nodes, encoders)
+        motion = self.predict_motion(pushed, nodes, encoders)
         answer = build_prediction(motion, nodes, loads, far, begun, promised, self.source)
         if past is not None:
             answer = replace(answer, memory={MEMORY: past.memory})
         if self.tool is not None:
             answer = replace(
-                answer, warm=collect_held_state(self._regressors, self._patch, self.within(pushed)[1], encoders)
+                answer, warm=collect_held_state(self._regressors, self._patch, self.clip_to_range(pushed)[1], encoders)
             )
         if self.force is None or self.tool is None:
             return answer
         return replace(
             answer,
-            reaction=compute_wrench(self.exerted(pushed, encoders), get_poses(loads, self.tool), self.tool),
-            reaction_bound=self.promised(self.force.bound, pushed, known, outside),
+            reaction=compute_wrench(self.predict_force(pushed, encoders), get_poses(loads, self.tool), self.tool),
+            reaction_bound=self.compute_bounds(self.force.bound, pushed, known, outside),
             cost=Cost({"predict": time.perf_counter() - begun}),
         )
 
-    def motion(self, pushed: Pushed, nodes: np.ndarray, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
+    def predict_motion(
+        self, pushed: Pushed, nodes: np.ndarray, encoders: Mapping[str, Encoder] = ENCODERS
+    ) -> np.ndarray:
         """Predict displacements (B, n, 3) [m] of mesh vertices `nodes` (n,), without range checks and bound.
 
         Beyond the training's forces the response per newton is that at the nearest training force.
         """
-        magnitude, asked = self.within(pushed)
+        magnitude, asked = self.clip_to_range(pushed)
         if not len(nodes):
             return np.zeros((len(magnitude), 0, 3))
         groups = self._modes_at(np.asarray(nodes, np.int64).tobytes())
@@ -268,12 +270,12 @@ class Learned:
         ]
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
-    def within(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
+    def clip_to_range(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
         """Return sizes (B,) of forces [N] or depths [m], and the loads with sizes clipped to the training range."""
         magnitude, direction = split_forces(pushed)
         return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
-    def exerted(self, pushed: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
+    def predict_force(self, pushed: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
         """Predict forces (B, 3) [N] of the tool at indentations; as `motion`, in proportion beyond the training.
 
         Raises
@@ -283,23 +285,25 @@ class Learned:
         """
         if self.force is None:
             raise InputError("this model does not know its tool's force: train it again, on newly simulated poses.")
-        magnitude, asked = self.within(pushed)
-        found = np.zeros(pushed.force.shape) + self.force.added(self._patch, asked)
+        magnitude, asked = self.clip_to_range(pushed)
+        found = np.zeros(pushed.force.shape) + self.force.predict_remainder(self._patch, asked)
         for part in self.parts:
             if isinstance(part.regressor, RigidContact):
-                found += part.regressor.exerted(encoders[part.encoder](self._patch, asked))
+                found += part.regressor.predict_force(encoders[part.encoder](self._patch, asked))
         return magnitude[:, None] * found
 
-    def promised(self, bound: Bound | None, pushed: Pushed, known: Measured, outside: Outside) -> np.ndarray:
+    def compute_bounds(self, bound: Bound | None, pushed: Pushed, known: Measured, outside: Outside) -> np.ndarray:
         """Compute the bounds (2, B) of loads, [m], or [N] for a force; NaN without one."""
         if bound is None:
             return np.stack([np.nan * outside.excess] * len(LEVELS))
         # The error, like the motion, is in proportion to a force below the training's smallest.
         weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
-        features = compute_features(pushed, self.envelope.within(known))
-        return np.where(weaker > 0.0, bound.of(features, known.magnitude, outside), 0.0) * weaker
+        features = compute_features(pushed, self.envelope.clip_to_range(known))
+        return np.where(weaker > 0.0, bound.evaluate(features, known.magnitude, outside), 0.0) * weaker
 
-    def distance(self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None) -> Distance:
+    def predict_distance(
+        self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None
+    ) -> Distance:
         """Predict the distance from the tool's tip to the tumour, both in the deformed brain: see `TipGauge`.
 
         Parameters
@@ -321,12 +325,14 @@ class Learned:
                 answer = self.deform(loads, at=self.nodes)
             apart = build_tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.tool)
         tip = self.tip or TipModel()
-        magnitude, within = self.within(pushed)
+        magnitude, within = self.clip_to_range(pushed)
         found = tip.apply_correction(apart, self._patch, within, magnitude)
         known = measure_loads(self._patch, pushed)
-        return Distance(found, self.promised(tip.bound, pushed, known, self.envelope.outside(pushed, known)))
+        return Distance(
+            found, self.compute_bounds(tip.bound, pushed, known, self.envelope.locate_outside(pushed, known))
+        )
 
-    def asked(self, loads: Loads) -> Pushed:
+    def to_input(self, loads: Loads) -> Pushed:
         """Convert loads to the model's input: pushes, or indentations of its tool's poses (`to_indentation`).
 
         Raises

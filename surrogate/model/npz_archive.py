@@ -46,7 +46,7 @@ class Archive:
     def __init__(self, file: BinaryIO, remedy: str = "", largest: int = LARGEST_MODEL) -> None:
         self._zip, self._remedy, self._largest = zipfile.ZipFile(file), remedy, largest
 
-    def text(self, name: str) -> str:
+    def read_text(self, name: str) -> str:
         """Read an array with a single text.
 
         Raises
@@ -57,7 +57,7 @@ class Archive:
         self._demand([name], LARGEST_HEADER)
         return str(self._array(name))
 
-    def arrays(self, names: Iterable[str]) -> dict[str, np.ndarray]:
+    def read_arrays(self, names: Iterable[str]) -> dict[str, np.ndarray]:
         """Read arrays by name.
 
         Raises
@@ -77,7 +77,7 @@ class Archive:
         InputError
             As `arrays`; one whose content has another digest.
         """
-        found = self.arrays(digests)
+        found = self.read_arrays(digests)
         for name, array in found.items():
             if compute_digest(array) != name:
                 raise self._damaged(f"its array {name!r} has another digest")
@@ -91,7 +91,7 @@ class Archive:
         InputError
             As `arrays`; header or arrays that do not match the seal.
         """
-        found = self.arrays(names)
+        found = self.read_arrays(names)
         if compute_seal(header, found) != header["seal"]:
             raise self._damaged("its header and arrays do not have the digest that it states")
         return found

@@ -48,7 +48,7 @@ OWN: dict[str, Own] = {}
 K = TypeVar("K", bound=type[Regressor])
 
 
-def learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
+def register_learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
     """Register a class of `Regressor` under a name; it is instantiated without arguments.
 
     `encoder`: features of a load to train on, a name in `encode.ENCODERS` or a function (Patch, Pushed) -> (B, f).

@@ -150,7 +150,7 @@ def _described_in(path: str | Path) -> Iterator[dict[str, Any]]:
 
 def _header(archive: Archive) -> dict[str, Any]:
     """Read the header of a model file; older files have no seal."""
-    header = json.loads(archive.text("header"))
+    header = json.loads(archive.read_text("header"))
     if "seal" in header:
         archive.read_sealed(header, ())
     return header

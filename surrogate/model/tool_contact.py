@@ -37,7 +37,7 @@ class ForceModel:
     learned: Fitted | None = None
     bound: Bound | None = None
 
-    def added(self, patch: Patch, asked: Pushed) -> np.ndarray | float:
+    def predict_remainder(self, patch: Patch, asked: Pushed) -> np.ndarray | float:
         """Predict the regressor's contribution (B, 3) [N/m] at indentations."""
         return 0.0 if self.learned is None else self.learned.predict(ENCODERS[self.encoder](patch, asked))
 
@@ -74,7 +74,7 @@ def collect_held_state(
 ) -> dict[str, np.ndarray]:
     """Return the contact to store with a result for the next warm start: rows (B, h), or nothing."""
     contact = _contact(regressors)
-    return {} if contact is None else {HELD: contact.held(encoders["core"](patch, asked))}
+    return {} if contact is None else {HELD: contact.compute_warm_start(encoders["core"](patch, asked))}
 
 
 def _contact(regressors: Sequence[Fitted]) -> RigidContact | None:

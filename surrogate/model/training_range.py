@@ -75,11 +75,11 @@ class Envelope:
     footprint: tuple[float, float]
     line_force: float
 
-    def holds(self, patch: Patch, pushed: Pushed) -> np.ndarray:
+    def is_inside(self, patch: Patch, pushed: Pushed) -> np.ndarray:
         """Return the mask (B,) of loads inside the range."""
-        return self.outside(pushed, measure_loads(patch, pushed)).excess == 0.0
+        return self.locate_outside(pushed, measure_loads(patch, pushed)).excess == 0.0
 
-    def repeats(self, point: np.ndarray, corners: np.ndarray) -> bool:
+    def is_training_point(self, point: np.ndarray, corners: np.ndarray) -> bool:
         """Return True if any of the points (B, 3) [m] is exactly a training point.
 
         The surface's corners (n, 3) [m] do not count: many different poses have the same nearest corner.
@@ -87,11 +87,11 @@ class Envelope:
         asked, known, free = (set(map(tuple, place.astype(np.float32))) for place in (point, self.points, corners))
         return bool((asked & known) - free)
 
-    def within(self, known: Measured) -> Measured:
+    def clip_to_range(self, known: Measured) -> Measured:
         """Return loads with forces clipped to the training range."""
         return known._replace(magnitude=np.clip(known.magnitude, *self.force))
 
-    def outside(self, pushed: Pushed, known: Measured) -> Outside:
+    def locate_outside(self, pushed: Pushed, known: Measured) -> Outside:
         """Compute the position of loads relative to the range."""
         magnitude, angle, overhang = known
         away = np.sqrt(compute_squared_distances(pushed.point, self.points).min(axis=1))

@@ -40,7 +40,7 @@ TEXT = (
 )
 
 
-def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
+def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     """Build the graph of a model: of the tumour, or of all its vertices.
 
     Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
@@ -69,36 +69,42 @@ def onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
     # Any two loads of the training range give the formulas the types and shapes of their arrays.
     down = np.array([0.0, 0.0, -envelope.force[1]])
     pushed = Pushed(
-        sheet.input("point", np.tile(patch.points[0], (2, 1)), "where the tool touches the resting tissue [m], RAS"),
-        sheet.input("force", np.tile(down, (2, 1)), "of the tool on the tissue [N], RAS"),
-        sheet.input("footprint", np.full(2, envelope.footprint[1]), "radius of the disc that it presses [m]"),
+        sheet.add_input(
+            "point", np.tile(patch.points[0], (2, 1)), "where the tool touches the resting tissue [m], RAS"
+        ),
+        sheet.add_input("force", np.tile(down, (2, 1)), "of the tool on the tissue [N], RAS"),
+        sheet.add_input("footprint", np.full(2, envelope.footprint[1]), "radius of the disc that it presses [m]"),
     )
 
     @cache
     def weight() -> Any:
         """Create the input of the footprint integral, once for all uses."""
         sample = np.full((2, len(patch.nodes)), 1.0 / len(patch.nodes))
-        sheet.output(sheet.constant(patch.nodes), Port("pressed", np.int64, patch.nodes.shape, "of the mesh"))
-        return sheet.input("weight", sample, "share of the force on each of the nodes `pressed`")
+        sheet.add_output(sheet.add_constant(patch.nodes), Port("pressed", np.int64, patch.nodes.shape, "of the mesh"))
+        return sheet.add_input("weight", sample, "share of the force on each of the nodes `pressed`")
 
     encoders = {
         "tool": compute_tool_features,
         "nodal": lambda _, pushed: distribute_forces(weight(), pushed),
         "rooted": lambda _, pushed: scale_by_root_force(distribute_forces(weight(), pushed), pushed),
     }
-    displacement: Any = model.motion(pushed, nodes, encoders)
+    displacement: Any = model.predict_motion(pushed, nodes, encoders)
     known = measure_loads(patch, pushed)
-    outside = envelope.outside(pushed, known)
+    outside = envelope.locate_outside(pushed, known)
     excess: Any = outside.excess
-    bound: Any = model.promised(model.bounds, pushed, known, outside)
+    bound: Any = model.compute_bounds(model.bounds, pushed, known, outside)
     rest = model.anatomy.mesh.nodes[nodes]
-    sheet.output(displacement, Port("displacement", np.float32, ("B", len(nodes), 3), "of the vertices `nodes` [m]"))
-    sheet.output(bound.T, Port("bound", np.float32, ("B", len(LEVELS)), "no tumour vertex is farther off [m]"))
-    sheet.output(excess, Port("excess", np.float32, ("B",), "how far outside the training range; 0 inside"))
-    sheet.output(excess > 0.0, Port("extrapolated", np.bool_, ("B",), "outside: do not rely on it"))
-    sheet.output(sheet.constant(nodes), Port("nodes", np.int64, nodes.shape, "of the mesh"))
-    sheet.output(sheet.constant(rest), Port("rest", np.float32, rest.shape, "where the vertices `nodes` lie [m], RAS"))
-    return sheet.model(name, TEXT, get_version("sulcus"), _notes(name, model))
+    sheet.add_output(
+        displacement, Port("displacement", np.float32, ("B", len(nodes), 3), "of the vertices `nodes` [m]")
+    )
+    sheet.add_output(bound.T, Port("bound", np.float32, ("B", len(LEVELS)), "no tumour vertex is farther off [m]"))
+    sheet.add_output(excess, Port("excess", np.float32, ("B",), "how far outside the training range; 0 inside"))
+    sheet.add_output(excess > 0.0, Port("extrapolated", np.bool_, ("B",), "outside: do not rely on it"))
+    sheet.add_output(sheet.add_constant(nodes), Port("nodes", np.int64, nodes.shape, "of the mesh"))
+    sheet.add_output(
+        sheet.add_constant(rest), Port("rest", np.float32, rest.shape, "where the vertices `nodes` lie [m], RAS")
+    )
+    return sheet.build_model(name, TEXT, get_version("sulcus"), _notes(name, model))
 
 
 def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False) -> None:
@@ -109,7 +115,7 @@ def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False
     InputError
         As `onnx_model`; a path that does not end in .onnx, or a folder that cannot be written.
     """
-    graph = onnx_model(name, model, cortex)
+    graph = build_onnx_model(name, model, cortex)
     with write_atomically(path, ".onnx") as partial:
         partial.write_bytes(graph.SerializeToString())
 

@@ -67,7 +67,7 @@ class Wire(NDArrayOperatorsMixin):
             return _arccos(self)
         if method != "__call__" or ufunc not in OPERATORS:
             return NotImplemented
-        return self.sheet.put(OPERATORS[ufunc], ufunc(*map(_sample, operands)), *self.sheet.alike(operands))
+        return self.sheet.put(OPERATORS[ufunc], ufunc(*map(_sample, operands)), *self.sheet.to_common_type(operands))
 
     def __array_function__(self, function: Callable, _: object, args: Sequence, kwargs: Mapping[str, Any]) -> Wire:
         """Write another function of NumPy."""
@@ -157,20 +157,20 @@ class Sheet:
 
     def put(self, kind: str, sample: np.ndarray, *inputs: Wire | np.ndarray, **attributes: Any) -> Wire:
         """Write an ONNX operator on wires and constants; `sample` is its result for the sample loads."""
-        names = tuple((each if isinstance(each, Wire) else self.constant(each)).name for each in inputs)
+        names = tuple((each if isinstance(each, Wire) else self.add_constant(each)).name for each in inputs)
         key = kind, names, tuple(attributes.items())
         if key not in self._made:
             self._made[key] = Wire(self, f"{kind}_{len(self._nodes)}", sample)
             self._nodes.append(Node(kind, names, self._made[key].name, attributes))
         return self._made[key]
 
-    def alike(self, operands: Sequence[Operand]) -> list[Wire]:
+    def to_common_type(self, operands: Sequence[Operand]) -> list[Wire]:
         """Convert operands to their common NumPy type: NumPy's operators mix types, those of graphs do not."""
         kind = np.result_type(*map(_sample, operands))
-        wires = (each if isinstance(each, Wire) else self.constant(np.asarray(each, kind)) for each in operands)
+        wires = (each if isinstance(each, Wire) else self.add_constant(np.asarray(each, kind)) for each in operands)
         return [wire.astype(kind.type) for wire in wires]
 
-    def constant(self, array: np.ndarray) -> Wire:
+    def add_constant(self, array: np.ndarray) -> Wire:
         """Add a constant of the array's own type; whole numbers in 64 bits."""
         array = np.asarray(array, np.int64) if array.dtype.kind in "iu" else array
         key = array.dtype.str, array.shape, array.tobytes()
@@ -179,17 +179,17 @@ class Sheet:
             self._constants[self._made[key].name] = array
         return self._made[key]
 
-    def input(self, name: str, sample: np.ndarray, text: str) -> Any:
+    def add_input(self, name: str, sample: np.ndarray, text: str) -> Any:
         """Add an input (B, ...) of single precision; formulas compute in double precision."""
         self._inputs.append(Port(name, np.float32, ("B", *sample.shape[1:]), text))
         return Wire(self, name, sample.astype(np.float32)).astype(np.float64)
 
-    def output(self, wire: Wire, port: Port) -> None:
+    def add_output(self, wire: Wire, port: Port) -> None:
         """Add an output, of the port's type."""
         self._nodes.append(Node("Identity", (wire.astype(port.kind).name,), port.name, {}))
         self._outputs.append(port)
 
-    def model(self, name: str, text: str, version: str, notes: Mapping[str, str]) -> ModelProto:
+    def build_model(self, name: str, text: str, version: str, notes: Mapping[str, str]) -> ModelProto:
         """Build the ONNX model; `notes` are its metadata.
 
         Raises
@@ -232,7 +232,7 @@ def _sample(operand: Operand) -> np.ndarray | float:
 
 def _concatenate(sheet: Sheet, arrays: Sequence[Operand], axis: int = 0) -> Wire:
     sample = np.concatenate([_sample(each) for each in arrays], axis)
-    return sheet.put("Concat", sample, *sheet.alike(arrays), axis=axis)
+    return sheet.put("Concat", sample, *sheet.to_common_type(arrays), axis=axis)
 
 
 def _column_stack(sheet: Sheet, arrays: Sequence[Wire]) -> Wire:
@@ -245,7 +245,7 @@ def _stack(sheet: Sheet, arrays: Sequence[Wire]) -> Wire:
 
 def _where(sheet: Sheet, condition: Wire, yes: Operand, no: Operand) -> Wire:
     sample = np.where(condition.sample, _sample(yes), _sample(no))
-    return sheet.put("Where", sample, condition, *sheet.alike([yes, no]))
+    return sheet.put("Where", sample, condition, *sheet.to_common_type([yes, no]))
 
 
 def _einsum(sheet: Sheet, equation: str, *operands: Any) -> Wire:
@@ -253,7 +253,7 @@ def _einsum(sheet: Sheet, equation: str, *operands: Any) -> Wire:
     if first == out + second[-1] and first.endswith(second):  # product and sum: ten times as fast in runtimes
         return (operands[0] * operands[1]).sum(axis=len(out))
     sample = np.einsum(equation, *map(_sample, operands))
-    return sheet.put("Einsum", sample, *sheet.alike(operands), equation=equation)
+    return sheet.put("Einsum", sample, *sheet.to_common_type(operands), equation=equation)
 
 
 def _searchsorted(_: Sheet, sites: np.ndarray, values: Wire) -> Wire:
@@ -298,7 +298,7 @@ def _(index: Wire, table: np.ndarray | Rounded) -> Any:
 
 @multiply_rows.register
 def _(rows: Wire, table: Rounded, index: np.ndarray) -> Any:
-    return (rows @ rows.sheet.constant(table.whole[index]).astype(np.float32)) * table.step
+    return (rows @ rows.sheet.add_constant(table.whole[index]).astype(np.float32)) * table.step
 
 
 @find_columns_in_use.register

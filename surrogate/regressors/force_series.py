@@ -73,12 +73,12 @@ class Series:
     table: Rounded
 
     @classmethod
-    def rounded(
+    def round_table(
         cls, corners: np.ndarray, triangles: np.ndarray, radii: np.ndarray, table: np.ndarray, step: np.ndarray
     ) -> Self:
         """Round a table (places, R, 19, r) to the steps of its terms (19,)."""
         steps = np.repeat(step, table.shape[-1])
-        return cls(corners, triangles, radii, Rounded.of(table.reshape(-1, len(steps)), steps))
+        return cls(corners, triangles, radii, Rounded.round_table(table.reshape(-1, len(steps)), steps))
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""

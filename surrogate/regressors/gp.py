@@ -93,7 +93,7 @@ class Gp(Stored):
         """Predict coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
         return (compute_matern(self._distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
 
-    def deviation(self, X: np.ndarray) -> np.ndarray:
+    def predict_deviation(self, X: np.ndarray) -> np.ndarray:
         """Predict the posterior standard deviation (B,), noise included, relative to that of the prior."""
         near = compute_matern(self._distance(X))
         known = solve_triangular(self._factor[0], near.T, lower=True, check_finite=False)

@@ -99,14 +99,18 @@ class RigidContact:
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of features (B, f), whose force is depth [m]."""
-        found = self.linear(X)
+        found = self.compute_linear(X)
         return (found * (self._terms(X)[:, : len(self.line)] @ self.line)).astype(np.float32)
 
-    def linear(self, X: np.ndarray) -> np.ndarray:
+    def compute_linear(self, X: np.ndarray) -> np.ndarray:
         """Compute the coefficients (B, r) for linear tissue."""
-        return self.force(X).astype(np.float32) @ self.answers / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
+        return (
+            self.compute_nodal_forces(X).astype(np.float32)
+            @ self.answers
+            / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
+        )
 
-    def exerted(self, X: np.ndarray) -> np.ndarray:
+    def predict_force(self, X: np.ndarray) -> np.ndarray:
         """Predict the force (B, 3) [N/m] that the tool exerts, per metre of depth; `grip` must have been fitted."""
         return self._resultant(X) * (self._terms(X) @ self.grip)[:, None]
 
@@ -115,7 +119,7 @@ class RigidContact:
         """Number of columns of `held`."""
         return self._width + len(self.compliance) + 4 * MOST_HELD
 
-    def held(self, X: np.ndarray) -> np.ndarray:
+    def compute_warm_start(self, X: np.ndarray) -> np.ndarray:
         """Return poses of rods or blades, forces and contact points (B, h): a warm start for the next pose."""
         return np.hstack([X[:, : self._width], self._found(X)])
 
@@ -141,10 +145,10 @@ class RigidContact:
 
     def _resultant(self, X: np.ndarray) -> np.ndarray:
         """Compute the tool's force (B, 3) [N/m] on linear tissue, per metre of depth."""
-        whole = self.force(X).reshape(len(X), -1, 3).sum(axis=1)
+        whole = self.compute_nodal_forces(X).reshape(len(X), -1, 3).sum(axis=1)
         return whole / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
 
-    def force(self, X: np.ndarray) -> np.ndarray:
+    def compute_nodal_forces(self, X: np.ndarray) -> np.ndarray:
         """Compute the tool's forces (B, 3 k) [N] on linear tissue at the nodes that it may touch."""
         return self._found(X)[:, : len(self.compliance)]
 
@@ -163,12 +167,12 @@ class RigidContact:
         self._last = asked, out
         return out
 
-    def fitted(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray, exerted: np.ndarray | None = None) -> Self:
+    def fit_lines(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray, exerted: np.ndarray | None = None) -> Self:
         """Fit the lines to coefficients Y (B, r); `alike` (r,) numbers the columns that share one.
 
         `exerted` (B, 3) [N/m] is the tool's force per metre of depth, if available.
         """
-        found, terms = self.linear(X), self._terms(X)
+        found, terms = self.compute_linear(X), self._terms(X)
         line = np.zeros((terms.shape[1], found.shape[1]))
         for each in np.unique(alike):
             mine = alike == each

@@ -35,21 +35,21 @@ class KnownDistances:
     loads: Loads
     distance: np.ndarray
 
-    def rows(self, index: np.ndarray | slice) -> KnownDistances:
+    def select(self, index: np.ndarray | slice) -> KnownDistances:
         """Select loads by numbers, a slice, or (B,) bool."""
         return KnownDistances(self.loads.rows(index), self.distance[index])
 
 
 def compute_distance_errors(model: Learned, known: KnownDistances) -> np.ndarray:
     """Compute absolute errors (B,) [m] of a model's distances relative to FEM."""
-    return np.abs(model.distance(known.loads).value - known.distance)
+    return np.abs(model.predict_distance(known.loads).value - known.distance)
 
 
 def add_correction(model: Learned, patch: Patch, known: KnownDistances) -> Learned:
     """Add a correction of distances to a model, trained on its training loads or some of them."""
-    plain, some = replace(model, tip=TipModel()), known.rows(slice(None, None, -(-len(known.loads) // MOST)))
-    off = some.distance - plain.distance(some.loads).value
-    return replace(model, tip=TipModel(fit_correction(patch, model.asked(some.loads), off)))
+    plain, some = replace(model, tip=TipModel()), known.select(slice(None, None, -(-len(known.loads) // MOST)))
+    off = some.distance - plain.predict_distance(some.loads).value
+    return replace(model, tip=TipModel(fit_correction(patch, model.to_input(some.loads), off)))
 
 
 def correct_if_better(
@@ -99,7 +99,7 @@ class Missed:
     features: np.ndarray
     error: np.ndarray
 
-    def rows(self, some: np.ndarray) -> Missed:
+    def select(self, some: np.ndarray) -> Missed:
         """Select loads by number or (B,) bool."""
         known, outside = Measured(*(each[some] for each in self.known)), Outside(*(each[some] for each in self.outside))
         return Missed(select_rows(self.pushed, some), known, outside, self.features[some], self.error[some])
@@ -119,7 +119,11 @@ def collect_missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarr
     """Combine errors (B,) [m] of a model with its input loads."""
     known, envelope = measure_loads(patch, pushed), model.envelope
     return Missed(
-        pushed, known, envelope.outside(pushed, known), compute_features(pushed, envelope.within(known)), error
+        pushed,
+        known,
+        envelope.locate_outside(pushed, known),
+        compute_features(pushed, envelope.clip_to_range(known)),
+        error,
     )
 
 
@@ -131,7 +135,7 @@ def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = N
     """
     if seen is None or len(near.error) >= ENOUGH:
         fits = _fits(near)
-        seen, near = near.rows(fits), near.rows(~fits)
+        seen, near = near.select(fits), near.select(~fits)
     known = near.features, near.force, near.error
     return fit_bound(
         (seen.features, seen.error), *known, way.each, curved=way.curved, away=near.outside.away, growth=growth
@@ -150,8 +154,8 @@ def compute_held_out_bounds(model: Learned, near: Missed, far: Missed, split: Di
     for each in np.unique(disc):
         here = disc == each
         own = bound_by(near, way, fit_growth(known, (ratio[~here], away[~here])))
-        some = far.rows(here)
-        bound[:, here] = model.promised(own, some.pushed, some.known, some.outside)
+        some = far.select(here)
+        bound[:, here] = model.compute_bounds(own, some.pushed, some.known, some.outside)
     return bound
 
 
@@ -164,8 +168,8 @@ def _over_plain(near: Missed, far: Missed, way: BoundFit) -> list[tuple[np.ndarr
     """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
     plain = bound_by(near, way, 0.0)
     return [
-        (each.error / plain.of(each.features, each.force, each.outside.here)[0], each.outside.away)
-        for each in (near.rows(~_fits(near)), far)
+        (each.error / plain.evaluate(each.features, each.force, each.outside.here)[0], each.outside.away)
+        for each in (near.select(~_fits(near)), far)
     ]
 
 
@@ -185,7 +189,7 @@ class ModelErrors:
     tip: Missed
     force: Missed | None = None
 
-    def known(self) -> dict[str, Missed]:
+    def list_available(self) -> dict[str, Missed]:
         """Return the available errors, by the names of `WAYS`."""
         found = {"tumour": self.tumour, "tip": self.tip}
         return found if self.force is None else {**found, "force": self.force}
@@ -218,7 +222,7 @@ class TrainingSolutions:
     distances: KnownDistances
     force: np.ndarray | None
 
-    def examples(self, rows: np.ndarray) -> Examples:
+    def select_examples(self, rows: np.ndarray) -> Examples:
         """Select rows (B,) bool as examples, to fit models on."""
         force = None if self.force is None else self.force[rows]
         return Examples(select_rows(self.pushed, rows), self.tumour[rows], self.cortex[rows], force)
@@ -238,8 +242,8 @@ class TrainingSolutions:
 
         return ModelErrors(
             of(self.compute_vertex_errors(model, rows).max(axis=1) if tumour is None else tumour),
-            of(compute_distance_errors(model, self.distances.rows(rows)) if tip is None else tip),
-            None if self.force is None else of(compute_force_errors(model.exerted(asked), self.force[rows])),
+            of(compute_distance_errors(model, self.distances.select(rows)) if tip is None else tip),
+            None if self.force is None else of(compute_force_errors(model.predict_force(asked), self.force[rows])),
         )
 
 
@@ -261,11 +265,11 @@ def read_solutions(data: Dataset, shared: Expansion) -> TrainingSolutions:
     pushed, nodes = _asked(data, loads, shared.patch), shared.tumour
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
-    tumour = data.displacement(nodes)[data.good]
-    cortex = data.displacement(shared.cortex)[data.good]
+    tumour = data.read_displacement(nodes)[data.good]
+    cortex = data.read_displacement(shared.cortex)[data.good]
     at, both = np.concatenate([nodes, shared.cortex]), np.concatenate([tumour, cortex], axis=1)
     distances = KnownDistances(loads, build_tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
-    reaction = None if data.tool is None else data.reaction()
+    reaction = None if data.tool is None else data.read_reaction()
     force = None if reaction is None else reaction[data.good, 0, :3]
     return TrainingSolutions(loads, pushed, shared.patch, nodes, tumour, cortex, distances, force)
 

@@ -40,5 +40,5 @@ def compute_residual_responses(
     """Compute residual responses (B, n, 3) [m/N]: motions `moved` (B, n, 3) [m] per newton minus the parts."""
     response = moved / split_forces(loads)[0][:, None, None]
     for part in parts:
-        response = response - part.response(ENCODERS[part.encoder](patch, loads))
+        response = response - part.compute_response(ENCODERS[part.encoder](patch, loads))
     return response

@@ -130,7 +130,7 @@ class Expansion:
             Data without a tissue.
         """
         known = self.tabulated
-        table = Rounded.of(known.second, PAIR_STEP * np.abs(known.second).max())
+        table = Rounded.round_table(known.second, PAIR_STEP * np.abs(known.second).max())
         return ModelPart("rooted", ForcePairs(known.pairs, table), known.pair_basis)
 
     @cached_property
@@ -142,7 +142,7 @@ class Expansion:
         paired = (self.pairs,) if len(self.tabulated.pairs) else ()
         return [(table, *paired) if k == 0 else (table,) for k, table in enumerate(self.tables)]
 
-    def bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
+    def build_bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
         """Compute bases of the examples' motion beyond the exact parts, at the tumour and the cortex if there is more.
 
         A dent as small as its tool is not a sum of a few modes, but its nonlinear part is. `tumour` and `cortex` are
@@ -154,7 +154,7 @@ class Expansion:
             for parts, moved, limits in both
         ]
 
-    def on(self, bases: list[Basis], left_out: np.ndarray) -> list[Series]:
+    def build_series(self, bases: list[Basis], left_out: np.ndarray) -> list[Series]:
         """Return the series beyond the exact parts, as coefficients of the examples' `bases`, without some places (P,).
 
         Raises
@@ -174,7 +174,7 @@ class Expansion:
             for order in SPANS[: len(parts)]:
                 every[inside, order] = 0.0
             step = SERIES_STEP * (np.abs(every).max(axis=(0, 1, 3)) * unit).max() / unit
-            found.append(Series.rounded(self.patch.points, triangles, self.radii, every, step))
+            found.append(Series.round_table(self.patch.points, triangles, self.radii, every, step))
         return found
 
     @cached_property
@@ -207,7 +207,7 @@ class Expansion:
             Data without a tissue.
         """
         begun = time.perf_counter()
-        contact, bases = condense_contact(self.fem(), self._known, self.data.tool)
+        contact, bases = condense_contact(self.build_fem(), self._known, self.data.tool)
         return contact, bases, time.perf_counter() - begun
 
     def _compliance(self, nodes: np.ndarray) -> ModelPart:
@@ -227,14 +227,14 @@ class Expansion:
         if self.kept is not None and self.kept.exists():
             with read_as(self.kept, "a table of the series", REMADE), self.kept.open("rb") as raw:
                 modes = [f"modes{k}" for k in range(len(self._known))]
-                file = Archive(raw, REMADE).arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
+                file = Archive(raw, REMADE).read_arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
                 bases = [Basis(nodes, file[name]) for name, nodes in zip(modes, self._known, strict=True)]
                 pair_basis = Basis(self.tumour, file["second_modes"])
                 return Tabulated(
                     bases, file["table"], file["pairs"], file["second"], pair_basis, float(file["seconds"])
                 )
         begun = time.perf_counter()
-        fem = self.fem()
+        fem = self.build_fem()
         bases, table, anew = self._tabulate(fem)
         pairs, second, pair_basis = self._paired(fem, bases[0])
         seconds = time.perf_counter() - begun if anew else np.nan
@@ -302,7 +302,7 @@ class Expansion:
         footprint = get_only_pushes(self.data.loads).footprint
         return choose_radii(float(footprint.min()), float(footprint.max()))
 
-    def fem(self) -> Fem:
+    def build_fem(self) -> Fem:
         """Build the data's FEM, in double precision.
 
         Raises

@@ -54,20 +54,20 @@ class SharedInputs:
     @cached_property
     def series(self) -> tuple[ModelPart, ...]:
         """Contribution of the FEM series beyond compliance, at the tumour and at the cortex, if there is more."""
-        bases = self.expansion.bases(self.basis_from, ADDED, COARSE)
-        found = self.expansion.on(bases, self._left_out(self.expansion.places))
+        bases = self.expansion.build_bases(self.basis_from, ADDED, COARSE)
+        found = self.expansion.build_series(bases, self._left_out(self.expansion.places))
         return tuple(ModelPart("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
     def solve_counts(self, name: str, examples: Examples) -> SolveCounts:
         """Count the FEM solves that a model of `LEARNERS` or `OF_POSES`, or a user-defined one, depends on."""
         known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
-        seconds = [data.seconds("load", loads)]
+        seconds = [data.estimate_seconds("load", loads)]
         of_tumour = name in ("linear", "residual", *EXPANDED)
         if data.tool is None and (len(known.cortex) or of_tumour):
             units = len(data.unit_good)
             inside = 3 * of_tumour * int(self._left_out(known.patch.points).sum())
-            seconds.append(data.seconds("unit response", units))
+            seconds.append(data.estimate_seconds("unit response", units))
         if name in TOUCHED:
             contact, _, took = known.contact
             units, inside = contact.points.size, 3 * int(self._left_out(contact.points).sum())
@@ -81,7 +81,7 @@ class SharedInputs:
         return SolveCounts(loads, units, series, inside, total)
 
     def _left_out(self, points: np.ndarray) -> np.ndarray:
-        return np.zeros(len(points), bool) if self.split is None else self.split.covers(points)
+        return np.zeros(len(points), bool) if self.split is None else self.split.is_covered(points)
 
 
 # Held-out discs of inner fits: number of centres, far apart; share of the loads that they hold.
@@ -106,9 +106,9 @@ class Tuned:
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
         """Fit the best of the regressors to rows X (n, f) of `compute_tool_features`, Y (n, r)."""
-        return self.settings[self.best(X, Y)]().fit(X, Y)
+        return self.settings[self.find_best(X, Y)]().fit(X, Y)
 
-    def best(self, X: np.ndarray, Y: np.ndarray) -> int:
+    def find_best(self, X: np.ndarray, Y: np.ndarray) -> int:
         """Return the index of the settings with the smallest squared error on the discs; deterministic."""
         if len(X) < FEWEST or len(self.settings) == 1:
             return 0
@@ -183,7 +183,7 @@ def fit_force_model(name: str, parts: Sequence[ModelPart], patch: Patch, example
     left = examples.force / split_forces(examples.loads)[0][:, None]
     for part in parts:
         if isinstance(part.regressor, RigidContact):
-            left = left - part.regressor.exerted(ENCODERS[part.encoder](patch, examples.loads))
+            left = left - part.regressor.predict_force(ENCODERS[part.encoder](patch, examples.loads))
     learned = make().fit(X, left)
     if name_of(type(learned)) is not None:
         _check_own(learned, X, left)
@@ -208,8 +208,8 @@ def _touched(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tupl
     coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
     alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
     force = None if examples.force is None else examples.force / size[:, 0]
-    part = ModelPart(encoder, contact.fitted(features, coefficients, alike, force), join_bases(bases))
-    answered = np.split(size * part.response(features), [len(known.tumour)], axis=1)
+    part = ModelPart(encoder, contact.fit_lines(features, coefficients, alike, force), join_bases(bases))
+    answered = np.split(size * part.compute_response(features), [len(known.tumour)], axis=1)
     return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 
 

@@ -171,7 +171,7 @@ class Fit:
     inputs: SharedInputs
     envelope: Envelope
 
-    def parts(self, name: str, patch: Patch) -> tuple[tuple[ModelPart, ...], ForceModel | None]:
+    def fit_parts(self, name: str, patch: Patch) -> tuple[tuple[ModelPart, ...], ForceModel | None]:
         """Fit a model type: the parts of its model, and its model of a tool's force."""
         with time_stage(f"learn {name}"):
             parts = fit_parts(name, self.inputs, self.examples)
@@ -190,7 +190,7 @@ class Result:
 
 
 def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, left: DiscSplit | None) -> Fit:
-    examples = answers.examples(rows)
+    examples = answers.select_examples(rows)
     return Fit(
         rows, examples, SharedInputs(examples, shared, left), compute_training_range(answers.patch, examples.loads)
     )
@@ -201,7 +201,7 @@ def _learn(
 ) -> Result:
     """Fit one model type outside the discs and score it inside, then fit it to all loads not used for calibration."""
     outside, patch = fits[0], answers.patch
-    parts, force = outside.parts(name, patch)
+    parts, force = outside.fit_parts(name, patch)
     training = {"learner": name, **data.provenance}
     model = Learned(data.anatomy, parts, outside.envelope, training=training, tool=data.tool, force=force)
     with time_stage("score"):
@@ -209,7 +209,7 @@ def _learn(
         solves = outside.inputs.solve_counts(name, outside.examples)
         scored = score(name, model, test, answers.tumour[split.test], answers.nodes, solves)
         distance = answers.compute_vertex_errors(model, split.test)
-        trained, held_out = (answers.distances.rows(rows) for rows in (outside.rows, split.test))
+        trained, held_out = (answers.distances.select(rows) for rows in (outside.rows, split.test))
         model, off = correct_if_better(model, patch, trained, held_out)
         far = answers.compute_errors(model, split.test, distance.max(axis=1), off)
         model = replace(
@@ -217,10 +217,10 @@ def _learn(
         )
     growth = dict.fromkeys(WAYS, USUAL_GROWTH)
     of_tumour = of_tip = None
-    promised, beside = None, apart & ~split.covers(answers.pushed.point)
+    promised, beside = None, apart & ~split.is_covered(answers.pushed.point)
     if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
         with time_stage("calibrate"):
-            near, there = answers.compute_errors(model, beside).known(), far.known()
+            near, there = answers.compute_errors(model, beside).list_available(), far.list_available()
             growth = {way: compute_growth(near[way], there[way], WAYS[way]) for way in near}
             bound = {way: compute_held_out_bounds(model, near[way], there[way], split, WAYS[way]) for way in near}
             of_tumour, of_tip = (
@@ -245,18 +245,18 @@ def _learn(
 
 def _fitted_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: Fit) -> Learned:
     """Fit the model to further loads, with a correction of its distances if it had one."""
-    parts, force = fit.parts(name, answers.patch)
+    parts, force = fit.fit_parts(name, answers.patch)
     fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
     if model.tip is None or model.tip.correction is None:
         return fitted
     with time_stage(f"learn {name}"):
-        return add_correction(fitted, answers.patch, answers.distances.rows(fit.rows))
+        return add_correction(fitted, answers.patch, answers.distances.select(fit.rows))
 
 
 def _calibrated(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
     """Add bounds, calibrated on errors `near` training loads, to a model; they grow by `growth` [1/m] towards `far`."""
-    seen = far.known()
-    bounds = {way: bound_by(here, WAYS[way], growth[way], seen[way]) for way, here in near.known().items()}
+    seen = far.list_available()
+    bounds = {way: bound_by(here, WAYS[way], growth[way], seen[way]) for way, here in near.list_available().items()}
     tip, force = model.tip or TipModel(), model.force
     return replace(
         model,

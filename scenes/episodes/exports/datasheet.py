@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ...script.shipped_files import template_path
+from ...script.shipped_files import get_template_path
 from ..reading.bodies import is_template
 from ..reading.contents import EpisodeContents
 from ..reading.schema import ARRAYS, PICTURES
@@ -47,13 +47,13 @@ def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str
     if same:
         yield "\nWhat is the same in all episodes that have it:\n"
         yield "| what | value | episodes |\n|---|---|---|"
-        yield from [f"| `{key}` | {cell_of(found[0])} | {len(found)} |" for key, found in same.items()][:MOST_DRAWN]
+        yield from [f"| `{key}` | {format_cell(found[0])} | {len(found)} |" for key, found in same.items()][:MOST_DRAWN]
 
 
 def format_range_row(key: str, found: Sequence[Any]) -> str:
     """Return a row of what varies."""
     if all(is_number(one) for one in found):
-        return f"| `{key}` | {cell_of(min(found))} | {cell_of(max(found))} | {len(found)} |"
+        return f"| `{key}` | {format_cell(min(found))} | {format_cell(max(found))} | {len(found)} |"
     often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, found)).most_common(8))
     return f"| `{key}` | {often} | | {len(found)} |"
 
@@ -63,7 +63,7 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def cell_of(value: Any) -> str:
+def format_cell(value: Any) -> str:
     """Return a value in a table: whole numbers in full, others to four digits."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
@@ -88,7 +88,7 @@ Else the name of an own one.
 """
 
 
-def origin_of(contents: EpisodeContents) -> str:
+def find_origin(contents: EpisodeContents) -> str:
     """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of an own one, or `UNSTATED`."""
     stated = read_parameters(contents).get("bodies.anatomies")
     if stated is not None:
@@ -98,19 +98,19 @@ def origin_of(contents: EpisodeContents) -> str:
 
 def get_template_notice() -> str:
     """Return the notice that the template's authors require in all copies, as Markdown."""
-    lines = template_path().with_suffix(".notice.txt").read_text(encoding="utf-8").splitlines()
+    lines = get_template_path().with_suffix(".notice.txt").read_text(encoding="utf-8").splitlines()
     head = "The template's brain, also in `bodies`, is made from the ICBM 152 template of 2009 (MNI152). Its notice:"
     return "\n".join(["", head, "", *(f"> {line}" for line in lines), ""])
 
 
 def has_template(episodes: Sequence[EpisodeContents]) -> bool:
     """Return True if any episode uses the template's brain."""
-    return any(origin_of(one) in (TEMPLATE, DRAWN) for one in episodes)
+    return any(find_origin(one) in (TEMPLATE, DRAWN) for one in episodes)
 
 
 def format_origins(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
     """Lines of the data sheet."""
-    for origin, count in Counter(origin_of(one) for one in episodes).most_common():
+    for origin, count in Counter(find_origin(one) for one in episodes).most_common():
         if origin in (TEMPLATE, DRAWN):
             tumour = "one and the same" if origin == TEMPLATE else "drawn"
             yield (

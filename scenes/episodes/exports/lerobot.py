@@ -48,7 +48,7 @@ class RowStatistics:
     count: int
 
     @classmethod
-    def of(cls, rows: np.ndarray) -> RowStatistics:
+    def compute(cls, rows: np.ndarray) -> RowStatistics:
         """Compute the statistics of rows (T, ...)."""
         rows = np.asarray(rows, np.float64)
         known = ~np.isnan(rows)
@@ -73,7 +73,7 @@ class RowStatistics:
             self.count + other.count,
         )
 
-    def said(self) -> dict[str, list]:
+    def to_lists(self) -> dict[str, list]:
         """Return lists of min, max, mean, std and count; zeros without data."""
         known = np.maximum(self.known, 1)
         mean = self.total / known
@@ -128,7 +128,7 @@ def write_lerobot(
                     )
                     columns |= {to_key(name): rows_ for name, rows_ in numbers.items()}
                     place = tables.write(file, contents, columns, pictures)
-                    spreads = {name: RowStatistics.of(array) for name, array in columns.items()}
+                    spreads = {name: RowStatistics.compute(array) for name, array in columns.items()}
                     spreads |= {
                         f"observation.images.{name}": measure_image_statistics(file, contents, name)
                         for name in pictures
@@ -249,12 +249,12 @@ def measure_image_statistics(file: h5py.File, contents: EpisodeContents, name: s
         picture = read_one_image(file, contents, name, frame)[::SPARSE, ::SPARSE]
         scale = contents.depth_scale if PICTURES[name] == DEPTH else 255.0
         found.append(picture.reshape(-1, picture.shape[2] if picture.ndim == 3 else 1) / scale)
-    return RowStatistics.of(np.concatenate(found))
+    return RowStatistics.compute(np.concatenate(found))
 
 
 def to_lerobot_statistics(name: str, spread: RowStatistics) -> dict[str, list]:
     """Convert statistics to LeRobot's form: of an image (channels, 1, 1)."""
-    said = spread.said()
+    said = spread.to_lists()
     if not name.startswith("observation.images."):
         return said
     return {key: value if key == "count" else [[[one]] for one in value] for key, value in said.items()}

@@ -11,7 +11,7 @@ from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 
-from ...script.shipped_files import template_path
+from ...script.shipped_files import get_template_path
 from .contents import EpisodeContents
 
 
@@ -25,7 +25,7 @@ def find_anatomy(contents: EpisodeContents) -> Anatomy | None:
 
 def is_template(digest: str) -> bool:
     """Return True if an anatomy's digest is that of the template."""
-    template = _read(template_path())
+    template = _read(get_template_path())
     return template is not None and template.digest == digest
 
 
@@ -38,7 +38,7 @@ def find_surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 @cache
 def _known(digest: str, folder: Path) -> Anatomy | None:
     places = [path for above in (folder, folder.parent) for path in sorted(above.glob("bodies/*/anatomy.vtu"))]
-    for path in (template_path(), *places):
+    for path in (get_template_path(), *places):
         anatomy = _read(path)
         if anatomy is not None and anatomy.digest == digest:
             return anatomy

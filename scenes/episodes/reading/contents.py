@@ -52,7 +52,7 @@ class OpenFiles:
     def __len__(self) -> int:
         return len(self._open)
 
-    def file(self, path: Path) -> h5py.File:
+    def get_file(self, path: Path) -> h5py.File:
         """Return the open file.
 
         Raises

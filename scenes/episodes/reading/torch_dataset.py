@@ -38,9 +38,9 @@ class EpisodeDataset(Dataset[dict[str, Any]]):
         """Return the window of a number, counted over all episodes."""
         return {name: _tensor(value) for name, value in self.episodes[index].items()}
 
-    def at(self, episode: int, first: int) -> dict[str, Any]:
+    def get_window(self, episode: int, first: int) -> dict[str, Any]:
         """Return the window of an episode that begins at a frame; InputError as `Episodes.at`."""
-        return {name: _tensor(value) for name, value in self.episodes.at(episode, first).items()}
+        return {name: _tensor(value) for name, value in self.episodes.get_window(episode, first).items()}
 
 
 def _tensor(value: Any) -> Any:

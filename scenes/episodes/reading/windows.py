@@ -189,7 +189,7 @@ class Episodes(Sequence[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the window of a number, counted over all episodes; IndexError beyond the last."""
         episode, first = self.place(index)
-        return self.at(episode, first)
+        return self.get_window(episode, first)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return (self[index] for index in range(len(self)))
@@ -202,7 +202,7 @@ class Episodes(Sequence[dict[str, Any]]):
         episode = int(np.searchsorted(self.ends, index, "right"))
         return episode, (index - (self.ends[episode - 1] if episode else 0)) * self.stride
 
-    def at(self, episode: int, first: int) -> dict[str, Any]:
+    def get_window(self, episode: int, first: int) -> dict[str, Any]:
         """Return the window of an episode that begins at a frame.
 
         Raises
@@ -214,13 +214,13 @@ class Episodes(Sequence[dict[str, Any]]):
         if not 0 <= first <= contents.frames - self.span:
             raise InputError(f"{contents.path}: no {self.span} of its {contents.frames} frames begin at {first}.")
         frames = range(first, first + self.span, self.step)
-        file = self.files.file(contents.path)
+        file = self.files.get_file(contents.path)
         found: dict[str, Any] = {name: read_rows(file, contents, name, frames) for name in self.keys}
         if any(name in ARRAYS and ARRAYS[name].axes[0] == SOLVED for name in self.keys):
             found[FEM_KNOWN] = np.isin(np.asarray(frames), contents.fem_frames)
         return {**found, "episode": episode, "frame": np.asarray(frames)}
 
-    def batches(self, size: int, seed: int | None = None) -> Iterator[dict[str, Any]]:
+    def iterate_batches(self, size: int, seed: int | None = None) -> Iterator[dict[str, Any]]:
         """Windows stacked, `size` at a time and fewer at the end; with a `seed` in an order that it shuffles.
 
         Raises
