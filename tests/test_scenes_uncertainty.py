@@ -200,7 +200,8 @@ class TestStored:
         knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
         assert knowing.uncertainty(scene) is not None
         others = (
-            scene.replace_tissue(replace(BRAIN, young=4000.0), None), scene.replace_tissue(None, "p1"), replace(scene, name="else"),
+            scene.replace_tissue(replace(BRAIN, young=4000.0), None), scene.replace_tissue(None, "p1"),
+            replace(scene, name="else"),
             replace(scene, path=lambda time: Touch(force=0.1)), replace(scene, effects=scene.effects[:-1]),
         )  # fmt: skip
         assert [knowing.uncertainty(other) for other in others] == [None] * 5

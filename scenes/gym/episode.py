@@ -243,7 +243,8 @@ class Episode:
         now = setting.site.anatomy.mesh.nodes[tumour] + touched.motion[np.searchsorted(touched.nodes, tumour)]
         left = np.isin(tumour, setting.get_stage(self.shown).anatomy.tumour_nodes)
         return {
-            "pose": self.actual.compute_pose(setting.task.tool), "force": touched.force.copy(), "pressure": touched.pressure,
+            "pose": self.actual.compute_pose(setting.task.tool),
+            "force": touched.force.copy(), "pressure": touched.pressure,
             "tumour_nodes": now, "tumour_middle": now[left].mean(axis=0), "model_error": touched.error,
             "target": target.copy(), "away": self.judged.away, "asked": float(self.drawn.goal.amount),
             "reached": self._reached(touched), "load": self.judged.load, "violations": self.violations,

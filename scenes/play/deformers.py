@@ -203,8 +203,8 @@ class Theatre:
         allowed = ", ".join(self.list_deformers(scene))
         if name == GUARDED and self.select_models(scene) and not self._guardable(scene):
             raise InputError(
-                f"{self.select_best(scene)} cannot be {GUARDED} in the scene {scene.name}: its tissue relaxes, so that finite "
-                f"elements would have to solve from the first frame on. Choose one of {allowed}."
+                f"{self.select_best(scene)} cannot be {GUARDED} in the scene {scene.name}: its tissue relaxes, so that "
+                f"finite elements would have to solve from the first frame on. Choose one of {allowed}."
             )
         if name == GUARDED and self._guardable(scene):
             model, limit = self.models[self.select_best(scene)], self.limit_of(scene)
