@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from scenes.cli import join_points, limit_threads, run_command
+from scenes.options.help import CommandParser
 
 BENCHMARKS = {
     "stages": "cost of each stage of a frame on this machine",
@@ -43,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def make_parser(*asked: str) -> argparse.ArgumentParser:
     """The parser of all measurements; those asked for know their arguments."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser = CommandParser(prog="python -m benchmarks", description=__doc__)
     names = parser.add_subparsers(dest="command", required=True, metavar="NAME")
     for name, text in BENCHMARKS.items():
         one = names.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")

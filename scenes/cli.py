@@ -17,6 +17,7 @@ from sim.runtime.versions import get_version
 
 from .commands.guidance import format_guidance
 from .commands.interrupt import INTERRUPTED
+from .options.help import CommandParser
 
 # A command's module is imported only when it is called: `sulcus solve` does not wait for torch.
 GROUPS = {
@@ -125,20 +126,11 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
 
     Those asked for know their arguments and examples.
     """
-    parser = argparse.ArgumentParser(
-        prog="sulcus",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description=__doc__,
-        epilog=_list_commands(),
-    )
+    parser = CommandParser(prog="sulcus", description=__doc__, epilog=_list_commands())
     parser.add_argument("--version", action="version", version=f"sulcus {get_version('sulcus')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in COMMANDS.items():
-        command = commands.add_parser(
-            name,
-            description=text[0].upper() + text[1:] + ".",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+        command = commands.add_parser(name, description=text[0].upper() + text[1:] + ".")
         command.set_defaults(program=f"sulcus {name}")
         if name in asked:
             command.epilog = format_guidance(name)
@@ -165,7 +157,7 @@ def add_plugin(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FILE.py",
-        help="a file with learners of your own; it is run as Python",
+        help="Python file that registers own learners; it is executed",
     )
 
 

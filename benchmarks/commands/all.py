@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = f"figures: {', '.join(NAMED)}"
     parser.add_argument(
         "--json", type=Path, metavar="OUT.json",
-        help=f"the record, written after every figure; an unfinished run goes on (default {OUT})",
+        help=f"the record, written after every figure; an unfinished run goes on (default: {OUT})",
     )  # fmt: skip
     parser.add_argument(
         "--only", nargs="+", choices=NAMED, default=list(NAMED), metavar="NAME",

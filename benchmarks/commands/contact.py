@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--depths", nargs="+", type=float, default=[1.0, 3.0], help="depths of the ball [mm] (default: 1 3)"
     )
-    parser.add_argument("--ball", type=float, default=6.0, help="radius of the ball [mm] (default %(default)g)")
+    parser.add_argument("--ball", type=float, default=6.0, help="radius of the ball [mm]")
     add_tissue_arguments(parser)
     add_device(parser)
     add_json(parser)

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--elements", nargs="+", default=list(ELEMENTS), choices=ELEMENTS, help="which (default: all)")
     parser.add_argument("--poisson", nargs="+", type=float, default=[0.30, 0.45, 0.49, 0.495], help="Poisson's ratios")
-    parser.add_argument("--force", type=float, default=0.1, help="of the press, on a 7 mm disc [N] (%(default)s)")
+    parser.add_argument("--force", type=float, default=0.1, help="of the press, on a 7 mm disc [N]")
     add_device(parser)
     add_json(parser)
 

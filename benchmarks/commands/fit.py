@@ -23,13 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_anatomy(parser)
     parser.add_argument("--finer", type=Path, metavar="FINER.vtu", help="a finer mesh of the same brain, of the truths")
-    parser.add_argument("--nodes", type=int, default=8000, help="of the template's finer mesh (default %(default)s)")
-    parser.add_argument("--twins", type=int, default=20, help="patients (default %(default)s)")
-    parser.add_argument("--presses", type=int, default=2, help="frames with a tool (default %(default)s)")
-    parser.add_argument("--drained", type=int, default=4, help="frames with drained fluid (default %(default)s)")
-    parser.add_argument("--forces", type=int, default=4, help="patients of whom a force is read (default %(default)s)")
-    parser.add_argument("--points", type=int, default=100, help="that are seen in a frame (default %(default)s)")
-    parser.add_argument("--cover", type=int, default=80, help="share of the open cortex [%%] (default %(default)s)")
+    parser.add_argument("--nodes", type=int, default=8000, help="of the template's finer mesh")
+    parser.add_argument("--twins", type=int, default=20, help="patients")
+    parser.add_argument("--presses", type=int, default=2, help="frames with a tool")
+    parser.add_argument("--drained", type=int, default=4, help="frames with drained fluid")
+    parser.add_argument("--forces", type=int, default=4, help="patients of whom a force is read")
+    parser.add_argument("--points", type=int, default=100, help="that are seen in a frame")
+    parser.add_argument("--cover", type=int, default=80, help="share of the open cortex [%%]")
     parser.add_argument(
         "--noise",
         nargs="+",

@@ -17,11 +17,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     from scenes.cli import add_plugin
 
-    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene")
     add_theatre(parser)
     add_plugin(parser)
-    parser.add_argument("--size", default="640x480", metavar="WxH", help="of the picture [pixel] (default %(default)s)")
-    parser.add_argument("--frames", type=int, default=120, help="frames that are timed (default %(default)s)")
+    parser.add_argument("--size", default="640x480", metavar="WxH", help="of the picture [pixel]")
+    parser.add_argument("--frames", type=int, default=120, help="frames that are timed")
     parser.add_argument(
         "--batch",
         type=int,

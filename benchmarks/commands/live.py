@@ -30,13 +30,13 @@ CHECKED = 20
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_anatomy(parser)
-    parser.add_argument("--frames", type=int, default=1000, help="frames of each tool (default %(default)s)")
+    parser.add_argument("--frames", type=int, default=1000, help="frames of each tool")
     parser.add_argument(
         "--checked", type=int,
-        help=f"frames held against the converged solution (default {CHECKED}, or all where there are fewer)",
+        help=f"frames held against the converged solution (default: {CHECKED}, or all where there are fewer)",
     )  # fmt: skip
     add_tissue_arguments(parser)
-    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element")
     add_device(parser)
     add_json(parser)
 

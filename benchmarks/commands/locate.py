@@ -40,21 +40,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--finer", type=Path, metavar="FINER.vtu",
         help="a finer mesh of the same brain, of which the truths are (default: the template's, of --nodes)",
     )  # fmt: skip
-    parser.add_argument(
-        "--nodes", type=int, default=8000, help="of the template's finer mesh, without --finer (default %(default)s)"
-    )
+    parser.add_argument("--nodes", type=int, default=8000, help="of the template's finer mesh, without --finer")
     parser.add_argument(
         "--element", choices=ELEMENTS, default=RECOMMENDED,
-        help="finite element of the truths (default %(default)s); p2 takes minutes a twin on a CPU",
+        help="finite element of the truths (default: %(default)s); p2 takes minutes a twin on a CPU",
     )  # fmt: skip
-    parser.add_argument("--twins", type=int, default=20, help="truths, a quarter by each cause (default %(default)s)")
-    parser.add_argument("--points", nargs="+", type=int, default=[100], help="points that are seen (default 100)")
+    parser.add_argument("--twins", type=int, default=20, help="truths, a quarter by each cause")
+    parser.add_argument("--points", nargs="+", type=int, default=[100], help="points that are seen (default: 100)")
     parser.add_argument(
-        "--cover", nargs="+", type=int, default=[36], help="share of the open cortex that they lie on [%%] (default 36)"
+        "--cover",
+        nargs="+",
+        type=int,
+        default=[36],
+        help="share of the open cortex that they lie on [%%] (default: 36)",
     )
     parser.add_argument(
         "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2),
-        help="levels (default 0 1 2). 0: none. 1 and 2: white 0.3 mm, smooth 0.5 mm, and a rigid error of half a "
+        help="levels (default: 0 1 2). 0: none. 1 and 2: white 0.3 mm, smooth 0.5 mm, and a rigid error of half a "
         "degree and 1 or 2 mm, whose size `sulcus locate` is given",
     )  # fmt: skip
     parser.add_argument(
@@ -62,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--slip", type=float, default=0.0, metavar="MM",
-        help="all points are displaced so far along the open cortex, as by a registration that slipped (default 0)",
+        help="all points are displaced so far along the open cortex, as by a registration that slipped (default: 0)",
     )  # fmt: skip
     parser.add_argument(
         "--wrong-registration", action="store_true",

@@ -17,7 +17,7 @@ from sim.bodies.meshfile import read_anatomy
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_anatomy(parser)
-    parser.add_argument("--runs", type=int, default=20, help="loads or frames of each row (default %(default)s)")
+    parser.add_argument("--runs", type=int, default=20, help="loads or frames of each row")
     add_device(parser)
     add_json(parser)
 

@@ -25,12 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--nodes", nargs="+", type=int, default=[5300, 17_000, 40_000], help="of the template's meshes")
     parser.add_argument(
         "--skulls", nargs="+", default=["bonded", "slide"], choices=(*SKULLS, "tearing", "pressing"),
-        help="what the skull does (default bonded slide). tearing: the bond lets go where it bears too much. "
+        help="what the skull does (default: bonded slide). tearing: the bond lets go where it bears too much. "
         "pressing: it bears nothing and has no gap",
     )  # fmt: skip
     parser.add_argument("--poisson", nargs="+", type=float, default=[0.45, 0.49], help="Poisson's ratios (0.45 0.49)")
-    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (%(default)s)")
-    parser.add_argument("--loads", type=int, default=8, help="how many (%(default)s)")
+    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="tool preset")
+    parser.add_argument("--loads", type=int, default=8, help="number of loads")
     add_device(parser)
     add_json(parser)
 

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=float,
         default=[1e-6],
-        help="relative residuals that are asked for, each in a run of its own (default 1e-6)",
+        help="relative residuals that are asked for, each in a run of its own (default: 1e-6)",
     )
     parser.add_argument(
         "--device", choices=("cpu", "cuda"), default="cpu", help="of ours and of tled; others have the CPU"
@@ -53,10 +53,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mesh", nargs="+", type=Path, metavar="MESH.vtu", help="made by `sulcus anatomy` (default: the template)"
     )
-    parser.add_argument("--loads", type=int, default=20, help="palpation loads, each from rest (default %(default)s)")
+    parser.add_argument("--loads", type=int, default=20, help="palpation loads, each from rest")
     add_seed(parser)
-    parser.add_argument("--starts", type=int, default=3, help="first answers of each engine (default %(default)s)")
-    parser.add_argument("--threads", type=int, default=2, help="of every engine (default %(default)s)")
+    parser.add_argument("--starts", type=int, default=3, help="first answers of each engine")
+    parser.add_argument("--threads", type=int, default=2, help="of every engine")
     add_json(parser)
 
 

@@ -17,11 +17,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     from scenes.cli import add_plugin
 
-    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene (default %(default)s)")
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene")
     add_theatre(parser)
     add_plugin(parser)
-    parser.add_argument("--solves", type=int, default=64, help="loads in the batch (default %(default)s)")
-    parser.add_argument("--batch", type=int, default=64, help="loads solved together (default %(default)s)")
+    parser.add_argument("--solves", type=int, default=64, help="loads in the batch")
+    parser.add_argument("--batch", type=int, default=64, help="loads solved together")
     add_json(parser)
 
 

@@ -54,12 +54,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--poisson", nargs="+", type=float, default=[0.45, 0.49], metavar="NU", help="Poisson's ratios (0.45 0.49)"
     )
-    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element (default %(default)s)")
+    parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element")
     parser.add_argument(
-        "--count", type=int, help=f"loads a row and device (default {CUDA_COUNT} on CUDA, {CPU_COUNT} on the CPU)"
+        "--count", type=int, help=f"loads a row and device (default: {CUDA_COUNT} on CUDA, {CPU_COUNT} on the CPU)"
     )
-    parser.add_argument("--batch", type=int, help=f"loads solved together (default all; {CPU_BATCH} on the CPU)")
-    parser.add_argument("--repeats", type=int, default=3, help="of each row; the median counts (default %(default)s)")
+    parser.add_argument("--batch", type=int, help=f"loads solved together (default: all; {CPU_BATCH} on the CPU)")
+    parser.add_argument("--repeats", type=int, default=3, help="of each row; the median counts")
     add_devices(parser)
     add_json(parser)
 

@@ -65,10 +65,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=5300,
         metavar="N",
-        help="number of mesh nodes, 2000 to 250000 (default %(default)s)",
+        help="number of mesh nodes, 2000 to 250000",
     )
     parser.add_argument(
-        "--craniotomy", type=float, metavar="MM", help="diameter of the opening along the cortex [mm] (default 50)"
+        "--craniotomy", type=float, metavar="MM", help="diameter of the opening along the cortex [mm] (default: 50)"
     )
     parser.add_argument(
         "--preset", choices=tuple(PRESETS), default="default", help="values of the options that are not given"

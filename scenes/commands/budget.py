@@ -64,29 +64,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--corner-px",
         type=float,
         default=0.1,
-        help="standard deviation of a marker corner [pixel] (default: %(default)s)",
+        help="standard deviation of a marker corner [pixel]",
     )
     parser.add_argument(
         "--latency-ms", type=float, default=0.0,
-        help="delay between the tracked and the drawn image [ms] (default: %(default)s)",
+        help="delay between the tracked and the drawn image [ms]",
     )  # fmt: skip
     parser.add_argument(
         "--clock-ms",
         type=float,
         default=5.0,
-        help="standard deviation of image and pose times [ms] (default: %(default)s)",
+        help="standard deviation of image and pose times [ms]",
     )
     parser.add_argument(
         "--readout-ms", type=float,
         help="readout time of a rolling shutter [ms] (default: `readout_time` of --camera, or none)",
     )  # fmt: skip
-    parser.add_argument(
-        "--draws", type=int, default=24, help=f"number of bodies to solve, >= {FEWEST} (default: %(default)s)"
-    )
-    parser.add_argument("--samples", type=int, default=1000, help="number of sampled errors (default: %(default)s)")
-    parser.add_argument(
-        "--twins", type=int, default=0, help="number of other bodies on which the band is tested (default: %(default)s)"
-    )
+    parser.add_argument("--draws", type=int, default=24, help=f"number of bodies to solve, >= {FEWEST}")
+    parser.add_argument("--samples", type=int, default=1000, help="number of sampled errors")
+    parser.add_argument("--twins", type=int, default=0, help="number of other bodies on which the band is tested")
     add_seed(parser, "the draws")
     add_device(parser, "finite elements")
     add_json(parser)

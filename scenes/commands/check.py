@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scenes", nargs="*",
         help="built-in scenes, or MY_SCENE.py; tracking: a synthetic video with markers that disappear (default: all)",
     )  # fmt: skip
-    parser.add_argument("--every", type=int, default=10, help="check every Nth frame (default: %(default)s)")
+    parser.add_argument("--every", type=int, default=10, help="check every Nth frame")
     add_theatre(parser)
     add_camera(parser)
     add_style(parser, without=("none",))  # there is an outline to be found

@@ -20,16 +20,14 @@ FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("episodes", nargs="+", type=Path, help="a folder of episodes, or episodes, .h5")
+    parser.add_argument("episodes", nargs="+", type=Path, help="folder of episodes, or episode files (.h5)")
     parser.add_argument(
         "--to",
         required=True,
         choices=FORMATS,
-        help="LeRobot v3.0, robomimic (.hdf5), images and tables, XDMF for ParaView, or the card of a data set",
+        help="output format: LeRobot v3.0, robomimic (.hdf5), images and tables, XDMF for ParaView, or a dataset card",
     )
-    parser.add_argument(
-        "--out", type=Path, help="new folder, or .hdf5 file; a card is written into the data set itself"
-    )
+    parser.add_argument("--out", type=Path, help="new folder or .hdf5 file; a card is written into the data set")
     add_force(parser)
     add_json(parser)
 

@@ -25,16 +25,16 @@ FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene or MY_SCENE.py (default press)")
+    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene or MY_SCENE.py")
     add_theatre(parser)
     add_camera(parser)
     add_style(parser)
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="network address of the server (default: %(default)s); users of other machines need a token",
+        help="network address of the server; users of other machines need a token",
     )
-    parser.add_argument("--port", type=int, default=8080, help="port, or the next free one (default %(default)s)")
+    parser.add_argument("--port", type=int, default=8080, help="port, or the next free one")
     add_address(parser)
     parser.add_argument(
         "--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)"

@@ -19,7 +19,7 @@ HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", ""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
-    parser.add_argument("--every", type=int, default=5, help="solve every Nth frame (default: %(default)s)")
+    parser.add_argument("--every", type=int, default=5, help="solve every Nth frame")
     add_anatomy(parser)
     add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)

@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", help="a built-in scene with a tool, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument(
         "--out", required=True, type=Path, metavar="DIR",
-        help="folder for film.mp4, camera.yaml and .json, registration.json, tool.json, truth.npz and truth.csv",
+        help="output folder of film.mp4, camera.yaml and .json, registration.json, tool.json, truth.npz and truth.csv",
     )  # fmt: skip
-    parser.add_argument("--every", type=int, default=1, help="record every Nth frame (default: %(default)s)")
+    parser.add_argument("--every", type=int, default=1, help="record every Nth frame")
     parser.add_argument("--seconds", type=float, help="duration of the recorded part of the scene [s] (default: all)")
     parser.add_argument("--png", action="store_true", help="write lossless DIR/frames/*.png instead of film.mp4")
     parser.add_argument(
@@ -48,11 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.5,
         metavar="PX",
-        help="standard deviation of the lens blur [pixel] (default: %(default)s)",
+        help="standard deviation of the lens blur [pixel]",
     )
-    parser.add_argument(
-        "--noise", type=float, default=2.0, help="standard deviation of the pixel noise, of 255 (default: %(default)s)"
-    )
+    parser.add_argument("--noise", type=float, default=2.0, help="standard deviation of the pixel noise, of 255")
     parser.add_argument(
         "--readout", type=float, metavar="MS",
         help="rolling-shutter readout time [ms] (default: the camera's)",

@@ -30,21 +30,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "frames", metavar="FRAME.csv", nargs="+",
         help="observations of each frame [mm, RAS]: `x,y,z,dx,dy,dz[,sigma]`, as `sulcus locate` reads it. "
-        "In a frame without tool some fluid has drained",
+        "A frame without tool is one with drained fluid",
     )  # fmt: skip
     parser.add_argument(
         "--tool", metavar="TOOLS.csv",
-        help="`frame,x,y,z[,radius][,force[,sigma]]`: tools that press in some frames, which count from 1. The tip and "
-        "the radius of the pressed disc [mm] (default 6); the force that was read and its error [N], or empty cells",
+        help="pressing tools, columns `frame,x,y,z[,radius][,force[,sigma]]`: frame number from 1, tip and radius of "
+        "the pressed disc [mm] (default: 6), measured force and its standard deviation [N], or empty cells",
     )  # fmt: skip
     parser.add_argument(
         "--rigid", type=float, default=0.8, metavar="MM",
-        help="standard deviation of the rigid registration error of a frame, per axis [mm] "
-        "(default %(default)s)",
+        help="standard deviation of the rigid registration error of a frame, per axis [mm]",
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, metavar="FILE.json",
-        help="the fitted tissue (default: ANATOMY.tissue.json, where `sulcus uncertainty` reads it)",
+        help="output file of the fitted tissue (default: ANATOMY.tissue.json, where `sulcus uncertainty` reads it)",
     )  # fmt: skip
     parser.add_argument(
         "--locator", metavar="FILE.npz", type=Path,
@@ -52,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_region_argument(parser, REGIONS)
     add_device(parser)
-    add_seed(parser, "a locator that is made")
+    add_seed(parser, "building a missing locator")
     add_force(parser)
     add_json(parser)
 

@@ -43,72 +43,72 @@ FAREWELL = 0.25
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("anatomy", type=Path, metavar="PATIENT.vtu", help="from `sulcus patient` or `sulcus anatomy`")
+    parser.add_argument(
+        "anatomy", type=Path, metavar="PATIENT.vtu", help="anatomy from `sulcus patient` or `sulcus anatomy`"
+    )
     parser.add_argument(
         "--model", type=Path, help="model of a pose-controlled tool (default: PATIENT.model.npz next to the anatomy)"
     )
     parser.add_argument(
         "--deformer", metavar="NAME",
         help="deformation model under the tool: a model of tool poses, guarded, fem or rest. rest: as in the "
-        "scan. Default: the best model that knows the tool, else rest",
+        "scan (default: the best model that knows the tool, else rest)",
     )  # fmt: skip
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="network address of the server (default: %(default)s, this machine only)"
-    )
-    parser.add_argument("--port", type=int, default=PORT, help="0: any free one (default %(default)s)")
+    parser.add_argument("--host", default="127.0.0.1", help="network address of the server")
+    parser.add_argument("--port", type=int, default=PORT, help="TCP port; 0: any free port")
     parser.add_argument(
         "--client",
         metavar="HOST[:PORT]",
-        help="hear this server, too, as that of PLUS, and send it nothing; --port is then another one than its own. An "
-        "IPv6 address stands in brackets",
+        help="also receive from this server, such as PLUS; nothing is sent to it. --port must differ from its port; "
+        "write an IPv6 address in brackets",
     )
-    parser.add_argument("--clients", type=int, default=16, help="maximum number of clients (default: %(default)s)")
-    what = "transforms that are heard, in mm; AToB takes places in A's frame to B's; the scan's space is RAS"
+    parser.add_argument("--clients", type=int, default=16, help="maximum number of clients")
+    what = "received transforms [mm]; AToB maps coordinates in frame A to frame B; the scan's space is RAS"
     names = parser.add_argument_group(what)
-    names.add_argument(
-        "--tool-name", default="StylusTipToReference", help="name of the incoming tool transform (default: %(default)s)"
-    )
+    names.add_argument("--tool-name", default="StylusTipToReference", help="name of the incoming tool transform")
     names.add_argument(
         "--reference-name",
         default="ReferenceToTracker",
-        help="name of the incoming reference transform, AToTracker (default: %(default)s)",
+        help="name of the incoming reference transform, AToTracker",
     )
     names.add_argument(
         "--camera-name",
         default="CameraToReference",
-        help="name of the incoming camera transform (default: %(default)s)",
+        help="name of the incoming camera transform",
     )
     names.add_argument(
         "--registration-name",
         default="ReferenceToRas",
-        help="name of the incoming scan registration, RAS (default: %(default)s)",
+        help="name of the incoming scan registration, RAS",
     )
     parser.add_argument(
         "--registration",
         metavar="R.json",
-        help="from `sulcus register --anatomy`, in place of a transform that is sent, which "
-        "is not checked and makes every answer doubtful",
+        help="registration from `sulcus register --anatomy`, instead of a received transform, which "
+        "cannot be checked: results are then marked unreliable",
     )
     parser.add_argument(
         "--tool", metavar="TOOL.json",
-        help="the tool, and where it is in the frame that is sent. Default: that of the model, at PLUS's StylusTip: "
-        "origin at the tip, z away from the shaft",
+        help="tool and its position in the received frame (default: the model's tool at PLUS's StylusTip: origin at "
+        "the tip, z away from the shaft)",
     )  # fmt: skip
     parser.add_argument(
         "--tracking-mm", type=float, default=0.5, metavar="MM",
-        help="standard deviation of the tip's place along each axis, which no message says (default %(default)s)",
+        help="standard deviation of the tip position per axis [mm], which no message contains",
     )  # fmt: skip
+    parser.add_argument("--stale", type=float, default=0.3, metavar="SECONDS", help="maximum pose age [s]")
     parser.add_argument(
-        "--stale", type=float, default=0.3, metavar="S", help="maximum pose age [s] (default: %(default)s)"
+        "--camera",
+        metavar="K.yaml",
+        help="calibration from `sulcus calibrate`: the overlay is drawn into each received IMAGE and sent back",
     )
-    parser.add_argument("--camera", metavar="K.yaml", help="from `sulcus calibrate`: IMAGE is drawn into and sent back")
     parser.add_argument(
         "--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)"
     )
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
     add_element_argument(parser)
-    add_device(parser, "finite elements and pictures")
+    add_device(parser, "FEM and rendering")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -24,31 +24,30 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("anatomy", metavar="ANATOMY.vtu", help="made by `sulcus anatomy` or `sulcus patient`")
+    parser.add_argument("anatomy", metavar="ANATOMY.vtu", help="anatomy from `sulcus anatomy` or `sulcus patient`")
     parser.add_argument(
         "observed",
         metavar="OBSERVED.csv",
-        help="observations [mm, RAS], with a header. `x,y,z,dx,dy,dz`: points in the scan, as of vessels, "
-        "and how they were seen to move; `x,y,z`: a cloud of where the open cortex is now. A last column `sigma` is "
-        "each point's error, of what is not rigid (default 0.58)",
+        help="observations [mm, RAS], with a header. `x,y,z,dx,dy,dz`: points in the scan, such as vessels, "
+        "and their observed displacements; `x,y,z`: point cloud of the deformed open cortex. Optional last column "
+        "`sigma`: non-rigid error of each point (default: 0.58)",
     )
     parser.add_argument(
-        "--tool", metavar="TIPS.csv", help="`x,y,z`: where tips of tools touch the cortex, as further evidence"
+        "--tool", metavar="TIPS.csv", help="contact points of tools on the cortex [mm], columns `x,y,z`"
     )
     parser.add_argument(
         "--rigid", type=float, default=0.8, metavar="MM",
-        help="standard deviation of the rigid registration error per axis [mm], with a "
-        "rotation in proportion (default %(default)s)",
+        help="standard deviation of the rigid registration error per axis [mm], with a proportional rotation",
     )  # fmt: skip
     parser.add_argument(
         "--registration-checked", action="store_true",
-        help="the registration was checked on fixed landmarks: no registration shift beyond --rigid is assumed",
+        help="registration verified on fixed landmarks: assume no registration shift beyond --rigid",
     )  # fmt: skip
     parser.add_argument(
         "--out",
         metavar="RESULT.vtu",
-        help="file for mean displacement and covariance of every vertex. Without it, the tumour alone is reported: a "
-        "small locator is enough",
+        help="file for mean displacement and covariance of every vertex (default: none; the tumour alone is reported, "
+        "and a small locator is enough)",
     )
     parser.add_argument(
         "--locator",
@@ -57,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="ensemble of the anatomy; computed in minutes if missing (default: next to the anatomy)",
     )
     add_region_argument(parser, REGIONS)
-    add_device(parser, "a locator that is made; without effect where there is one")
+    add_device(parser, "building a missing locator")
     add_seed(parser, "a locator that is made; without effect where there is one")
     add_force(parser)
     add_json(parser)

@@ -29,13 +29,13 @@ REGIONS = f"{AS_LEARNED}. A locator knows how many times a region is as stiff as
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument(
-        "anatomy", metavar="ANATOMY.vtu", type=Path, help="made by `sulcus anatomy` or `sulcus patient`"
+        "anatomy", metavar="ANATOMY.vtu", type=Path, help="anatomy from `sulcus anatomy` or `sulcus patient`"
     )
-    parser.add_argument("--out", metavar="FILE.npz", type=Path, help="the locator (default: ANATOMY.locator.npz)")
+    parser.add_argument("--out", metavar="FILE.npz", type=Path, help="output file (default: ANATOMY.locator.npz)")
     parser.add_argument(
         "--small",
         action="store_true",
-        help="keep open cortex and tumour alone, a tenth of the file: enough for scenes, `sulcus fit`, and "
+        help="store the open cortex and the tumour only, a tenth of the file: enough for scenes, `sulcus fit`, and "
         "`sulcus locate` without --out",
     )
     add_region_argument(parser, REGIONS)

@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--deformer", metavar="NAME",
         help="deformation model under the tool: a model of tool poses, guarded, fem or rest. rest: as in the "
-        "scan. Default: the best model that knows the tool, else rest",
+        "scan (default: the best model that knows the tool, else rest)",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="FILM.mp4", help="video with overlay: .mp4, .gif or .webp")
     parser.add_argument(
@@ -80,9 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "a hand: nothing is drawn over it",
     )  # fmt: skip
     add_style(parser)
-    parser.add_argument(
-        "--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s] (default: %(default)s)"
-    )
+    parser.add_argument("--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s]")
     parser.add_argument(
         "--live", action="store_true", help="process the video in real time: frames that arrive too fast are skipped"
     )
@@ -92,9 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--page", action="store_true", help="show the video in the browser; a live camera always has a page"
     )
-    parser.add_argument(
-        "--port", type=int, default=8080, help="port of the page, or the next free one (default: %(default)s)"
-    )
+    parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one")
     add_address(parser)
     parser.add_argument(
         "--seconds", type=float, default=np.inf, help="close the page after this many seconds (default: never)"

@@ -48,14 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="anatomy to write, PATIENT.vtu; data (.h5) and models (.model.npz) are written next to it",
     )
-    parser.add_argument(
-        "--nodes", type=int, default=5300, help="number of mesh nodes, 2000 to 250000 (default %(default)s)"
-    )
+    parser.add_argument("--nodes", type=int, default=5300, help="number of mesh nodes, 2000 to 250000")
     parser.add_argument(
         "--craniotomy",
         type=float,
         default=50.0,
-        help="diameter of the opening along the cortex [mm] (default %(default)s)",
+        help="diameter of the opening along the cortex [mm]",
     )
     add_opening_arguments(parser)
     parser.add_argument(
@@ -63,21 +61,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="preview in seconds, without making anything: numbers, warnings, and the image PATIENT.inspect.png",
     )
-    parser.add_argument("--count", type=int, default=1000, help="loads to simulate (default %(default)s)")
+    parser.add_argument("--count", type=int, default=1000, help="number of loads to simulate")
     parser.add_argument(
         "--preset", choices=PRESETS, default="palpation",
-        help="the tool. mixed: all of them; seed: the published protocol; brutal: far beyond surgery. "
-        "Default: %(default)s",
+        help="tool preset; mixed: all tools; seed: the published protocol; brutal: far beyond surgical loads"
     )  # fmt: skip
-    parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law (default %(default)s)")
+    parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law")
     add_region_argument(parser)
     add_element_argument(parser)
     parser.add_argument(
         "--learners",
         default="linear,series,series-gp",
-        help="model types, see `sulcus train --help`, separated by commas (default: %(default)s)",
+        help="model types, see `sulcus train --help`, separated by commas",
     )
-    add_devices(parser, "loads are simulated on all of these; models are trained on the first. ")
+    add_devices(parser, "; loads are simulated on all, models trained on the first")
     add_force(parser)
     add_json(parser, "a JSON line of each step, then one of the seconds")
 

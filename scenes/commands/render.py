@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--out", required=True, type=Path, help="folder of frame_0000.png, frame_0001.png, ...")
-    parser.add_argument("--every", type=int, default=1, help="render every Nth frame (default: %(default)s)")
+    parser.add_argument("--every", type=int, default=1, help="render every Nth frame")
     parser.add_argument("--film", type=Path, help="also write a video: .mp4, .gif or .webp")
     parser.add_argument("--plain", action="store_true", help="leave out the panel of figures")
     add_theatre(parser)

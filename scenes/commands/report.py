@@ -33,28 +33,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size.add_argument(
         "--quick",
         action="store_true",
-        help=f"a small report: {QUICK[0]} simulated loads, few comparisons, and one mesh. It takes 12 minutes on two "
-        "cores; without it, hours",
+        help=f"small report with {QUICK[0]} simulated loads, few comparisons and one mesh: minutes instead of hours",
     )
     size.add_argument(
         "--full", action="store_true", help="every combination of law, element, mesh, tolerance and precision"
     )
-    parser.add_argument(
-        "--out", type=Path, default=Path("report"), metavar="DIR", help="folder of the page (default %(default)s)"
-    )
-    add_devices(parser, "loads are simulated on all of these, and everything else is measured on the first. ")
+    parser.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="output folder")
+    add_devices(parser, "; loads are simulated on all, everything else is measured on the first")
     parser.add_argument(
         "--data", nargs="+", type=Path, default=[], metavar="DATA.h5",
-        help="data sets of `sulcus simulate`, each with rows of its own (default: one is made, smoothed, palpation)",
+        help="data sets from `sulcus simulate`, each with its own rows (default: a new one: smoothed, palpation)",
     )  # fmt: skip
     parser.add_argument(
-        "--anatomy", metavar="MESH.vtu", help="anatomy to simulate on where no data are given (default: the template)"
+        "--anatomy", metavar="MESH.vtu", help="anatomy of the simulation without --data (default: the template)"
     )
     parser.add_argument(
         "--loads",
         type=int,
         metavar="N",
-        help=f"number of loads compared with the reference (--quick: {QUICK[1]}, else {WHOLE[1]})",
+        help=f"number of loads compared with the reference (default: {WHOLE[1]}; with --quick {QUICK[1]})",
     )
     add_force(parser)
     add_json(parser)

@@ -49,27 +49,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--element", choices=ELEMENTS,
-        help="element of the mesh (default smoothed: linear tetrahedra lock as nu nears 0.5; p2 where the mesh brings "
-        "mid-edge nodes)",
+        help="element of the mesh (default: smoothed, because linear tetrahedra lock as nu nears 0.5; p2 for meshes "
+        "with mid-edge nodes)",
     )  # fmt: skip
     parser.add_argument(
         "--beside", nargs="+", choices=ELEMENTS, default=[], metavar="ELEMENT",
-        help="add a row for each of these elements on the same mesh: it shows the error of the mesh itself",
+        help="also compute with these elements on the same mesh, to show the discretisation error",
     )  # fmt: skip
-    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="the tool (default %(default)s)")
-    parser.add_argument("--count", type=int, default=32, help="loads to draw (default %(default)s)")
+    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="tool preset")
+    parser.add_argument("--count", type=int, default=32, help="number of sampled loads")
     add_seed(parser)
     add_device(parser)
     parser.add_argument(
         "--factorial", action="store_true",
-        help="every combination of skull, Poisson's ratio, opening, depth and stiffness of the template's tumour, in "
-        "place of one change at a time. It takes an hour on two cores. --out gets the table, and a plot beside it "
-        "(.png)",
+        help="compute every combination of skull, Poisson's ratio, opening, depth and stiffness of the template's "
+        "tumour, instead of one change at a time (an hour on two cores); --out then also gets a plot (.png)",
     )  # fmt: skip
-    parser.add_argument(
-        "--nodes", type=int, default=5300, help="number of nodes of the meshes of --factorial (default %(default)s)"
-    )
-    parser.add_argument("--out", type=Path, metavar="TABLE.csv", help="the table, unrounded")
+    parser.add_argument("--nodes", type=int, default=5300, help="number of mesh nodes with --factorial")
+    parser.add_argument("--out", type=Path, metavar="TABLE.csv", help="output table, unrounded")
     add_force(parser)
     add_json(parser)
 

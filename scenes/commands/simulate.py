@@ -54,44 +54,46 @@ SMALLEST_MM, LARGEST_MM = 0.1, 200.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "anatomy", nargs="?", metavar="ANATOMY.vtu", help="from `sulcus anatomy`; default: the template"
+        "anatomy",
+        nargs="?",
+        metavar="ANATOMY.vtu",
+        help="anatomy from `sulcus anatomy` (default: the template that ships)",
     )
     parser.add_argument("--out", required=True, metavar="DATA.h5", help="output data set; resumed if incomplete")
-    parser.add_argument("--count", type=int, default=2000, help="number of loads (default: %(default)s)")
+    parser.add_argument("--count", type=int, default=2000, help="number of loads")
     parser.add_argument(
         "--preset", choices=PRESETS, default="palpation",
-        help="the tool. mixed: all of them; seed: the published protocol; brutal: far beyond surgery. "
-        "Default: %(default)s",
+        help="tool preset; mixed: all tools; seed: the published protocol; brutal: far beyond surgical loads"
     )  # fmt: skip
     parser.add_argument(
         "--poses",
         action="store_true",
-        help="press with a rigid tool that is moved by pose, instead of a force on its footprint. Without --ball, "
-        "--capsule or --blade it is a ball of the preset's middle radius",
+        help="move a rigid tool by pose, instead of a force on its footprint (default shape: ball of the preset's mean "
+        "radius)",
     )
     shape = parser.add_mutually_exclusive_group()
-    shape.add_argument("--ball", type=float, metavar="MM", help="ball: radius [mm] (7 in the scene palpate)")
+    shape.add_argument("--ball", type=float, metavar="MM", help="radius of a ball [mm], such as 7 in the scene palpate")
     shape.add_argument(
         "--capsule",
         type=float,
         nargs=2,
         metavar=("RADIUS", "LENGTH"),
-        help="round rod, such as a dissector or a closed bipolar: radius and length of its straight part [mm]",
+        help="radius and length of the straight part of a round rod [mm], such as a dissector or a closed bipolar",
     )
     shape.add_argument(
         "--blade", type=float, nargs=3, metavar=("WIDTH", "LENGTH", "EDGE"),
-        help="flat blade: width, length and edge radius [mm] (12 26 1.5 in the scene retract)",
+        help="width, length and edge radius of a flat blade [mm], such as 12 26 1.5 in the scene retract",
     )  # fmt: skip
     add_seed(parser)
     add_tissue_arguments(parser)
     add_element_argument(parser)
     add_skull_argument(parser, ("bonded", "slide"))
-    parser.add_argument("--tolerance", type=float, default=1e-4, help="relative residual (default %(default)s)")
+    parser.add_argument("--tolerance", type=float, default=1e-4, help="tolerance of the relative residual")
     widest = f"up to {MemoryBudget.widest}, on CUDA {MemoryBudget.widest_on_cuda}"
     parser.add_argument(
         "--batch",
         type=int,
-        help=f"loads solved together (default: as many as fit, {widest}; a resumed file keeps its own)",
+        help=f"number of loads solved together (default: as many as fit, {widest}; a resumed file keeps its own)",
     )
     add_devices(parser)
     add_force(parser)

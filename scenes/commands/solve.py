@@ -27,14 +27,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
         "mesh",
-        help="mesh of linear or quadratic (`tetra10`) tetrahedra. It needs point data `fixed` (V,) or (V, 3), and "
-        "`force` (V, 3) [N] or `prescribed` (V, 3) in the file's unit of length. Optional are `slide_normal` (V, 3), "
-        "`start` (V, 3), a first guess in the file's unit, and cell data `region`. Mid-edge nodes that the file brings "
-        "are nodes as any other: held only where `fixed` says so",
+        help="mesh of linear or quadratic (`tetra10`) tetrahedra with point data `fixed` (V,) or (V, 3), and "
+        "`force` (V, 3) [N] or `prescribed` (V, 3) in the file's unit of length; optional: `slide_normal` (V, 3), "
+        "`start` (V, 3), an initial guess in the file's unit, and cell data `region`. Mid-edge nodes in the file "
+        "are fixed only where `fixed` marks them",
     )
     add_tissue_arguments(parser, whole=True)
     add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
-    parser.add_argument("--tolerance", type=float, default=1e-6, help="relative residual (default %(default)g)")
+    parser.add_argument("--tolerance", type=float, default=1e-6, help="tolerance of the relative residual")
     parser.add_argument(
         "--any-strain",
         action="store_true",
@@ -44,19 +44,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--precision",
         default="float64",
         choices=("float32", "float64"),
-        help="scalar type of the solver: float32 is faster and reaches no tolerance below "
-        f"{FLOOR['float32']:g} (default %(default)s)",
+        help=f"scalar type of the solver: float32 is faster, with tolerances of at least {FLOOR['float32']:g}",
     )
-    parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file (default %(default)s)")
+    parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file")
     add_device(parser)
     parser.add_argument(
-        "--out", required=True, help=".vtu in metres with point data `displacement` [m]; not the mesh itself"
+        "--out",
+        required=True,
+        help="output .vtu in metres with point data `displacement` [m]; must not be the input mesh",
     )
     # The constraints of the file, for comparisons with other programs.
     add_skull_argument(parser, ("slide", "bonded", "contact"))
     add_force(parser)
-    parser.add_argument("--explain", action="store_true", help="say first which solvers are tried, in which order")
-    add_json(parser, "changes nothing: the result is one JSON line in any case")
+    parser.add_argument("--explain", action="store_true", help="print the solvers in the order in which they are tried")
+    add_json(parser, "no effect: the result is always one JSON line")
 
 
 def run(args: argparse.Namespace) -> int:

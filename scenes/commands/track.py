@@ -28,18 +28,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
     parser.add_argument("--out", required=True, metavar="POSES.csv", help="CSV with one pose per frame")
-    parser.add_argument("--body", choices=BODIES, default="tool", help="tracked body (default: %(default)s)")
+    parser.add_argument("--body", choices=BODIES, default="tool", help="tracked body")
     parser.add_argument(
         "--frame", choices=FRAMES, default="camera",
-        help="coordinate system of the poses; patient and board must be visible (default: %(default)s)",
+        help="coordinate system of the poses; patient and board must be visible",
     )  # fmt: skip
     parser.add_argument(
         "--tip", type=float, nargs=3, metavar=("X", "Y", "Z"),
-        help="the tool's tip in the frame of its cube [mm], from `sulcus calibrate --pivot` (default 0 0 -150)",
+        help="the tool's tip in the frame of its cube [mm], from `sulcus calibrate --pivot` (default: 0 0 -150)",
     )  # fmt: skip
-    parser.add_argument(
-        "--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s] (default: %(default)s)"
-    )
+    parser.add_argument("--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s]")
     add_json(parser)
     add_force(parser)
 

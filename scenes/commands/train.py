@@ -31,15 +31,15 @@ from ..options.shared_options import add_devices, add_json
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("data", metavar="DATA.h5", help="from `sulcus simulate`; nothing else is needed")
-    parser.add_argument("--out", required=True, metavar="MODEL.npz", help="file for all models")
+    parser.add_argument("data", metavar="DATA.h5", help="data set from `sulcus simulate`")
+    parser.add_argument("--out", required=True, metavar="MODEL.npz", help="output file of all models")
     parser.add_argument(
         "--learners",
         help=f"model types: {', '.join(LEARNERS)}, or for poses {', '.join(OF_POSES)}, separated by commas (default: "
         "all that the data can train)",
     )
     parser.add_argument("--most", type=int, metavar="LOADS", help="maximum number of training loads (default: all)")
-    add_devices(parser, "where finite elements make the series; of a list the first. ")
+    add_devices(parser, "; the power series is computed by FEM on the first")
     add_force(parser)
     add_json(parser)
 

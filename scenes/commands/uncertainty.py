@@ -41,14 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
-    parser.add_argument(
-        "--draws", type=int, default=40, help=f"number of sampled bodies to solve, >= {FEWEST} (default: %(default)s)"
-    )
+    parser.add_argument("--draws", type=int, default=40, help=f"number of sampled bodies to solve, >= {FEWEST}")
     parser.add_argument(
         "--twins",
         type=int,
         default=20,
-        help="synthetic patients, not among the draws, on which the bound is tested; 0: none (default %(default)s)",
+        help="synthetic patients, not among the draws, on which the bound is tested; 0: none",
     )
     parser.add_argument(
         "--tissue", type=Path, metavar="FILE.json",

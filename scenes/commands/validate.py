@@ -20,9 +20,11 @@ MOST_SAID = 50
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("episodes", nargs="+", type=Path, help="folders of episodes, or episodes, .h5")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes at a time (%(default)s)")
-    parser.add_argument("--solve", type=int, default=0, metavar="K", help="solve K frames of each episode again")
+    parser.add_argument("episodes", nargs="+", type=Path, help="folders of episodes, or episode files (.h5)")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="number of processes")
+    parser.add_argument(
+        "--solve", type=int, default=0, metavar="K", help="number of frames of each episode to solve again"
+    )
     add_device(parser, "--solve")
     add_json(parser)
 

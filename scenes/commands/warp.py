@@ -31,35 +31,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
         "anatomy", nargs="?", type=Path, metavar="PATIENT.vtu",
-        help="made by `sulcus anatomy` or `sulcus patient` (default: the template that ships)",
+        help="anatomy from `sulcus anatomy` or `sulcus patient` (default: the template that ships)",
     )  # fmt: skip
     cause = parser.add_mutually_exclusive_group(required=True)
-    cause.add_argument("--scene", metavar="NAME", help="a moment of a scene, or of MY_SCENE.py, by finite elements")
+    cause.add_argument("--scene", metavar="NAME", help="built-in scene or MY_SCENE.py, solved by FEM at one frame")
     cause.add_argument(
         "--load", type=load, metavar="X,Y,Z,N",
-        help="a round tool that pushes inwards with N newton on the open cortex nearest to a place [mm, RAS]",
+        help="force [N] of a round tool that presses inwards on the open cortex nearest to a point [mm, RAS]",
     )  # fmt: skip
     cause.add_argument(
         "--located", type=Path, metavar="RESULT.vtu",
-        help="a result of `sulcus locate`, whose covariance gives the tumour's bound, or of `sulcus solve`",
+        help="result of `sulcus locate`, whose covariance bounds the tumour position, or of `sulcus solve`",
     )  # fmt: skip
     parser.add_argument("--frame", type=int, metavar="K", help="frame number of --scene")
     parser.add_argument(
         "--sequence", type=int, metavar="EVERY",
-        help="also write the forward field of every Nth frame of the scene, as a sequence for Slicer",
+        help="also write the forward field of every Nth frame of the scene, as a sequence for 3D Slicer",
     )  # fmt: skip
     parser.add_argument(
         "--image", type=Path, nargs="+", action="extend", default=[], metavar="T1.nii.gz",
-        help="images of the patient, in the space of the labels that the anatomy was made from",
+        help="images of the patient, in the space of the label map of the anatomy",
     )  # fmt: skip
     add_axes(parser)
     parser.add_argument(
         "--labels", type=Path, nargs="+", action="extend", default=[], metavar="LABELS.nii.gz",
         help="label maps in the same space; resampled with nearest neighbour",
     )  # fmt: skip
-    parser.add_argument(
-        "--interpolation", choices=ORDERS, default=ORDERS[0], help="interpolation of images (default: %(default)s)"
-    )
+    parser.add_argument("--interpolation", choices=ORDERS, default=ORDERS[0], help="interpolation of images")
     parser.add_argument(
         "--spacing", type=float, metavar="MM",
         help="grid spacing, 0.3 to 5 mm (default: 1, or finer until tumour and landmarks are within 0.05 mm)",
@@ -68,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_trajectory(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
-    add_device(parser, "finite elements")
+    add_device(parser, "FEM")
     add_json(parser)
 
 

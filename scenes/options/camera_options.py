@@ -19,9 +19,12 @@ PATHS = ("hand-held", "microscope", "orbit")
 
 def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None:
     """Declare the camera's options: shared by every command that draws a scene; `path` is the usual one."""
-    group = parser.add_argument_group("the camera; docs/camera.md says more")
+    group = parser.add_argument_group("camera options; see docs/camera.md")
     group.add_argument(
-        "--camera", type=Path, metavar="FILE.yaml", help="calibration of a camera, of OpenCV or ROS (default: ideal)"
+        "--camera",
+        type=Path,
+        metavar="FILE.yaml",
+        help="camera calibration in the format of OpenCV or ROS (default: ideal camera)",
     )
     group.add_argument(
         "--size",
@@ -30,7 +33,7 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
         help="scale the calibration of --camera to images of this size [pixel]",
     )
     group.add_argument("--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})")
-    group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held (default: %(default)s)")
+    group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
 
 

@@ -22,7 +22,7 @@ FRAME = re.compile(r"frame_\d{4,}\.png")
 
 def add_force(parser: argparse.ArgumentParser) -> None:
     """Declare --force: shared by every command that writes."""
-    parser.add_argument("--force", action="store_true", help="replace files that are there")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
 def check_output_path(

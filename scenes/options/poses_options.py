@@ -22,20 +22,20 @@ AUTO = "auto"
 
 def add_poses(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    group = parser.add_argument_group("poses of another tracker, with a clock of its own; docs/overlay.md says more")
+    group = parser.add_argument_group("poses of an external tracker with its own clock; see docs/external_tracker.md")
     group.add_argument(
         "--poses", type=Path, nargs=2, metavar=("TOOL.csv", "PATIENT.csv"),
         help="poses of the tool and of the patient's reference in the tracker's frame, as `sulcus track` writes them",
     )  # fmt: skip
     group.add_argument(
-        "--clock", nargs="+", metavar="S", default=["0"],
+        "--clock", nargs="+", metavar="SECONDS", default=["0"],
         help="tracker time minus image time [s], and its standard deviation (default: 0). auto: from the "
-        "motion of a cube and a reference that the film shows, too",
+        "motion of a cube and a reference that the video also shows",
     )  # fmt: skip
     group.add_argument(
         "--hand-eye", type=Path, metavar="H.json",
-        help="camera pose in the tracker's frame, from `sulcus calibrate --hand-eye --json` (default: the video "
-        "says it by the printed reference)",
+        help="camera pose in the tracker's frame, from `sulcus calibrate --hand-eye --json` (default: from the "
+        "printed reference in the video)",
     )  # fmt: skip
     group.add_argument(
         "--camera-poses", type=Path, metavar="CAMERA.csv",

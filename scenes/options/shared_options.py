@@ -18,24 +18,25 @@ if TYPE_CHECKING:
 
 def add_anatomy(parser: argparse.ArgumentParser) -> None:
     """Declare `--anatomy`; None stands for the template."""
-    parser.add_argument("--anatomy", type=Path, help=".vtu made by `sulcus anatomy` (default: the template that ships)")
+    parser.add_argument(
+        "--anatomy", type=Path, help="anatomy from `sulcus anatomy`, .vtu (default: the template that ships)"
+    )
 
 
 def add_device(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     """Declare `--device` of one device; `purpose` is what works there, where that is not all of the command."""
     parser.add_argument(
-        "--device", default="auto", help=f"auto, cpu, cuda or cuda:1{purpose and f', for {purpose}'} (default auto)"
+        "--device", default="auto", help=f"compute device{purpose and f' for {purpose}'}: auto, cpu, cuda or cuda:1"
     )
 
 
 def add_devices(parser: argparse.ArgumentParser, meant: str = "") -> None:
-    """Declare `--device` of several devices; `meant` is a sentence before, where not the whole command works there."""
+    """Declare `--device` of several devices; `meant` says how they share the work."""
     parser.add_argument(
         "--device",
         default="auto",
         metavar="DEVICES",
-        help=f"{meant}auto, cpu or cuda. Several with commas between, as in cuda:0,cuda:1, have a process each. all: "
-        "every graphics card. Default: %(default)s",
+        help=f"compute devices: auto, cpu, cuda, all, or a list such as cuda:0,cuda:1 with one process each{meant}",
     )
 
 
@@ -43,10 +44,10 @@ def add_seed(
     parser: argparse.ArgumentParser, purpose: str = "the random draw", kind: Callable[[str], int] = int
 ) -> None:
     """Declare `--seed` of a `purpose`, read as `kind`."""
-    parser.add_argument("--seed", type=kind, default=0, help=f"seed of {purpose} (default %(default)s)")
+    parser.add_argument("--seed", type=kind, default=0, help=f"seed of {purpose}")
 
 
-def add_json(parser: argparse.ArgumentParser, meaning: str = "print one JSON line in place of the text") -> None:
+def add_json(parser: argparse.ArgumentParser, meaning: str = "print one JSON line instead of text") -> None:
     """Declare `--json`."""
     parser.add_argument("--json", action="store_true", help=meaning)
 
@@ -69,17 +70,16 @@ def add_style(parser: argparse.ArgumentParser, without: tuple[Style, ...] = ()) 
     from ar.overlay.styles import STYLES
 
     styles: list[Style] = [style for style in STYLES if style not in without]
-    said = ". ".join(f"{style}: {STYLES[style]}" for style in styles if style != "none")
-    parser.add_argument(
-        "--style", choices=styles, default="window", help=f"overlay style (default: %(default)s). {said}"
-    )
+    said = "; ".join(f"{style}: {STYLES[style]}" for style in styles if style != "none")
+    parser.add_argument("--style", choices=styles, default="window", help=f"overlay style; {said}")
 
 
 def add_address(parser: argparse.ArgumentParser) -> None:
     """Declare --address."""
     parser.add_argument(
         "--address", action="append", default=[], metavar="https://NAME[:PORT]",
-        help="address of the page behind a proxy, a tunnel or another port, which then asks for a token; repeatable",
+        help="public address of the page behind a proxy, a tunnel or a forwarded port, which requires a token; "
+        "repeatable",
     )  # fmt: skip
 
 

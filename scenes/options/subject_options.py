@@ -22,11 +22,9 @@ from .placement_options import point
 
 def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None:
     """Declare --brain, --tumour, --mask, --tumour-in, and by these `names` the convention that labels follow."""
+    parser.add_argument("--brain", type=parse_labels, metavar="1,2", help="labels of brain, by number or segment name")
     parser.add_argument(
-        "--brain", type=parse_labels, metavar="1,2", help="labels that are brain, by number or by a segment's name"
-    )
-    parser.add_argument(
-        "--tumour", type=parse_labels, metavar="3,4", help="labels that are tumour, by number or by a segment's name"
+        "--tumour", type=parse_labels, metavar="3,4", help="labels of tumour, by number or segment name"
     )
     said = ". ".join(f"{name}: {one.source}" for name, one in CONVENTIONS.items())
     parser.add_argument(
@@ -39,25 +37,22 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
         "--mask", type=Path, metavar="BRAIN.nii.gz",
         help="brain mask (non-zero voxels), instead of --brain; may have its own grid",
     )  # fmt: skip
-    parser.add_argument(
-        "--tumour-in", type=Path, metavar="FILE", help="the file in which the tumour is marked, on a grid of its own"
-    )
+    parser.add_argument("--tumour-in", type=Path, metavar="FILE", help="label map of the tumour, on its own grid")
     add_axes(parser)
     for name, number in PART_LABELS.items():
         counts = "tumour" if name == "necrosis" else "brain"
         parser.add_argument(
             f"--{name}", type=parse_labels, metavar="LABELS",
-            help=f"labels that are {name}: they count as {counts}, and become region {number} for its own stiffness",
+            help=f"labels of {name}; part of the {counts}, and region {number} with its own stiffness",
         )  # fmt: skip
     for name in SEPTA:
         parser.add_argument(
             f"--{name}", type=parse_labels, metavar="LABELS",
-            help=f"labels that are {name}, a sheet of dura: they count as brain, and what lies at them does not move. "
-            "No convention marks it",
+            help=f"labels of the {name}, a sheet of dura: part of the brain, fixed; no convention marks it",
         )  # fmt: skip
     parser.add_argument(
         "--regions", type=lambda text: tuple(text.split(",")), default=(), metavar="NAMES",
-        help=f"parts that the convention marks and that become regions, of {', '.join(PART_LABELS)}",
+        help=f"parts marked by the convention that become regions: {', '.join(PART_LABELS)}",
     )  # fmt: skip
 
 
@@ -122,12 +117,12 @@ SMALLEST_ML, LARGEST_ML = 20.0, 5000.0
 
 def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare which healthy head is taken and where its tumour is drawn."""
-    drawn = parser.add_argument_group("a tumour drawn in a healthy head, without --labels")
+    drawn = parser.add_argument_group("synthetic tumour in a healthy head, without --labels")
     drawn.add_argument(
         "--head",
         choices=("template", "fsaverage"),
-        help="healthy head: the ICBM template (default), or fsaverage's inner skull, from the package mne. Or give "
-        "--mask, the brain of any healthy head, with --t1 if you like",
+        help="healthy head: the ICBM template, or fsaverage's inner skull from the package mne (default: template). "
+        "For another head give --mask, and --t1 if available",
     )
     drawn.add_argument(
         "--brain-ml",
@@ -155,7 +150,7 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="depth of a synthetic falx in the midline, which does not move [mm, 10 to 60] (default: no falx)",
     )
-    drawn.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default 0)")
+    drawn.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default: 0)")
 
 
 def describe_source(args: argparse.Namespace) -> str:

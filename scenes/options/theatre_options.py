@@ -24,7 +24,9 @@ def add_bodies(parser: argparse.ArgumentParser) -> None:
     """Declare which anatomy and models there are."""
     add_anatomy(parser)
     parser.add_argument(
-        "--model", type=Path, help="models from `sulcus train`, MODEL.npz (default: MESH.model.npz next to the anatomy)"
+        "--model",
+        type=Path,
+        help="trained models from `sulcus train`, .npz (default: MESH.model.npz next to the anatomy)",
     )
     add_trajectory(parser)
 
@@ -35,8 +37,8 @@ def add_trajectory(parser: argparse.ArgumentParser) -> None:
         "--trajectory",
         type=Path,
         metavar="LINE.mrk.json",
-        help="from 3D Slicer: the tool goes in where this line enters the open cortex, and along it. A point says only "
-        "where; the tool then goes straight inwards. Default: at the middle of the opening",
+        help="line from 3D Slicer along which the tool enters the open cortex, or a point, where it enters straight "
+        "inwards (default: the centre of the craniotomy)",
     )
 
 
@@ -45,17 +47,17 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
-        help="deformation model: a trained one (linear, ann, svr, ...), fem, or guarded: the best of them, and finite "
-        "elements where it is unsure. auto: chosen by --within-mm or --within-ms. Default: the model of least error",
+        help="deformation model: a trained one (linear, ann, svr, ...); fem; guarded: the best trained model with FEM "
+        "where it is unreliable; auto: chosen by --within-mm or --within-ms (default: the model with the smallest "
+        "error)",
     )
     parser.add_argument(
         "--guard-mm",
         type=float,
         metavar="MM",
-        help="95 %% bound of the surface error of the tumour beyond which guarded uses finite elements "
-        "[mm] (default 0.2)",
+        help="bound (95 %%) of the tumour's surface error above which guarded uses FEM [mm] (default: 0.2)",
     )
-    budget = parser.add_argument_group("a budget, in place of --deformer; errors are those that models state")
+    budget = parser.add_argument_group("budget, instead of --deformer; errors as reported by the models")
     budget.add_argument(
         "--within-mm",
         type=float,
@@ -70,7 +72,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     )
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
-    add_device(parser, "finite elements")
+    add_device(parser, "FEM")
 
 
 def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> Theatre:

@@ -29,7 +29,7 @@ Operated brains have 7.3 kPa, and their tumours 11.4 to 33.1 kPa in the mean of 
 Ultraschall Med. 37:584-590. The laws of brain in `MATERIALS` have 2.0 to 3.3 kPa.
 """
 AS_BRAIN = "the tissue of the brain"
-AS_LEARNED = f"what the models beside the anatomy learned, or {AS_BRAIN}"
+AS_LEARNED = f"as in the models' training data, or {AS_BRAIN}"
 
 
 def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, default_regions: str = AS_BRAIN) -> None:
@@ -37,7 +37,7 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, d
 
     The help describes each tissue if `whole`, else names it.
     """
-    sets = f"{', '.join(MATERIALS)} (`sulcus solve --help` gives their time scales and sources)"
+    sets = f"{', '.join(MATERIALS)}; see docs/concepts/physics.md"
     if whole:
         each = (f"{name} holds for {known.time_scale}. Source: {known.source}" for name, known in MATERIALS.items())
         sets = ". ".join(each)
@@ -46,27 +46,26 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, d
         default="default",
         choices=(*MATERIALS, *LAWS, Ogden.law),
         metavar="TISSUE",
-        help=f"tissue law ({', '.join((*LAWS, Ogden.law))}), or a named tissue, which is a law with its constants. "
-        f"Named tissues: {sets}. Default: %(default)s",
+        help=f"tissue law ({', '.join((*LAWS, Ogden.law))}), or named tissue: {sets}",
     )
     parser.add_argument(
-        "--young", type=float, metavar="PA", help=f"Young's modulus [Pa] (default the material's, or {BRAIN.young:g})"
+        "--young", type=float, metavar="PA", help=f"Young's modulus [Pa] (default: the material's, or {BRAIN.young:g})"
     )
     parser.add_argument(
-        "--poisson", type=float, metavar="NU", help=f"Poisson's ratio (default the material's, or {BRAIN.poisson:g})"
+        "--poisson", type=float, metavar="NU", help=f"Poisson's ratio (default: the material's, or {BRAIN.poisson:g})"
     )
     parser.add_argument(
         "--ogden",
         metavar="C1,M1;C2,M2",
-        help="terms of --material ogden, in FEBio's form: psi = sum of C/M^2 (l1^M + l2^M + l3^M - 3) [Pa] + "
-        "K/2 (ln J)^2. Where mu and alpha are given with 2 mu/alpha^2, C is 2 mu",
+        help="terms of --material ogden, psi = sum of C/M^2 (l1^M + l2^M + l3^M - 3) + K/2 (ln J)^2 [Pa], as in FEBio; "
+        "C is 2 mu of the form with 2 mu/alpha^2",
     )
     parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
     parser.add_argument(
         "--prony",
         metavar="G1,TAU1;G2,TAU2",
-        help="Prony series of the shear resistance: the share G relaxes with the time TAU [s]. In the scene "
-        'retract it is "0.45,0.5;0.365,50"',
+        help="Prony series of the shear modulus: fractions G and relaxation times TAU [s], such as "
+        '"0.45,0.5;0.365,50" in the scene retract',
     )
     add_region_argument(parser, default_regions)
 
@@ -78,25 +77,25 @@ def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN
         action="append",
         default=[],
         metavar="REGION:YOUNG[,POISSON]",
-        help=f"a region's own Young's modulus [Pa], and Poisson's ratio if it is another. Regions have a number or a "
-        f"name ({', '.join(OWN)}), as in oedema:2000 or 3:2000,0.45; with Ogden's law REGION:C1,M1;C2,M2;K. May be "
-        f"repeated. Default: {default}; necrosis that of the tumour",
+        help=f"Young's modulus [Pa] and, optionally, Poisson's ratio of a region, by number or name "
+        f"({', '.join(OWN)}), such as oedema:2000 or 3:2000,0.45; for Ogden's law REGION:C1,M1;C2,M2;K; repeatable "
+        f"(default: {default}; necrosis as the tumour)",
     )
 
 
 def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] = tuple(SKULLS)) -> None:
     """Declare --skull, one of `choices`, the first of which is the default."""
     words = {
-        "bonded": "the meninges hold the brain",
-        "slide": "it slides without friction and never comes off",
-        "contact": "it slides without friction, and comes off",
+        "bonded": "fixed by the meninges",
+        "slide": "frictionless sliding without separation",
+        "contact": "frictionless sliding with separation",
     }
-    said = ". ".join(f"{name}: {words[name]}" for name in choices)
+    said = "; ".join(f"{name}: {words[name]}" for name in choices)
     parser.add_argument(
         "--skull",
         choices=choices,
         default=choices[0],
-        help=f"boundary condition at the skull. {said}. Default: %(default)s",
+        help=f"boundary condition at the skull; {said}",
     )
 
 
@@ -106,7 +105,7 @@ def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMEND
         "--element",
         choices=ELEMENTS,
         help=". ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
-        + f". Default: {meant}; p2 where the mesh brings mid-edge nodes of its own",
+        + f" (default: {meant}; p2 for meshes with mid-edge nodes)",
     )
 
 

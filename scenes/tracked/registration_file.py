@@ -97,8 +97,8 @@ def describe_other_mesh(registration: Registration, anatomy: Anatomy, path: str 
         return ""
     if made.compute_distance(here) > SAME:
         raise InputError(
-            f"{path}: was made for another anatomy: bounds or tumour are {1e3 * made.compute_distance(here):.0f} mm from those "
-            "of this one. Give the --anatomy that was registered, or register this one."
+            f"{path}: was made for another anatomy: bounds or tumour are {1e3 * made.compute_distance(here):.0f} mm "
+            "from those of this one. Give the --anatomy that was registered, or register this one."
         )
     return f"{path} was made for another mesh of what seems to be the same scan"
 

@@ -1,0 +1,50 @@
+"""Help of commands: options in sections, `(default: X)` for each default, metavars of type or unit."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+SECTIONS = {
+    "scene": "--anatomy --trajectory --scene --frame-number",
+    "tissue": "--material --young --poisson --ogden --bulk --prony --region --skull --element",
+    "model": "--model --deformer --guard --within-error --within-time --learner --learners --locator --device --plugin",
+    "camera": "--camera --intrinsics --size --path --path-seed --eye",
+    "output": "--out --json --force --style --host --port --address",
+}
+"""Options in a section of the help of each command that has them; others stay under "options"."""
+UNITS = {"mm": "MM", "ms": "MS", "s": "SECONDS", "Pa": "PA", "pixel": "PX", "ml": "ML", "1/s": "HZ"}
+"""Metavars by unit."""
+KINDS: dict[Any, str] = {float: "X", Path: "FILE", None: "NAME"}
+"""Metavars by type; others are numbers."""
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Formatter that completes each option's help."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text, default = action.help or "", action.default
+        if default is False or default in (None, "", argparse.SUPPRESS, [], ()) or "default: " in text:
+            return text
+        return f"{text} (default: %(default)s)"
+
+    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
+        unit = re.search(r"\[([^\],]+)", action.help or "")
+        return (unit and UNITS.get(unit[1])) or KINDS.get(action.type, "N")
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Parser of a command, with `SECTIONS`."""
+
+    def __init__(self, **settings: Any) -> None:
+        self._sections: dict[str, argparse._ArgumentGroup] = {}
+        super().__init__(**{"formatter_class": HelpFormatter, **settings})
+        for title, names in SECTIONS.items():
+            self._sections |= dict.fromkeys(names.split(), self.add_argument_group(f"{title} options"))
+
+    def add_argument(self, *names: Any, **settings: Any) -> argparse.Action:
+        """Declare an argument, in its section if it has one."""
+        section = self._sections.get(names[0]) if names else None
+        return (super() if section is None else section).add_argument(*names, **settings)
