@@ -4,34 +4,50 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from functools import partial
 
 from benchmarks.__main__ import BENCHMARKS, make_parser
-from scenes.cli import COMMANDS, make_parsers
+from scenes.cli import COMMANDS, GROUPS, make_parsers
+from scenes.options.help import HelpFormatter
 
 WIDTH = 72
 """Characters of a line of code that a page shows."""
 
 
-def command_page() -> str:
-    """A page in Markdown: a section for each command, with its usage, its arguments and its examples."""
+def command_pages() -> dict[str, str]:
+    """Pages in Markdown by the place of their files: one for each command, and their list in groups."""
     _, parsers = make_parsers(*COMMANDS)
-    whole = ["# Command line", "What `sulcus COMMAND --help` prints, of every command. In words: {doc}`/commands`."]
-    for name, parser in {**parsers, "python -m benchmarks": make_parser(*BENCHMARKS)}.items():
-        whole += _section(name, parser, "##")
-    return "\n\n".join(whole) + "\n"
+    whole = ["# Command line", "One page for each command, with the text of `sulcus COMMAND --help`."]
+    for title, group in {
+        **GROUPS,
+        "Measurements of the project": {"benchmarks": "time and check the software"},
+    }.items():
+        links = "\n".join(f"| [{name}](commands/{name}.md) | {text} |" for name, text in group.items())
+        tree = "\n".join(f"commands/{name}" for name in group)
+        whole += [
+            f"## {title}",
+            f"| command | purpose |\n|---|---|\n{links}",
+            f"```{{toctree}}\n:hidden:\n\n{tree}\n```",
+        ]
+    pages = {f"commands/{name}.md": _page(name, parser) for name, parser in parsers.items()}
+    pages["commands/benchmarks.md"] = _page("python -m benchmarks", make_parser(*BENCHMARKS))
+    return {"command-line.md": "\n\n".join(whole) + "\n", **pages}
+
+
+def _page(name: str, parser: argparse.ArgumentParser) -> str:
+    return "\n\n".join(_section(name, parser, "#")) + "\n"
 
 
 def _section(name: str, parser: argparse.ArgumentParser, level: str) -> Iterator[str]:
     yield f"{level} {name}"
     if parser.description:
         yield _words(parser.description)
-    parser.formatter_class = partial(argparse.HelpFormatter, width=WIDTH)
-    yield _code(parser.format_usage().strip())
+    formatter = HelpFormatter(parser.prog, width=WIDTH)
+    formatter.add_usage(parser.usage, parser._actions, parser._mutually_exclusive_groups)
+    yield _code(formatter.format_help().strip())
     for group in parser._action_groups:
-        rows = [row for action in group._group_actions if (row := _row(action))]
+        rows = [row for action in group._group_actions if (row := _row(action, formatter))]
         if rows:
-            title = (group.title or "").capitalize()
+            title = (group.title or "").partition(";")[0].capitalize()
             yield f"**{title}.** {_words(group.description or '')}".strip()
             yield "\n\n".join(rows)
     if parser.epilog:
@@ -42,27 +58,13 @@ def _section(name: str, parser: argparse.ArgumentParser, level: str) -> Iterator
                 yield from _section(f"{name} {inner}", command, level + "#")
 
 
-def _row(action: argparse.Action) -> str | None:
+def _row(action: argparse.Action, formatter: HelpFormatter) -> str | None:
     """A name and what it means, as a definition; None of `--help`, which all have."""
     if isinstance(action, argparse._HelpAction | argparse._SubParsersAction) or action.help == argparse.SUPPRESS:
         return None
-    value = _value(action)
-    if action.option_strings:
-        name = ", ".join(f"`{option} {value}`" if value else f"`{option}`" for option in action.option_strings)
-    else:
-        name = f"`{value}`"
-    text = (action.help or "") % {**vars(action), "prog": "sulcus"}
+    names = formatter._format_action_invocation(action).replace(", ", "`, `")
     needed = "**needed** " if action.required and action.option_strings else ""
-    return f"{name}\n: {needed}{_words(text)}" if text else name
-
-
-def _value(action: argparse.Action) -> str:
-    if action.nargs == 0:
-        return ""
-    if action.choices is not None and action.metavar is None:
-        return "{" + ",".join(map(str, action.choices)) + "}"
-    shown = action.metavar or (action.dest.upper() if action.option_strings else action.dest)
-    return " ".join(shown) if isinstance(shown, tuple) else shown
+    return f"`{names}`\n: {needed}{_words(formatter._expand_help(action))}" if action.help else f"`{names}`"
 
 
 def _words(text: str) -> str:

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from array_tables import dataset_table, episode_table
-from command_pages import command_page
+from command_pages import command_pages
 from example_scripts import copy_scripts
 from public_names import reference_pages
 from sphinx.application import Sphinx
@@ -35,7 +35,7 @@ def _make(app: Sphinx) -> None:
     source, made = Path(app.srcdir), Path(app.srcdir) / "generated"
     made.mkdir(exist_ok=True)
     pages = {
-        "command-line.md": command_page(),
+        **command_pages(),
         "dataset-arrays.txt": dataset_table(),
         "episode-arrays.txt": episode_table(),
         "changes.md": (source.parent / "CHANGELOG.md").read_text().replace("](docs/", "](../"),
