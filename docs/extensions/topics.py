@@ -33,7 +33,8 @@ TOPICS = {
     },
     "scenes": {
         "Scenes": "Scene find_scene Bounds Player Frame Theatre open_theatre Site build_site get_template_path",
-        "Tool motion": "Touch press slide palpate stroke_cortex keep_idle draw lay Instrument Probe Blade Debulking Lying",
+        "Tool motion": """Touch press slide palpate stroke_cortex keep_idle draw lay Instrument Probe Blade Debulking
+            Lying""",
         "Cameras": "Viewpoint HandHeld Microscope Orbit Focus read_calibration write_calibration",
         "Observation of the cortex": "Sight StereoSight",
         "Episodes": "collect Episodes EpisodeDataset read_episodes write_card",
