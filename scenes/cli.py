@@ -17,7 +17,7 @@ from sim.runtime.versions import get_version
 
 from .commands.guidance import format_guidance
 from .commands.interrupt import INTERRUPTED
-from .options.help import CommandParser
+from .options.help import CommandParser, replace_former
 
 # A command's module is imported only when it is called: `sulcus solve` does not wait for torch.
 GROUPS = {
@@ -90,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0 (done), 1 (ran, but did not reach what was asked) or 2 (bad input)."""
     if argv is None:
         limit_threads()
-    arguments = join_points(sys.argv[1:] if argv is None else argv)
+    arguments = join_points(replace_former(sys.argv[1:] if argv is None else argv))
     asked = arguments[0] if arguments else None
     if asked == "bench":
         print("sulcus bench: is now `python -m benchmarks NAME`, from a checkout of the repository.", file=sys.stderr)

@@ -32,8 +32,8 @@ def test_the_command_names_every_part_and_refuses_bad_input(box, tmp_path, capsy
         (["--path", "microscope"], "zooms"),
         (["--intrinsics", "k.json"], "give it by --camera"),
         (["--registration", "none.json"], "no such file"),
-        (["--readout-ms", "9000"], "--readout-ms 9000: an image's rows"),
-        (["--corner-px", "-1"], "--corner-px -1"),
+        (["--readout", "9000"], "--readout 9000: an image's rows"),
+        (["--corner-noise", "-1"], "--corner-noise -1"),
         (["--samples", "10"], "--samples"),
     ):
         assert main([*words, *more]) == 2

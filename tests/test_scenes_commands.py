@@ -22,7 +22,7 @@ def test_unknown_scene_is_rejected_before_anatomy_opens(words, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     assert main([*words.split(), "--anatomy", "no.vtu"]) == 2
     assert "no scene is called 'x'" in capsys.readouterr().err
-    assert main(["warp", "no.vtu", "--scene", "x", "--frame", "1", "--out", "o"]) == 2
+    assert main(["warp", "no.vtu", "--scene", "x", "--frame-number", "1", "--out", "o"]) == 2
     assert "no scene is called 'x'" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 

@@ -73,7 +73,7 @@ def test_bad_input_is_one_sentence(folder, capsys):
     (folder / "tools.csv").write_text("frame,x,y,z\n2,1,2,3\n")
     assert main(["fit", body, first, first, "--force"]) == 2
     assert "frames 1 and 2 are the same" in capsys.readouterr().err
-    assert main(["fit", body, first, "--tool", str(folder / "tools.csv"), "--force"]) == 2
+    assert main(["fit", body, first, "--tool-log", str(folder / "tools.csv"), "--force"]) == 2
     assert "is of frame 2, but there are 1" in capsys.readouterr().err
     assert main(["fit", body, first, "--region", "tumour:9000", "--force"]) == 2
     assert "--region tumour: its stiffness is what `sulcus fit` finds" in capsys.readouterr().err

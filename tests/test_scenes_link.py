@@ -59,7 +59,7 @@ def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay
         (["--tool-name", "N\u00e4del"], "--tool-name 'N\u00e4del': must be of printable"),
         (["--camera-name", " "], "--camera-name ' '"),
         (["--tool-name", "StylusTipToReferenceA", "--camera-name", "StylusTipToReferenceB"], "their first 20"),
-        (["--tracking-mm", "-1"], "--tracking-mm -1"),
+        (["--tracking-noise", "-1"], "--tracking-noise -1"),
         (["--client", ":18944"], "--client :18944"),
         *((["--client", host], f"--client {host}: port 18944 of this machine") for host in SELF),
         (["--registration", "none.json"], "none.json: no such file"),

@@ -100,7 +100,16 @@ def test_in_the_patient_s_frame_the_camera_is_of_no_account(folder, camera, tool
     assert main(["track", str(folder), "--camera", camera, "--out", str(tmp_path / "p.csv"), "--body", "patient"]) == 0
     assert [row["state"] for row in read_csv(tmp_path / "p.csv")] == ["good"] * 5
     capsys.readouterr()
-    boardless = ["track", str(folder), "--camera", camera, "--out", str(tmp_path / "b.csv"), "--frame", "board"]
+    boardless = [
+        "track",
+        str(folder),
+        "--camera",
+        camera,
+        "--out",
+        str(tmp_path / "b.csv"),
+        "--reference-frame",
+        "board",
+    ]
     assert main(boardless) == 1 and "60.0 %  board lost: too few corners" in capsys.readouterr().out
 
 

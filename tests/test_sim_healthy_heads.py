@@ -69,7 +69,7 @@ def skull(tmp_path, monkeypatch):
 
 
 def test_fsaverage_has_its_inner_skull_and_size(skull, tmp_path, capsys):
-    words = ("--head", "fsaverage", "--brain-ml", 1300, "--nodes", 2000, "--cover", 8, "--json")
+    words = ("--head", "fsaverage", "--brain-volume", 1300, "--nodes", 2000, "--cover", 8, "--json")
     code, text, _ = run(capsys, *words, "--out", tmp_path / "fs.vtu")
     summary = json.loads(text)
     nodes = read_anatomy(tmp_path / "fs.vtu").mesh.nodes
@@ -147,7 +147,7 @@ def test_tumour_is_drawn_in_mask_with_t1(masked, capsys):
     assert np.linalg.norm(at / (55.0 * EGG)) == pytest.approx(1.0, abs=0.05)
     direction = np.array([40.0, 3.4, 52.6])
     assert at @ direction > 0.99 * np.linalg.norm(at) * np.linalg.norm(direction)
-    code, text, _ = run(capsys, *words, "--brain-ml", 1400, "--falx-depth", 20, "--out", masked / "large.vtu")
+    code, text, _ = run(capsys, *words, "--brain-volume", 1400, "--falx-depth", 20, "--out", masked / "large.vtu")
     large, factor = json.loads(text), (1400 / own["brain_ml"]) ** (1 / 3)
     assert code == 0 and large["brain_ml"] == pytest.approx(1400, rel=0.01) and large["septa_nodes"]["falx"] > 10
     walls = read_anatomy(masked / "large.vtu")
@@ -170,7 +170,7 @@ def test_tumour_is_drawn_in_mask_with_t1(masked, capsys):
         (("--mask", "zero.nii.gz"), "zero.nii.gz: has no voxel other than 0"),
         (("--mask", "tiny.nii.gz"), "make a brain of 0.064 ml"),
         (("--mask", "brain.nii.gz", "--head", "fsaverage"), "leave one of them out"),
-        (("--mask", "brain.nii.gz", "--brain-ml", "nan"), "--brain-ml nan is outside 20 to 5000"),
+        (("--mask", "brain.nii.gz", "--brain-volume", "nan"), "--brain-volume nan is outside 20 to 5000"),
         (("--mask", "brain.nii.gz", "--radius", "35", "--cover", "60"), "reaches out of the brain"),
         (("--mask", "brain.nii.gz", "--tumour", "2"), "--tumour belongs to a label volume"),
         (("--mask", "brain.nii.gz", "--radius", "5", "--falx-depth", "70"), "a falx of 70 mm is outside 10 to 60 mm"),

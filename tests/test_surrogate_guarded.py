@@ -122,12 +122,12 @@ def test_the_limit_is_the_user_s(theatre):
     assert "where its error may exceed 0.05 mm" in strict.described(GUARDED, small())
     parser = argparse.ArgumentParser()
     add_theatre(parser)
-    asked = parser.parse_args(["--guard-mm", "0.05", "--device", "cpu"])
+    asked = parser.parse_args(["--guard", "0.05", "--device", "cpu"])
     assert build_requested_theatre(asked).limit == pytest.approx(5e-5)
     assert build_requested_theatre(parser.parse_args(["--device", "cpu"])).limit is None
     for words in ("0", "-1", "nan"):
         with pytest.raises(InputError, match="give a positive number of millimetres"):
-            build_requested_theatre(parser.parse_args(["--guard-mm", words, "--device", "cpu"]))
+            build_requested_theatre(parser.parse_args(["--guard", words, "--device", "cpu"]))
 
 
 def test_scene_model_is_named_with_description(theatre):

@@ -46,7 +46,7 @@ def test_finite_elements_depend_on_the_share_alone(box):
 def test_the_command_draws_times_where_tissue_relaxes(tmp_path, box, capsys):
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
-    wanted = ["simulate", str(mesh), "--out", str(out), "--poses", "--count", "2", "--json"]
+    wanted = ["simulate", str(mesh), "--out", str(out), "--pose-control", "--count", "2", "--json"]
     wanted += ["--preset", "dissector", "--capsule", "2", "26"]
     assert main([*wanted, "--element", "p1", "--prony", "0.45,0.5;0.365,50"]) == 0
     found = read_dataset(out)

@@ -21,7 +21,7 @@ from ..published.protocol import positions_of, trained_in_turn
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("data", metavar="DATA.h5", help="from `sulcus simulate --preset seed`")
+    parser.add_argument("data", metavar="DATA.h5", help="from `sulcus simulate --tool-preset seed`")
     parser.add_argument("--learners", nargs="+", default=list(MACHINES), choices=MACHINES, help="which (default: all)")
     parser.add_argument("--count", type=int, help="use the first so many loads only")
     add_json(parser)

@@ -61,23 +61,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="from `sulcus register` (default: a published 1.56 mm along each axis)",
     )  # fmt: skip
     parser.add_argument(
-        "--corner-px",
+        "--corner-noise",
         type=float,
         default=0.1,
         help="standard deviation of a marker corner [pixel]",
     )
     parser.add_argument(
-        "--latency-ms", type=float, default=0.0,
+        "--latency", type=float, default=0.0,
         help="delay between the tracked and the drawn image [ms]",
     )  # fmt: skip
     parser.add_argument(
-        "--clock-ms",
+        "--time-noise",
         type=float,
         default=5.0,
         help="standard deviation of image and pose times [ms]",
     )
     parser.add_argument(
-        "--readout-ms", type=float,
+        "--readout", type=float,
         help="readout time of a rolling shutter [ms] (default: `readout_time` of --camera, or none)",
     )  # fmt: skip
     parser.add_argument("--draws", type=int, default=24, help=f"number of bodies to solve, >= {FEWEST}")
@@ -107,10 +107,10 @@ def run(args: argparse.Namespace) -> int:
     check_at_least("--samples", args.samples, FEWEST_SAMPLES)
     check_at_least("--twins", args.twins, 0)
     for name, value in (
-        ("--corner-px", args.corner_px),
-        ("--latency-ms", args.latency_ms),
-        ("--clock-ms", args.clock_ms),
-        ("--readout-ms", args.readout_ms or 0.0),
+        ("--corner-noise", args.corner_noise),
+        ("--latency", args.latency),
+        ("--time-noise", args.time_noise),
+        ("--readout", args.readout or 0.0),
     ):
         if not 0.0 <= value < 1e4:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
         rest=Stage(scene, site).select_stage(scene.build_loads(site, scene.path(time), time)).tumour_at_rest.vertices,
         field=still.fields[number], normals=still.normals[number], velocity=compute_velocity(still, number),
         bodies=own_bodies, meshes=meshes, own_mesh=own_mesh, surrogate=_promised(theatre, scene, time),
-        registration=registration, corner=args.corner_px, latency=1e-3 * args.latency_ms, clock=1e-3 * args.clock_ms,
+        registration=registration, corner=args.corner_noise, latency=1e-3 * args.latency, clock=1e-3 * args.time_noise,
     )  # fmt: skip
     twins = None
     if args.twins:
@@ -166,12 +166,12 @@ def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
     get_tissue(scene)
     filmed = add_targets(args, scene)
     calibration = filmed.viewpoint.calibration
-    if args.readout_ms is None or calibration is None:
+    if args.readout is None or calibration is None:
         return filmed
     try:
-        rolling = replace(calibration, readout=1e-3 * args.readout_ms)
+        rolling = replace(calibration, readout=1e-3 * args.readout)
     except ValueError as error:
-        raise InputError(f"--readout-ms {args.readout_ms:g}: {error}") from error
+        raise InputError(f"--readout {args.readout:g}: {error}") from error
     return replace(filmed, viewpoint=replace(filmed.viewpoint, calibration=rolling))
 
 
@@ -248,7 +248,7 @@ def _flat(args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: d
             "width": calibration.width, "height": calibration.height, "focal_px": list(calibration.focal),
             "distance_mm": 1e3 * filmed.viewpoint.distance, "path": args.path or "stays",
         },
-        "latency_ms": args.latency_ms, "clock_ms": args.clock_ms, "corner_px": args.corner_px,
+        "latency_ms": args.latency, "clock_ms": args.time_noise, "corner_px": args.corner_noise,
         "readout_ms": 1e3 * calibration.readout,
         "samples": args.samples, "bodies": len(filmed.bodies), "seed": args.seed,
         "parts": {name: _figures(errors) for name, errors in rows.items()},

@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "A frame without tool is one with drained fluid",
     )  # fmt: skip
     parser.add_argument(
-        "--tool", metavar="TOOLS.csv",
+        "--tool-log", metavar="TOOLS.csv",
         help="pressing tools, columns `frame,x,y,z[,radius][,force[,sigma]]`: frame number from 1, tip and radius of "
         "the pressed disc [mm] (default: 6), measured force and its standard deviation [N], or empty cells",
     )  # fmt: skip
@@ -98,7 +98,7 @@ def _frames(args: argparse.Namespace) -> list[Frame]:
     from surrogate.fitting.frame import Frame, read_tools
     from surrogate.locating.observed_files import read_observation
 
-    tools = ((),) * len(args.frames) if args.tool is None else read_tools(args.tool, len(args.frames))
+    tools = ((),) * len(args.frames) if args.tool_log is None else read_tools(args.tool_log, len(args.frames))
     seen = [replace(read_observation(path), rigid=1e-3 * args.rigid) for path in args.frames]
     return [Frame(*each) for each in zip(seen, tools, strict=True)]
 

@@ -35,14 +35,14 @@ next: run it by ONNX Runtime; the file itself says what goes in and what comes o
 next: sulcus demo --anatomy patient.vtu""",
     "locate": """examples:
   sulcus locate patient.vtu vessels.csv --out located.vtu
-  sulcus locate patient.vtu cloud.csv --tool tips.csv --out located.vtu --json
+  sulcus locate patient.vtu cloud.csv --tips tips.csv --out located.vtu --json
 next: open located.vtu in ParaView; `displacement` and `deviation` are in metres""",
     "locator": """examples:
   sulcus locator patient.vtu
   sulcus locator patient.vtu --small
 next: sulcus demo sag --anatomy patient.vtu, which finds patient.locator.npz beside the mesh""",
     "fit": """examples:
-  sulcus fit patient.vtu drained1.csv drained2.csv pressed.csv --tool tools.csv
+  sulcus fit patient.vtu drained1.csv drained2.csv pressed.csv --tool-log tools.csv
   sulcus fit patient.vtu drained1.csv drained2.csv --rigid 0.3 --json
 next: sulcus uncertainty press --anatomy patient.vtu, which draws its bodies from patient.tissue.json""",
     "scenes": """examples:
@@ -79,10 +79,10 @@ next: give the same command on every machine that sees the folder""",
   sulcus markers --out markers
 next: print markers/markers.pdf at 100 %, measure its rulers, glue; then film the board for sulcus calibrate""",
     "track": """example:
-  sulcus track film.mp4 --camera camera.yaml --frame patient --out tool.csv
+  sulcus track film.mp4 --camera camera.yaml --reference-frame patient --out tool.csv
 next: sulcus calibrate --pivot tool.csv, where the film shows the tool pivoting""",
     "warp": """examples:
-  sulcus warp patient.vtu --scene press --frame 60 --image t1.nii.gz --out warp
+  sulcus warp patient.vtu --scene press --frame-number 60 --image t1.nii.gz --out warp
   sulcus warp patient.vtu --located located.vtu --image t1.nii.gz --out warp
 next: read warp/README.txt""",
     "film": """examples:

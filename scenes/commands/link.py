@@ -93,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "the tip, z away from the shaft)",
     )  # fmt: skip
     parser.add_argument(
-        "--tracking-mm", type=float, default=0.5, metavar="MM",
+        "--tracking-noise", type=float, default=0.5, metavar="MM",
         help="standard deviation of the tip position per axis [mm], which no message contains",
     )  # fmt: skip
     parser.add_argument("--stale", type=float, default=0.3, metavar="SECONDS", help="maximum pose age [s]")
@@ -122,8 +122,8 @@ def run(args: argparse.Namespace) -> int:
     for name, value in {"--seconds": args.seconds, "--stale": args.stale, "--clients": args.clients}.items():
         if not value > 0:
             raise InputError(f"{name} {value:g}: give a positive number, or leave it out.")
-    if not 0.0 <= args.tracking_mm < 100.0:
-        raise InputError(f"--tracking-mm {args.tracking_mm:g}: give millimetres, 0 to 100.")
+    if not 0.0 <= args.tracking_noise < 100.0:
+        raise InputError(f"--tracking-noise {args.tracking_noise:g}: give millimetres, 0 to 100.")
     if not 0 <= args.port < 1 << 16:
         raise InputError(f"--port {args.port}: give a port from 0 to 65535.")
     names = parse_names(args)
@@ -264,7 +264,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
     tool = tool or _tool_of(theatre, args.anatomy)
     scene = apply_tissue_options(args, build_tracked_scene(args, tool.shape), theatre)
     deformer, who = build_mover(args, theatre, scene, True)
-    stage, tracking = theatre.build_stage(scene), 1e-3 * args.tracking_mm
+    stage, tracking = theatre.build_stage(scene), 1e-3 * args.tracking_noise
     eye = None
     if calibration is not None:
         device = find_device(args.device, LIVE.precision).name
@@ -295,6 +295,6 @@ def _tool_of(theatre: Theatre, path: Path) -> TrackedTool:
     if not posed:
         raise InputError(
             f"no model beside {path} knows a tool's poses. Give --tool TOOL.json with --deformer fem, or make a model: "
-            "`sulcus simulate --poses`, `sulcus train`."
+            "`sulcus simulate --pose-control`, `sulcus train`."
         )
     return TrackedTool(min(posed, key=lambda each: each[0])[1], np.diag([1.0, -1.0, -1.0, 1.0]))

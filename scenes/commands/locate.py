@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "`sigma`: non-rigid error of each point (default: 0.58)",
     )
     parser.add_argument(
-        "--tool", metavar="TIPS.csv", help="contact points of tools on the cortex [mm], columns `x,y,z`"
+        "--tips", metavar="TIPS.csv", help="contact points of tools on the cortex [mm], columns `x,y,z`"
     )
     parser.add_argument(
         "--rigid", type=float, default=0.8, metavar="MM",
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
     observation = replace(
-        read_observation(args.observed, args.tool), rigid=1e-3 * args.rigid, checked=args.registration_checked
+        read_observation(args.observed, args.tips), rigid=1e-3 * args.rigid, checked=args.registration_checked
     )
     to_evidence(anatomy, observation)  # reject points that cannot be placed before the locator is loaded
     locator = find_locator(args, anatomy, small=out is None)

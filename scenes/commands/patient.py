@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--count", type=int, default=1000, help="number of loads to simulate")
     parser.add_argument(
-        "--preset", choices=PRESETS, default="palpation",
+        "--tool-preset", choices=PRESETS, default="palpation",
         help="tool preset; mixed: all tools; seed: the published protocol; brutal: far beyond surgical loads"
     )  # fmt: skip
     parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law")
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
         ["anatomy", *label_words(args), *t1,
          "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), *to_opening_options(args),
          "--out", str(args.out)],
-        ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--preset", args.preset,
+        ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--tool-preset", args.tool_preset,
          "--device", args.device, "--material", args.material,
          *([] if args.element is None else ["--element", args.element]),
          *(f"--region={text}" for text in args.region)],

@@ -53,10 +53,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "with mid-edge nodes)",
     )  # fmt: skip
     parser.add_argument(
-        "--beside", nargs="+", choices=ELEMENTS, default=[], metavar="ELEMENT",
+        "--compare", nargs="+", choices=ELEMENTS, default=[], metavar="ELEMENT",
         help="also compute with these elements on the same mesh, to show the discretisation error",
     )  # fmt: skip
-    parser.add_argument("--preset", choices=PRESETS, default="palpation", help="tool preset")
+    parser.add_argument("--tool-preset", choices=PRESETS, default="palpation", help="tool preset")
     parser.add_argument("--count", type=int, default=32, help="number of sampled loads")
     add_seed(parser)
     add_device(parser)
@@ -85,14 +85,14 @@ def run(args: argparse.Namespace) -> int:
     anatomy = theatre.anatomy
     pushed = (model for model in theatre.models.values() if model.tool is None)
     model = min(pushed, key=lambda model: model.bound, default=None)
-    loads = draw(args.preset, anatomy, args.count, args.seed)
+    loads = draw(args.tool_preset, anatomy, args.count, args.seed)
     body = BodyVariant(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))
     study = SensitivityStudy(anatomy, loads, body, device=args.device)
-    changed = list_variants(anatomy, body, args.beside)
+    changed = list_variants(anatomy, body, args.compare)
     where = describe_machine(args.device)
     lines = sys.stderr if args.json else sys.stdout
     print(
-        f"{where}\n\n{_opening(study, args.preset)}\n\n{_line(HEAD)}\n{_line(['-' * width for width in WIDTHS])}",
+        f"{where}\n\n{_opening(study, args.tool_preset)}\n\n{_line(HEAD)}\n{_line(['-' * width for width in WIDTHS])}",
         file=lines,
         flush=True,
     )
@@ -108,12 +108,12 @@ def run(args: argparse.Namespace) -> int:
         write_table(args.out, table)
     failed = sum(row.force.failed + row.motion.failed for row in found)
     if args.json:
-        stated = {"preset": args.preset, "loads": len(loads), "seed": args.seed, "default": asdict(body)}
+        stated = {"preset": args.tool_preset, "loads": len(loads), "seed": args.seed, "default": asdict(body)}
         surrogate = _stated(model) if model else None
         whole = {"machine": where, **stated, "failed": failed, "surrogate": surrogate, "rows": table}
         print(to_json_line(whole))
     else:
-        print("\n".join([*_bound(model), NOTE, *_remarks(study, args.beside, model, failed)]))
+        print("\n".join([*_bound(model), NOTE, *_remarks(study, args.compare, model, failed)]))
     return 1 if failed else 0
 
 
@@ -189,13 +189,13 @@ def _remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | No
         stated = _stated(model)
         said.append(
             f"The surrogate's error is its stated bound on held-out {stated['preset']} loads against its own "
-            f"finite elements, of the kind {stated['element']}. How far off those are, --beside says."
+            f"finite elements, of the kind {stated['element']}. How far off those are, --compare says."
         )
     else:
         said.append("No surrogate's error stands beside: no model with a bound lies beside this anatomy (--model).")
     said.append(LOCKING[study.body.element])
     if not beside:
-        said.append("The mesh's own error is not known here: --beside p2 compares quadratic elements on this mesh.")
+        said.append("The mesh's own error is not known here: --compare p2 compares quadratic elements on this mesh.")
     if not study.anatomy.slide_normal.any():
         said.append("This anatomy has no skull: what it does has no row.")
     return said

@@ -62,11 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="DATA.h5", help="output data set; resumed if incomplete")
     parser.add_argument("--count", type=int, default=2000, help="number of loads")
     parser.add_argument(
-        "--preset", choices=PRESETS, default="palpation",
+        "--tool-preset", choices=PRESETS, default="palpation",
         help="tool preset; mixed: all tools; seed: the published protocol; brutal: far beyond surgical loads"
     )  # fmt: skip
     parser.add_argument(
-        "--poses",
+        "--pose-control",
         action="store_true",
         help="move a rigid tool by pose, instead of a force on its footprint (default shape: ball of the preset's mean "
         "radius)",
@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
         tissue = parse_tissue(args)
         tool, loads = _drawn(args, anatomy, tissue)
     precision = "float32" if args.tolerance >= 1e-4 else "float64"
-    accuracy = Accuracy(args.tolerance, precision=precision, limit_strain=args.preset not in BEYOND_TISSUE)
+    accuracy = Accuracy(args.tolerance, precision=precision, limit_strain=args.tool_preset not in BEYOND_TISSUE)
     effects: tuple[Effect, ...] = (*pushed_effects(anatomy, elasticity, args.skull), NodalForce())
     if tool is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
             "element": solver.element,
             "accuracy": repr(accuracy),
             "device": devices[0].split(":")[0],
-            "preset": args.preset,
+            "preset": args.tool_preset,
             "seed": str(args.seed),
             **({} if tool is None else {"shape": repr(tool)}),
             **({"history": HISTORY} if tool is not None and tissue.prony else {}),
@@ -157,12 +157,14 @@ def run(args: argparse.Namespace) -> int:
 def _drawn(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
     """Return the tool whose poses were asked for, if they were, and the loads; of tissue that relaxes with times."""
     asked = _asked(args)
-    if not args.poses:
+    if not args.pose_control:
         if asked is not None:
-            raise InputError("--ball, --capsule and --blade are moved by pose: give --poses too, or leave them out.")
-        return None, draw(args.preset, anatomy, args.count, args.seed)
-    tool = choose_ball(args.preset) if asked is None else asked
-    loads = draw_poses(args.preset, anatomy, args.count, args.seed, tool)
+            raise InputError(
+                "--ball, --capsule and --blade are moved by pose: give --pose-control too, or leave them out."
+            )
+        return None, draw(args.tool_preset, anatomy, args.count, args.seed)
+    tool = choose_ball(args.tool_preset) if asked is None else asked
+    loads = draw_poses(args.tool_preset, anatomy, args.count, args.seed, tool)
     return tool, Loads(loads.causes, sample_times(len(loads), args.seed)) if tissue.prony else loads
 
 
@@ -203,12 +205,12 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
             "outcome": counts,
             "seconds": {"unit responses": solved.unit_seconds, "loads": solved.load_seconds},
             "loads_per_second": rate,
-            "nominal_refused": 0.0 if args.poses else compute_rejected_share(args.preset),
+            "nominal_refused": 0.0 if args.pose_control else compute_rejected_share(args.tool_preset),
         }
         print(json.dumps(said))
         return
     if asked < args.count:
-        print(f"the preset {args.preset} has {asked} loads: all of them were taken.")
+        print(f"the preset {args.tool_preset} has {asked} loads: all of them were taken.")
     if len(outcomes) > asked:
         print(
             f"{args.out} already holds {len(outcomes)} loads, more than the {asked} asked for: nothing was taken away."
@@ -218,8 +220,8 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
     print(f"Solved by {solver}.")
     if rate is not None:
         print(f"{rate:.4g} loads a second, from their footprints to the file.")
-    if not args.poses and describe_rejected(args.preset):
-        print(describe_rejected(args.preset))
+    if not args.pose_control and describe_rejected(args.tool_preset):
+        print(describe_rejected(args.tool_preset))
     if failed:
         print(
             f"{failed} answers are not reliable (their outcomes say why); they stay in the file and are not trained on."

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="POSES.csv", help="CSV with one pose per frame")
     parser.add_argument("--body", choices=BODIES, default="tool", help="tracked body")
     parser.add_argument(
-        "--frame", choices=FRAMES, default="camera",
+        "--reference-frame", choices=FRAMES, default="camera",
         help="coordinate system of the poses; patient and board must be visible",
     )  # fmt: skip
     parser.add_argument(
@@ -60,8 +60,10 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
-    if args.body == args.frame:
-        raise InputError(f"the {args.body} is at rest in its own frame: choose --frame camera, or another --body.")
+    if args.body == args.reference_frame:
+        raise InputError(
+            f"the {args.body} is at rest in its own frame: choose --reference-frame camera, or another --body."
+        )
     out = check_output_path(args.out, ".csv", args.force, [args.pictures, Path(args.camera)])
     tip = np.array([0.0, 0.0, -TIP]) if args.tip is None else 1e-3 * np.array(args.tip)
     if not np.isfinite(tip).all():
@@ -69,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     calibration = read_calibration(args.camera)
     check_video(args.pictures, args.rate, calibration, args.camera)
     begun = time.perf_counter()
-    rows = list(follow_body(args.pictures, calibration, args.body, args.frame, args.rate))
+    rows = list(follow_body(args.pictures, calibration, args.body, args.reference_frame, args.rate))
     seconds = time.perf_counter() - begun
     write_poses(out, rows, tip)
     good = sum(row.pose is not None for row in rows)
@@ -81,5 +83,5 @@ def run(args: argparse.Namespace) -> int:
         print(f"{len(rows)} pictures of the {args.body}, {middle:.1f} ms each (median):")
         for (lacks, verdict), count in Counter((row.lacks, row.verdict) for row in rows).most_common():
             print(f"  {100.0 * count / len(rows):5.1f} %  {f'{lacks} ' if lacks else ''}{verdict.value}")
-        print(f"written: {out}, in the {args.frame}'s frame")
+        print(f"written: {out}, in the {args.reference_frame}'s frame")
     return 0 if good else 1

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--located", type=Path, metavar="RESULT.vtu",
         help="result of `sulcus locate`, whose covariance bounds the tumour position, or of `sulcus solve`",
     )  # fmt: skip
-    parser.add_argument("--frame", type=int, metavar="K", help="frame number of --scene")
+    parser.add_argument("--frame-number", type=int, metavar="K", help="frame number of --scene")
     parser.add_argument(
         "--sequence", type=int, metavar="EVERY",
         help="also write the forward field of every Nth frame of the scene, as a sequence for 3D Slicer",
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_axes(parser)
     parser.add_argument(
-        "--labels", type=Path, nargs="+", action="extend", default=[], metavar="LABELS.nii.gz",
+        "--label-maps", type=Path, nargs="+", action="extend", default=[], metavar="LABELS.nii.gz",
         help="label maps in the same space; resampled with nearest neighbour",
     )  # fmt: skip
     parser.add_argument("--interpolation", choices=ORDERS, default=ORDERS[0], help="interpolation of images")
@@ -99,7 +99,8 @@ def run(args: argparse.Namespace) -> int:
         theatre = open_theatre(args.anatomy, None, args.device)
         scene = None if args.located else build_scene(args, theatre)
         pictures = [
-            read_picture(path, theatre.anatomy, path in args.labels, args.axes) for path in (*args.image, *args.labels)
+            read_picture(path, theatre.anatomy, path in args.label_maps, args.axes)
+            for path in (*args.image, *args.label_maps)
         ]
         for picture in pictures:
             for warning in picture.warnings:
@@ -135,13 +136,13 @@ def check_warp_options(args: argparse.Namespace) -> None:
 
     if args.spacing is not None and not 1e3 * FINEST <= args.spacing <= 1e3 * COARSEST:
         raise InputError(f"--spacing {args.spacing:g}: give {1e3 * FINEST:g} to {1e3 * COARSEST:g} mm.")
-    if args.scene is None and (args.frame is not None or args.sequence is not None):
-        raise InputError("--frame and --sequence are of a --scene: give one, or leave them out.")
+    if args.scene is None and (args.frame_number is not None or args.sequence is not None):
+        raise InputError("--frame-number and --sequence are of a --scene: give one, or leave them out.")
     if args.scene is None and args.trajectory is not None:
         raise InputError("--trajectory is of a --scene: a --load has its own place. Leave one of them out.")
-    if args.scene is not None and args.frame is None:
-        raise InputError("--frame: say which moment of the scene, by its number; `sulcus demo` shows them.")
-    names = [to_warped_name(path) for path in (*args.image, *args.labels)]
+    if args.scene is not None and args.frame_number is None:
+        raise InputError("--frame-number: say which moment of the scene, by its number; `sulcus demo` shows them.")
+    names = [to_warped_name(path) for path in (*args.image, *args.label_maps)]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two images would both become {name}. Rename one, or warp them one after the other.")
@@ -159,8 +160,8 @@ def build_scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
         return apply_tissue_options(args, replace(build_pushing_scene(theatre, args.load), name="load"), theatre)
     scene = build_requested_scene(args, args.scene, theatre)
     last = len(scene.times) - 1
-    if not 0 <= args.frame <= last:
-        raise InputError(f"--frame {args.frame}: {scene.name} has the frames 0 to {last}.")
+    if not 0 <= args.frame_number <= last:
+        raise InputError(f"--frame-number {args.frame_number}: {scene.name} has the frames 0 to {last}.")
     if args.sequence is not None and not 1 <= args.sequence <= last:
         raise InputError(f"--sequence {args.sequence}: give 1 to {last}, one frame in so many.")
     return scene
@@ -210,7 +211,7 @@ def select_moments(
 
     if scene is None:
         return read_moment(args.located, theatre.anatomy), []
-    wanted = args.frame or 0
+    wanted = args.frame_number or 0
     many = [] if args.sequence is None else list(range(0, len(scene.times), args.sequence))
     frames = sorted({wanted, *many})
     with tqdm(total=frames[-1] + 1, unit="frame", desc="finite elements", file=sys.stderr) as bar:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,21 @@ UNITS = {"mm": "MM", "ms": "MS", "s": "SECONDS", "Pa": "PA", "pixel": "PX", "ml"
 """Metavars by unit."""
 KINDS: dict[Any, str] = {float: "X", Path: "FILE", None: "NAME"}
 """Metavars by type; others are numbers."""
+
+FORMER = {
+    "": "guard-mm:guard within-mm:within-error within-ms:within-time",
+    "anatomy": "brain-ml:brain-volume",
+    "budget": "corner-px:corner-noise latency-ms:latency clock-ms:time-noise readout-ms:readout",
+    "fit": "tool:tool-log",
+    "link": "tracking-mm:tracking-noise",
+    "locate": "tool:tips",
+    "patient": "preset:tool-preset",
+    "sensitivity": "preset:tool-preset beside:compare",
+    "simulate": "preset:tool-preset poses:pose-control",
+    "track": "frame:reference-frame",
+    "warp": "frame:frame-number labels:label-maps",
+}
+"""Former and present names of options of all commands ("") and of one: accepted for one release."""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -48,3 +65,17 @@ class CommandParser(argparse.ArgumentParser):
         """Declare an argument, in its section if it has one."""
         section = self._sections.get(names[0]) if names else None
         return (super() if section is None else section).add_argument(*names, **settings)
+
+
+def replace_former(arguments: Sequence[str]) -> list[str]:
+    """Replace former names of options, with a notice for each."""
+    command = arguments[0] if arguments else ""
+    pairs = [pair.partition(":") for key in {"", command} for pair in FORMER.get(key, "").split()]
+    names = {f"--{former}": f"--{present}" for former, _, present in pairs}
+    replaced = []
+    for argument in arguments:
+        name, equal, value = argument.partition("=")
+        if name in names:
+            print(f"sulcus {command}: {name} is now {names[name]}", file=sys.stderr)
+        replaced.append(f"{names.get(name, name)}{equal}{value}")
+    return replaced

@@ -125,7 +125,7 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
         "For another head give --mask, and --t1 if available",
     )
     drawn.add_argument(
-        "--brain-ml",
+        "--brain-volume",
         type=float,
         metavar="ML",
         help="volume to which the brain is scaled [ml] (default: 1470; with --mask, its own)",
@@ -179,8 +179,10 @@ def build_drawn_subject(args: argparse.Namespace, chosen: dict[str, Any]) -> Sub
         raise InputError("--t1 colours your own brain: give --labels or --mask too, or leave it out.")
     if args.mask is not None and args.head is not None:
         raise InputError(f"--mask says whose brain it is, and --head {args.head} does: leave one of them out.")
-    if args.brain_ml is not None and not SMALLEST_ML <= args.brain_ml <= LARGEST_ML:
-        raise InputError(f"--brain-ml {args.brain_ml:g} is outside {SMALLEST_ML:g} to {LARGEST_ML:g}: choose between.")
+    if args.brain_volume is not None and not SMALLEST_ML <= args.brain_volume <= LARGEST_ML:
+        raise InputError(
+            f"--brain-volume {args.brain_volume:g} is outside {SMALLEST_ML:g} to {LARGEST_ML:g}: choose between."
+        )
     if args.tumour_at is not None and (args.site is not None or args.cover is not None):
         raise InputError("--tumour-at says where the tumour lies: leave out --site and --cover, or --tumour-at.")
     middle = None if args.tumour_at is None else tuple(1e-3 * value for value in args.tumour_at)
@@ -192,7 +194,7 @@ def build_drawn_subject(args: argparse.Namespace, chosen: dict[str, Any]) -> Sub
 
 
 def _in_head(tumour: Tumour, args: argparse.Namespace) -> Subject:
-    volume = None if args.brain_ml is None else 1e-6 * args.brain_ml
+    volume = None if args.brain_volume is None else 1e-6 * args.brain_volume
     if args.mask is not None:
         return build_synthetic_subject(tumour, build_masked_head(args.mask, args.t1, volume))
     head = Head() if volume is None else Head(volume)

@@ -48,24 +48,24 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--deformer",
         help="deformation model: a trained one (linear, ann, svr, ...); fem; guarded: the best trained model with FEM "
-        "where it is unreliable; auto: chosen by --within-mm or --within-ms (default: the model with the smallest "
+        "where it is unreliable; auto: chosen by --within-error or --within-time (default: the model with the smallest "
         "error)",
     )
     parser.add_argument(
-        "--guard-mm",
+        "--guard",
         type=float,
         metavar="MM",
         help="bound (95 %%) of the tumour's surface error above which guarded uses FEM [mm] (default: 0.2)",
     )
     budget = parser.add_argument_group("budget, instead of --deformer; errors as reported by the models")
     budget.add_argument(
-        "--within-mm",
+        "--within-error",
         type=float,
         metavar="MM",
         help="use the fastest deformation model whose reported error is at most this [mm]",
     )
     budget.add_argument(
-        "--within-ms",
+        "--within-time",
         type=float,
         metavar="MS",
         help="use the most accurate deformation model that needs at most this per frame [ms]",
@@ -86,11 +86,11 @@ def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> Theatre:
     from ..play.deformers import open_theatre
 
     theatre = open_theatre(args.anatomy, args.model, args.device, scenes)
-    if args.guard_mm is None:
+    if args.guard is None:
         return theatre
-    if not 0.0 < args.guard_mm < float("inf"):
-        raise InputError(f"--guard-mm {args.guard_mm:g}: give a positive number of millimetres, or leave it out.")
-    return replace(theatre, limit=1e-3 * args.guard_mm)
+    if not 0.0 < args.guard < float("inf"):
+        raise InputError(f"--guard {args.guard:g}: give a positive number of millimetres, or leave it out.")
+    return replace(theatre, limit=1e-3 * args.guard)
 
 
 def build_requested_scene(args: argparse.Namespace, name: str, theatre: Theatre) -> Scene:
@@ -142,7 +142,7 @@ def choose_deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene) ->
     InputError
         A deformer and a budget, or a budget that none here meets.
     """
-    budget = args.within_mm, args.within_ms
+    budget = args.within_error, args.within_time
     if args.deformer != "auto" and budget == (None, None):
         if args.deformer is None and not theatre.select_models(scene):
             from ..play.deformers import TRUTH

@@ -42,8 +42,8 @@ def choose(offers: Sequence[Offer], within_mm: float | None = None, within_ms: f
     bounds = [f"{bound:g} {unit}" for unit, bound in given.items() if bound is not None]
     if not bounds or any(bound is not None and not bound > 0.0 for bound in given.values()):
         raise InputError(
-            f"no deformer can be chosen within {' and '.join(bounds) or 'no bound'}: give --within-mm, --within-ms or "
-            "both, positive."
+            f"no deformer can be chosen within {' and '.join(bounds) or 'no bound'}: give --within-error, "
+            "--within-time or both, positive."
         )
     exact = [offer for offer in offers if within_mm is None or offer.error_mm <= within_mm]
     fast = [offer for offer in offers if within_ms is None or offer.median_ms <= within_ms]
