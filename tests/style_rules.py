@@ -19,7 +19,8 @@ FIRST_WORDS = re.compile(r"\W*(?:what|how|where|whether|which|who|whose|whom|of|
 """Words that begin no docstring, comment, help string or heading."""
 BANNED = re.compile(
     r"\b(?:so (?:many|much|far|long|exactly)|beside|anew|nobody|somebody|whoever|of (?:no )?account|by itself|heard"
-    r"|felt|(?:is|are) said|in turn|make good|want of|goes on|promised|refus(?:e[sd]?|al)|film(?:s|ed)?|pictures?"
+    r"|felt|(?:is|are) said|in turn|make good|want of|goes on|promised|refus(?:e[sd]?|al)|(?<!sulcus )(?<![\w/])film(?:s|ed)?(?![\w/.])|pictures?"
+    r""
     r"|answer(?:s|ed)?|off by|far off|mm off|above all|likewise|stated|learnt|(?:un)?taught|teach(?:es|ing)?|told"
     r"|vicinit(?:y|ies)|lanes?|rungs?)\b",
     re.IGNORECASE,
@@ -31,6 +32,8 @@ HISTORY = re.compile(
 """Words of history, for which user pages have no room."""
 QUOTED = re.compile(r"``[^`]+``|`[^`]+`|\$[^$]+\$|\"[^\"]*\"")
 """Code, formulas and titles of cited works."""
+NAMES = re.compile(r"^[\w*, ]+\n {4}(?=(\S.*)$)", re.MULTILINE)
+"""Names of parameters above their description, whose first line is the group."""
 VERBS = frozenset((Path(__file__).parent / "data/verbs.txt").read_text().split())
 """Verbs that public functions begin with, next to `is`, `has`, `can`, `to`, `from` and `as`."""
 OPENERS = VERBS | {"is", "has", "can", "to", "from", "as"}
@@ -99,13 +102,13 @@ def find_headings(page: str) -> list[str]:
 
 
 def begins_well(text: str) -> bool:
-    """Return True unless the first word is one of `FIRST_WORDS`; a name in backticks is none."""
-    return text.lstrip().startswith("`") or not FIRST_WORDS.match(text)
+    """Return True unless text or the description of a parameter begins with a word of `FIRST_WORDS`."""
+    return all(part.lstrip().startswith("`") or not FIRST_WORDS.match(part) for part in (text, *NAMES.findall(text)))
 
 
 def find_banned(text: str) -> list[str]:
-    """Banned words of a text, outside code, formulas and titles."""
-    return BANNED.findall(QUOTED.sub("x", text))
+    """Banned words of a text, outside code, formulas, titles and names of parameters."""
+    return BANNED.findall(QUOTED.sub("x", NAMES.sub("", text)))
 
 
 def find_functions(path: Path) -> Iterator[str]:
