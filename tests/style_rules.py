@@ -19,8 +19,8 @@ FIRST_WORDS = re.compile(r"\W*(?:what|how|where|whether|which|who|whose|whom|of|
 """Words that begin no docstring, comment, help string or heading."""
 BANNED = re.compile(
     r"\b(?:so (?:many|much|far|long|exactly)|beside|anew|nobody|somebody|whoever|of (?:no )?account|by itself|heard"
-    r"|felt|(?:is|are) said|in turn|make good|want of|goes on|promised|refus(?:e[sd]?|al)|(?<!sulcus )(?<![\w/])film(?:s|ed)?(?![\w/.])|pictures?"
-    r""
+    r"|felt|(?:is|are) said|in turn|make good|want of|goes on|promised|refus(?:e[sd]?|al)|pictures?"
+    r"|(?<!sulcus )(?<![\w/])film(?:s|ed)?(?![\w/.])"
     r"|answer(?:s|ed)?|off by|far off|mm off|above all|likewise|stated|learnt|(?:un)?taught|teach(?:es|ing)?|told"
     r"|vicinit(?:y|ies)|lanes?|rungs?)\b",
     re.IGNORECASE,
