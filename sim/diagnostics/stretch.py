@@ -12,9 +12,10 @@ from ..runtime.device import Device, forward_kernel
 # "A comprehensive experimental study on material properties of human brain tissue", J. Biomech. 46:2795-2801.
 LEAST, MOST = 0.5, 1.5
 ROUND_OFF = 1e-4  # tolerance of the range, for a stretch of 1.5 in single precision
-# Volume beyond that range from which a deformation is unreliable: absolute [m^3], and relative to a small mesh. Tools
-# strain a little tissue beyond it at their edges: surgical loads up to 0.6 ml, the hardest spatulas 2.5 ml.
-VOLUME, SHARE = 1e-6, 0.1
+# Volume beyond that range above which a deformation is unreliable. Tools strain some tissue beyond it at their edges:
+# surgical loads up to 0.6 ml, the hardest spatulas 2.5 ml.
+VOLUME = 1e-6  # [m^3].
+SHARE = 0.1  # Relative to a small mesh.
 
 
 @cache

@@ -24,6 +24,7 @@ from ..runtime.threads import choose_threads, limit_to_one_thread, run_together
 from .symbolic import FRONT_SIZES, Front, FrontSizes, build_fronts
 from .triangular_solve import Sweep, add_lower
 
+# Cholesky factor, inverse of a triangular matrix, symmetric update, and triangular solve.
 potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 syrk, trsm = get_blas_funcs(("syrk", "trsm"), dtype=np.float64)
 

@@ -61,7 +61,7 @@ def choose_preconditioner(
     Raises
     ------
     InputError
-        A free rest stiffness that is singular, or a device with too little memory.
+        A free undeformed stiffness that is singular, or a device with too little memory.
     """
     device, constraint = problem.device, problem.constraint
     if constraint.basis().nnz == 0:

@@ -95,6 +95,7 @@ def build_kernel(device: Device, code: str) -> wp.Kernel:
     return sweep
 
 
+# Scatter-add of the lower half of a matrix to rows and columns of another.
 ADD = """
     for (int j = 0; j < place.shape[0]; ++j) {
         double* to = whole.data + (size_t)place.data[j] * whole.shape[1];

@@ -54,7 +54,7 @@ class NearPart:
     stragglers: float = 0.05
 
 
-NEAR = NearPart()
+NEAR = NearPart()  # Default.
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ class ForceLimits:
     bytes: int = 2**30
 
 
-FORCES = ForceLimits()
+FORCES = ForceLimits()  # Default.
 BENT = ForceLimits(late=FORCES.iterations)
 """Limits for a model that need not be convex."""
 

@@ -71,6 +71,7 @@ class StiffnessUpdate:
         return {name: getattr(self, field)[None] for field, name in LEARNT.items()}
 
 
+# Keys of warm-start data, by field of `StiffnessUpdate`.
 LEARNT = {field: f"stiffening's {field}" for field in ("rows", "added", "factor", "pivots")}
 
 

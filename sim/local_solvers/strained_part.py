@@ -62,7 +62,7 @@ class StrainLimits:
     bytes: int = 2**31
 
 
-STRAINS = StrainLimits()
+STRAINS = StrainLimits()  # Default.
 ON_CARD = StrainLimits(least=0.1, nodes=480, cut=0.5, near=1600)
 """Limits on a GPU, which inverts a larger model in less time than the saved steps take."""
 

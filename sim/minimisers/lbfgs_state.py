@@ -18,7 +18,7 @@ from .lbfgs_kernels import DONE, PAIRS, PRODUCTS, SOME, SUMS, build_kernels, get
 from .lbfgs_trial_kernels import multiply_of
 from .residual import Balance, compute_balance, compute_constant_gradients
 
-Shapes = Mapping[str, tuple[int, ...]]
+Shapes = Mapping[str, tuple[int, ...]]  # Array shapes by name, without the axis of load cases.
 
 
 def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:

@@ -14,9 +14,8 @@ from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
 from .lbfgs_kernels import FREE, GOLD, GZ, OWN, SLOPE, SOME, WHOLE, YW
 
-# Rows, or nodes, of a single load case per thread.
-EACH = 2  # On CUDA.
-EACH_ON_CPU = 1024
+EACH = 2  # Rows, or nodes, of a single load case per thread on CUDA.
+EACH_ON_CPU = 1024  # The same on the CPU.
 
 
 @dataclass(frozen=True)

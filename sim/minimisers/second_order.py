@@ -23,8 +23,8 @@ from ..discretisation.term import Strained
 from ..runtime.threads import choose_threads, run_together
 from ..runtime.views import run_in_order, to_host, to_library
 
-# Elements of one batch, on the CPU: the data of a pair fit into the cache of a core; on CUDA: they fill a GPU.
-FEW, MANY = 256, 4096
+FEW = 256  # Elements of one batch on the CPU: the data of a pair fit into the cache of a core.
+MANY = 4096  # The same on CUDA: they fill a GPU.
 
 
 @dataclass(frozen=True, eq=False)

@@ -233,7 +233,7 @@ def _longest_file() -> int | None:
     return None if soft == resource.RLIM_INFINITY else soft
 
 
-REMEDY = "Choose another folder, or free space there."
+REMEDY = "Choose another folder, or free space there."  # Ends messages on failed writes.
 
 
 def _megabytes(size: int) -> str:

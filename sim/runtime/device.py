@@ -20,7 +20,7 @@ forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 EVERY = "all"
 """Name of all GPUs in a list of devices."""
 
-SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}
+SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}  # Warp's scalar types.
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Device:
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.name, record_tape=False)
 
 
-_loading, _loaded = Lock(), set[wp.Module]()
+_loading, _loaded = Lock(), set[wp.Module]()  # Lock of compilation; modules that are loaded on the CPU.
 
 
 def load(module: wp.Module) -> None:

@@ -22,13 +22,13 @@ from typing import Any, BinaryIO, TypeVar
 from ..errors import InputError
 from .atomic_files import explain_error, write_atomically
 
-MARK = b"sulcus\r\n"
+MARK = b"sulcus\r\n"  # First bytes of every record.
 # Header of a record: mark, group, first row, length of the payload that follows, digest of all but the mark.
 HEAD = struct.Struct("<8s8sQQ16s")
 # Group of the first record, which describes the run; its digest has no key, so that another run can read it.
 RUN = "run"
-Batch = tuple[str, int]
-Held = bytes | mmap.mmap
+Batch = tuple[str, int]  # Group and first row.
+Held = bytes | mmap.mmap  # Contents of a journal.
 R = TypeVar("R")
 LONGEST = 1 << 16
 """Maximum number of bytes that are read for a description."""

@@ -13,9 +13,9 @@ from tempfile import TemporaryFile, gettempdir, mkdtemp
 
 from ..errors import InputError
 
-VARIABLE = "WARP_CACHE_PATH"
-NAME = "sulcus-kernels"
-REMEDY = f"Set {VARIABLE} to a folder that can be written."
+VARIABLE = "WARP_CACHE_PATH"  # Environment variable with Warp's folder.
+NAME = "sulcus-kernels"  # Prefix of the temporary folder.
+REMEDY = f"Set {VARIABLE} to a folder that can be written."  # Ends the messages below.
 
 
 def ensure_writable_cache() -> None:

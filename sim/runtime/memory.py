@@ -16,7 +16,7 @@ from .device import Device
 # Arrays counted on the CPU, 2026-11-24: at most 46 with multigrid (19,508 and 26,452 nodes, smoothed).
 WORK_COLUMNS = 60
 ANSWER_COPIES = 3  # Copies of the result on the host while batches are joined, in double precision.
-COARSER = "take a coarser mesh, or a larger machine."
+COARSER = "take a coarser mesh, or a larger machine."  # Remedy if not even one load fits.
 
 
 @dataclass(frozen=True)

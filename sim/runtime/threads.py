@@ -40,7 +40,7 @@ def limit_to_one_thread() -> Iterator[None]:
                 limit.restore_original_limits()
 
 
-Task = Callable[[], object]
+Task = Callable[[], object]  # Function to run on a thread.
 
 
 @dataclass(frozen=True)

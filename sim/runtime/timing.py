@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_listening: list[dict[str, float]] = []
+_listening: list[dict[str, float]] = []  # Seconds by stage of each active listener.
 
 
 @contextmanager

@@ -26,9 +26,9 @@ from .captured_frame import FRAME_EVALUATIONS
 Alone = ClampedElimination | StrainedDescent
 """Local solver for a single load."""
 WORTH = 16  # Load cases from which the set-up of a shared local subproblem pays.
-# Maximum residual evaluations before Newton-CG. On CUDA a small batch costs almost as much as one load case, so Newton
-# comes last.
-EVALUATIONS, EVALUATIONS_ON_CUDA = 60, 800
+EVALUATIONS = 60  # Maximum residual evaluations before Newton-CG on the CPU.
+# The same on CUDA, where a small batch costs almost as much as one load case, so that Newton-CG comes late.
+EVALUATIONS_ON_CUDA = 800
 FEWEST = 10  # With a smaller budget of outer iterations only Newton-CG is used: its steps are longer.
 
 

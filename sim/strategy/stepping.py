@@ -30,7 +30,7 @@ class LoadStepping:
     patience: int = 4
 
 
-STEPPING = LoadStepping()
+STEPPING = LoadStepping()  # Default.
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class GapContinuation:
     nearly: float = 0.1
 
 
-GAPS = GapContinuation()
+GAPS = GapContinuation()  # Default.
 
 
 @dataclass(frozen=True, eq=False)

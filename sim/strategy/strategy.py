@@ -31,7 +31,7 @@ from ..runtime.views import run_in_order, to_host, view
 from .plan import Alone, SolverPlan, SolverStep
 from .stepping import GAPS, STEPPING, GapContinuation, LoadStepping, Shares
 
-NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
+NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS history.
 
 
 @dataclass(frozen=True, eq=False)
