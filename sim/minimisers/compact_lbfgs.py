@@ -35,7 +35,7 @@ class CurvaturePairs:
         return compute_middle(self.sy, self.yw)
 
     def weights(self, force: np.ndarray) -> np.ndarray:
-        """Compute M [S, W]' force (2m,) of a force (3N,)."""
+        """Compute the coefficients M [S, W]' force (2m,) for a force (3N,)."""
         force = force.astype(self.s.dtype)
         return self.middle @ np.concatenate([self.s @ force, self.w @ force])
 
@@ -62,7 +62,7 @@ def build_empty_history(rows: int, kind: str) -> CurvaturePairs:
 
 
 def compute_middle(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
-    """Compute M (..., 2m, 2m) from s_i . y_j and y_i . w_j (..., m, m), oldest first; zero pairs have no effect."""
+    """Compute the middle matrix M (..., 2m, 2m) from s_i . y_j and y_i . w_j (..., m, m); zero pairs have no effect."""
     upper, eye = np.triu(sy), np.eye(sy.shape[-1])
     own = np.diagonal(upper, axis1=-2, axis2=-1)[..., None] * eye
     inverse = np.linalg.inv(upper + np.where(own == 0.0, eye, 0.0))
@@ -78,7 +78,7 @@ class PairsOfColumns:
     device
         Device of the arrays.
     rows, columns
-        3N and b.
+        Numbers of unknowns 3N and load cases b.
     """
 
     def __init__(self, device: Device, rows: int, columns: int):
@@ -137,13 +137,13 @@ class PairsOfColumns:
 
 @dataclass(frozen=True, eq=False)
 class LbfgsHistory:
-    """[S, W]' (k, 2m, 3N) and M (k, 2m, 2m) of k load cases."""
+    """Compact L-BFGS representation of k load cases: [S, W]' (k, 2m, 3N) and the middle matrix M (k, 2m, 2m)."""
 
     sw: Any
     middle: Any
 
     def weights(self, force: Any) -> Any:
-        """Compute M [S, W]' force (k, 2m, 1) of forces (3N, k) [N]."""
+        """Compute the coefficients M [S, W]' force (k, 2m, 1) for forces (3N, k) [N]."""
         return self.middle @ (self.sw @ force.T[:, :, None])
 
     def motion(self, weights: Any) -> Any:

@@ -48,7 +48,7 @@ ON_CUDA = Schedule(between=2, smaller=0.75)  # A check stalls the GPU.
 
 @dataclass(frozen=True, eq=False)
 class Descended:
-    """u (3N, b) [m] on the device; (b,) on the host: status, accepted steps, relative residuals; the history."""
+    """End of a descent: u (3N, b) [m] on the device; status, steps, relative residuals (b,) on the host; history."""
 
     u: wp.array
     status: np.ndarray

@@ -93,7 +93,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         # outputs
         products: wp.array2d(dtype=wp.float64),
     ):
-        """Multiply the new gradient g' with each s, each w, z' and z; and y with w of the new pair."""
+        """Compute inner products: of the new gradient g' with each s and w, with z' and z (z = M^-1 g); y . w."""
         block, c = wp.tid()
         last = g.shape[0] - 1
         own = several()
@@ -136,7 +136,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         slot: wp.array(dtype=wp.int32),
         aiming: wp.array(dtype=wp.int32),
     ):
-        """Accept the trial step (first: the start itself) or backtrack. `aiming` marks a needed new direction."""
+        """Accept the trial step, or backtrack; the first trial is the start. `aiming` marks a due direction."""
         c = wp.tid()
         accepted[c] = 0
         slot[c] = -1

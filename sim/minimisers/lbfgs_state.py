@@ -22,7 +22,7 @@ Shapes = Mapping[str, tuple[int, ...]]  # Array shapes by name, without the axis
 
 
 def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
-    """List by number type: dtype, shapes of the arrays that move with load cases, and of recomputed ones."""
+    """Return, by number type, the dtype, the shapes of arrays that move with load cases, and of recomputed ones."""
     vector, pairs, terms = (problem.rows,), (PAIRS, problem.rows), (len(problem.terms),)
     return {
         "scalar": (
@@ -62,7 +62,7 @@ def allocate_ground(problem: Problem, width: int) -> dict[str, wp.array]:
 
 @dataclass(frozen=True, eq=False)
 class LbfgsState:
-    """Arrays of `width` load cases by name; by number type, those that move with load cases; and the memory."""
+    """L-BFGS arrays of `width` load cases by name; those that move with load cases, by number type; the memory."""
 
     columns: Mapping[str, wp.array]
     moved: Mapping[str, wp.array]
@@ -158,7 +158,7 @@ class Workspace:
         return np.append(stay, np.full(self.width - len(stay), stay[-1]))
 
     def prepare(self) -> None:
-        """Prepare the iteration from the present state."""
+        """Clear temporary arrays, and prepare a preconditioner on the host for the present batch."""
         self.columns["part"].zero_()
         self.columns["bound"].fill_(1.0)
         if self._preconditioner.on_device:
@@ -168,7 +168,7 @@ class Workspace:
         self._preconditioner.prepare(self._problem, u.shape[1])
 
     def turn(self, times: int) -> None:
-        """Run L-BFGS iterations."""
+        """Run this number of L-BFGS iterations."""
         device = self._problem.device
         if not (device.on_cuda and self._preconditioner.on_device):
             for _ in range(times):

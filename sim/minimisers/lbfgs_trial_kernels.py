@@ -136,7 +136,7 @@ def multiply_of(device: Device, pairs: int) -> wp.Kernel:
         # outputs
         products: wp.array2d(dtype=wp.float64),
     ):
-        """Multiply the new gradient g' with each s, each w, z' and z; and y with w of the new pair."""
+        """Compute inner products: of the new gradient g' with each s and w, with z' and z (z = M^-1 g); y . w."""
         product, thread = wp.tid()
         pair = product % m
         if product < 2 * m and pair >= known[0]:

@@ -111,7 +111,7 @@ class ResidualState:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Function that evaluates the residual of states of the batch that a problem has begun.
+    """Callable that evaluates the residuals of the batch that a problem has begun.
 
     `constant` (3N, b) [N] is the summed gradient of the constant terms, `square` (b,) the largest square norm of one.
     """
@@ -121,7 +121,7 @@ class Judge:
     square: np.ndarray
 
     def __call__(self, u: wp.array) -> ResidualState:
-        """Evaluate the states u (3N, b) [m]."""
+        """Return the residuals of states u (3N, b) [m]."""
         found = compute_balance(self.problem, u, self.constant)
         sums = found.sums.numpy()
         with np.errstate(invalid="ignore", over="ignore"):
