@@ -30,7 +30,7 @@ def as_pushes(loads: Loads) -> np.ndarray | None:
 
 
 def compute_shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Compute a (B,) for three successive pushes (B, 7); zero if one has no force, or the last two are the same.
+    """Compute the factors a (B,) of three successive pushes (B, 7); zero without force, or if the last two are equal.
 
     Lengths are measured against the last footprint, forces against the last force.
     """
