@@ -1,4 +1,4 @@
-"""Nonlinear elimination: the most strained part is solved repeatedly as a local subproblem, and the rest follows it.
+"""Nonlinear elimination: the most strained part is a repeated local subproblem, which the remaining mesh follows.
 
 Close to the tools tissue is far from its undeformed stiffness, elsewhere it is nearly linear. A descent from the
 undeformed stiffness spends most of its iterations on the near part, at the cost of the whole mesh. Here each cycle

@@ -1,4 +1,4 @@
-"""Nonlinear elimination without an exact inverse: strained tissue is brought to equilibrium before the rest moves.
+"""Nonlinear elimination without an exact inverse: strained tissue reaches equilibrium before the other nodes move.
 
 With multigrid, which inverts the undeformed stiffness only approximately, the far part cannot be condensed. So the part
 near a load, clamped at its boundary (`clamped_part.py`), is solved as a local subproblem. L-BFGS minimises the

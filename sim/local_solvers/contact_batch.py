@@ -14,7 +14,7 @@ from .strained_part import StrainedModel
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """u (3N, b) [m]; gradients (3N, b) [N] of the smooth terms, and of all; 2-norms (b,) of the latter; scales (b,)."""
+    """State u (3N, b) [m]; gradients (3N, b) [N] of the smooth terms, and of all, with 2-norms (b,); scales (b,)."""
 
     u: Any
     smooth: Any

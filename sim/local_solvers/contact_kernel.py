@@ -29,7 +29,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def dot(x: wp.array2d(dtype=wp.float64), y: wp.array2d(dtype=wp.float64), c: int, me: int) -> wp.float64:
-        """Compute x . y."""
+        """Compute the inner product x . y of a load case, by all threads of the block."""
         own = wp.float64(0.0)
         for r in range(me, x.shape[0], threads):
             own += x[r, c] * y[r, c]
@@ -97,7 +97,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def curve(stage: Stage, near: Near, definite: int, m: int, s: Scratch, c: int, me: int):
-        """Assemble their curvature at w between the m touched nodes."""
+        """Assemble the curvature of barrier and proximal term at w between the m touched nodes."""
         for i in range(me // across, 3 * m, down):
             for j in range(me % across, 3 * m, across):
                 s.stiff[c, i, j] = wp.float64(0.0)
@@ -142,7 +142,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def give(model: ComplianceModel, out: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
-        """Compute the motion of all nodes under minus the change."""
+        """Compute the motion of all nodes under the negative change of the forces: out = -C change."""
         m, size = pull(model, s, c, me), out.shape[0]
         for first in range(me, size, wide * threads):
             sums = Strip()
@@ -167,7 +167,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def give_touched(model: ComplianceModel, size: int, s: Scratch, c: int, me: int):
-        """Compute the motion of the touched nodes, `size` rows, under the change: to `at`."""
+        """Compute the motion of the touched nodes, `size` rows, under the change of the forces: at = C change."""
         m = pull(model, s, c, me)
         for i in range(me, size, threads):
             row = 3 * s.touched[c, i // 3] + i % 3

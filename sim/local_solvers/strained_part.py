@@ -69,7 +69,7 @@ ON_CARD = StrainLimits(least=0.1, nodes=480, cut=0.5, near=1600)
 
 @dataclass(frozen=True, eq=False)
 class StrainedModel:
-    """Models of b load cases, as updates of the undeformed compliance: arrays of `views.library`.
+    """Models of b load cases, as updates of the undeformed compliance: arrays of `views.get_library`.
 
     nodes (b, k) are indices into the compliance, matrix (b, 3k, 3k) is M [N/m], zero where a load case has fewer nodes.
     own (b, 3n, 3n) [m/N] is the change of the compliance between the n touchable nodes.
