@@ -32,7 +32,7 @@ class Columns:
 
 
 class Compliance:
-    """H (3N, 3N) [m/N], applied by a preconditioner, and its columns at n nodes: arrays of `views.library`.
+    """Compliance H (3N, 3N) [m/N], applied by a preconditioner, and its columns at n nodes: `views.get_library` arrays.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ def estimate_inverse_bytes(rows: int, device: Device) -> int:
 
 @cache
 def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Build kernels to the matrix's unknowns, in type `low`, and back; each thread takes `some` rows."""
+    """Build kernels that map to the matrix's unknowns, in type `low`, and back; each thread takes `some` rows."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -157,7 +157,7 @@ class DenseInverse:
         return count == 1 and self._inverse.dtype == torch.float16
 
     def _room(self, count: int) -> Buffers:
-        """Return buffers for one batch width; those of workspaces are kept, and the last other."""
+        """Return the buffers for a batch width; those of workspace widths stay cached, and the latest other."""
         if count not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
             low, name = LOW[self._device.precision], self._device.name
