@@ -86,7 +86,7 @@ class Bond:
         return share.numpy()
 
     def share(self, force: wp.array) -> np.ndarray:
-        """Return the maximum of `shares` (B,): above 1 the bond would debond. NaN without a skull."""
+        """Return the maximum of `shares` (B,): above 1 the bond would fail. NaN without a skull."""
         return self._largest(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 
     def _largest(self, force: wp.array, share: wp.array | None = None) -> wp.array:

@@ -110,7 +110,7 @@ class Leak:
         ]
 
     def share(self, u: wp.array) -> np.ndarray:
-        """Compute the relative leak (B,) at u (3N, B) [m] on the device; 0 without leak; NaN if no surface is open."""
+        """Compute the relative leak (B,) at u (3N, B) [m] on the device; 0 without leak, NaN if nothing is open."""
         out = wp.zeros((2, u.shape[1]), dtype=wp.float64, device=self._device.name)
         self._device.launch(build_kernel(self._device), (len(self._arrays[3]), u.shape[1]), [u, *self._arrays], [out])
         passed, swept = out.numpy()

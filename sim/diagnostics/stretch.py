@@ -37,7 +37,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         """Compute the extreme eigenvalues of C = F^T F: q + 2 p cos(phi), q + 2 p cos(phi + 2 pi / 3).
 
         q = tr C / 3, 6 p^2 = |C - q I|^2, cos(3 phi) = det((C - q I) / p) / 2: Smith 1961, "Eigenvalues of a symmetric
-        3 x 3 matrix", Commun. ACM 4:168. They are within q +- 2 p, which suffices for most elements.
+        3 x 3 matrix", Commun. ACM 4:168. The bounds q +- 2 p make them unnecessary for most elements.
         """
         e, c = wp.tid()
         for k in range(gradient.shape[1]):
