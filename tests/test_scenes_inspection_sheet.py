@@ -101,7 +101,7 @@ def test_missing_folder_is_made_or_rejected(tmp_path, capsys):
     assert main([*words, str(tmp_path / "new" / "a" / "p.vtu")]) == 0
     assert [path.name for path in (tmp_path / "new" / "a").iterdir()] == ["p.inspect.png"]
     assert main([*words, str(tmp_path / "file" / "p.vtu")]) == 2
-    assert "cannot be made" in capsys.readouterr().err
+    assert "cannot be created" in capsys.readouterr().err
 
 
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])

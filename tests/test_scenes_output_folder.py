@@ -241,7 +241,7 @@ def test_a_folder_that_is_not_empty_is_left_alone(folder, capsys):
     mine.parent.mkdir()
     mine.write_text("my own")
     assert warp(folder, *located, out="mine") == 2
-    assert "mine: is there and not empty" in capsys.readouterr().err and list(mine.parent.iterdir()) == [mine]
+    assert "mine: exists and is not empty" in capsys.readouterr().err and list(mine.parent.iterdir()) == [mine]
     mine.unlink()
     assert warp(folder, *located, out="mine") == 0
     before = {path.name for path in mine.parent.iterdir()}

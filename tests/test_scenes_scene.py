@@ -189,12 +189,12 @@ IMPORT = "from scenes.script.scene import Scene"
     [
         ("", "my.py: has no SCENE. Let it say SCENE = Scene"),
         ("SCENE = 'press'", "my.py: its SCENE is a str. Make it a scenes.Scene."),
-        ("\nSCENE = Scene(", r"my.py, line 2: is no Python \('\(' was never closed\). Mend the file."),
-        ("one = 1\nSCENE = one / 0\n", "my.py, line 2: raised ZeroDivisionError: division by zero. Mend the file."),
+        ("\nSCENE = Scene(", r"my.py, line 2: is not valid Python \('\(' was never closed\). Correct the file."),
+        ("one = 1\nSCENE = one / 0\n", "my.py, line 2: raised ZeroDivisionError: division by zero. Correct the file."),
         ("import no_such_module", "line 1: raised ModuleNotFoundError: No module named 'no_such_module'"),
         ("raise SystemExit(3)", "line 1: raised SystemExit: 3"),
         ("def f():\n    raise ValueError('deep')\nf()", "line 2: raised ValueError: deep"),
-        ("x = '\0'", "my.py: is no Python|my.py, line 1: is no Python"),
+        ("x = '\0'", "my.py: is not valid Python|my.py, line 1: is not valid Python"),
         (
             "from sim.material import Material\n\nMaterial('linear', 3000.0, 0.5)",
             r"my.py, line 3: Poisson's ratio is 0.5: give a number",

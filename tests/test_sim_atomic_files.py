@@ -81,7 +81,7 @@ def test_output_to_a_folder_or_through_a_file_is_refused(tmp_path: Path) -> None
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
         check_output(tmp_path / "folder.vtu", ".vtu")
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be created"):
         check_output(tmp_path / "file" / "a.vtu", ".vtu")
 
 

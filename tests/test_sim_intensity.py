@@ -97,5 +97,5 @@ def test_a_volume_elsewhere_or_without_numbers_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_intensity(tmp_path / "none.nii.gz")
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="folder cannot be made"):
+    with pytest.raises(InputError, match="folder cannot be created"):
         write_intensity(tmp_path / "file" / "a.t1.nii.gz", ramp())

@@ -17,7 +17,7 @@ def test_damaged_journal_header_discards_records(tmp_path):
     damaged[HEAD.size + 2] ^= 1
     path.write_bytes(damaged)
     with (
-        pytest.raises(InputError, match="is no unfinished run, or its beginning is damaged"),
+        pytest.raises(InputError, match="is not an unfinished run, or its beginning is damaged"),
         open_journal(path, {"seed": "1"}),
     ):
         pass
@@ -56,6 +56,6 @@ def test_rows_of_a_run_are_read_but_for_one_that_a_kill_tore(tmp_path):
 def test_files_of_earlier_versions_and_of_others_are_rejected(tmp_path, content):
     path = tmp_path / "trial.rows"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"is no unfinished run.*delete it"), open_journal(path, {}):
+    with pytest.raises(InputError, match=r"is not an unfinished run.*delete it"), open_journal(path, {}):
         pass
     assert path.read_bytes() == content and run_of(path) == {}

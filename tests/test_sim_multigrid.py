@@ -120,4 +120,4 @@ def test_device_out_of_memory_differs_from_free_body():
     assert explain_no_factor(full, "cuda:0").startswith(
         "cuda:0 has too little free memory for this mesh: end what else runs"
     )
-    assert explain_no_factor(RuntimeError("a pivot is 0"), "cpu").endswith("(a pivot is 0): is every part held?")
+    assert explain_no_factor(RuntimeError("a pivot is 0"), "cpu").endswith("(a pivot is 0): fix or support every part.")

@@ -169,10 +169,14 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
         ),
         (
             {"live": True, "element": "smoothed"},
-            ("A single load begins with L-BFGS from a stiffness that knows the few hundred nodes",),
+            ("A single load begins with L-BFGS from a stiffness that is updated at the few hundred nodes",),
             ("moved by pose",),
         ),
-        ({"element": "p2"}, ("clamped at its rim", "One load is solved at a time", "multigrid"), ("loads and more",)),
+        (
+            {"element": "p2"},
+            ("clamped at its boundary", "One load is solved at a time", "multigrid"),
+            ("loads and more",),
+        ),
         (
             {"accuracy": replace(TRAIN, outer=3, steps=0)},
             ("Every load is solved by Newton-CG",),

@@ -27,12 +27,12 @@ def test_a_list_names_devices_one_by_one(words, names):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        ("all,cpu", "names devices beside 'all'"),
-        ("cpu,", "names a device that has no name"),
+        ("all,cpu", "lists devices together with 'all'"),
+        ("cpu,", "contains an empty device name"),
         ("", "'' names no device: choose auto, or cpu"),
         (" , ", "names no device: choose auto, or cpu"),
         ("cpu,abacus", "no device 'abacus' here: choose auto or cpu"),
-        pytest.param("all", r"'all' means every graphics card, and there is none.*or name devices", marks=NO_CARD),
+        pytest.param("all", r"'all' means every GPU, and there is none.*or name devices", marks=NO_CARD),
         pytest.param("cpu,cuda:0", "no device 'cuda:0' here, as no NVIDIA driver", marks=NO_CARD),
     ],
 )
@@ -43,7 +43,7 @@ def test_what_is_no_list_of_devices_is_a_sentence(words, reason):
 
 @pytest.mark.parametrize("words", ["cpu,cpu", "all", "cuda:0,cuda:1"])
 def test_who_wants_one_device_refuses_several(words):
-    with pytest.raises(InputError, match=f"'{words}' names several devices, and one is wanted here: choose auto or"):
+    with pytest.raises(InputError, match=f"'{words}' names several devices, but only one is allowed here: choose"):
         find_device(words, "float32")
 
 
@@ -55,7 +55,7 @@ def test_cards_are_listed_and_not_mixed_with_processors(monkeypatch):
     monkeypatch.setattr(wp, "get_devices", lambda: [Card(name) for name in ("cpu", "cuda:0", "cuda:1")])
     assert parse_device_names("all") == ("cuda:0", "cuda:1") == parse_device_names("cuda,cuda:1")
     assert parse_device_names("cuda:0,cuda:0") == ("cuda:0", "cuda:0")
-    with pytest.raises(InputError, match="'cuda:0,cpu' names processors beside graphics cards"):
+    with pytest.raises(InputError, match="'cuda:0,cpu' mixes CPU and GPUs"):
         parse_device_names("cuda:0,cpu")
 
 
@@ -109,7 +109,7 @@ def test_finished_results_precede_reported_death():
         for task, _ in map_unordered(children, doing, ["doze and die", 0, "nap", 9]):
             given.append(task)
             time.sleep(1.5)
-    assert "the process on cpu was ended (Killed), for want of memory most likely" in str(lost.value)
+    assert "the process on cpu was ended (Killed), probably out of memory" in str(lost.value)
     assert "give --device one cpu less" in str(lost.value) and given == [0, "nap"]
 
 

@@ -112,7 +112,7 @@ def test_killed_process_loses_no_finished_case(tmp_path, body):
 def test_a_batch_that_no_memory_holds_begins_no_file(body, devices):
     """A file keeps its batch, so that a smaller one would be refused beside it."""
     asked = LazyFem(body, (*pushed_effects(body, BRAIN), NodalForce()), TRAIN, "p1", 10**9, 2 * 10**9)
-    refused = pytest.raises(InputError, match=r"the answers to 1000000000 loads take about .* are free: solve at most")
+    refused = pytest.raises(InputError, match=r"the results of 1000000000 loads take about .* are free: solve at most")
     with refused, open_solvers(asked, devices, print):
         pytest.fail("it would begin")
 
@@ -142,7 +142,7 @@ def test_run_resumes_on_other_devices_in_same_batches(tmp_path, box_file, capsys
         (["simulate", "BOX", "--out", "a.h5", "--device", "cpu,cpu", "--batch", "0"], "batch is 0"),
         (
             ["demo", "--anatomy", "BOX", "--device", "cpu,cpu"],
-            "'cpu,cpu' names several devices, and one is wanted here",
+            "'cpu,cpu' names several devices, but only one is allowed here",
         ),
     ],
 )

@@ -106,7 +106,7 @@ class TestUnfinished:
     def test_a_foreign_file_is_named(self, tmp_path, pretender, loads, content):
         partial = tmp_path / "data.h5.partial"
         partial.write_bytes(content)
-        with pytest.raises(InputError, match=r"data\.h5\.partial: is no unfinished run.*delete it"):
+        with pytest.raises(InputError, match=r"data\.h5\.partial: is not an unfinished run.*delete it"):
             simulate(tmp_path / "data.h5", pretender, loads, SAID, 8)
         assert partial.read_bytes() == content
 
@@ -274,7 +274,7 @@ class TestRoom:
         ("size", "asked", "sentence"),
         [
             (1_000_000, True, "files are limited to 1.0 MB here"),
-            (1_000_000, False, r"data\.h5\.partial: takes no more \(File too large\)"),
+            (1_000_000, False, r"data\.h5\.partial: cannot be extended \(File too large\)"),
             (3_250_000, False, r"data\.h5: cannot be written \(File too large\)"),
         ],
     )

@@ -1,1 +1,1 @@
-"""What an answer says of itself beside its motion: tractions on the bond, tissue that passes the skull."""
+"""Checks of a solution beyond equilibrium: traction on the bond, tissue that passes the skull, excessive strain."""

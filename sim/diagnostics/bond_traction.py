@@ -1,4 +1,4 @@
-"""How near the bond between brain and skull comes to tearing."""
+"""Traction on the bond between brain and skull, relative to its strength."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ from ..runtime.device import Device, forward_kernel
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """Return the kernel of a device's scalar type, over (patch, column)."""
+    """Build the kernel for a device's scalar type, over (patch, load case)."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -31,7 +31,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         share: wp.array2d(dtype=wp.float64),
         most: wp.array(dtype=wp.float64),
     ):
-        """s = |(max(t.n, 0) / tension, t - (t.n) n / shear)| of each patch, t = sum of forces / area; the largest."""
+        """Compute s = |(max(t.n, 0) / tension, t - (t.n) n / shear)| per patch, t = forces / area, and its maximum."""
         p, c = wp.tid()
         t = wp.vec3d()
         for k in range(first[p], first[p + 1]):
@@ -49,11 +49,12 @@ def build_kernel(device: Device) -> wp.Kernel:
 
 
 class Bond:
-    """The largest traction between brain and skull, as a share of what `Bonded` bears.
+    """Largest traction between brain and skull, relative to the strength in `Bonded`.
 
-    Tension and shear count together, as sqrt((t_n / tension)^2 + (t_s / shear)^2): the quadratic nominal stress
-    criterion of cohesive layers (Camanho, Davila 2002, NASA/TM-2002-211737, eq. 16). Pressure breaks nothing.
-    Tractions are means over `around` [m] of each node: at the rim of an opening they have no limit, but a mean.
+    Tension and shear are combined as sqrt((t_n / tension)^2 + (t_s / shear)^2): the quadratic nominal stress criterion
+    of cohesive layers (Camanho, Davila 2002, NASA/TM-2002-211737, eq. 16). Pressure never breaks the bond. Tractions
+    are means over a radius `around` [m] of each node: at the edge of a craniotomy they are singular, but their mean is
+    not.
     """
 
     def __init__(self, effect: Bonded, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 5e-3):
@@ -63,7 +64,7 @@ class Bond:
         wall = (covered | anatomy.held.all(axis=1))[corners].all(axis=1) & covered[corners].any(axis=1)
         triangles = space.surface[wall]
         share = np.repeat(compute_areas(space.nodes[triangles[:, :3]])[:, None] / 3.0, 3, axis=1)
-        # Of a quadratic triangle's area the corners' shape functions have none.
+        # For quadratic triangles, the integrals of the corners' shape functions are zero.
         area = np.bincount(triangles[:, -3:].ravel(), share.ravel(), space.count)
         nodes = np.unique(triangles)
         near = KDTree(space.nodes[nodes]).query_ball_point(space.nodes[nodes], around)
@@ -79,19 +80,19 @@ class Bond:
         ]
 
     def shares(self, force: wp.array) -> np.ndarray:
-        """Round `nodes` (n,), of what the wall exerts on the body, force (3N, B) [N] on the device: (n, B)."""
+        """Compute the relative traction (n, B) at `nodes` (n,) from the skull's forces (3N, B) [N] on the brain."""
         share = wp.zeros((len(self.nodes), force.shape[1]), dtype=wp.float64, device=self._device.name)
         self._largest(force, share)
         return share.numpy()
 
     def share(self, force: wp.array) -> np.ndarray:
-        """Return the largest of `shares` (B,): above 1 the bond would tear. NaN where no skull is."""
+        """Return the maximum of `shares` (B,): above 1 the bond would fail. NaN without a skull."""
         return self._largest(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 
     def _largest(self, force: wp.array, share: wp.array | None = None) -> wp.array:
-        """Return the largest share of each column (B,), on the device.
+        """Compute the largest relative traction of each load case (B,), on the device.
 
-        All of them (n, B) into `share`, where it is given.
+        All values (n, B) are written to `share`, if it is given.
         """
         most = wp.zeros(force.shape[1], dtype=wp.float64, device=self._device.name)
         inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]

@@ -1,4 +1,4 @@
-"""Fields of a `Deformation` that say whether its tissue is one: leak, bond, stretch, and the outcomes that follow."""
+"""Diagnostic fields of a `Deformation`: leak, bond, stretch, and the outcomes that follow from them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .stretch import Stretch
 
 
 class Diagnostics:
-    """Measures the deformations of an anatomy under some effects."""
+    """Diagnostics of the deformations of an anatomy under some effects."""
 
     def __init__(
         self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, limit_strain: bool
@@ -30,20 +30,20 @@ class Diagnostics:
 
     @property
     def needs_forces(self) -> bool:
-        """Return True if `fields` needs the forces of fixed nodes."""
+        """True if `fields` needs the forces at fixed nodes."""
         return self._bond is not None
 
     def fields(self, u: wp.array, force: wp.array | None) -> dict[str, np.ndarray]:
-        """Fields `leaked`, `bond`, `stretch` and `strained` at u (3N, B) [m] with internal forces (3N, B) [N]."""
+        """Compute `leaked`, `bond`, `stretch` and `strained` at u (3N, B) [m] with internal forces (3N, B) [N]."""
         bond = self._bond.share(force) if self._bond and force is not None else np.array(np.nan)
         return {"leaked": self._leak.share(u), "bond": bond, **self.strains(u)}
 
     def strains(self, u: wp.array) -> dict[str, np.ndarray]:
-        """Fields `stretch` and `strained` at u (3N, B) [m]."""
+        """Compute `stretch` and `strained` at u (3N, B) [m]."""
         return self._stretch.measure(u)
 
     def outcomes(self, outcome: np.ndarray, inverted: np.ndarray, strained: np.ndarray) -> np.ndarray:
-        """Outcomes (B,), with those equilibria marked that are not of tissue, if strains are limited.
+        """Return outcomes (B,), in which equilibria that real tissue cannot have are marked, if strains are limited.
 
         inverted (B,) counts tetrahedra; strained (B,) [m^3] as in `Deformation`.
         """

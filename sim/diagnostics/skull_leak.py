@@ -1,4 +1,4 @@
-"""Volume of tissue that passes the closed skull: zero in a head."""
+"""Volume of tissue that passes the closed skull: zero in a real head."""
 
 from functools import cache
 
@@ -19,7 +19,7 @@ WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
 def integrate_facet_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The integrals (S, n, 3) [m^2] of N_i n over outward triangles (S, n): n = 3 or, quadratic and perhaps curved, 6.
+    """Integrate N_i n (S, n, 3) [m^2] over outward triangles (S, n): n = 3 or, quadratic and perhaps curved, 6.
 
     With N_i the shape function of node i (nodes (N, 3) [m]) and n the outward normal. The sum of products with the
     nodes' displacements is the volume that the triangle sweeps.
@@ -38,7 +38,7 @@ def integrate_facet_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndar
 
 
 def integrate_surface_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Integrate N_i n (N, 3) [m^2] over the whole surface, as `integrate_facet_normals`: grad N_i over the body.
+    """Integrate N_i n (N, 3) [m^2] over the whole surface, as `integrate_facet_normals`: grad N_i over the volume.
 
     Engelman, Sani, Gresho 1982, "The implementation of normal and/or tangential boundary conditions in finite element
     codes for incompressible fluid flow", Int. J. Numer. Methods Fluids 2:225-238.
@@ -50,7 +50,7 @@ def integrate_surface_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.nd
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """Kernel of a device's scalar type, over (patch, column)."""
+    """Build the kernel for a device's scalar type, over (patch, load case)."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -63,7 +63,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """v = sum a_i . u_i of a patch; out_0 += max(v, 0) where a skull covers it, out_1 += |v| where none does."""
+        """Compute v = sum a_i . u_i of a patch; add max(v, 0) to out_0 if covered by the skull, or |v| to out_1."""
         s, c = wp.tid()
         v = wp.float64(0.0)
         for i in range(first[s], first[s + 1]):
@@ -78,11 +78,11 @@ def build_kernel(device: Device) -> wp.Kernel:
 
 
 class Leak:
-    """The volume that passes out through the closed skull, as a share of what the opening takes in and gives out.
+    """Volume that passes out through the closed skull, relative to the volume swept by the open surface.
 
     The flux through each covered facet is averaged over those within `around` [m], the size of a palpating tool. Sums
-    over the facets of one node would not do: nodes that slide along the mean normal of their facets make these zero by
-    construction, whatever passes each facet.
+    over the facets of one node would not work: nodes that slide along the mean normal of their facets make these zero
+    by construction, whatever passes each facet.
     """
 
     def __init__(self, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 7e-3):
@@ -110,7 +110,7 @@ class Leak:
         ]
 
     def share(self, u: wp.array) -> np.ndarray:
-        """Of u (3N, B) [m] on the device: (B,), zero where nothing passes, NaN of what passes where nothing is open."""
+        """Compute the relative leak (B,) at u (3N, B) [m] on the device; 0 without leak, NaN if nothing is open."""
         out = wp.zeros((2, u.shape[1]), dtype=wp.float64, device=self._device.name)
         self._device.launch(build_kernel(self._device), (len(self._arrays[3]), u.shape[1]), [u, *self._arrays], [out])
         passed, swept = out.numpy()

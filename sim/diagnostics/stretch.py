@@ -1,4 +1,4 @@
-"""Principal stretches of deformed tissue, and the volume that is strained beyond what was measured on brain."""
+"""Principal stretches of deformed tissue, and the volume that is strained beyond measured data on brain."""
 
 from functools import cache
 
@@ -8,19 +8,19 @@ import warp as wp
 from ..discretisation.space import Discretisation
 from ..runtime.device import Device, forward_kernel
 
-# Principal stretches to which human brain was compressed and stretched: engineering strains of 50 % in Jin, Zhu, Mao,
-# Shen, Yang 2013, "A comprehensive experimental study on material properties of human brain tissue", J. Biomech.
-# 46:2795-2801.
+# Range of principal stretches in tests of human brain: engineering strains of 50 % in Jin, Zhu, Mao, Shen, Yang 2013,
+# "A comprehensive experimental study on material properties of human brain tissue", J. Biomech. 46:2795-2801.
 LEAST, MOST = 0.5, 1.5
-ROUND_OFF = 1e-4  # a stretch of 1.5 in single precision is within the range
-# Volume beyond that range from which a deformation is not reliable [m^3], and as a share of a small body. Tools strain
-# a little tissue beyond it at their rims: in surgical loads up to 0.6 ml, under the hardest spatulas 2.5 ml.
-VOLUME, SHARE = 1e-6, 0.1
+ROUND_OFF = 1e-4  # tolerance of the range, for a stretch of 1.5 in single precision
+# Volume beyond that range above which a deformation is unreliable. Tools strain some tissue beyond it at their edges:
+# surgical loads up to 0.6 ml, the hardest spatulas 2.5 ml.
+VOLUME = 1e-6  # [m^3].
+SHARE = 0.1  # Relative to a small mesh.
 
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """Kernel over (element, column)."""
+    """Build the kernel over (element, load case)."""
     scalar, vec, mat = device.scalar, device.vector, device.matrix
     low, high = wp.constant(wp.float64((LEAST - ROUND_OFF) ** 2)), wp.constant(wp.float64((MOST + ROUND_OFF) ** 2))
 
@@ -34,10 +34,10 @@ def build_kernel(device: Device) -> wp.Kernel:
         # outputs: least and most square stretch, volume
         found: wp.array2d(dtype=wp.float64),
     ):
-        """Extreme eigenvalues of C = F^T F: q + 2 p cos(phi), q + 2 p cos(phi + 2 pi / 3).
+        """Compute the extreme eigenvalues of C = F^T F: q + 2 p cos(phi), q + 2 p cos(phi + 2 pi / 3).
 
         q = tr C / 3, 6 p^2 = |C - q I|^2, cos(3 phi) = det((C - q I) / p) / 2: Smith 1961, "Eigenvalues of a symmetric
-        3 x 3 matrix", Commun. ACM 4:168. They lie within q +- 2 p, so that most elements need no more than that.
+        3 x 3 matrix", Commun. ACM 4:168. The bounds q +- 2 p make them unnecessary for most elements.
         """
         e, c = wp.tid()
         for k in range(gradient.shape[1]):
@@ -65,7 +65,7 @@ def build_kernel(device: Device) -> wp.Kernel:
 
 
 class Stretch:
-    """Measures the displacement gradients that a discretisation's law sees: of smoothed elements the averages."""
+    """Stretch of the displacement gradients in a discretisation's material law: averages in smoothed elements."""
 
     def __init__(self, space: Discretisation, device: Device):
         elements = space.parts(np.ones(len(space.mesh.tets), bool))[0].elements
@@ -80,12 +80,12 @@ class Stretch:
         ]
 
     def measure(self, u: wp.array) -> dict[str, np.ndarray]:
-        """Fields `stretch` and `strained` of a `Deformation` at u (3N, B) [m] on the device."""
+        """Compute `stretch` and `strained` of a `Deformation` at u (3N, B) [m] on the device."""
         found = self._device.array(np.repeat([[1.0], [1.0], [0.0]], u.shape[1], axis=1), wp.float64)
         self._device.launch(build_kernel(self._device), (len(self._shape[1]), u.shape[1]), [u, *self._shape], [found])
         least, most, volume = found.numpy()
         return {"stretch": np.sqrt(np.stack([least.clip(0.0), most])), "strained": volume}
 
     def is_beyond_range(self, volume: np.ndarray) -> np.ndarray:
-        """Return whether volumes (B,) [m^3] strained beyond the measured range are too large to rely on: (B,) bool."""
+        """Return True (B,) for volumes (B,) [m^3] strained beyond the measured range that make results unreliable."""
         return volume > self._limit

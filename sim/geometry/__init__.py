@@ -1,1 +1,1 @@
-"""Tetrahedral meshes and triangulated surfaces, in NumPy alone."""
+"""Tetrahedral meshes and triangulated surfaces, in NumPy only."""

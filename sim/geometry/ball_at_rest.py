@@ -1,4 +1,4 @@
-"""Where a ball comes to rest on a triangulated surface: exact first contact with faces, edges and vertices."""
+"""First contact of a ball with a triangulated surface: exact for faces, edges and vertices."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ import numpy as np
 
 from ..errors import InputError
 
-# Of the radius: rounding must not let a ball slip between a face and its edge.
-SLACK = 1e-9
+SLACK = 1e-9  # Tolerance relative to the radius, so that by rounding no ball slips between a face and its edge.
 
 
 def find_resting_tip(
     nodes: np.ndarray, triangles: np.ndarray, through: np.ndarray, inward: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Return the tip (3,) [m] of one ball: `find_resting_tips` on nodes (V, 3) [m], along a line through (3,) [m]."""
+    """Find the tip (3,) [m] of one ball: `find_resting_tips` on nodes (V, 3) [m], along a line through (3,) [m]."""
     return find_resting_tips(nodes[None], triangles, through[None], inward, np.array([radius]))[0]
 
 
 def find_resting_tips(
     nodes: np.ndarray, triangles: np.ndarray, through: np.ndarray, inward: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
-    """Return the tips (B, 3) [m] of balls that come down a line each until they first touch a surface of their own.
+    """Find the tips (B, 3) [m] of balls, each moved down a line until its first contact with its own surface.
 
-    A ball comes from infinitely far; its centre stays on the line. Its tip is its lowest point along `inward`, which
-    need not be the point that touches. The ball enters a triangle's neighbourhood of its own radius: a plate, three
-    cylinders and three balls (Ericson 2005, "Real-Time Collision Detection", section 5.5.6); the first of them counts.
+    A ball comes from infinity; its centre stays on the line. Its tip is its lowest point along `inward`, which need not
+    be the point of contact. The centre enters a triangle's neighbourhood of the ball's radius: a plate, three cylinders
+    and three balls (Ericson 2005, "Real-Time Collision Detection", section 5.5.6); the first of them is the contact.
 
     Parameters
     ----------
@@ -34,12 +33,12 @@ def find_resting_tips(
     through, inward
         Any point (B, 3) [m] of each line, and the unit direction (3,) in which the balls move.
     radius
-        Of each ball (B,) [m].
+        Radius of each ball (B,) [m].
 
     Raises
     ------
     InputError
-        A ball that never touches the surface on its way.
+        A ball whose path misses the surface.
     """
     across = nodes - through[:, None]
     across = across - (across @ inward)[..., None] * inward
@@ -53,26 +52,26 @@ def find_resting_tips(
     passing = np.flatnonzero(first == np.inf)
     if len(passing):
         raise InputError(
-            f"a ball of {1e3 * radius[passing[0]]:.3g} mm passes the surface by on the line through "
-            f"{np.round(1e3 * through[passing[0]], 1)} mm: choose a line that meets the surface."
+            f"the path of the ball of radius {1e3 * radius[passing[0]]:.3g} mm through "
+            f"{np.round(1e3 * through[passing[0]], 1)} mm misses the surface: choose another path."
         )
     return through + (first + radius)[:, None] * inward
 
 
 def _vertices(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """How far along the line (M, 3) [m] the centre is as the ball first touches a corner (M, 3, 3) [m]; inf: never."""
+    """Compute the centre's path (M, 3) [m] to the first contact with each corner (M, 3, 3) [m]; inf: no contact."""
     along = corners @ inward
     room = radius**2 - (np.einsum("mpi,mpi->mp", corners, corners) - along**2)
     return np.where(room >= 0.0, along - np.sqrt(np.maximum(room, 0.0)), np.inf)
 
 
 def _edges(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Return the same of what lies between the ends of the triangles' edges (M, 3)."""
+    """Compute the centre's path (M, 3) to the first contact with the interior of each edge."""
     edge = np.roll(corners, -1, axis=1) - corners
     square = np.einsum("mei,mei->me", edge, edge)
     unit = edge / np.sqrt(np.where(square > 0.0, square, 1.0))[..., None]
     slope, offset = unit @ inward, np.einsum("mei,mei->me", unit, corners)
-    # What is left of direction and way to the start, square to the edge.
+    # Components of the direction, and of the vector to the start, perpendicular to the edge.
     down, away = inward - slope[..., None] * unit, corners - offset[..., None] * unit
     steep, half = np.einsum("mei,mei->me", down, down), np.einsum("mei,mei->me", down, away)
     room = half**2 - steep * (np.einsum("mei,mei->me", away, away) - radius**2)
@@ -83,7 +82,7 @@ def _edges(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.nd
 
 
 def _faces(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Return the same of the triangles' insides (M, 1), whichever side the ball comes from."""
+    """Compute the centre's path (M, 1) to the first contact with the interior of each triangle, from either side."""
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(ab, ac)
     twice = np.linalg.norm(normal, axis=1)

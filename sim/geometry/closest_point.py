@@ -1,4 +1,4 @@
-"""The point of a triangulated surface that is closest to a given one, in plain NumPy."""
+"""Closest point of a triangulated surface, in plain NumPy."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Share of a distance that two ways to find it may differ by.
-ROUNDING = 1e-9
-# Points that are held against shared triangles at once: more only take more memory.
-TOGETHER = 128
+ROUNDING = 1e-9  # Relative difference of one distance computed in two ways.
+TOGETHER = 128  # Points compared with shared triangles at once: more only take more memory.
 
 
 class Closest(NamedTuple):
-    """Closest points (B, 3) [m], and where they lie: triangle (B,) and barycentric weights (B, 3)."""
+    """Closest points (B, 3) [m], with their triangles (B,) and barycentric weights (B, 3)."""
 
     point: np.ndarray
     triangle: np.ndarray
@@ -21,11 +19,11 @@ class Closest(NamedTuple):
 
 
 def find_closest_points(points: np.ndarray, corners: np.ndarray) -> Closest:
-    """Find what is closest to points (B, 3) [m] on triangles with corners (S, 3, 3), or (B, S, 3, 3) [m].
+    """Find the closest points to points (B, 3) [m] on triangles with corners (S, 3, 3), or (B, S, 3, 3) [m].
 
-    It is the foot on a triangle's plane where that lies inside, else the closest point of an edge. Triangles without
-    area have edges all the same. Of triangles that all points share, each point is held against those alone that may be
-    the closest; the distance to the middle of every one is looked at.
+    It is the projection to a triangle's plane if this is inside, else the closest point of an edge. Triangles without
+    area still have edges. For triangles shared by all points, the distances to all centroids select the few triangles
+    that may be closest to each point.
     """
     if corners.ndim == 3:
         middle, reach = compute_bounding_balls(corners)
@@ -45,7 +43,7 @@ def find_closest_points(points: np.ndarray, corners: np.ndarray) -> Closest:
     normal = np.cross(edge[:, :, 0], edge[:, :, 1])
     twice = np.einsum("bsi,bsi->bs", normal, normal)  # the square of twice the area
     twice = np.where(twice > 0.0, twice, np.inf)[..., None]
-    # The weight of a corner is the area that the foot spans with the edge across from it.
+    # A corner's weight is the area spanned by the projection and the opposite edge.
     spanned = np.einsum("bsi,bsei->bse", normal, np.cross(edge, arm)) / twice
     inner = np.roll(spanned, -1, axis=2)
     inside = (inner > 0.0).all(axis=2)
@@ -64,18 +62,18 @@ def find_closest_points(points: np.ndarray, corners: np.ndarray) -> Closest:
 
 
 def compute_bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middles (S, 3) and radii (S,) [m] of balls that hold a triangle each, of corners (S, 3, 3) [m]."""
+    """Compute centroids (S, 3) and radii (S,) [m] of balls that contain a triangle each, of corners (S, 3, 3) [m]."""
     middle = corners.mean(axis=1)
     return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
 
 
 def _candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Numbers (B, k) of triangles, given by their `compute_bounding_balls`, among which the closest is.
+    """List triangles (B, k), given by their `compute_bounding_balls`, that include the closest one to each point.
 
-    No middle lies nearer than their nearest corner may.
+    A triangle is left out if no point of it can be closer than the nearest centroid.
 
-    Each row begins with those that may be the closest, in rising order, so that of equal ones the first is found. The
-    first of them fills the rest.
+    Each row begins with the possibly closest triangles in ascending order, so that of equal ones the first is found.
+    The remainder of the row repeats the first of them.
     """
     x, y, z = (points[:, axis, None] - middle[:, axis] for axis in range(3))
     away = np.sqrt(x * x + y * y + z * z)

@@ -1,4 +1,4 @@
-"""Distances along a triangulated surface."""
+"""Geodesic distances on a triangulated surface."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from .tetmesh import compute_row_keys
 def compute_geodesic_distances(
     nodes: np.ndarray, triangles: np.ndarray, source: np.ndarray, limit: float, steiner: int = 4
 ) -> np.ndarray:
-    """Length (V,) [m] of the shortest path over the surface `triangles` (S, 3) from `source` (3,) to each node.
+    """Compute the shortest paths (V,) [m] over the surface `triangles` (S, 3) from `source` (3,) to each node.
 
     Infinite for nodes off the surface or farther than `limit` [m]. Dijkstra's algorithm on a graph of the nodes and
     of further points on the edges, joined straight across each triangle (Lanthier, Maheshwari & Sack 2001). The
-    source is joined to the triangles round the node nearest to it. With four points on every edge (`steiner`) the paths
+    source is joined to the triangles around its nearest node. With four points on every edge (`steiner`) the paths
     are at most about 1 % too long.
     """
     size = np.linalg.norm(nodes[triangles] - nodes[np.roll(triangles, 1, axis=1)], axis=2).max()
@@ -29,7 +29,7 @@ def compute_geodesic_distances(
     points = np.concatenate([points, source[None]])
     start = len(points) - 1
     links = np.concatenate([links, np.stack([first, np.full(len(first), start)], axis=1)])
-    links = links[np.unique(compute_row_keys(links), return_index=True)[1]]  # once each: the graph would add doubles up
+    links = links[np.unique(compute_row_keys(links), return_index=True)[1]]  # unique: the graph would sum duplicates
     length = np.linalg.norm(points[links[:, 0]] - points[links[:, 1]], axis=1)
     graph = coo_array((np.maximum(length, 1e-12), links.T), shape=(start + 1, start + 1)).tocsr()
     along = csgraph.dijkstra(graph, directed=False, indices=start, limit=limit)
@@ -39,7 +39,7 @@ def compute_geodesic_distances(
 
 
 def _with_steiner_points(nodes: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """All points of the graph, the nodes first, and those on the rim of each triangle (S, 3 + 3 count)."""
+    """Return all points of the graph, the nodes first, and their numbers on each triangle (S, 3 + 3 count)."""
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, first, number = np.unique(compute_row_keys(sides), return_index=True, return_inverse=True)
     edges = sides[first]

@@ -1,4 +1,4 @@
-"""Reading one mesh's answer at material points of another: which tetrahedron holds a point, and where in it."""
+"""Interpolation of one mesh's solution at material points of another: tetrahedron and barycentric weights of points."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from scipy.spatial import KDTree
 
 from .tetmesh import TetMesh
 
-# Tetrahedra that are looked at first: 97 of 100 points are in one of them. Weights below this are rounding.
-FIRST, ROUNDING = 4, 1e-12
+FIRST = 4  # Nearest tetrahedra that are tested first: they contain 97 % of points.
+ROUNDING = 1e-12  # Barycentric weights below this are round-off.
 
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """Points in a mesh: vertices (n, 4) of the tetrahedron that holds each, and barycentric weights (n, 4)."""
+    """Points in a mesh: vertices (n, 4) of the tetrahedron that contains each, and barycentric weights (n, 4)."""
 
     vertices: np.ndarray
     weights: np.ndarray
 
     def read(self, field: np.ndarray) -> np.ndarray:
-        """Values (B, n, k) at the points, linear between the vertices' (B, V, k)."""
+        """Interpolate linearly to values (B, n, k) at the points from those (B, V, k) at the vertices."""
         return np.einsum("nc,bnck->bnk", self.weights, field[:, self.vertices])
 
 
 def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
-    """Find points (n, 3) [m]; one outside is read at the place nearest to it by barycentric coordinates.
+    """Locate points (n, 3) [m]; for one outside the mesh, its weights are clipped to a nearby tetrahedron.
 
-    In graded meshes the tetrahedron that holds a point is among the 64 `candidates` whose middles are nearest to it.
+    In graded meshes the tetrahedron of a point is among the 64 `candidates` with the nearest centroids.
     """
     tet, weights = _best(mesh, points, min(FIRST, candidates))
     unheld = np.flatnonzero(weights.min(axis=1) < -ROUNDING)
@@ -40,9 +40,9 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
 
 
 class _Cells(NamedTuple):
-    """The middles of a mesh's tetrahedra, their first corners (T, 3) [m], and inverses (T, 3, 3) [1/m] of their edges.
+    """Centroids of a mesh's tetrahedra, their first corners (T, 3) [m], and inverses (T, 3, 3) [1/m] of their edges.
 
-    An inverse makes barycentric weights of the other corners from how far a point is from the first.
+    An inverse maps a point's position relative to the first corner to the barycentric weights of the others.
     """
 
     middles: KDTree
@@ -58,7 +58,7 @@ def _cells(mesh: TetMesh) -> _Cells:
 
 
 def _best(mesh: TetMesh, points: np.ndarray, candidates: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra (n,), of so many near points (n, 3) [m], that these are least outside of, and weights (n, 4) there."""
+    """Choose, of the nearest `candidates`, the tetrahedra (n,) with the largest minimum weight, and weights (n, 4)."""
     cells, count = _cells(mesh), min(candidates, len(mesh.tets))
     near = cells.middles.query(points, k=count)[1].reshape(len(points), count)
     inner = np.einsum("nkij,nkj->nki", cells.inverse[near], points[:, None] - cells.corner[near])

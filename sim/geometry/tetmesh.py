@@ -1,4 +1,4 @@
-"""Tetrahedral meshes: nodes, linear or quadratic tetrahedra, region labels, and the surface that follows from them."""
+"""Tetrahedral meshes: nodes, linear or quadratic tetrahedra, region labels, and their surface."""
 
 from __future__ import annotations
 
@@ -11,37 +11,35 @@ import numpy as np
 
 from ..errors import InputError
 
-# Faces of a positively oriented tetrahedron, normals outwards.
-FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
-EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-# The order of VTK's and meshio's quadratic tetrahedra; and corners, then middles, when corners 2 and 3 change places.
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # Corners of the faces, with outward normals.
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])  # Corners of the edges.
+# Edges of quadratic tetrahedra in the order of VTK and meshio; corners, then mid-edge nodes, with corners 2, 3 swapped.
 QUADRATIC_EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 TURNED = [0, 1, 3, 2, 4, 8, 7, 6, 5, 9]
-TRIANGLE_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
-# A volume below this share of the longest edge cubed is round-off, not an element.
-ZERO_VOLUME = 1e-12
-SLIVER_DEGREES = 1.0
+TRIANGLE_EDGES = np.array([[0, 1], [1, 2], [2, 0]])  # Corners of a triangle's edges.
+ZERO_VOLUME = 1e-12  # Volume, relative to the longest edge cubed, below which an element is degenerate.
+SLIVER_DEGREES = 1.0  # Dihedral angle below which an element is a sliver [degrees].
 
 
 class MeshWarning(UserWarning):
-    """A mesh that can be used but will cost accuracy or was probably not meant so."""
+    """Warning about a mesh that reduces accuracy, or is probably not as intended."""
 
 
 def compute_signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Signed volumes (T,) [m^3] of tetrahedra `tets` (T, 4) over `nodes` (V, 3) [m]."""
+    """Compute the signed volumes (T,) [m^3] of tetrahedra `tets` (T, 4) over `nodes` (V, 3) [m]."""
     a, b, c, d = (nodes[tets[:, k]] for k in range(4))
     return np.einsum("ti,ti->t", np.cross(b - a, c - a), d - a) / 6.0
 
 
 def find_single_faces(tets: np.ndarray) -> np.ndarray:
-    """Triangles (S, 3), outwards, that belong to exactly one of the tetrahedra `tets` (T, 4)."""
+    """Return the outward triangles (S, 3) that belong to exactly one of the tetrahedra `tets` (T, 4)."""
     faces = tets[:, FACES].reshape(-1, 3)
     _, first, count = np.unique(compute_row_keys(faces), return_index=True, return_counts=True)
     return faces[np.sort(first[count == 1])]
 
 
 def compute_row_keys(rows: np.ndarray) -> np.ndarray:
-    """One number (n,) for each row (n, 2) or (n, 3) of node numbers, the same in whatever order the row names them.
+    """Return one number (n,) for each row (n, 2) or (n, 3) of node numbers, independent of their order in the row.
 
     Sorting such numbers is ten times faster than sorting rows. They are distinct up to two million nodes.
     """
@@ -52,7 +50,7 @@ def compute_row_keys(rows: np.ndarray) -> np.ndarray:
 
 
 def compute_dihedral_angles(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Dihedral angles (T, 6) [degrees] at the edges of each tetrahedron."""
+    """Compute the dihedral angles (T, 6) [degrees] at the edges of each tetrahedron."""
     corners = nodes[tets[:, FACES]]  # (T, 4, 3, 3)
     normals = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
@@ -62,7 +60,7 @@ def compute_dihedral_angles(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class TetMesh:
-    """Tetrahedra in metres, linear unless they bring mid-edge nodes.
+    """Tetrahedral mesh in metres, linear unless it has mid-edge nodes.
 
     Parameters
     ----------
@@ -117,45 +115,45 @@ class TetMesh:
 
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:
-        """What makes the mesh: nodes, tetrahedra, regions, and middles if there are any."""
+        """Arrays that define the mesh: nodes, tetrahedra, regions, and mid-edge nodes if there are any."""
         linear = self.nodes, self.tets, self.region
         return linear if self.middles is None else (*linear, self.middles)
 
     @cached_property
     def table(self) -> np.ndarray:
-        """Every node of every tetrahedron, (T, 4) or, quadratic, (T, 10): corners, then middles."""
+        """Nodes of each tetrahedron, (T, 4) or, quadratic, (T, 10): corners, then mid-edge nodes."""
         return self.tets if self.middles is None else np.hstack([self.tets, self.middles])
 
     @cached_property
     def volumes(self) -> np.ndarray:
-        """Element volumes (T,) [m^3], between straight edges."""
+        """Element volumes (T,) [m^3], with straight edges."""
         return compute_signed_volumes(self.nodes, self.tets)
 
     @cached_property
     def surface(self) -> np.ndarray:
-        """Outer triangles (S, 3), outwards, by their corners."""
+        """Outer triangles (S, 3), by their corners, with outward normals."""
         return find_single_faces(self.tets)
 
     def within(self, *labels: int) -> np.ndarray:
-        """(T,) bool: the elements of these regions."""
+        """Mark (T,) bool the elements of these regions."""
         return np.isin(self.region, labels)
 
     def find_boundary(self, *labels: int) -> np.ndarray:
-        """Triangles (S, 3), outwards, by their corners, round the elements of these regions together."""
+        """Return the boundary triangles (S, 3) of these regions together, by their corners, with outward normals."""
         return find_single_faces(self.tets[self.within(*labels)])
 
     def nodes_of(self, *labels: int) -> np.ndarray:
-        """Sorted node numbers (n,) of the elements of these regions."""
+        """Return the node numbers (n,) of these regions' elements, ascending."""
         return np.unique(self.table[self.within(*labels)])
 
     @cached_property
     def digest(self) -> str:
-        """Hash of `arrays` (hexadecimal): the same bytes, the same mesh."""
+        """Hash of `arrays` (hexadecimal), equal for equal meshes."""
         return compute_digest(*self.arrays)
 
 
 def compute_digest(*arrays: np.ndarray) -> str:
-    """SHA-256 of the arrays' bytes and shapes, shortened to 16 hexadecimal digits."""
+    """Compute the SHA-256 of the arrays' bytes and shapes, shortened to 16 hexadecimal digits."""
     sha = hashlib.sha256()
     for array in arrays:
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
@@ -164,9 +162,9 @@ def compute_digest(*arrays: np.ndarray) -> str:
 
 
 def orient_tetrahedra(nodes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
-    """Tetrahedra with every volume positive, and how many were turned. Zero volumes stay as they are.
+    """Return tetrahedra with positive volumes, and the number of those reoriented. Zero volumes stay as they are.
 
-    table (T, 4) corners or (T, 10) corners and middles: when corners change places, so do the edges between them.
+    table (T, 4) corners or (T, 10) corners and mid-edge nodes: if corners are swapped, so are the edges between them.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Conjugate gradients, factors, inverses, multigrid, and which of them preconditions a problem."""
+"""Conjugate gradients, factors, inverses and multigrid, and the choice of a preconditioner."""

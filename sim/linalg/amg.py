@@ -1,8 +1,8 @@
 """Smoothed-aggregation algebraic multigrid, for meshes whose stiffness is too large to factorise.
 
 Vanek, Mandel, Brezina 1996, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
-problems", Computing 56:179-196; the coarse levels must represent the rigid motions. PyAMG finds the levels, once, on
-the host (Bell, Olson, Schroder, Southworth 2023, J. Open Source Softw. 8:5495); the cycle is ours, `multigrid.py`.
+problems", Computing 56:179-196; the coarse levels must represent the rigid motions. PyAMG builds the levels once, on
+the host (Bell, Olson, Schroder, Southworth 2023, J. Open Source Softw. 8:5495); the cycle is that of `multigrid.py`.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, ma
 from .pcg import Preconditioner
 
 Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
-"""Solves K over motions L (n, m) whose unknowns are numbered by node (m,), as `multifrontal.Factor` does."""
-# Every neighbour counts. Energy-minimising smoothing draws no random numbers: the same mesh gives the same levels.
+"""Function that solves K over motions L (n, m), unknowns numbered by node (m,), as `multifrontal.Factor` does."""
+# No strength threshold. Energy-minimising smoothing draws no random numbers: the same mesh gives the same levels.
 SETTING: dict[str, Any] = {
     "strength": ("symmetric", {"theta": 0.0}),
     "smooth": ("energy", {"krylov": "cg", "maxiter": 2, "degree": 1}),
@@ -37,9 +37,9 @@ def build_multigrid_cycle(
     largest_last: int = 1_000,
     smoother: Chebyshev = CHEBYSHEV,
 ) -> Preconditioner:
-    """One V-cycle on K (3N, 3N) [N/m], positive definite in blocks of nodes, with rigid motions (3N, 6).
+    """Build one V-cycle on K (3N, 3N) [N/m], positive definite in blocks of nodes, with rigid motions (3N, 6).
 
-    A level of up to `largest_last` nodes, of six unknowns each, is the last.
+    The last level has at most `largest_last` nodes, of six unknowns each.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def build_multigrid_cycle(
 
 
 def _direct(stiffness: sp.csc_array, motions: sp.csc_array, size: int, direct: Direct) -> Preconditioner:
-    """Over the motions, `size` to a node, that move anything: of aggregates with few unknowns some do not."""
+    """Build a direct solver over the motions, `size` to a node; zero motions, of small aggregates, are left out."""
     moving = np.flatnonzero(abs(motions).sum(axis=0) > 0.0)
     return direct(stiffness, motions[:, moving], moving // size)
 
@@ -73,7 +73,7 @@ def _blocks(matrix: sp.bsr_matrix) -> sp.bsr_array:
 
 
 def build_rigid_motions(points: np.ndarray) -> np.ndarray:
-    """Return translations and rotations (3N, 6) of points (N, 3); lengths as shares of the body's."""
+    """Return translations and rotations (3N, 6) of points (N, 3), with lengths relative to the extent of the points."""
     arm = points - points.mean(axis=0)
     arm /= np.abs(arm).max()
     turns = [np.cross(axis, arm) for axis in np.eye(3)]

@@ -1,4 +1,4 @@
-"""Small dense systems, each a block of threads' own: Cholesky's factor, and solving with it, in double precision.
+"""Cholesky factorisation and solution of small dense systems, one per block of threads, in double precision.
 
 Golub, Van Loan 2013, "Matrix Computations", algorithm 4.2.1 in its outer product form.
 """
@@ -14,7 +14,7 @@ from ..runtime.device import Device
 
 @dataclass(frozen=True)
 class BlockFactorFunctions:
-    """Functions of Warp on matrices (b, n, n) and vectors (b, n), of which the first `size` rows count."""
+    """Warp functions for matrices (b, n, n) and vectors (b, n), of which the first `size` rows are used."""
 
     factor: wp.Function
     solve: wp.Function
@@ -22,7 +22,7 @@ class BlockFactorFunctions:
 
 @cache
 def build_functions(device: Device) -> BlockFactorFunctions:
-    """Those for the blocks of a device."""
+    """Build the functions for the blocks of a device."""
     down, across = get_block_shape(device)
     threads = down * across
 
@@ -30,7 +30,7 @@ def build_functions(device: Device) -> BlockFactorFunctions:
     def factor(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int) -> bool:
         """Factorise A = L L' in place: A is read from the upper half; False if A is not positive definite.
 
-        Then nothing that is left means anything.
+        Then the contents of `a` are invalid.
         """
         i0, j0 = me // across, me % across
         for k in range(size):
@@ -56,7 +56,7 @@ def build_functions(device: Device) -> BlockFactorFunctions:
 
     @wp.func
     def solve(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int, x: wp.array2d(dtype=wp.float64)):
-        """x = A^-1 x, of A what `factor` has left."""
+        """Solve A x = b in place, with the result of `factor`."""
         for k in range(size):
             y = x[c, k] / a[c, k, k]
             for i in range(k + 1 + me, size, threads):

@@ -1,9 +1,9 @@
-"""Symmetric positive definite matrices inverted and eliminated on CUDA: in place, half of them, in blocks.
+"""Inversion and elimination of symmetric positive definite matrices on CUDA: in place, lower half only, in blocks.
 
-The first unknowns of a symmetric matrix [[A, B^T], [B, C]] are exchanged with their right-hand sides. This makes
-[[-A^-1, A^-1 B^T], [B A^-1, C - B A^-1 B^T]] of it. Goodnight 1979, "A tutorial on the SWEEP operator", Am. Stat.
-33:149-158. Of all unknowns it leaves the inverse, in n^3 operations and 4 n^2 bytes of double precision, where a
-library's factor and inverse stand beside each other. Uses torch, as `dense_inverse` does.
+The first unknowns of a symmetric matrix [[A, B^T], [B, C]] are exchanged with their right-hand sides. This gives
+[[-A^-1, A^-1 B^T], [B A^-1, C - B A^-1 B^T]]. Goodnight 1979, "A tutorial on the SWEEP operator", Am. Stat. 33:149-158.
+Exchanging all unknowns gives the inverse, in n^3 operations and 4 n^2 bytes of double precision, while a library needs
+memory for factor and inverse at once. Uses torch, as `dense_inverse` does.
 """
 
 from __future__ import annotations
@@ -18,24 +18,23 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
-# Rows of blocks that stand beside the matrix while it is exchanged.
-BESIDE = 3
+BESIDE = 3  # Temporary block rows, in addition to the matrix, during an exchange.
 
 
 @dataclass(frozen=True)
 class Exchange:
-    """How large the blocks of an exchange are, and what it may take.
+    """Block size and limits of an exchange.
 
     Parameters
     ----------
     block
-        Unknowns of a block: rows of blocks stand beside the matrix.
+        Unknowns per block; temporary memory is proportional to it.
     share
-        Of the free memory.
+        Fraction of the free memory that may be used.
     longest
-        [s] that it may take.
+        Maximum duration [s].
     trial
-        Side of the product that tells how fast a device multiplies.
+        Size of the matrix product that measures the speed of a device.
     """
 
     block: int = 4096
@@ -46,23 +45,23 @@ class Exchange:
 
 @cache
 def measure_rate_of_work(where: str, trial: int = Exchange.trial) -> float:
-    """Multiplications and additions a second in double precision, measured by a second product of side `trial`."""
+    """Measure multiply-adds per second in double precision, by the second of two matrix products of size `trial`."""
     one = torch.ones((trial, trial), dtype=torch.float64, device=where)
     spent = 0.0
     for _ in range(2):
         begun = time.perf_counter()
-        float((one @ one)[0, 0])  # waits for it
+        float((one @ one)[0, 0])  # waits for the result
         spent = time.perf_counter() - begun
     return trial**3 / spent
 
 
 def exchange_bytes(count: int, settings: Exchange = Exchange()) -> int:
-    """What an exchange of so many unknowns takes: half the matrix in double precision, and what stands beside it."""
+    """Estimate the memory of an exchange [bytes]: half the matrix in double precision, and temporary block rows."""
     return 8 * (count * (count + settings.block) // 2 + BESIDE * min(count, settings.block) * count)
 
 
 def can_exchange(count: int, where: str, besides: int = 0, settings: Exchange = Exchange()) -> bool:
-    """Whether a card can exchange so many unknowns, beside so many bytes, in its free memory and in time."""
+    """Return True if a GPU can exchange `count` unknowns in time, and has memory for that and `besides` bytes."""
     if not torch.cuda.is_available():
         return False
     free, _ = torch.cuda.mem_get_info(where)
@@ -72,7 +71,7 @@ def can_exchange(count: int, where: str, besides: int = 0, settings: Exchange = 
 
 
 def to_half_rows(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[torch.Tensor]:
-    """A symmetric matrix (n, n) in rows of blocks between the cuts, each as far as its own block on the diagonal."""
+    """Split a symmetric matrix (n, n) into rows of blocks between the cuts, each up to its diagonal block."""
     rows, out = sp.csr_array(matrix), []
     for first, stop in pairwise(cuts):
         part = sp.coo_array(rows[first:stop])
@@ -84,7 +83,7 @@ def to_half_rows(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[
 
 
 def invert(rows: Sequence[torch.Tensor]) -> None:
-    """-A^-1 in place of A, as `to_half_rows` has them.
+    """Replace A by -A^-1, in the rows of `to_half_rows`.
 
     Raises
     ------
@@ -109,14 +108,14 @@ def invert(rows: Sequence[torch.Tensor]) -> None:
 
 
 def compute_block_cuts(count: int, block: int = Exchange.block) -> list[int]:
-    """Where the blocks of so many unknowns begin and end."""
+    """Return the bounds of the blocks of `count` unknowns."""
     return [*range(0, count, block), count]
 
 
 def eliminate_unknowns(
     matrix: sp.csc_array, border: sp.csc_array, where: str, block: int = Exchange.block
 ) -> tuple[np.ndarray, np.ndarray]:
-    """X = A^-1 B (n, m) in single precision and B^T X (m, m), of sparse A (n, n) and B (n, m).
+    """Compute X = A^-1 B (n, m) in single precision and B^T X (m, m), of sparse A (n, n) and B (n, m).
 
     Raises
     ------
@@ -129,7 +128,7 @@ def eliminate_unknowns(
     *rows, last = to_half_rows(whole, [*cuts, stop], where)
     for k in range(len(rows)):
         _eliminate(rows[k], [*rows[k + 1 :], last])
-    while rows:  # and back
+    while rows:  # back substitution
         row = rows.pop()
         own = slice(row.shape[1] - len(row), row.shape[1])
         for first, stop in pairwise(cuts[: len(rows) + 1]):
@@ -138,7 +137,7 @@ def eliminate_unknowns(
 
 
 def _eliminate(row: torch.Tensor, below: Sequence[torch.Tensor]) -> None:
-    """Take a block's unknowns out of the rows below, which keep what solves for it in their place."""
+    """Eliminate a block's unknowns from the rows below, which store the solution for them in its columns."""
     stop = row.shape[1]
     own = slice(stop - len(row), stop)
     across = torch.cat([later[:, own].T for later in below], dim=1)
@@ -154,6 +153,6 @@ def _inverse(block: torch.Tensor) -> torch.Tensor:
 
 
 def release(where: str) -> None:
-    """Give back what nobody holds: batches of loads want the room."""
+    """Release cached GPU memory, which batches of loads need."""
     if where != "cpu":
         torch.cuda.empty_cache()

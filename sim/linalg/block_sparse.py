@@ -1,4 +1,4 @@
-"""A sparse matrix of small dense blocks, times many columns."""
+"""Product of a sparse matrix of small dense blocks with many columns."""
 
 from functools import cache
 
@@ -8,8 +8,9 @@ import warp as wp
 
 from ..runtime.device import Device, forward_kernel
 
-# A row of blocks times x (n, b) on the CPU; blocks are stored by their columns. Eight columns of x together fill vector
-# registers. For one the rows of a block do, WIDE >= ROWS of them: those beyond are the next column's, or padding.
+# Block row times x (n, b) on the CPU; blocks are stored by columns. Eight columns of x together fill vector registers.
+# For a single column the rows of a block do, WIDE >= ROWS of them: the surplus belongs to the next column, or is
+# padding.
 ROW = """
     const int b = x.shape[1];
     int c = 0;
@@ -38,12 +39,12 @@ ROW = """
         for (int r = 0; r < ROWS; ++r) out.data[((size_t)ROWS * i + r) * b + c] += factor * sum[0][r];
     }
 """
-LANES = 4
+LANES = 4  # Scalars per vector register; WIDE is a multiple of it.
 
 
 @cache
 def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
-    """Kernel on a graphics card for blocks (rows, columns) of a device's scalar type, over block rows and columns."""
+    """Build the CUDA kernel for blocks (rows, columns) of a device's scalar type, over block rows and columns."""
     scalar = device.scalar
     mat, vec = wp.types.matrix((rows, columns), scalar), wp.types.vector(columns, scalar)
     wide = wp.types.vector(rows, scalar)
@@ -58,7 +59,7 @@ def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_i += factor sum over j of A_ij x_j."""
+        """Add factor times sum over j of A_ij x_j to out_i."""
         i, c = wp.tid()
         total = wide()
         for k in range(first[i], first[i + 1]):
@@ -74,7 +75,7 @@ def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
 
 @cache
 def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
-    """Return the same on the CPU, over block rows."""
+    """Build the CPU kernel for the same product, over block rows."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
     code = ROW.replace("real", real).replace("WIDE", str(-(-rows // LANES) * LANES))
@@ -100,14 +101,14 @@ def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_i += factor sum over j of A_ij x_j, in all columns."""
+        """Add factor times sum over j of A_ij x_j to out_i, in all columns."""
         add_row(wp.tid(), first, column, block, factor, x, out)
 
     return add_product
 
 
 class Sparse:
-    """A matrix (m, n) in compressed rows of blocks."""
+    """Sparse matrix (m, n) in block compressed rows (BSR)."""
 
     def __init__(self, matrix: sp.bsr_array, device: Device):
         self._device = device
@@ -121,13 +122,13 @@ class Sparse:
         self._entries = [*indices, blocks]
 
     def times(self, x: wp.array) -> wp.array:
-        """Return a x (m, b) of x (n, b)."""
+        """Compute A x (m, b) of x (n, b)."""
         out = self._device.zeros(self.rows, x.shape[1])
         self.add_to(out, 1.0, x)
         return out
 
     def add_to(self, out: wp.array, factor: float, x: wp.array) -> None:
-        """out (m, b) += factor A x, with x (n, b)."""
+        """Add factor A x to out (m, b), with x (n, b)."""
         inputs, count = [*self._entries, self._device.scalar(factor), x], self.rows // self._size[0]
         if self._device.on_cuda:
             self._device.launch(build_kernel(self._device, *self._size), (count, x.shape[1]), inputs, [out])

@@ -1,4 +1,4 @@
-"""How a body at rest gives way to forces on some of its nodes: columns of its preconditioner, made when needed."""
+"""Compliance of the undeformed mesh at some nodes: columns of its preconditioner, computed when needed."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ from .pcg import Preconditioner
 
 @dataclass(frozen=True)
 class Columns:
-    """Which columns of a compliance are made together, and how many are kept.
+    """Block size and cache of a compliance's columns.
 
     Parameters
     ----------
     block
-        Nodes whose columns are made together, always by the same arithmetic: what is kept decides on time, never on
-        numbers.
+        Nodes whose columns are computed together, always by the same arithmetic: the cache affects time, never values.
     most_bytes, fewest_blocks
-        Bytes of columns that are kept at most, or so many blocks where these take more.
+        Maximum size of the cached columns [bytes]; minimum number of cached blocks, if these are larger.
     """
 
     block: int = 16
@@ -33,20 +32,20 @@ class Columns:
 
 
 class Compliance:
-    """H (3N, 3N) [m/N], as a preconditioner does it, and its columns at n nodes: arrays of `views.library`.
+    """Compliance H (3N, 3N) [m/N], applied by a preconditioner, and its columns at n nodes: `views.get_library` arrays.
 
     Parameters
     ----------
     problem
-        Whose free motions count.
+        Problem whose free motions are used.
     preconditioner
-        Of the problem, alike at every state.
+        Preconditioner of the problem, the same at every state.
     nodes
         (n,) node numbers.
     columns
-        How they are made and kept.
+        Block size and cache of the columns.
 
-    `rows` (3n,) are those of the nodes, and `places` the same on the device.
+    `rows` (3n,) are the rows of the nodes, and `places` the same on the device.
     """
 
     def __init__(
@@ -64,7 +63,7 @@ class Compliance:
         self._block = lru_cache(self._kept)(self._columns)
 
     def answered(self, force: Any) -> Any:
-        """H force: motions (3N, b) [m] under forces (3N, b) [N]."""
+        """Compute H force: displacements (3N, b) [m] under forces (3N, b) [N]."""
         device, constraint = self._problem.device, self._problem.constraint
         pull, out = device.zeros(*force.shape), device.zeros(*force.shape)
         view(pull)[:] = force
@@ -74,11 +73,11 @@ class Compliance:
         return view(out)
 
     def spread(self, force: Any) -> Any:
-        """Motion (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n."""
+        """Compute the displacements (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n of `nodes`."""
         device, every = self._problem.device, -(-len(force) // self._width)
         out = view(device.zeros(self._problem.rows, force.shape[1]))
         force = cast_like(out, force)
-        # A card multiplies by zeros sooner than it says where they are.
+        # On a GPU, multiplying by zeros is faster than asking where they are.
         at_hand = device.on_cuda and self.known[: len(force) // 3].all() and every <= self._kept
         for block in range(every) if at_hand else self._acting(to_host((force != 0.0).any(1))):
             some = force[self._rows(block)]
@@ -86,19 +85,19 @@ class Compliance:
         return out
 
     def moved(self, force: Any) -> Any:
-        """Motion (3n, b) [m] of all its nodes under forces (3m, b) [N] on the first m, all of them known."""
+        """Compute the displacements (3n, b) [m] of `nodes` under forces (3m, b) [N] on the first m, all known."""
         if self._problem.device.on_cuda:
             return self.columns[: len(force)].T @ to_double(force)
         acting = np.flatnonzero(to_host((force != 0.0).any(1)))
         return self.columns[acting].T @ to_double(force[acting])
 
     def between(self, acting: np.ndarray) -> Any:
-        """H (3n, 3n) [m/N] between these n nodes: at least its columns at those that are `acting` (n,) bool."""
+        """Return H (3n, 3n) [m/N] between `nodes`; the columns at `acting` (n,) bool nodes are valid."""
         self.ensure_known(acting)
         return self.columns.T
 
     def ensure_known(self, acting: np.ndarray) -> None:
-        """See to it that at least the `columns`, here rows, at `acting` (n,) nodes are `known` (n,)."""
+        """Compute the missing `columns` (stored as rows) at `acting` (n,) nodes, and mark them in `known` (n,)."""
         missing = acting & ~self.known
         if missing.any() and isinstance(self._preconditioner, Factor):
             self.columns[:], self.known[:] = self._preconditioner.compliance(self.rows).T, True
@@ -106,14 +105,14 @@ class Compliance:
             self._block(block)
 
     def _acting(self, rows: np.ndarray) -> list[int]:
-        """Return the blocks that some rows (3n,) bool are in."""
+        """Return the blocks that some rows (3n,) bool belong to."""
         return np.unique(np.flatnonzero(rows) // self._width).tolist()
 
     def _rows(self, block: int) -> slice:
         return slice(self._width * block, self._width * (block + 1))
 
     def _columns(self, block: int) -> Any:
-        """(3N, k) [m/N], and what stands of them between the nodes, in double precision."""
+        """Compute a block's columns (3N, k) [m/N], and store their rows at the nodes in double precision."""
         own = self._rows(block)
         unit = np.zeros((self._problem.rows, self._width))
         unit[self.rows[own], np.arange(len(self.rows[own]))] = 1.0

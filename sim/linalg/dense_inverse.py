@@ -1,10 +1,10 @@
-"""CUDA's preconditioner for meshes of a few thousand nodes: the inverse rest stiffness as one dense matrix.
+"""Preconditioner on CUDA for meshes of a few thousand nodes: dense inverse of the undeformed stiffness.
 
-One matrix product serves a whole batch of load cases, where triangular solves would leave the card idle. In single
-precision the inverse is kept in half precision, which the card's tensor cores multiply at their full rate. Scaled to a
-unit diagonal, and each column to unit length, its numbers fit half precision's range. Its eleven bits spoil no stiff
-mode (bfloat16's eight do, at nu = 0.49). The only file of this room that uses torch, for its matrix product; it is
-imported by its arm in `preconditioner` alone.
+One matrix product serves a whole batch of load cases, where triangular solves would leave the GPU idle. In single
+precision the inverse is stored in half precision, which tensor cores multiply at their full rate. With a unit diagonal,
+and each column scaled to unit length, its values fit the range of half precision. Its eleven bits resolve the stiff
+modes (bfloat16's eight do not, at nu = 0.49). Of the preconditioners only this file uses torch, for the matrix product;
+only `preconditioner` imports it, where it is chosen.
 """
 
 from dataclasses import dataclass
@@ -22,27 +22,25 @@ from ..runtime.device import Device, forward_kernel
 from . import block_inverse
 from .half_symv import add_product, list_tiles
 
-# Tensor cores want rows and columns in multiples of this.
-TILE = 64
-# Rows that one thread takes.
-SOME = 8
-# What the matrix is kept in, for each precision of the solver.
+TILE = 64  # Tensor cores need rows and columns in multiples of this.
+SOME = 8  # Rows per thread.
+# Type of the stored matrix, for each precision of the solver.
 LOW = {"float32": wp.float16, "float64": wp.float64}
 
 
 def can_invert(rows: int, device: Device) -> bool:
-    """Whether the card can invert `rows` unknowns, in time, and keep the inverse."""
+    """Return True if the GPU can invert `rows` unknowns in time, and store the inverse."""
     return block_inverse.can_exchange(rows, wp.device_to_torch(device.name), estimate_inverse_bytes(rows, device))
 
 
 def estimate_inverse_bytes(rows: int, device: Device) -> int:
-    """What the inverse of so many unknowns takes."""
+    """Estimate the memory of the inverse of `rows` unknowns [bytes]."""
     return wp.types.type_size_in_bytes(LOW[device.precision]) * rows**2
 
 
 @cache
 def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Kernels into the matrix's unknowns, as numbers of type `low`, and back; each thread takes `some` rows."""
+    """Build kernels that map to the matrix's unknowns, in type `low`, and back; each thread takes `some` rows."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -56,7 +54,7 @@ def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Ke
         # outputs
         out: wp.array2d(dtype=low),
     ):
-        """out_i = scale_i (L^T r)_i / |r|."""
+        """Compute out_i = scale_i (L^T r)_i / |r|."""
         block, c = wp.tid()
         size = scalar(wp.sqrt(square[c]))
         share = wp.where(size > scalar(0.0), scalar(1.0) / size, scalar(0.0))
@@ -78,7 +76,7 @@ def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Ke
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_r = |r| (L x)_r."""
+        """Compute out_r = |r| (L x)_r."""
         block, c = wp.tid()
         size = scalar(wp.sqrt(square[c]))
         for j in range(some):
@@ -94,7 +92,7 @@ def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Ke
 
 @dataclass(frozen=True, eq=False)
 class Buffers:
-    """Right-hand sides and solutions of one batch width, in the matrix's unknowns; square lengths (b,)."""
+    """Right-hand sides and solutions for one batch width, in the matrix's unknowns; squared norms (b,)."""
 
     right: wp.array
     solved: wp.array
@@ -102,14 +100,14 @@ class Buffers:
 
 
 class DenseInverse:
-    """A rest stiffness K over some motions L, L (L^T K L)^-1 L^T, inverted in double precision.
+    """Inverse of an undeformed stiffness K over some motions L: L (L^T K L)^-1 L^T, computed in double precision.
 
     stiffness K (3N, 3N) [N/m]; motions L (3N, n), independent columns.
 
     Raises
     ------
     RuntimeError
-        K is not positive definite over these motions: something is not held.
+        K is not positive definite over these motions: some part is not fixed.
     """
 
     on_device = True
@@ -134,10 +132,10 @@ class DenseInverse:
         torch.cuda.synchronize(where)
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """The rest stiffness serves every state."""
+        """Do nothing: the undeformed stiffness is used at every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """One dense matrix product, in Warp's stream."""
+        """Multiply by the dense matrix, in Warp's stream."""
         device, count = self._device, r.shape[1]
         room, some = self._room(count), SOME if count > 1 else 1
         lower, raise_ = build_kernels(device, room.right.dtype, some)
@@ -155,11 +153,11 @@ class DenseInverse:
         device.launch(raise_, (-(-r.shape[0] // some), count), inputs, [out])
 
     def _halves(self, count: int) -> bool:
-        """Whether so many columns are multiplied by half of the matrix: then all they cost is reading it."""
+        """Return True if only half of the matrix is read: for one load case reading is the whole cost."""
         return count == 1 and self._inverse.dtype == torch.float16
 
     def _room(self, count: int) -> Buffers:
-        """For batches of one width; those of rooms are kept, and the last other."""
+        """Return the buffers for a batch width; those of workspace widths stay cached, and the latest other."""
         if count not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
             low, name = LOW[self._device.precision], self._device.name
@@ -172,9 +170,9 @@ class DenseInverse:
 
 
 def _scaled(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torch.dtype) -> torch.Tensor:
-    """Return the matrix (size, size) whose negative lower half is in `rows` of blocks, over scales.
+    """Build the scaled matrix (size, size) whose negative lower half is in `rows` of blocks.
 
-    Rows are given back.
+    Empties `rows`, to free their memory.
     """
     out = torch.zeros((size, size), dtype=kind, device=scale.device)
     while rows:

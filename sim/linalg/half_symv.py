@@ -1,6 +1,6 @@
-"""A large symmetric matrix in half precision times one column on CUDA: what lies under the diagonal is not read.
+"""Product of a large symmetric matrix in half precision with one column on CUDA, reading its upper half only.
 
-Reading is all that one column costs, so that half of the matrix is half of the time.
+For one column reading is the whole cost, so that half of the matrix takes half of the time.
 """
 
 import numpy as np
@@ -8,7 +8,7 @@ import warp as wp
 
 from ..runtime.device import forward_kernel
 
-# Rows and columns of a tile, which one block of as many threads takes: eight warps of 32 rows each.
+# Rows and columns of a tile, which one block of 256 threads takes: eight warps of 32 rows each.
 TILE = 256
 
 
@@ -81,18 +81,18 @@ def _add_product(
     # outputs
     y: wp.array(dtype=wp.float32),
 ):
-    """y += A x: a tile on the diagonal adds to its rows, one above also, transposed, to its columns."""
+    """Add A x to y: a tile on the diagonal adds to its rows, one above it also, transposed, to its columns."""
     tile = tiles[wp.tid() // TILE]
     _add_tile(tile[0], tile[1], matrix, x, y)
 
 
 def list_tiles(size: int, device: str) -> wp.array:
-    """Return the tiles (n,) on and above the diagonal of a matrix with so many rows."""
+    """List the tiles (n,) on and above the diagonal of a matrix with `size` rows."""
     above = np.stack(np.triu_indices(-(-size // TILE)), axis=1).astype(np.int32)
     return wp.array(above, dtype=wp.vec2i, device=device)
 
 
 def add_product(tiles: wp.array, matrix: wp.array, x: wp.array, y: wp.array) -> None:
-    """y (n,) += A x (n,), single precision, with A (n, n) symmetric in half precision and n a multiple of 64."""
+    """Add A x (n,) to y (n,), in single precision, with A (n, n) symmetric in half precision and n a multiple of 64."""
     dim, device = len(tiles) * TILE, matrix.device
     wp.launch(_add_product, dim, [tiles, matrix, x], [y], device=device, block_dim=TILE, record_tape=False)

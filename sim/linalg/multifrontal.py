@@ -1,7 +1,7 @@
-"""The rest stiffness, factorised once and applied to many right-hand sides: multifrontal elimination in dense blocks.
+"""Undeformed stiffness, factorised once for many right-hand sides: multifrontal elimination in dense blocks.
 
-Each front keeps one dense panel, so that both sweeps of a solve are a product a front: memory's speed for one
-right-hand side, the arithmetic's for many. SuperLU, with its small supernodes, takes three times as long for one and
+Each front stores one dense panel, so that each sweep of a solve is one product per front: limited by memory for one
+right-hand side, by arithmetic for many. SuperLU, with its small supernodes, takes three times as long for one and
 twenty times for 64.
 """
 
@@ -24,27 +24,28 @@ from ..runtime.threads import choose_threads, limit_to_one_thread, run_together
 from .symbolic import FRONT_SIZES, Front, FrontSizes, build_fronts
 from .triangular_solve import Sweep, add_lower
 
+# Cholesky factor, inverse of a triangular matrix, symmetric update, and triangular solve.
 potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 syrk, trsm = get_blas_funcs(("syrk", "trsm"), dtype=np.float64)
 
-# Border unknowns and their lower half of a matrix (m, m), for each front that these wait for.
+# For each later front: border unknowns (m,), and the lower half of the update matrix (m, m) at them.
 Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 
 @dataclass(frozen=True)
 class Factorisation:
-    """How a factor is made and swept.
+    """Settings of a factor and of its sweeps.
 
     Parameters
     ----------
     few
-        Right-hand sides up to which sweeps one by one are faster than products of matrices.
+        Right-hand sides up to which separate sweeps are faster than matrix products.
     strip
-        Right-hand sides that stay in a core's cache while they are swept.
+        Right-hand sides of one sweep, so that they stay in a core's cache.
     singular
-        A pivot that has shrunk to this share of its diagonal is zero: the last digits are round-off.
+        A pivot below this fraction of its diagonal entry counts as zero: the remaining digits are round-off.
     fronts
-        What is eliminated together.
+        Sizes of the fronts.
     """
 
     few: int = 3
@@ -54,7 +55,7 @@ class Factorisation:
 
 
 class Factor:
-    """A stiffness K over some motions, L (L^T K L)^-1 L^T, factorised once on the host in double precision.
+    """Stiffness K over some motions, L (L^T K L)^-1 L^T, factorised once on the host in double precision.
 
     Parameters
     ----------
@@ -63,17 +64,17 @@ class Factor:
     motions
         L (3N, n): independent motions as columns. Their own unknowns, three to a node, are numbered by `node` (n,).
     device
-        Where the right-hand sides live.
+        Device of the right-hand sides.
     precision
-        In which the factor is kept; what it does is symmetric and positive definite in both. Single precision has half
+        Precision of the stored factor; the result is symmetric and positive definite in both. Single precision halves
         the bytes to read.
     settings
-        How it is made and swept.
+        Settings of the factor and of its sweeps.
 
     Raises
     ------
     RuntimeError
-        K is singular over these motions: something is not held.
+        K is singular over these motions: some part is not fixed.
     """
 
     on_device = False
@@ -99,23 +100,23 @@ class Factor:
         self._sweep = Sweep(fronts, values, precision)
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """The rest stiffness serves every state."""
+        """Do nothing: the undeformed stiffness is used at every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """One sweep up and one down for the live columns: the others would cost as much."""
+        """Solve for the live load cases alone, by one sweep up and one down: the others would cost as much."""
         values = r.numpy()
         solved = np.zeros_like(values)
         x = self._transposed @ values[:, live]
-        # Single precision holds no forces of 1e-40 N beside columns of 1 N.
+        # Scaled, because single precision cannot represent forces of 1e-40 N in a product with load cases of 1 N.
         size = np.abs(x).max(axis=0, initial=0.0)
         size[size == 0.0] = 1.0
         solved[:, live] = self._motions @ (self._solved((x / size).astype(self._precision)) * size)
         out.assign(solved)
 
     def compliance(self, rows: np.ndarray) -> np.ndarray:
-        """What it does (m, m) [m/N] at some of the 3N rows (m,) alone, in the factor's precision.
+        """Compute the compliance (m, m) [m/N] at some of the 3N rows (m,), in the factor's precision.
 
-        Only fronts that these rows or what depends on them belong to are swept.
+        Only the fronts of these rows, and those that depend on them, are swept.
         """
         chosen = self._motions[rows]
         unit = sp.csc_array(chosen.T)
@@ -142,7 +143,7 @@ class Factor:
     def _solved(self, x: np.ndarray) -> np.ndarray:
         if x.shape[1] <= self._settings.few:
             return self._sweep.solved(x)
-        # Threads of BLAS wait for one another at every front, ages where something else runs on their cores.
+        # BLAS threads wait for one another at every front, very long where other processes use their cores.
         with limit_to_one_thread():
             return _swept(self._panels, x)
 
@@ -154,10 +155,10 @@ def find_moved_nodes(basis: sp.csc_array) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class FrontPanel:
-    """What is kept of a front of k own and m border unknowns: `values` (k, k + m) = R^-T [1, -R^-1 C^T].
+    """Stored part of a front of k own and m border unknowns: `values` (k, k + m) = R^-T [1, -R^-1 C^T].
 
-    S = R R^T (k, k) and C (m, k) are the rows of the matrix at the front's own and border unknowns, less what was
-    eliminated before them. Down is the transpose of up, whatever was rounded: the whole stays symmetric and positive
+    S = R R^T (k, k) and C (m, k) are the rows of the matrix at the front's own and border unknowns, after the earlier
+    eliminations. `down` is the exact transpose of `up` despite rounding: the product stays symmetric and positive
     definite.
     """
 
@@ -165,19 +166,19 @@ class FrontPanel:
     values: np.ndarray
 
     def up(self, x: np.ndarray) -> None:
-        """x_own = R^-1 x_own, x_border -= C S^-1 x_own, in x (n, b)."""
+        """Eliminate: x_own = R^-1 x_own, x_border -= C S^-1 x_own, in x (n, b)."""
         own = slice(self.front.first, self.front.stop)
         product = self.values.T @ x[own]
         x[own] = product[: len(self.values)]
         x[self.front.border] += product[len(self.values) :]
 
     def down(self, x: np.ndarray) -> None:
-        """x_own = R^-T x_own - S^-1 C^T x_border, in x (n, b)."""
+        """Substitute back: x_own = R^-T x_own - S^-1 C^T x_border, in x (n, b)."""
         x[self.front.first : self.front.stop] = self.values @ x[self.front.rows]
 
 
 def _swept(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
-    """x (n, b) after both sweeps through these panels, in place."""
+    """Apply both sweeps through these panels to x (n, b), in place."""
     for panel in panels:
         panel.up(x)
     for panel in reversed(panels):
@@ -188,7 +189,7 @@ def _swept(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
 def factorise_panels(
     matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision, singular: float
 ) -> tuple[np.ndarray, list[FrontPanel]]:
-    """Return the values of all panels, one after the other in one array; and the panels.
+    """Factorise a matrix; return the values of all panels in one array, and the panels.
 
     Raises
     ------
@@ -218,7 +219,7 @@ def factorise_panels(
 
 
 class _Fronts:
-    """Fronts of a sparse matrix, one after the other; those of different parts may be eliminated at the same time."""
+    """Elimination of the fronts of a sparse matrix; fronts of different parts may be eliminated at the same time."""
 
     def __init__(self, matrix: sp.csc_array, panels: Sequence[FrontPanel], singular: float):
         self._matrix, self._panels = matrix, panels
@@ -227,7 +228,7 @@ class _Fronts:
         self._owner = np.repeat(np.arange(len(panels)), sizes)
 
     def eliminate(self, numbers: range, updates: Updates) -> None:
-        """Fill the panels of these fronts; `updates` brings what waits for them, and leaves with what waits later."""
+        """Fill the panels of these fronts; `updates` holds their pending updates, and gains those of later fronts."""
         for number in numbers:
             panel = self._panels[number]
             front, size = panel.front, len(panel.values)
@@ -245,7 +246,7 @@ class _Fronts:
                 panel.values[:, size:] = -trsm(1.0, root, across, side=1, lower=1).T
 
     def _rows(self, front: Front) -> np.ndarray:
-        """Return the matrix (k + m, k + m) at a front's unknowns, as far as its own columns hold; the lower half."""
+        """Assemble the matrix (k + m, k + m) at a front's unknowns from its own columns; the lower half."""
         start, rows, size = self._matrix.indptr, front.rows, front.stop - front.first
         whole = np.zeros((len(rows), len(rows)), order="F")
         entries = slice(start[front.first], start[front.stop])

@@ -1,9 +1,9 @@
-"""Levels: Chebyshev smoothing on the rest stiffness, and a coarse solver for what varies slowly.
+"""Multigrid: Chebyshev smoothing on the undeformed stiffness, and a coarse solver for slowly varying errors.
 
 For quadratic tetrahedra the coarse motions are those of linear ones on the same corners (p-multigrid). Sundar, Stadler,
 Biros 2015, "Comparison of multigrid algorithms for high-order continuous finite element discretizations", Numer. Linear
 Algebra Appl. 22:664-680. The smoother is Chebyshev's polynomial of block Jacobi: Adams et al. 2003, J. Comput. Phys.
-188:593-610. A coarse solver may have two levels itself (`sim/linalg/amg.py`).
+188:593-610. A coarse solver may have two levels too (`sim/linalg/amg.py`).
 """
 
 from dataclasses import dataclass
@@ -23,18 +23,18 @@ from .pcg import Preconditioner
 
 @dataclass(frozen=True)
 class Chebyshev:
-    """The smoother of a level.
+    """Smoother of a level.
 
     Parameters
     ----------
     degree
-        Of the polynomial: products with the stiffness before the coarse solver, and as many after it.
+        Degree of the polynomial: products with the stiffness before the coarse solver, and as many after it.
     damped
-        It damps eigenvalues from the largest down to this share of it; the coarse solver has the rest.
+        Smallest damped eigenvalue, relative to the largest; the coarse solver handles the others.
     power_iterations
-        Products from which the largest eigenvalue is estimated, once.
+        Products in the estimate of the largest eigenvalue, which is computed once.
     margin
-        Times that estimate, which comes from below.
+        Factor on this estimate, which is from below.
     """
 
     degree: int = 3
@@ -44,12 +44,12 @@ class Chebyshev:
 
 
 CHEBYSHEV = Chebyshev()
-"""The smoother of every level unless another is given."""
+"""Default smoother of every level."""
 
 
 @cache
 def build_kernel(device: Device, size: int) -> wp.Kernel:
-    """Kernel of the block-diagonal step, with blocks (size, size)."""
+    """Build the kernel of the block-diagonal step, with blocks (size, size)."""
     scalar = device.scalar
     mat, vec = wp.types.matrix((size, size), scalar), wp.types.vector(size, scalar)
 
@@ -63,7 +63,7 @@ def build_kernel(device: Device, size: int) -> wp.Kernel:
         d: wp.array2d(dtype=scalar),
         x: wp.array2d(dtype=scalar),
     ):
-        """d_i = kept d_i + added D_i^-1 r_i, and x_i += d_i."""
+        """Compute d_i = kept d_i + added D_i^-1 r_i, and add it to x_i."""
         i, c = wp.tid()
         part = vec()
         for k in range(size):
@@ -78,23 +78,23 @@ def build_kernel(device: Device, size: int) -> wp.Kernel:
 
 
 class TwoLevel:
-    """A symmetric cycle: smooth, correct by the coarse solver, smooth.
+    """Symmetric cycle: smooth, correct by the coarse solver, smooth.
 
     Parameters
     ----------
     coarse
         L A^-1 L^T for some motions L, with A at least L^T K L.
     stiffness
-        K (n, n) [N/m] at rest in square blocks, positive definite.
+        Undeformed K (n, n) [N/m] in square blocks, positive definite.
     device
-        Where its arrays live.
+        Device of its arrays.
     name
-        What a person calls it.
+        Name for messages.
     smoother
-        Of this level.
+        Smoother of this level.
     """
 
-    on_device = False  # a cycle makes its arrays as it goes: no captured graph may replay it
+    on_device = False  # a cycle allocates arrays, which a captured graph cannot replay
 
     def __init__(
         self,
@@ -113,10 +113,10 @@ class TwoLevel:
         self._largest = smoother.margin * self._power()
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """The rest stiffness serves every state."""
+        """Do nothing: the undeformed stiffness is used at every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """One cycle, for the live columns."""
+        """Run one cycle, for the live load cases."""
         if live.all():
             wp.copy(out, self._cycle(r))
             return
@@ -133,7 +133,7 @@ class TwoLevel:
         return x
 
     def _smooth(self, x: wp.array, r: wp.array) -> None:
-        """Add to x the polynomial of its residual r, which is overwritten. Saad 2003, algorithm 12.1."""
+        """Add the smoothing polynomial applied to the residual r to x; r is overwritten. Saad 2003, algorithm 12.1."""
         low = self._smoother.damped * self._largest
         centre, radius = (self._largest + low) / 2.0, (self._largest - low) / 2.0
         ratio = radius / centre
@@ -156,7 +156,7 @@ class TwoLevel:
         self._device.launch(step, (r.shape[0] // self._size, r.shape[1]), inputs, [d, x])
 
     def _power(self) -> float:
-        """Return the largest eigenvalue of D^-1 K."""
+        """Estimate the largest eigenvalue of D^-1 K by power iteration."""
         device = self._device
         x = device.array(np.random.default_rng(0).normal(size=(self._stiffness.rows, 1)))
         largest = 1.0
@@ -170,7 +170,7 @@ class TwoLevel:
 
 
 class ReducedPreconditioner:
-    """L M L^T: a preconditioner M of fewer unknowns, for what motions L (m, n), in blocks, can do."""
+    """L M L^T: a preconditioner M of fewer unknowns, prolonged by motions L (m, n), in blocks."""
 
     on_device = False
 
@@ -179,10 +179,10 @@ class ReducedPreconditioner:
         self._up, self._down = Sparse(motions, device), Sparse(sp.bsr_array(motions.T), device)
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """The rest stiffness serves every state."""
+        """Do nothing: the undeformed stiffness is used at every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Down, and up again."""
+        """Restrict, apply the coarse preconditioner, and prolong."""
         right = self._down.times(r)
         solved = self._device.zeros(*right.shape)
         self.coarse.apply(right, live, solved)
@@ -190,7 +190,7 @@ class ReducedPreconditioner:
 
 
 def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_array:
-    """P K P (3N, 3N) in blocks of nodes, P the projection to what is free; made regular where nothing is."""
+    """Compute P K P (3N, 3N) in blocks of nodes, P the projection to free unknowns; regularised at the others."""
     basis = constraint.basis()
     projection = sp.csr_array(basis @ basis.T)
     blocked = sp.eye_array(constraint.held.size) - projection
@@ -198,13 +198,13 @@ def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_a
 
 
 def make_regular(matrix: sp.csr_array, size: int) -> sp.bsr_array:
-    """Return the matrix in blocks (size, size); unknowns of no element get the mean of its diagonal on theirs."""
+    """Convert to blocks (size, size); zero diagonal entries, of unknowns without elements, become the mean."""
     diagonal = matrix.diagonal()
     missing = np.where(diagonal == 0.0, diagonal.mean(), 0.0)
     return sp.bsr_array(sp.csr_array(matrix + sp.diags_array(missing)), blocksize=(size, size))
 
 
 def _diagonal(blocks: sp.bsr_array) -> np.ndarray:
-    """Diagonal blocks (N, k, k)."""
+    """Return the diagonal blocks (N, k, k)."""
     row = np.repeat(np.arange(len(blocks.indptr) - 1), np.diff(blocks.indptr))
     return blocks.data[row == blocks.indices]

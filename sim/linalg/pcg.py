@@ -1,8 +1,8 @@
-"""Preconditioned conjugate gradients on a batch of columns, and the preconditioners.
+"""Preconditioned conjugate gradients on a batch of load cases, and the protocol of preconditioners.
 
 Steihaug 1983, "The conjugate gradient method and trust regions in large scale optimization", SIAM J. Numer. Anal.
-20:626-637. Where the curvature is negative, or the solution leaves a ball in the preconditioner's norm, the iteration
-stops. What it has is a descent direction, and the shorter it is, the more like the preconditioned gradient.
+20:626-637. At negative curvature, or at the boundary of a ball in the preconditioner's norm, the iteration stops. The
+result is a descent direction; the shorter it is, the closer it is to the preconditioned gradient.
 """
 
 from dataclasses import dataclass
@@ -18,28 +18,28 @@ from ..runtime.device import Device, forward_kernel
 
 
 class Preconditioner(Protocol):
-    """An approximate inverse of the free curvature, symmetric and positive definite."""
+    """Approximate inverse of the free stiffness, symmetric and positive definite."""
 
     @property
     def on_device(self) -> bool:
-        """Whether `apply` only launches work on the device, for batches of one width always in the same arrays.
+        """True if `apply` only launches kernels on the device, in the same arrays for all batches of one width.
 
-        A graphics card replays it, whatever is `live`.
+        Then a GPU can replay it, whatever is `live`.
         """
         ...
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Use the last linearisation, if it matters; the batch has so many columns."""
+        """Use the last linearisation, if it matters; `columns` is the width of the batch."""
         ...
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """out (3N, b) = M^-1 r (3N, b), in the columns that are `live` (b,); the others may hold anything finite."""
+        """Compute out = M^-1 r (3N, b) for load cases `live` (b,); the others may hold anything finite."""
         ...
 
 
 @cache
 def build_block_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
-    """Kernels of the block-Jacobi preconditioner."""
+    """Build the kernels of the block-Jacobi preconditioner."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
 
     @forward_kernel(module="unique")
@@ -47,7 +47,7 @@ def build_block_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
         # outputs
         blocks: wp.array2d(dtype=mat),
     ):
-        """B <- B^-1; the identity over |B| where B is not positive definite."""
+        """Replace B by B^-1; by the identity over |B| where B is not positive definite."""
         i, c = wp.tid()
         B = blocks[i, c]
         size = wp.abs(B[0, 0]) + wp.abs(B[1, 1]) + wp.abs(B[2, 2])
@@ -65,7 +65,7 @@ def build_block_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_i = B_i r_i."""
+        """Compute out_i = B_i r_i."""
         i, c = wp.tid()
         x = blocks[i, c] * vec(r[3 * i, c], r[3 * i + 1, c], r[3 * i + 2, c])
         for k in range(3):
@@ -75,7 +75,7 @@ def build_block_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
 
 
 class BlockJacobi:
-    """The 3 x 3 diagonal blocks of the current curvature, inverted: for meshes too large to factorise."""
+    """Inverse of the 3 x 3 diagonal blocks of the tangent stiffness: for meshes too large to factorise."""
 
     on_device = False
 
@@ -90,14 +90,14 @@ class BlockJacobi:
         self._blocks = blocks
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """out = B^-1 r, node by node."""
+        """Compute out = B^-1 r, node by node."""
         assert self._blocks is not None
         self._device.launch(build_block_kernels(self._device)[1], self._blocks.shape, [self._blocks, r], [out])
 
 
 @dataclass(frozen=True, eq=False)
 class LinearSolution:
-    """x (3N, b); where the iteration stopped short, at negative curvature or at the radius (b,) bool.
+    """Solution x (3N, b); True (b,) where it was truncated, at negative curvature or at the radius.
 
     size (b,): the preconditioner's norm sqrt(x . M x) [J^1/2]; iterations of the batch.
     """
@@ -116,7 +116,7 @@ def solve_conjugate_gradients(
     most: int,
     radius: np.ndarray | None = None,
 ) -> LinearSolution:
-    """Solve P K P x = r at the last linearisation, per column until |r| <= tolerance (b,), or truncated.
+    """Solve P K P x = r at the last linearisation, per load case until |r| <= tolerance (b,), or truncated.
 
     Parameters
     ----------
@@ -127,8 +127,8 @@ def solve_conjugate_gradients(
     most
         Largest number of iterations.
     radius
-        (b,) [J^1/2]: x stays within it in the preconditioner's norm; where the curvature is negative it goes that far.
-        Without a radius x stops there with what it has, or with the first direction.
+        (b,) [J^1/2]: bound of x in the preconditioner's norm; at negative curvature x is extended to it.
+        Without a radius x stops there with its present value, or with the first direction.
     """
     device, columns = problem.device, r.shape[1]
     reach = np.full(columns, np.inf) if radius is None else radius
@@ -155,7 +155,7 @@ def solve_conjugate_gradients(
             alpha = np.where(pq > 0.0, rz / pq, longest)
         stop = live & (~(pq > 0.0) | (alpha >= longest))
         alpha = np.minimum(alpha, longest)
-        # Nothing bounds it and nothing is gathered yet: the preconditioned gradient is a descent direction.
+        # Without a radius, in the first iteration: the preconditioned gradient is a descent direction.
         alpha = np.where(live, np.where(np.isfinite(alpha), alpha, float(iterations == 0)), 0.0)
         combine_columns(device, x, alpha, p, x)
         combine_columns(device, r, -alpha, q, r)

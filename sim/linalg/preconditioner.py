@@ -1,4 +1,4 @@
-"""Which preconditioner serves a problem: chosen by its size, its element and its device."""
+"""Choice of a problem's preconditioner by its size, its element and its device."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ from .pcg import BlockJacobi, Preconditioner
 
 @dataclass(frozen=True)
 class Preconditioning:
-    """Up to which sizes each kind of preconditioner pays, and what the levels do.
+    """Sizes up to which each kind of preconditioner is fastest, and settings of multigrid.
 
     Parameters
     ----------
     largest_factor
-        Unknowns above which levels cost less than a factor on the CPU. Of 17,000 nodes, levels against factor: 6.8 and
-        7.1 s to set up, 16 and 11 ms to apply to one column, 51 and 83 ms to eight. CUDA inverts what fits.
+        Unknowns above which multigrid is faster than a factor on the CPU. For 17,000 nodes, multigrid and factor:
+        set-up 6.8 and 7.1 s; application 16 and 11 ms for one load case, 51 and 83 ms for eight. CUDA inverts what
+        fits.
     largest_smoothed_factor
-        The same of smoothed strains, which link the neighbours of neighbours: their own factor has more entries.
+        The same for smoothed strains, which couple neighbours of neighbours: their factor has more entries.
     largest_last
-        Nodes, of six unknowns each, that the last level of algebraic multigrid may have; it is factorised.
+        Maximum nodes, of six unknowns each, of the last level of algebraic multigrid, which is factorised.
     smoother
-        Of every level.
+        Smoother of every level.
     """
 
     largest_factor: int = 50_000
@@ -51,18 +52,16 @@ def choose_preconditioner(
     step: float = math.inf,
     settings: Preconditioning = Preconditioning(),
 ) -> Preconditioner:
-    """Return the rest stiffness, inverted (CUDA) or factorised where that pays.
+    """Build the preconditioner: undeformed stiffness, inverted (CUDA) or factorised if this is fast enough.
 
-    Two levels where it has too many entries.
-
-    Algebraic multigrid where even the coarse level does not fit; block Jacobi where nothing is free to move.
-    `unsmoothed` assembles the rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh. It does so over a
-    step in time [s], as `step` is what the stiffness is taken over.
+    Two levels if it has too many entries; algebraic multigrid if even the coarse level is too large; block Jacobi if no
+    node is free. `unsmoothed` assembles the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh,
+    for a time step [s]; `step` is the time step of the stiffness.
 
     Raises
     ------
     InputError
-        A free rest stiffness that is singular, or a device with too little memory.
+        A free undeformed stiffness that is singular, or a device with too little memory.
     """
     device, constraint = problem.device, problem.constraint
     if constraint.basis().nnz == 0:
@@ -76,7 +75,7 @@ def choose_preconditioner(
             name = f"p-multigrid on {name_of(lifted.coarse)}"
             return TwoLevel(lifted, project_to_free(stiffness, constraint), device, name, settings.smoother)
         if space.element == "smoothed" and problem.rows > settings.largest_smoothed_factor:
-            # An average resists less than what is averaged, so that the coarse solver never overshoots.
+            # Averaging reduces the stiffness, so that the coarse solver never overshoots.
             coarse = _solver(unsmoothed(step), constraint, space.nodes, device, settings)
             name = f"two levels on {name_of(coarse)}"
             fine = project_to_free(problem.rest_curvature(step), constraint)
@@ -87,14 +86,14 @@ def choose_preconditioner(
 
 
 def explain_no_factor(error: RuntimeError, device: str) -> str:
-    """Why there is no factor, as a person reads it: a device without memory, or a body that is not held."""
+    """Explain why there is no factor: a device without memory, or a mesh that is not fixed."""
     if "allocate" in str(error):
         return f"{device} has too little free memory for this mesh: end what else runs there, or choose --device cpu."
-    return f"the stiffness at rest cannot be factorised ({error}): is every part held?"
+    return f"the undeformed stiffness cannot be factorised ({error}): fix or support every part."
 
 
 def name_of(preconditioner: Preconditioner) -> str:
-    """What a person calls it."""
+    """Return the name of a preconditioner for messages."""
     match preconditioner:
         case TwoLevel():
             return preconditioner.name
@@ -107,17 +106,17 @@ def name_of(preconditioner: Preconditioner) -> str:
 
 
 def is_exact(preconditioner: Preconditioner) -> bool:
-    """Whether it is the inverse of the whole rest stiffness, up to rounding."""
+    """Return True if it is the inverse of the whole undeformed stiffness, up to rounding."""
     return name_of(preconditioner) in ("sparse factor", "dense inverse")
 
 
 def build_rest_solver(problem: Problem) -> Preconditioner:
-    """Return the whole free rest stiffness, inverted or factorised, in the problem's own precision.
+    """Build the inverse or factor of the free undeformed stiffness, in the problem's own precision.
 
     Raises
     ------
     RuntimeError
-        It is singular.
+        The stiffness is singular.
     """
     basis = problem.constraint.basis()
     device = problem.device
@@ -127,7 +126,7 @@ def build_rest_solver(problem: Problem) -> Preconditioner:
 def _on_corners(
     stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device, settings: Preconditioning
 ) -> ReducedPreconditioner:
-    """What linear tetrahedra on the same corners can do, as far as it is free."""
+    """Build the coarse preconditioner on linear tetrahedra with the same corners, as far as their motion is free."""
     corner, free = np.unique(space.table[:, :4]), constraint.basis()
     every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
     own = Constraint(constraint.held[corner], constraint.normal[corner], device)
@@ -138,7 +137,7 @@ def _on_corners(
 def _solver(
     stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray, device: Device, settings: Preconditioning
 ) -> Preconditioner:
-    """K (3N, 3N) over what is free of nodes at points (N, 3): inverted or factorised where that pays."""
+    """Build the solver of K (3N, 3N) over free nodes at points (N, 3): direct if fast enough, else multigrid."""
     basis = constraint.basis()
     count = len(basis.indptr) - 1
     if _inverts(count, device) if device.on_cuda else count <= settings.largest_factor:
@@ -151,7 +150,7 @@ def _solver(
 
 
 def _inverts(count: int, device: Device) -> bool:
-    """Whether a card inverts so many unknowns."""
+    """Return True if a GPU inverts `count` unknowns."""
     from .dense_inverse import can_invert
 
     return can_invert(count, device)
@@ -160,14 +159,14 @@ def _inverts(count: int, device: Device) -> bool:
 def build_direct(
     stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device, precision: Precision = "float32"
 ) -> Preconditioner:
-    """K (3N, 3N) over some motions (3N, n), each of one `node` (n,): inverted where that fits, else factorised.
+    """Build a direct solver of K (3N, 3N) over motions (3N, n), each of one `node` (n,): inverse if it fits, or factor.
 
     A factor is kept in `precision`.
 
     Raises
     ------
     RuntimeError
-        It is singular.
+        K is singular.
     """
     if device.on_cuda and _inverts(len(node), device):
         from .dense_inverse import DenseInverse

@@ -1,4 +1,4 @@
-"""Answers of the stiffness at rest alone, in the solver's own precision: what a series is made of."""
+"""Solver with the undeformed stiffness alone, in the problem's precision, for power series."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from .preconditioner import build_rest_solver, is_exact
 
 @dataclass(frozen=True, eq=False)
 class RestStiffnessSolver:
-    """The linear body that a problem is at rest.
+    """Linear solver with the undeformed stiffness of a problem.
 
     Parameters
     ----------
     problem
-        Whose stiffness is solved with.
+        Problem whose stiffness is used.
     preconditioner
-        Of the problem: for conjugate gradients, where no inverse is had.
+        Preconditioner of the problem: for conjugate gradients, if there is no exact inverse.
     inner
-        Most iterations of these.
+        Maximum iterations of these.
     tolerance
         Relative residual of the linear solves.
     largest_factor
-        Unknowns up to which the solves are worth a factor of their own on the CPU. Of 17,000 smoothed nodes it takes
-        12 s, and a solve 10 ms instead of 295 by two levels.
+        Unknowns up to which the solves justify a factor of their own on the CPU. For 17,000 smoothed nodes it takes
+        12 s, and a solve 10 ms instead of 295 with two levels.
     """
 
     problem: Problem
@@ -42,12 +42,12 @@ class RestStiffnessSolver:
 
     @cached_property
     def exact(self) -> Preconditioner | None:
-        """The inverse of the rest stiffness in the solver's own precision, where one is had or pays for many solves."""
+        """Inverse of the undeformed stiffness in the problem's precision, if available or worth it for many solves."""
         pays = not self.problem.device.on_cuda and self.problem.rows <= self.largest_factor
         return build_rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
 
     def answer(self, force: wp.array) -> wp.array:
-        """Motions (3N, b) [m] that it answers forces (3N, b) [N] with; the forces are lost.
+        """Solve for the displacements (3N, b) [m] under forces (3N, b) [N]; the forces are overwritten.
 
         Raises
         ------
@@ -66,7 +66,7 @@ class RestStiffnessSolver:
         found = solve_conjugate_gradients(problem, self.preconditioner, force, wanted, self.inner)
         if (compute_norms(problem.device, force) > 10.0 * wanted).any():
             raise InputError(
-                f"a linear solve of the series did not reach {self.tolerance:g} in {self.inner} iterations: ask for an "
-                "Accuracy of more `inner` ones."
+                f"a linear solve of the power series did not reach {self.tolerance:g} in {self.inner} iterations: "
+                "increase `inner` of its Accuracy."
             )
         return found.x

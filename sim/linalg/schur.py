@@ -1,4 +1,4 @@
-"""Static condensation: how stiff the rest of a body is, at rest, for a part of it, and how it follows.
+"""Static condensation: undeformed stiffness of the exterior of a part, and the motion of this exterior.
 
 Guyan 1965, "Reduction of stiffness and mass matrices", AIAA J. 3:380.
 """
@@ -19,14 +19,14 @@ from .preconditioner import build_direct
 
 @dataclass(frozen=True)
 class Condensing:
-    """How a part is parted from the rest of a body, and how the rest is solved for.
+    """Settings of a condensation.
 
     Parameters
     ----------
     round_off
-        Entries up to this share of the largest are what subtraction leaves of zero.
+        Entries up to this fraction of the largest are round-off of a subtraction, and count as zero.
     strip
-        Columns that are solved for together: bounds the memory that it takes.
+        Columns solved together: bounds the memory.
     """
 
     round_off: float = 1e-9
@@ -35,10 +35,10 @@ class Condensing:
 
 @dataclass(frozen=True, eq=False)
 class Condensation:
-    """What a part of a body feels of the rest.
+    """Exterior of a part of the mesh, condensed to the rows that both share.
 
-    rows (m,) are those of the part's 3n that touch the rest. stiffness (m, m) [N/m] is that of the rest there. follow
-    (3N, m) is how the whole body's rows move when these do, zero in the part itself.
+    rows (m,) are those of the part's 3n that touch the exterior. stiffness (m, m) [N/m] is the condensed stiffness of
+    the exterior. follow (3N, m) maps their motion to the whole mesh, zero in the part itself.
     """
 
     rows: np.ndarray
@@ -49,12 +49,12 @@ class Condensation:
 def condense_exterior(
     problem: Problem, nodes: np.ndarray, own: sp.csc_array, settings: Condensing = Condensing()
 ) -> Condensation:
-    """The rest of a body beside the part of `nodes` (n,), whose own elements have the stiffness `own` (3n, 3n) at rest.
+    """Condense the exterior of the part of `nodes` (n,), whose elements have the undeformed stiffness `own` (3n, 3n).
 
     Raises
     ------
     RuntimeError
-        The rest is not held even where the part is.
+        The exterior is not fixed even if the part is.
     """
     part = (3 * nodes[:, None] + np.arange(3)).ravel()
     whole, basis = sp.csr_array(problem.rest_curvature()), problem.constraint.basis()
@@ -70,9 +70,9 @@ def condense_exterior(
 def _followed(
     whole: sp.csr_array, far: sp.csc_array, coupling: sp.csc_array, device: Device, strip: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """-L (L^T K L)^-1 L^T B (3N, m) and what it takes from the stiffness (m, m), of motions L and a coupling B (3N, m).
+    """Compute -L (L^T K L)^-1 L^T B (3N, m) and the Schur reduction (m, m), of motions L and a coupling B (3N, m).
 
-    CUDA takes them apart in blocks where these fit.
+    CUDA eliminates in blocks if these fit.
     """
     if device.on_cuda:
         from . import block_inverse

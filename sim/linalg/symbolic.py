@@ -1,4 +1,4 @@
-"""Which unknowns of a sparse matrix are eliminated together, and in what order.
+"""Symbolic factorisation: elimination order of a sparse matrix, and its fronts.
 
 Duff, Reid 1983, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM Trans. Math. Softw.
 9:302-325; the elimination tree is Liu's: 1990, SIAM J. Matrix Anal. Appl. 11:134-172.
@@ -15,16 +15,16 @@ from scipy.sparse import csgraph
 
 @dataclass(frozen=True)
 class FrontSizes:
-    """How large fronts are, and how far the work is divided.
+    """Sizes of fronts, and division of the work.
 
     Parameters
     ----------
     leaf
-        Whole subtrees of at most so many unknowns are one front.
+        Whole subtrees with at most this number of unknowns are one front.
     zeros
-        Two fronts are joined while that stores at most so many zeros: another dense product costs as much.
+        Two fronts are joined if that stores at most this number of zeros: another dense product costs as much.
     most_above
-        Parts are not divided further once so many fronts are above them.
+        Division stops when this number of fronts is above the parts.
     """
 
     leaf: int = 64
@@ -33,12 +33,12 @@ class FrontSizes:
 
 
 FRONT_SIZES = FrontSizes()
-"""Fronts as a factor has them unless others are given."""
+"""Default sizes of the fronts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """The unknowns first, ..., stop - 1, and the later ones (m,), ascending, that their elimination couples."""
+    """Unknowns first, ..., stop - 1, and the later ones (m,), ascending, that are coupled by their elimination."""
 
     first: int
     stop: int
@@ -46,19 +46,17 @@ class Front:
 
     @property
     def rows(self) -> np.ndarray:
-        """Its own unknowns, then the border's."""
+        """Own unknowns of the front, then those of the border."""
         return np.concatenate([np.arange(self.first, self.stop), self.border])
 
 
 def build_fronts(
     matrix: sp.csc_array, node: np.ndarray, parts: int = 1, settings: FrontSizes = FRONT_SIZES
 ) -> tuple[np.ndarray, list[list[Front]]]:
-    """Return an order (n,) of a matrix's unknowns with little fill, and its fronts.
+    """Compute an order (n,) of a matrix's unknowns with little fill, and its fronts, each before those it touches.
 
-    Every front comes before those it touches.
-
-    `node` (n,): unknowns of one node stay together. The fronts come in so many parts that do not touch one another, of
-    about the same work, and in a last one, which all of them touch.
+    `node` (n,): unknowns of one node stay together. The fronts are in `parts` parts that do not touch one another, of
+    about equal work, and in a last one, which all of them touch.
     """
     number, member, weight = np.unique(node, return_inverse=True, return_counts=True)
     entry = sp.coo_array(matrix)
@@ -88,13 +86,13 @@ def build_fronts(
 
 
 def order_by_dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.ndarray:
-    """Return an order (N,) of a symmetric graph's nodes with little fill: nested dissection.
+    """Compute an order (N,) of a symmetric graph's nodes with little fill: nested dissection.
 
-    By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by levels, down to some unknowns a
-    `leaf`, with more fill: George, Liu 1978, SIAM J. Numer. Anal. 15:1053-1069.
+    By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by level sets, with more fill, until
+    a part has at most `leaf` unknowns: George, Liu 1978, SIAM J. Numer. Anal. 15:1053-1069.
     """
     count = len(graph.indptr) - 1
-    if count == 0:  # METIS divides by it
+    if count == 0:  # METIS would divide by zero
         return np.zeros(0, int)
     try:
         import pymetis
@@ -105,7 +103,7 @@ def order_by_dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.
 
 
 def order_by_levels(graph: sp.csr_array, nodes: np.ndarray, leaf: int) -> np.ndarray:
-    """Return the same nodes (k,), the middle level between two far ends last; both sides likewise."""
+    """Order nodes (k,) by level sets from one end: the middle level last, both sides recursively before it."""
     if 3 * len(nodes) <= leaf:
         return nodes
     inside = graph[nodes][:, nodes]
@@ -120,7 +118,7 @@ def order_by_levels(graph: sp.csr_array, nodes: np.ndarray, leaf: int) -> np.nda
 
 
 def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """start, ..., start + count - 1 of each, one after the other."""
+    """Concatenate the ranges start, ..., start + count - 1."""
     return np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
@@ -140,9 +138,9 @@ def _parents(graph: sp.csr_array) -> list[int]:
 
 
 def _groups(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Nodes that are eliminated together, and the later nodes that these couple, group by group.
+    """List groups of nodes that are eliminated together, each with the later nodes that it couples.
 
-    graph (N, N) in its order; weight (N,) unknowns a node.
+    graph (N, N) in its order; weight (N,) unknowns per node.
     """
     parent, count = _parents(graph), len(weight)
     below, top = weight.tolist(), list(range(count))
@@ -156,7 +154,7 @@ def _groups(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> li
     for node in range(count):
         members.setdefault(top[node], []).append(node)
 
-    # Sets of nodes are the bits of whole numbers: a union is one operation.
+    # Sets of nodes are the bits of integers: a union is one operation.
     alike = {int(unknowns): _bits(np.flatnonzero(weight == unknowns), count) for unknowns in np.unique(weight)}
 
     def size(nodes: int) -> int:
@@ -189,10 +187,10 @@ def _groups(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> li
 def _divided(
     groups: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, parts: int, most_above: int
 ) -> list[list[int]]:
-    """Whole subtrees of groups in so many parts, and in a last one what is above them; each in its order.
+    """Divide whole subtrees of groups into `parts` parts, and what is above them into a last one; each in its order.
 
-    The heaviest subtree is opened, its top left to the last part, as long as that shortens the whole. The whole is the
-    last part and the longest of the others, one after the other.
+    The heaviest subtree is opened, and its top moved to the last part, as long as the total work becomes shorter. The
+    total is the last part plus the longest of the others.
     """
     owner = np.zeros(len(weight), int)
     for number, (own, _) in enumerate(groups):
@@ -231,13 +229,13 @@ def _divided(
 
 
 def _bits(nodes: np.ndarray, count: int) -> int:
-    """Return some of `count` nodes as the bits of a whole number."""
+    """Encode some of `count` nodes as the bits of an integer."""
     flags = np.zeros(count, bool)
     flags[nodes] = True
     return int.from_bytes(np.packbits(flags, bitorder="little").tobytes(), "little")
 
 
 def _nodes(bits: int, count: int) -> np.ndarray:
-    """Return the nodes again, ascending."""
+    """Decode the nodes, ascending."""
     packed = np.frombuffer(bits.to_bytes(-(-count // 8), "little"), np.uint8)
     return np.flatnonzero(np.unpackbits(packed, bitorder="little"))

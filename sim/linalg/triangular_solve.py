@@ -1,4 +1,4 @@
-"""One right-hand side through all fronts of a factor: native loops, at the speed of memory."""
+"""Sweeps of one right-hand side through all fronts of a factor: native loops, limited by memory bandwidth."""
 
 from collections.abc import Sequence
 from functools import cache, partial
@@ -12,8 +12,8 @@ from ..runtime.device import Device, forward_kernel
 from ..runtime.threads import run_together
 from .symbolic import Front
 
-# Upwards: x_own gives way to the first k of t = panel^T x_own, and the border takes the rest. Four rows of a panel at a
-# time read and write t once; they begin with zeros.
+# Elimination: x_own becomes the first k of t = panel^T x_own, and the others are added to x_border. Four rows of a
+# panel at a time read and write t once; the rows begin with zeros.
 UP = """
     real* x = xs.data + (size_t)column * xs.shape[1];
     real* t = work.data + (size_t)column * work.shape[1];
@@ -40,7 +40,7 @@ UP = """
         for (int i = k; i < n; ++i) x[b[i - k]] += t[i];
     }
 """
-# Downwards: x_own = panel (x_own, x_border). Sixteen sums let the compiler use vector registers.
+# Back substitution: x_own = panel (x_own, x_border). Sixteen sums let the compiler use vector registers.
 DOWN = """
     real* x = xs.data + (size_t)column * xs.shape[1];
     real* t = work.data + (size_t)column * work.shape[1];
@@ -66,7 +66,7 @@ DOWN = """
 
 @cache
 def build_kernel(device: Device, code: str) -> wp.Kernel:
-    """The sweep `UP`, which eliminates, or `DOWN`, which substitutes back, in each row of xs (b, n), front by front."""
+    """Build the kernel that eliminates (`UP`) or substitutes back (`DOWN`) in each row of xs (b, n), front by front."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
 
@@ -95,6 +95,7 @@ def build_kernel(device: Device, code: str) -> wp.Kernel:
     return sweep
 
 
+# Scatter-add of the lower half of a matrix to rows and columns of another.
 ADD = """
     for (int j = 0; j < place.shape[0]; ++j) {
         double* to = whole.data + (size_t)place.data[j] * whole.shape[1];
@@ -115,23 +116,23 @@ def _add_part(
     # outputs
     whole: wp.array2d(dtype=wp.float64),
 ):
-    """Both are transposed: columns lie in one piece."""
+    """Add the part; both arrays are transposed, so that columns are contiguous."""
     _add(part, place, whole)
 
 
 def add_lower(part: np.ndarray, place: np.ndarray, whole: np.ndarray) -> None:
     """Add the lower half of `part` (m, m) to rows and columns `place` (m,), ascending, of `whole`; both by columns.
 
-    NumPy takes ten times as long for it.
+    NumPy takes ten times as long.
     """
     views = [wp.array(array, device="cpu", copy=False) for array in (part.T, place, whole.T)]
     Device("cpu", "float64").launch(_add_part, (1,), views[:2], views[2:])
 
 
 class Sweep:
-    """The fronts of a factor, part by part, and the values of its panels, one after the other.
+    """Sweeps through the fronts of a factor, part by part, with the values of all panels in one array.
 
-    All parts but the last are swept at the same time, each in right-hand sides of its own.
+    All parts but the last are swept at the same time, each on its own copy of the right-hand sides.
     """
 
     def __init__(self, fronts: Sequence[Sequence[Front]], values: np.ndarray, precision: Precision):
@@ -152,7 +153,7 @@ class Sweep:
         self._lower, self._upper = [slice(a, b) for a, b in pairwise(unknowns[:-1])], slice(*unknowns[-2:])
 
     def solved(self, x: np.ndarray) -> np.ndarray:
-        """x (n, b) after both sweeps, column by column."""
+        """Solve for x (n, b) by both sweeps, column by column."""
         if not x.size:
             return x
         columns, parts = x.shape[1], len(self._lower)

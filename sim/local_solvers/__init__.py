@@ -1,1 +1,1 @@
-"""What one load strains or touches most, solved by itself: nonlinear elimination and contact."""
+"""Local solvers for strongly strained or touched tissue: nonlinear elimination and contact."""

@@ -1,15 +1,15 @@
-"""Nonlinear elimination: a part that is strained most is solved by itself, again and again, and the rest follows it.
+"""Nonlinear elimination: the most strained part is a repeated local subproblem, which the remaining mesh follows.
 
-Close to the tools tissue is far from its rest stiffness, elsewhere it is nearly linear. A descent from the rest
-stiffness spends most of its iterations on the first, at the price of the whole body. Here each cycle corrects the whole
-with the rest stiffness, then solves the near part in its surroundings, as stiff as at rest. The far part follows:
-Gendre, Allix, Gosselet, Comte 2009, "Non-intrusive and exact global/local techniques for structural problems with local
-plasticity", Comput. Mech. 44:233-245. The outer loop is that of nonlinear elimination (`outer_loop.py`).
+Close to the tools tissue is far from its undeformed stiffness, elsewhere it is nearly linear. A descent from the
+undeformed stiffness spends most of its iterations on the near part, at the cost of the whole mesh. Here each cycle
+corrects the whole with the undeformed stiffness, then solves the near part within the linear far part. The far part
+follows: Gendre, Allix, Gosselet, Comte 2009, "Non-intrusive and exact global/local techniques for structural problems
+with local plasticity", Comput. Mech. 44:233-245. The outer loop is that of nonlinear elimination (`outer_loop.py`).
 
-C is the inverse of the rest stiffness, r the gradient at u, and e = -C r the linear correction. The near part finds x
-of n(u + x) - n(u) + F x = (n' + F) e there. Here n are its internal forces, n' and F the stiffness of its own and that
-of the far part, condensed, at rest. The far part takes e + H (x - e): H is how it follows the rows that both share.
-Were n linear, x would be e.
+C is the inverse of the undeformed stiffness, r the gradient at u, and e = -C r the linear correction. The near part
+solves n(u + x) - n(u) + F x = (n' + F) e for x. Here n are its internal forces, n' its undeformed stiffness, and F that
+of the far part, condensed. The far part takes e + H (x - e), where H maps the shared rows to the far part. If n were
+linear, x would be e.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from .outer_loop import USUAL, CycleLimits, run_cycles
 
 @dataclass(frozen=True)
 class NearPart:
-    """Which tissue is near the opening, and how long it is solved by itself.
+    """Extent of the near part, and limits of its solution.
 
     Parameters
     ----------
     share, largest_opening
-        Of the tetrahedra, where the free surface is at most such a share of all of it.
+        Fraction of the tetrahedra; largest fraction of surface vertices that may be free.
     iterations, stragglers
-        Most of L-BFGS in one cycle, which ends earlier where at most this share of the columns is left.
+        Maximum L-BFGS iterations in one cycle, which ends earlier if at most this fraction of the load cases is live.
     """
 
     share: float = 0.2
@@ -54,23 +54,24 @@ class NearPart:
     stragglers: float = 0.05
 
 
-NEAR = NearPart()
+NEAR = NearPart()  # Default.
 
 
 @dataclass(frozen=True, eq=False)
 class BatchElimination:
-    """A descent for problems that are nonlinear in a small place.
+    """Solver for problems that are nonlinear in a small region.
 
     problem, preconditioner
-        The whole body, and its inverse rest stiffness.
+        Whole problem, and its inverse undeformed stiffness.
     rows
-        (3n,) on the device: the near part's among the whole's 3N.
+        (3n,) on the device: rows of the near part among the whole's 3N.
     part, lbfgs
-        The near part in its surroundings, and the descent that solves it.
+        Near part within the condensed far part, and the solver of this subproblem.
     shared, follow
-        (m,) rows of the near part that the far part touches, on the device; (x (m, b), out (3N, b)): how it follows.
+        (m,) rows of the near part shared with the far part, on the device; (x (m, b), out (3N, b)): the far part's
+        motion.
     limits, near
-        When cycles end; how long the near part is solved.
+        Limits of the cycles; extent and limits of the near part.
     """
 
     problem: Problem
@@ -86,7 +87,7 @@ class BatchElimination:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """As `Lbfgs.descend`, in at most `most` cycles; nothing is learnt."""
+        """Solve as `Lbfgs.descend`, in at most `most` cycles; returns no L-BFGS history."""
 
         def cycle(judge: Judge, now: ResidualState, force: np.ndarray) -> ResidualState:
             return judge(self._corrected(now.u, now.g, force))
@@ -94,9 +95,9 @@ class BatchElimination:
         return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _corrected(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
-        """Return the next state (3N, b), from the free gradient g (3N, b) at u (3N, b).
+        """Run one cycle from residual g (3N, b) at u (3N, b); return the next state (3N, b).
 
-        Force (b,) [N] may be left near.
+        The near part is solved to a residual of `force` (b,) [N].
         """
         device, count = self.problem.device, u.shape[1]
         every = np.ones(count, bool)
@@ -107,7 +108,7 @@ class BatchElimination:
         near, aim = take_rows(device, u, self.rows), take_rows(device, out, self.rows)
         back, part = combine_columns(device, near, -1.0, aim, wp.empty_like(aim)), self.part.problem
         g = device.zeros(*near.shape)
-        part.linearise(near, every)  # at rest, as positive definite curvature is
+        part.linearise(near, every)  # `definite`: the undeformed curvature
         part.add_curvature(back, g)
         self.part.put(None)
         load = part.gradient(near)
@@ -119,26 +120,26 @@ class BatchElimination:
         missed = combine_columns(device, found.u, -1.0, aim, aim)
         followed = wp.empty_like(out)
         self.follow(take_rows(device, missed, self.shared), followed)
-        self.problem.constraint.project_nodes(followed)  # what is rounded row by row leaves the planes it slides on
+        self.problem.constraint.project_nodes(followed)  # removes motion off the sliding planes by rounding
         combine_columns(device, out, 1.0, followed, out)
         put_rows(device, found.u, self.rows, out)
         return out
 
 
 def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
-    """Whether a part of the surface is free, and no large one."""
+    """Return True if the free surface is a small part of the whole surface, and not empty."""
     return 0 < len(open_vertices(space, constraint)) <= NEAR.largest_opening * len(np.unique(space.mesh.surface))
 
 
 def find_near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray:
-    """(T,) bool: the share `NEAR.share` nearest to where the surface is free."""
+    """Mark (T,) bool the fraction `NEAR.share` of the tetrahedra that is nearest to the free surface."""
     mesh = space.mesh
     distance, _ = KDTree(mesh.nodes[open_vertices(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
     return distance <= np.quantile(distance, NEAR.share)
 
 
 def open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:
-    """Vertices (n,) of the surface that neither are held nor slide."""
+    """List the surface vertices (n,) that are neither fixed nor slide."""
     surface = np.unique(space.mesh.surface)
     return surface[~constraint.held[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
 
@@ -146,10 +147,9 @@ def open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:
 def build_batch_elimination(
     problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> BatchElimination | None:
-    """Of the tissue near the opening, which is small; None where that is too nearly singular to be taken apart.
+    """Build the solver for the tissue near the opening; None if that part is too close to singular to be condensed.
 
-    The preconditioner is an inverse: levels, which solve nearly, would leave a share of every correction to the next
-    cycle.
+    The preconditioner must be an exact inverse: multigrid would leave part of every correction to the next cycle.
     """
     device = problem.device
     chosen = find_near_tetrahedra(space, problem.constraint)

@@ -1,8 +1,8 @@
-"""Nonlinear elimination without an inverse: what a load strains much is in equilibrium before the body around it moves.
+"""Nonlinear elimination without an exact inverse: strained tissue reaches equilibrium before the other nodes move.
 
-Where the rest stiffness is known only nearly (levels), the surroundings of a part cannot be condensed. So the part of
-the body near a load, held at its rim (`clamped_part.py`), is brought to equilibrium by itself. L-BFGS minimises what is
-left, a function of the body around it, whose curvature the rest stiffness knows well.
+With multigrid, which inverts the undeformed stiffness only approximately, the far part cannot be condensed. So the part
+near a load, clamped at its boundary (`clamped_part.py`), is solved as a local subproblem. L-BFGS minimises the
+remaining function of the surrounding nodes, whose curvature is close to the undeformed stiffness.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from .outer_loop import CycleLimits, run_cycles
 
 @dataclass(frozen=True)
 class ClampedSize:
-    """Which tissue is clamped off, and how often a step of the whole is cut.
+    """Extent of the clamped part, and number of backtracking steps.
 
     Parameters
     ----------
     strained, largest
-        What the linear answer strains more than this, the most strained tetrahedra first, of at most this share of all;
-        and all tetrahedra that touch these.
+        Norm of the displacement gradient of the linear solution above which tetrahedra belong to the part, the most
+        strained first, up to this fraction of all; and all tetrahedra that touch these.
     left, added
-        A cycle may leave more than this share of the free force, and so many nodes may have most of what is beyond the
-        part. Then these and what touches them are added to it.
+        If a cycle leaves more than this fraction of the residual, and at most this number of nodes have most of the
+        residual outside the part, these nodes and what touches them are added to it.
     cuts
-        Most of one step.
+        Maximum backtracking steps of one step.
     """
 
     strained: float = 0.15
@@ -51,19 +51,20 @@ class ClampedSize:
     cuts: int = 6
 
 
+# Few cycles, because each is expensive; the line search already rejects steps whose forces explode.
 DEAR = CycleLimits(cycles=30, patience=8, rise=1e6, forcing=0.1, enough=0.5)
 
 
 @dataclass(frozen=True, eq=False)
 class ClampedElimination:
-    """A descent for single loads on one problem: quadratic elements, whose rest stiffness has levels and no inverse.
+    """Solver of single loads for quadratic elements, whose undeformed stiffness is inverted by multigrid only.
 
     problem, preconditioner
-        The whole body's.
+        Whole problem, and its preconditioner.
     effects, space
-        What the problem was compiled from.
+        Effects and discretisation that the problem was compiled from.
     limits, size
-        When cycles end: one is dear here, and the line search cuts what explodes. Which part is clamped off.
+        Limits of the cycles; extent of the clamped part.
     """
 
     problem: Problem
@@ -76,7 +77,7 @@ class ClampedElimination:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """As `Lbfgs.descend`, of one column, in at most `most` cycles; nothing is learnt."""
+        """Solve as `Lbfgs.descend`, for one load case, in at most `most` cycles; returns no L-BFGS history."""
         chosen, part, pairs = (
             np.zeros(len(self.space.table), bool),
             None,
@@ -113,9 +114,9 @@ class ClampedElimination:
         return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
 
     def _lower(self, judge: Judge, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float) -> ResidualState:
-        """Return a step along d (3N,) that does not go too far, and the part settled to `force` [N] there.
+        """Search along d (3N,) with the part solved to `force` [N] at each trial; return the accepted state.
 
-        Its free force is not finite where no step that was tried leads on.
+        Its residual is not finite if no trial step is accepted.
         """
         promised, device = -float(_host(now.g) @ d), self.problem.device
         way = device.array(d[:, None])
@@ -129,7 +130,7 @@ class ClampedElimination:
         return replace(now, free=np.full(1, np.inf))
 
     def _solved(self, g: wp.array) -> np.ndarray:
-        """How the body at rest answers a force g (3N, 1) [N]: (3N,) [m]."""
+        """Compute the linear response (3N,) [m] of the undeformed mesh to a force g (3N, 1) [N]."""
         z = wp.zeros_like(g)
         self.preconditioner.apply(g, np.ones(1, bool), z)
         self.problem.constraint.project_nodes(z)
@@ -144,9 +145,9 @@ class ClampedElimination:
         return table[np.argsort(-strain)[:most]].ravel()
 
     def _left(self, g: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Return the few nodes (k,) beyond these that have most of the free gradient g (3N,) there.
+        """Return the few nodes (k,) outside the part that have most of the residual g (3N,) there.
 
-        None if no few have.
+        Empty if it is spread over more nodes.
         """
         square = (g.reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
         square[nodes] = 0.0
@@ -154,7 +155,7 @@ class ClampedElimination:
         return most if 2.0 * square[most].sum() > square.sum() else most[:0]
 
     def _touching(self, nodes: np.ndarray) -> np.ndarray:
-        """(T,) bool: the tetrahedra of these nodes (k,)."""
+        """Mark (T,) bool the tetrahedra that contain any of these nodes (k,)."""
         touched = np.zeros(self.space.count, bool)
         touched[nodes] = True
         return touched[self.space.table].max(axis=1)
@@ -166,5 +167,5 @@ class ClampedElimination:
 
 
 def _host(column: wp.array) -> np.ndarray:
-    """(3N,) of a column (3N, 1) on the CPU."""
+    """Copy a column (3N, 1) on the CPU to (3N,)."""
     return column.numpy()[:, 0]

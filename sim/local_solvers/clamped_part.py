@@ -1,4 +1,4 @@
-"""Some of a body's tetrahedra by themselves, held where they touch the others: brought to equilibrium between."""
+"""Local subproblem of some tetrahedra, whose nodes shared with other tetrahedra are fixed."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from ..minimisers.newton_cg import NewtonCG
 
 @dataclass(frozen=True)
 class PartLimits:
-    """Budgets of a clamped part.
+    """Iteration limits of a clamped part.
 
     Parameters
     ----------
     iterations, stale
-        What so many iterations of L-BFGS leave is Newton's. A factor with which so many were taken is made anew.
+        Maximum L-BFGS iterations before Newton; iterations above which the factor is recomputed.
     outer, inner
-        Newton's, as `Accuracy` has them.
+        Limits of Newton, as in `Accuracy`.
     """
 
     iterations: int = 400
@@ -40,22 +40,22 @@ class PartLimits:
 
 
 class ClampedPart:
-    """A part of one load case, whose rim does not move.
+    """Part of the mesh under one load case, clamped at its boundary.
 
     Parameters
     ----------
     problem
-        The whole body's, which has begun the load case alone.
+        Whole problem, which has begun this load case alone.
     effects, space
-        What it was compiled from.
+        Effects and discretisation that it was compiled from.
     chosen
         (T,) bool: the part's tetrahedra, at least one.
     constant
-        (3N, 1) [N]: the gradient of the loads, which do not depend on where the body is.
+        (3N, 1) [N]: gradient of the loads, which do not depend on the displacements.
     u
-        (3N, 1) [m]: where the body is about.
+        (3N, 1) [m]: approximate displacements, at which the stiffness is factorised.
     limits
-        Budgets.
+        Iteration limits.
     """
 
     def __init__(
@@ -79,9 +79,9 @@ class ClampedPart:
             self._begin_with(self._part.rest_curvature())
 
     def settled(self, u: wp.array, force: float) -> wp.array:
-        """u (3N, 1) with the part in equilibrium, but for a free gradient of about `force` [N].
+        """Return u (3N, 1) with the part in equilibrium, to a residual of about `force` [N].
 
-        As it is, where the part's forces are not finite.
+        Return u unchanged if the part's forces are not finite.
         """
         part, device, values, limits = self._part, self._part.device, u.numpy().copy(), self._limits
         part.constraint.begin(values[self._rows], None, None)
@@ -101,7 +101,7 @@ class ClampedPart:
         return device.array(values)
 
     def _begin_at(self, u: wp.array) -> bool:
-        """Let L-BFGS begin with the curvature at u (3n, 1), if that is positive definite."""
+        """Use the tangent stiffness at u (3n, 1) as initial Hessian of L-BFGS; False if it is not positive definite."""
         self._part.linearise(u, np.zeros(1, bool))
         try:
             self._begin_with(self._curvature())
@@ -110,7 +110,7 @@ class ClampedPart:
         return True
 
     def _begin_with(self, stiffness: sp.csc_array) -> None:
-        """Let L-BFGS begin with a stiffness (3n, 3n) [N/m]."""
+        """Use a stiffness (3n, 3n) [N/m] as initial Hessian of L-BFGS."""
         basis = self._part.constraint.basis()
         self._factor = Factor(stiffness, basis, find_moved_nodes(basis), self._part.device)
         self._lbfgs = Lbfgs(self._part, self._factor)

@@ -1,4 +1,4 @@
-"""Columns on their way to where tissue and tools are in equilibrium, and what each of them has learnt."""
+"""State of the load cases of a contact solve, with their models of the stiffness."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .strained_part import StrainedModel
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """u (3N, b) [m]; free gradients (3N, b) [N] of all that is smooth, and of all; 2-norms (b,), and scales (b,)."""
+    """State u (3N, b) [m]; gradients (3N, b) [N] of the smooth terms, and of all, with 2-norms (b,); scales (b,)."""
 
     u: Any
     smooth: Any
@@ -24,21 +24,21 @@ class ContactState:
 
     @property
     def relative(self) -> np.ndarray:
-        """The relative residuals (b,)."""
+        """Relative residuals (b,)."""
         return compute_relative(self.free, self.scale)
 
     @property
     def finite(self) -> np.ndarray:
-        """(b,) bool: whether each is a state at all. Forces that overflow have no scale."""
+        """True (b,) where residual and scale are finite; forces may overflow."""
         return np.isfinite(self.free) & np.isfinite(self.scale)
 
     def rows(self, stay: np.ndarray) -> ContactState:
-        """Return some of the columns (k,)."""
+        """Return the state of some load cases (k,)."""
         parts = (self.u[:, stay], self.smooth[:, stay], self.whole[:, stay])
         return ContactState(*parts, self.free[stay], self.scale[stay])
 
     def put(self, columns: np.ndarray, some: Any, other: ContactState) -> None:
-        """Write columns (k,) of another state over these; `some` are the same of an array's."""
+        """Overwrite load cases (k,) with those of another state; `some` is the same selection for device arrays."""
         for mine, its in ((self.u, other.u), (self.smooth, other.smooth), (self.whole, other.whole)):
             mine[:, some] = its[:, some]
         self.free[columns], self.scale[columns] = other.free[columns], other.scale[columns]
@@ -46,23 +46,23 @@ class ContactState:
 
 @dataclass(eq=False)
 class Batch:
-    """Columns on their way. Arrays (.., b) last; each column aims, tries, and is cut, by itself.
+    """Live load cases, on the last axis of arrays (.., b); each has its own direction, step length and proximal term.
 
     judge, now
-        What measures them, and where they are.
+        Function that evaluates residuals, and the present state.
     pairs, model
-        What they have learnt, or what strained tissue changes of how the body at rest moves; `stale` (b,) bool says
-        whose model is to be made anew.
+        L-BFGS histories, or models of strained tissue that correct the undeformed compliance; `stale` (b,) bool marks
+        models to be recomputed.
     force, rest, aimed
-        (3n, b) [N] the tools' as the model has them; (3N, b) [m] what the body at rest answers what is out of balance
-        under these. Under the third they will be after the step, where there is a model.
+        (3n, b) [N] forces of the tools; (3N, b) [m] linear response of the undeformed mesh to the residual with these
+        forces; (3n, b) [N] forces after the step, if there is a model.
     x, length, promised
-        (3N, b) [m] the direction, and (b,) the step along it that is tried; what it promises.
+        (3N, b) [m] direction, (b,) trial step length, and (b,) [J] predicted decrease.
     drag, slow, steps
-        (b,).
+        (b,) proximal coefficient, steps in a row with little progress, and number of steps.
     failed, waiting, gone
-        (b,) how often in a row no forces of the tools were found; which (b,) bool are to be tried again, and which have
-        ended and stand by until the others close ranks.
+        (b,) failures in a row to find the tools' forces; (b,) bool: to be tried again; (b,) bool: ended, but still in
+        the arrays.
     """
 
     judge: Judge
@@ -84,7 +84,7 @@ class Batch:
     gone: np.ndarray
 
     def keep(self, stay: np.ndarray) -> None:
-        """Keep these columns (k,)."""
+        """Keep these load cases (k,)."""
         self.judge, self.now = self.judge.rows(stay), self.now.rows(stay)
         if self.model is None:
             self.pairs.keep(stay)
@@ -97,11 +97,11 @@ class Batch:
 
     @property
     def learnt(self) -> np.ndarray:
-        """Which columns (b,) have a model beside the rest."""
+        """True (b,) where a load case has a model that differs from the undeformed stiffness."""
         return self.pairs.count > 0 if self.model is None else self.model.bent
 
     def forget(self, columns: np.ndarray) -> None:
-        """Of some columns (k,) nothing is known but the rest."""
+        """Reset the model of some load cases (k,) to the undeformed stiffness."""
         if not len(columns):
             return
         if self.model is None:

@@ -1,13 +1,13 @@
-"""Equilibrium of soft tissue and hard tools, which touch it in few nodes: a model of the one, the other as it is.
+"""Equilibrium of soft tissue with rigid tools that touch few nodes: tissue by a quadratic model, contact exactly.
 
 A proximal quasi-Newton method (Lee, Sun, Saunders 2014, "Proximal Newton-type methods for minimizing composite
 functions", SIAM J. Optim. 24:1420-1443). Each step minimises
 
     s'(u) x + x . B x / 2 + c(u + x),
 
-with s the potential of all that is smooth, B the rest stiffness and what L-BFGS has learnt since, and c the barrier of
-tools, which is no model. c depends on the few nodes that tools can touch, and all else follows them. With H = B^-1 they
-move by x = -H (s'(u) + f), with the tools' forces f on them as `contact_forces` finds them.
+with s the potential of the smooth terms, B the undeformed stiffness with its L-BFGS or strain update, and c the barrier
+of the tools, not approximated. c depends on the few touchable nodes, and all others follow them. With H = B^-1 they
+move by x = -H (s'(u) + f), with the tools' forces f on them from `contact_forces`.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ from .strained_part import STRAINS, StrainedPart, StrainLimits
 
 @dataclass(frozen=True, eq=False)
 class ContactDescent:
-    """A descent for a problem with one `Local` barrier, whose constraints stay closed.
+    """Solver for a problem with one `Local` barrier, whose constraints stay satisfied.
 
     problem
-        What is minimised.
+        Problem to solve.
     preconditioner
-        Of this problem at rest, alike at every state.
+        Its inverse undeformed stiffness, the same at every state.
     barrier
-        Its only one.
+        Its only barrier.
     limits
-        When it goes on, and when it gives up.
+        Limits of the iteration.
     strains
-        Which tissue counts as strained.
+        Limits of strained tissue.
     replays
-        Single columns take steps that a card captures as graphs.
+        True if steps of single load cases are captured as GPU graphs.
     """
 
     problem: Problem
@@ -67,25 +67,25 @@ class ContactDescent:
 
     @cached_property
     def compliance(self) -> Compliance:
-        """At the nodes that can be touched; after them those that may be strained, if they have a model."""
+        """Compliance at the touchable nodes, followed by those that a model of strained tissue may include."""
         exact = is_exact(self.preconditioner)
         own = self.barrier.touchable
         nodes = self.barrier.around(self.strains.near) if exact else own
         compliance = Compliance(self.problem, self.preconditioner, nodes)
-        if exact and self.problem.device.on_cuda:  # as much at once as at one node
+        if exact and self.problem.device.on_cuda:  # all columns take as long as one
             compliance.ensure_known(np.arange(len(nodes)) < len(own))
         return compliance
 
     @cached_property
     def _strained(self) -> StrainedPart | None:
-        """Makes models of strained tissue; levels, whose columns take long, learn from steps instead."""
+        """Builder of models of strained tissue; None with multigrid, whose compliance is slow."""
         if not is_exact(self.preconditioner):
             return None
         return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable), self.strains)
 
     @cached_property
     def steps(self) -> ContactSteps | None:
-        """Those of single columns; None where nothing is to be replayed."""
+        """Captured steps for single load cases; None if steps are not captured."""
         if self._strained is None or not self.replays:
             return None
         self._strained.prepare()
@@ -94,21 +94,21 @@ class ContactDescent:
 
     @cached_property
     def _rows(self) -> Any:
-        """Those (3n,) of the nodes that can be touched, on the device."""
+        """Rows (3n,) of the touchable nodes, on the device."""
         return self.compliance.places[: 3 * len(self.barrier.touchable)]
 
     @cached_property
     def _room(self) -> Callable[[int, int, int], Scratch]:
-        """`allocate_scratch`, which takes long, of sizes that were asked for lately."""
+        """`allocate_scratch`, which is slow, with the last two results cached."""
         return lru_cache(2)(partial(allocate_scratch, self._exact))
 
     @property
     def _exact(self) -> Device:
-        """The device in double precision."""
+        """Device with double precision."""
         return replace(self.problem.device, precision="float64")
 
     def descend(self, start: wp.array, tolerance: np.ndarray, most: int) -> Descended:
-        """As `Lbfgs.descend`, in at most `most` steps of each column; nothing is learnt."""
+        """Solve as `Lbfgs.descend`, in at most `most` steps of each load case; returns no L-BFGS history."""
         count, device, limits = start.shape[1], self.problem.device, self.limits
         result, live = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
@@ -155,9 +155,9 @@ class ContactDescent:
         )  # fmt: skip
 
     def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
-        """Take steps of a single column in arrays that stay, until it has come to its end.
+        """Run captured steps of a single load case until it ends.
 
-        Or until it wants what the others do: more touched nodes than there is room for, or Newton.
+        Return early if it needs what only the other path has: more workspace for touched nodes, or Newton.
         """
         known, judge, limits = None, batch.judge, self.limits
         if batch.model is None or not steps.set_tools(judge.constant):
@@ -174,7 +174,7 @@ class ContactDescent:
             if self._waits(batch, said[[STATUS]] != FOUND).any():
                 return
             if batch.waiting.any():
-                # Its model may have been forgotten.
+                # Its model may have been reset.
                 known = None if batch.failed[0] % limits.times == 0 else known
                 continue
             batch.promised[:] = said[PROMISED]
@@ -187,16 +187,16 @@ class ContactDescent:
             if there.any():
                 steps.move_to_last_step()
                 batch.now.free[:], batch.now.scale[:] = free, scale
-            else:  # it has forgotten its model
+            else:  # its model has been reset
                 known = None
 
     def _ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
-        """Which columns (b,) have come to their end, in equilibrium or not."""
+        """Return the load cases (b,) that have ended, in equilibrium or not."""
         lost = (batch.slow >= self.limits.patience) | (batch.steps >= most) | ~batch.now.finite
         return lost | (batch.now.relative <= tolerance)
 
     def _renew(self, batch: Batch, wanted: np.ndarray) -> None:
-        """Make stale models anew of the columns that are `wanted` (b,) bool."""
+        """Recompute the stale models of the load cases `wanted` (b,) bool."""
         renewed = np.flatnonzero(wanted & batch.stale)
         if batch.model is not None and self._strained is not None and len(renewed):
             fresh = self._strained.model(from_view(self.problem.device, batch.now.u), renewed)
@@ -205,15 +205,15 @@ class ContactDescent:
                 batch.model = batch.model.merge_columns(renewed, fresh)
 
     def _exactly(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
-        """To what share (b,) of themselves the tools' forces are to be found."""
+        """Return the relative tolerance (b,) of the tools' forces."""
         limits = self.limits
         return np.maximum(limits.forcing * np.minimum(batch.now.relative, 1.0), limits.enough * tolerance)
 
     def _aimed(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
-        """Give the columns that are `wanted` (b,) bool a direction; which (b,) have none, whatever was tried.
+        """Compute directions of the load cases `wanted` (b,) bool; return which (b,) have failed finally.
 
-        One whose model has no equilibrium waits for the next time, dragged more; then it forgets what it has learnt. At
-        last a model will do that is not convex. Others need not wait for it.
+        A load case whose model has no equilibrium waits for the next call, with a larger proximal term; then its model
+        is reset; at last a model that is not convex is accepted. Other load cases do not wait for it.
         """
         self._renew(batch, wanted)
         force, found = batch.force + 0.0, np.zeros(len(wanted), bool)
@@ -229,11 +229,11 @@ class ContactDescent:
         return over
 
     def _bends(self, batch: Batch) -> np.ndarray:
-        """Which columns (b,) take a model that is not convex."""
+        """Return the load cases (b,) whose model may be non-convex."""
         return batch.failed >= 2 * self.limits.times
 
     def _waits(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
-        """Increase the drag of columns (b,) bool without forces; return which (b,) have no trial left."""
+        """Increase the proximal coefficient where no forces were found (b,) bool; return which (b,) fail finally."""
         times = self.limits.times
         batch.waiting = waiting
         batch.failed = np.where(waiting, batch.failed + 1, 0)
@@ -243,7 +243,7 @@ class ContactDescent:
         return batch.failed >= 3 * times
 
     def _direct(self, batch: Batch, some: np.ndarray, force: Any) -> None:
-        """The directions of some columns (k,) under the tools' forces (3n, b)."""
+        """Compute directions, step lengths and predicted decreases of load cases (k,) under forces (3n, b)."""
         now, device = batch.now, self.problem.device
         on = select_columns(device, some, len(batch.drag))
         if batch.model is None:
@@ -263,7 +263,7 @@ class ContactDescent:
     def _forces(
         self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
     ) -> tuple[Any, np.ndarray]:
-        """The tools' forces (3n, k) where the model of some columns (k,) is in equilibrium, and which (k,) have one."""
+        """Solve for the tools' forces (3n, k) on the model for load cases (k,); return which (k,) are solved."""
         rows, now = self._rows, batch.now
         on = select_columns(self.problem.device, some, len(batch.drag))
         barrier, known = self.barrier.reduced(some), batch.force[:, on]
@@ -284,9 +284,9 @@ class ContactDescent:
         return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.drag[some], most)
 
     def _bent(self, batch: Batch, force: Any) -> tuple[Any, Any]:
-        """Forces (3N, b) [N] that the body at rest is to follow beside: those of tools that are new, and of a model.
+        """Compute additional forces (3N, b) [N] on the undeformed mesh: changes of contact forces, model corrections.
 
-        The second is how the nodes that can be touched move (3n, b) [m] with what the model adds.
+        Return also the motion (3n, b) [m] of the touchable nodes under the model's corrections.
         """
         assert batch.model is not None
         device, compliance = self.problem.device, self.compliance
@@ -301,10 +301,10 @@ class ContactDescent:
         return np.maximum(self.limits.drag, self.limits.growth * drag)
 
     def _tried(self, batch: Batch) -> np.ndarray:
-        """Try the step of every column that does not wait; which columns (b,) want another direction.
+        """Evaluate the trial step of each load case that does not wait; return which (b,) need another direction.
 
-        They have taken it, as the energy still falls there, or about so. Or hardly anything is left of it after cuts:
-        then they have not moved, and forget what has misled them.
+        That is, they accepted the step, because the energy still falls there, or nearly so; or backtracking left almost
+        no step: then they stay, and their model is reset.
         """
         now, going = batch.now, ~(batch.waiting | batch.gone)
         t = np.where(going, batch.length, 0.0)
@@ -323,15 +323,15 @@ class ContactDescent:
         return misled | there | (batch.waiting & ~batch.gone)
 
     def _decided(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Which columns (b,) take steps of a length t (b,), and which were misled; others' are cut.
+        """Accept steps of length t (b,), or shorten them; return which (b,) are accepted, and which reset their model.
 
-        By the slopes `ahead` (b,) and the free forces (b,) there.
+        The decision uses the slopes `ahead` (b,) and the residuals `free` (b,) there.
         """
         limits, now, going = self.limits, batch.now, ~(batch.waiting | batch.gone)
         far = going & is_step_too_long(ahead, batch.promised) & (t > limits.least)
         batch.length, there = np.where(far, t * backtrack_by_slopes(ahead, batch.promised), t), going & ~far
         misled = far & (batch.length < limits.shortest)
-        if misled.any():  # a card is asked only then
+        if misled.any():  # reading from the GPU only if needed
             misled &= batch.learnt
         well = (t > limits.long) & (free <= limits.left * now.free)
         eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
@@ -344,7 +344,7 @@ class ContactDescent:
         return there, misled
 
     def _learn(self, batch: Batch, new: ContactState, taken: np.ndarray, some: Any) -> None:
-        """From steps that columns (k,) have taken to a new state; `some` are the same of an array's."""
+        """Update the models with the accepted steps of load cases (k,); `some` is this selection for device arrays."""
         now = batch.now
         if batch.model is not None:
             batch.force[:, some] = batch.aimed[:, some]
@@ -360,7 +360,7 @@ class ContactDescent:
             batch.pairs.update_history(taken[felt], moved[:, on], change[:, on], way[:, on])
 
     def _felt(self, now: ContactState) -> Any:
-        """Return forces (3n, b) that balance all that is smooth, where tools touch."""
+        """Return the forces (3n, b) at touched nodes that balance the smooth terms."""
         barrier, rows = self.barrier.reduced(np.arange(len(now.free))), self._rows
         own = to_double(now.smooth[rows])
         if barrier is None:
@@ -371,13 +371,13 @@ class ContactDescent:
         return (-own.reshape(shape) * touched[:, None]).reshape(slope.shape)
 
     def _pull(self, smooth: Any, force: Any) -> Any:
-        """Smooth gradients (3N, b) and forces (3n, b) on the touchable nodes, together (3N, b)."""
+        """Add forces (3n, b) on the touchable nodes to smooth gradients (3N, b)."""
         out = smooth + 0.0
         out[self._rows] += force
         return out
 
     def _judged(self, judge: Judge, u: Any) -> ContactState:
-        """Return the states u (3N, b), as `Problem.residual` measures them."""
+        """Evaluate the states u (3N, b) as `Problem.residual` does."""
         problem, device = self.problem, self.problem.device
         place, pressed = device.zeros(*u.shape), device.zeros(*u.shape)
         view(place)[:] = u
@@ -388,7 +388,7 @@ class ContactDescent:
         return ContactState(view(place), whole - view(pressed), whole, found.free, found.scale)
 
     def _answered(self, smooth: Any, force: Any) -> Any:
-        """How the body at rest moves (3N, b) [m] under what is out of balance."""
+        """Compute the linear response (3N, b) [m] of the undeformed mesh to the residual."""
         return self.compliance.answered(self._pull(smooth, force))
 
 

@@ -1,12 +1,12 @@
-"""Where the few nodes that tools touch come to rest, while all else follows as a quadratic model has it.
+"""Contact forces: equilibrium of the few touched nodes, with all others following a quadratic model.
 
-With C (3n, 3n) the compliance of the model at these nodes and w0 where they would go untouched, w minimises
+With C (3n, 3n) the compliance of the model at these nodes and w0 their positions without contact, w minimises
 
     (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over the touched,
 
-c the barrier of tools and d a drag from where they are, v. It is found by Newton's method for the forces f that tools
-exert, w = w0 - C f: these are none but at touched nodes, and so C is never inverted. It is given where nodes go under
-forces that are nearly right, w1 = w0 - C f1: of differences little is rounded away.
+c the barrier of the tools and d a proximal coefficient about the present positions v. Newton's method solves for the
+tools' forces f, with w = w0 - C f: these vanish except at touched nodes, so that C is never inverted. The input is the
+position under approximate forces, w1 = w0 - C f1, because differences from it have little round-off.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from .contact_structs import CROWDED, FOUND, OPEN, UNKNOWN, ComplianceModel, End
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """When Newton's method for the tools' forces ends.
+    """Limits of Newton's method for the tools' forces.
 
     Parameters
     ----------
     iterations, cuts
-        Most, and most cuts of one step.
+        Maximum iterations, and backtracking steps of one iteration.
     few, most
-        Touched nodes: room is made for few at first; more than most are no few.
+        Touched nodes: capacity of the first workspace, and of the largest.
     late
-        A model that is not convex after so many iterations is not going to be.
+        Iterations after which a model that is still not convex is given up.
     rounded
-        A compliance is rounded: this share of its mean makes it definite.
+        Shift of the compliance matrix, relative to its mean diagonal, that makes it positive definite despite rounding.
     bytes
-        Of the matrices of all columns that are solved at once.
+        Memory of the matrices of all load cases solved at once [bytes].
     """
 
     iterations: int = 60
@@ -57,17 +57,17 @@ class ForceLimits:
     bytes: int = 2**30
 
 
-FORCES = ForceLimits()
+FORCES = ForceLimits()  # Default.
 BENT = ForceLimits(late=FORCES.iterations)
-"""A model need not be convex."""
+"""Limits for a model that need not be convex."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactCompliance:
-    """C of a model: what a body at rest does, and what b columns have learnt since, at the n nodes of the compliance.
+    """Compliance C at n nodes: that of the undeformed mesh, plus the updates of b load cases.
 
-    `learnt` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision; none where nothing was learnt yet. `own`
-    (b, 3n, 3n) in single precision is what strained tissue changes. `room` is `allocate_scratch`, which may be kept.
+    `learnt` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision are L-BFGS updates, None without history. `own`
+    (b, 3n, 3n) in single precision is the change by strained tissue. `room` is `allocate_scratch`, perhaps cached.
     """
 
     rest: Compliance
@@ -78,14 +78,14 @@ class ContactCompliance:
     own: Any = None
 
     def ensure_known(self, force: Any) -> None:
-        """See to it that the compliance is known where forces (3n, b) act on its first nodes."""
+        """Compute the undeformed compliance, if missing, at the nodes on which forces (3n, b) act."""
         every = self.rest.known.copy()
         if not every[: len(force) // 3].all():
             every[: len(force) // 3] = to_host((force != 0.0).any(1)).reshape(-1, 3).any(axis=1)
             self.rest.ensure_known(every)
 
     def model(self, columns: np.ndarray, rounded: float) -> ComplianceModel:
-        """Of some columns (k,)."""
+        """Return the compliance of some load cases (k,) for kernels."""
         out, n, count = ComplianceModel(), len(self.rest.rows), len(columns)
         out.rest, out.known = from_view(self.device, self.rest.columns), self.device.array(self.rest.known, wp.int32)
         none = wp.zeros((count, 0, 0), dtype=wp.float32, device=self.device.name)
@@ -108,11 +108,11 @@ def solve_contact_forces(
     drag: np.ndarray,
     limits: ForceLimits = FORCES,
 ) -> tuple[Any, np.ndarray]:
-    """Return the forces f (3n, b) [N], and in which columns (b,) they have been found.
+    """Solve for the forces f (3n, b) [N]; return them, and which load cases (b,) are solved.
 
-    None are found where the model is not convex: its tools are sharper than its tissue is stiff, and it would go far
-    astray. From where the nodes are, `here` (3n, b) [m]; w1 is `there` and f1 `known` (3n, b). They are exact to a
-    `tolerance` (b,), relative. `drag` (b,) is d in units of how stiff a touched node is.
+    A load case fails if its model is not convex: the curvature of the tool exceeds the stiffness of the tissue, and the
+    step would be far too long. `here` (3n, b) [m] are the present positions, w1 is `there` and f1 `known` (3n, b). The
+    forces have a relative `tolerance` (b,). `drag` (b,) is d relative to the stiffness of a touched node.
     """
     out, status = known + 0.0, np.full(here.shape[1], OPEN)
     soft.ensure_known(known)
@@ -145,9 +145,9 @@ def _solved(
     limits: ForceLimits,
     room: int,
 ) -> tuple[Any, np.ndarray, Any]:
-    """Return forces (3n, k) of some columns (k,) with room for so many touched nodes, status (k,), and places (n, k).
+    """Solve for forces (3n, k), status (k,) and places (n, k) of load cases (k,), for up to `room` touched nodes.
 
-    Of the columns' `own` here, there and known forces (3n, k), and tolerance and drag (k,) as `asked`.
+    `own` are their here, there and known forces (3n, k), `asked` their tolerance and drag (k,).
     """
     device, count = soft.device, len(columns)
     nodes, functions = len(own[0]) // 3, barrier.functions
@@ -171,14 +171,14 @@ def _solved(
 
 
 def allocate_ends(limits: ForceLimits, room: int) -> Ends:
-    """As the kernel takes them, with room for so many touched nodes."""
+    """Return the limits for the kernel, with capacity for `room` touched nodes."""
     ends = Ends()
     ends.iterations, ends.cuts, ends.late, ends.room = limits.iterations, limits.cuts, limits.late, room
     return ends
 
 
 def allocate_scratch(device: Device, nodes: int, columns: int, room: int) -> Scratch:
-    """For so many nodes, columns, and touched nodes."""
+    """Allocate scratch arrays for numbers of nodes, load cases, and touched nodes (`room`)."""
 
     def numbers(*shape: int) -> wp.array:
         return wp.empty(shape, dtype=wp.float64, device=device.name)

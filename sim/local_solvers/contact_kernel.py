@@ -1,4 +1,4 @@
-"""Newton's method for the forces of tools, each column's by a block of threads from beginning to end."""
+"""Kernel of Newton's method for contact forces: one block of threads solves one load case completely."""
 
 from functools import cache
 
@@ -11,14 +11,14 @@ from ..runtime.blocks import before, get_block_shape, total, wait
 from ..runtime.device import Device, forward_kernel
 from .contact_structs import CROWDED, FOUND, NONE, OPEN, UNKNOWN, ComplianceModel, Ends, Scratch
 
-# So many sums at once keep a thread from waiting for memory; where there are many threads, few.
-WIDE, NARROW = 8, 2
-TOUCHED, ACTING = wp.constant(0), wp.constant(1)
+WIDE = 8  # Sums per thread at once, to hide memory latency on the CPU.
+NARROW = 2  # The same on CUDA, with its many threads.
+TOUCHED, ACTING = wp.constant(0), wp.constant(1)  # Columns of `Scratch.counts`: touched nodes; nodes with a change.
 
 
 @cache
 def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
-    """It, for what touches: launches over (column, thread)."""
+    """Build the kernel for a barrier, launched over (load case, thread)."""
     down, across = get_block_shape(device)
     threads, dense, Stage, Near = down * across, build_functions(device), barrier.stage, barrier.near
     wide = wp.constant(NARROW if device.on_cuda else WIDE)
@@ -29,7 +29,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def dot(x: wp.array2d(dtype=wp.float64), y: wp.array2d(dtype=wp.float64), c: int, me: int) -> wp.float64:
-        """x . y."""
+        """Compute the inner product x . y of a load case, by all threads of the block."""
         own = wp.float64(0.0)
         for r in range(me, x.shape[0], threads):
             own += x[r, c] * y[r, c]
@@ -37,13 +37,13 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def acts(x: wp.array2d(dtype=wp.float64), i: int, c: int) -> bool:
-        """Whether x is not zero at a node."""
+        """Return True if x is not zero at a node."""
         zero = wp.float64(0.0)
         return x[3 * i, c] != zero or x[3 * i + 1, c] != zero or x[3 * i + 2, c] != zero
 
     @wp.func
     def alike(x: wp.array2d(dtype=wp.float64), place: wp.array2d(dtype=wp.int32), c: int, me: int) -> bool:
-        """Whether the nodes where x is not zero are those that have a place."""
+        """Return True if the nodes where x is not zero are exactly those that have a place."""
         other = wp.float64(0.0)
         for i in range(me, place.shape[0], threads):
             if acts(x, i, c) != (place[i, c] >= 0):
@@ -60,7 +60,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         c: int,
         me: int,
     ) -> int:
-        """Return the nodes where x is not zero, ascending: how many, which, and each node's place among them or -1."""
+        """List the nodes where x is not zero, ascending, with their places (others: -1), and return their number."""
         n = place.shape[0]
         own = (n + threads - 1) // threads
         begin, end = wp.min(me * own, n), wp.min((me + 1) * own, n)
@@ -90,14 +90,14 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         c: int,
         me: int,
     ):
-        """The slope at x."""
+        """Compute the gradient of barrier and proximal term at x."""
         for r in range(me, x.shape[0], threads):
             s.slope[r, c] = s.held[r, c] * (x[r, c] - here[r, c])
         add_force(x, stage, near, c, me, s.slope)
 
     @wp.func
     def curve(stage: Stage, near: Near, definite: int, m: int, s: Scratch, c: int, me: int):
-        """The curvature at w between the m touched nodes."""
+        """Assemble the curvature of barrier and proximal term at w between the m touched nodes."""
         for i in range(me // across, 3 * m, down):
             for j in range(me % across, 3 * m, across):
                 s.stiff[c, i, j] = wp.float64(0.0)
@@ -109,7 +109,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def changed(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
-        """What strained tissue changes of the compliance."""
+        """Return the change of the compliance by strained tissue."""
         own = wp.float64(0.0)
         if model.own.shape[1] > 0:
             own = wp.float64(model.own[c, i, j])
@@ -117,12 +117,12 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def between(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
-        """The compliance between touched nodes, symmetric: half precision may have rounded its columns at rest."""
+        """Return the compliance between touched nodes, symmetrised: half precision may have rounded its columns."""
         return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + changed(model, c, i, j)
 
     @wp.func
     def pull(model: ComplianceModel, s: Scratch, c: int, me: int) -> int:
-        """On how many nodes the change acts, which, and what weights it gives to what was learnt."""
+        """List the nodes on which the change acts, compute the L-BFGS weights of it, and return their number."""
         m = listed(s.change, s.acts, s.acting, s.counts, ACTING, c, me)
         pairs = model.learnt.shape[1]
         for p in range(me, pairs, threads):
@@ -142,7 +142,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def give(model: ComplianceModel, out: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
-        """How far all nodes go against the change."""
+        """Compute the motion of all nodes under the negative change of the forces: out = -C change."""
         m, size = pull(model, s, c, me), out.shape[0]
         for first in range(me, size, wide * threads):
             sums = Strip()
@@ -167,7 +167,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def give_touched(model: ComplianceModel, size: int, s: Scratch, c: int, me: int):
-        """How far the touched nodes, `size` numbers, go under the change: to `at`."""
+        """Compute the motion of the touched nodes, `size` rows, under the change of the forces: at = C change."""
         m = pull(model, s, c, me)
         for i in range(me, size, threads):
             row = 3 * s.touched[c, i // 3] + i % 3
@@ -182,7 +182,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def soften(model: ComplianceModel, m: int, s: Scratch, c: int, me: int) -> wp.float64:
-        """Return the compliance between m touched nodes; its mean."""
+        """Assemble the compliance between m touched nodes, and return its mean diagonal."""
         pairs = model.learnt.shape[1]
         for j in range(me, 3 * m, threads):
             row = 3 * s.touched[c, j // 3] + j % 3
@@ -211,9 +211,9 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def relieve(m: int, s: Scratch, c: int, me: int) -> bool:
-        """Take D (1 + C D)^-1 a from the change, C = L L' as `soft` has it; false where that is not convex.
+        """Subtract D (1 + C D)^-1 a from the change, C = L L' as in `soft`; False if this is not convex.
 
-        It is D (a - L (1 + L' D L)^-1 L' D a): Woodbury 1950. a is what `at` is at the touched nodes.
+        It is D (a - L (1 + L' D L)^-1 L' D a): Woodbury 1950. a is `at` at the touched nodes.
         """
         size = 3 * m
         for i in range(me // across, size, down):
@@ -267,7 +267,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def are_known(model: ComplianceModel, m: int, s: Scratch, c: int) -> bool:
-        """Whether the compliance at all touched nodes is."""
+        """Return True if the compliance is available at all touched nodes."""
         missing = wp.int32(0)
         for i in range(m):
             missing += 1 - model.known[s.touched[c, i]]
@@ -290,7 +290,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         out: wp.array2d(dtype=wp.float64),
         status: wp.array(dtype=wp.int32),
     ):
-        """As `contact_forces.settled`, of columns that are open."""
+        """Solve as `contact_forces.solve_contact_forces` for load cases with the status `OPEN`."""
         c, me = wp.tid()
         c = c + first
         if status[c] != OPEN:
@@ -308,7 +308,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             if me == 0:
                 status[c] = wp.where(m > ends.room, CROWDED, UNKNOWN)
             return
-        sound = wp.bool(False)  # whether L L' is the compliance between the touched nodes
+        sound = wp.bool(False)  # True if `soft` holds a valid Cholesky factor
         if m > 0:
             stiff = drag[c] / soften(model, m, s, c, me)
             for i in range(me, 3 * m, threads):
@@ -350,7 +350,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 verdict = wp.int32(UNKNOWN)
             if verdict != OPEN:
                 break
-            # What is out of balance, and the change of the forces that makes good for it.
+            # Residual, and the Newton step of the forces.
             convex = True
             if m > 0:
                 give_touched(model, 3 * m, s, c, me)
@@ -361,7 +361,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 if sound:
                     curve(stage, near, 0, m, s, c, me)
                     convex = relieve(m, s, c, me)
-                if sound and not convex:  # there tools count as flat
+                if sound and not convex:  # retry with positive semi-definite contact curvature
                     curve(stage, near, 1, m, s, c, me)
                     relieve(m, s, c, me)
             give(model, s.way, s, c, me)

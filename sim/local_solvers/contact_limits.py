@@ -1,32 +1,32 @@
-"""When steps under tools are cut, damped by a drag, and left to Newton."""
+"""Limits of steps under tools: backtracking, proximal term, and hand-over to Newton."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class ContactLimits:
-    """When steps are cut, damped by a drag, and left to Newton.
+    """Limits of steps under tools: backtracking, proximal term, and hand-over to Newton.
 
     Parameters
     ----------
     forcing, enough
-        Tools' forces are exact to this share of the whole residual, or of the tolerance.
+        Relative tolerance of the tools' forces: fraction of the relative residual, or of the tolerance if larger.
     left, long
-        A step does well that leaves so much of the free force, and is not cut shorter than this.
+        A good step leaves at most this fraction of the residual, and is longer than this fraction of the direction.
     patience
-        After so many in a row that do not, Newton goes on.
+        Number of steps in a row that are not good, after which Newton takes over.
     shortest
-        A step that is cut to less than this is not taken if what was learnt may have misled it.
+        Step length below which backtracking ends and the model is reset, if there is one.
     least
-        A step so short is taken as it is.
+        Step length at or below which a step is accepted without test.
     stale
-        A model of strained tissue that left more than this share of the free force is made anew.
+        Remaining fraction of the residual above which the model of strained tissue is recomputed.
     felt
-        [J] A step that is worth less is round-off, and nothing is learnt from it.
+        [J] Product s . y at or below which a curvature pair is round-off, and not stored.
     drag, growth, times
-        The first drag that is tried where one is wanted, by how much it grows and shrinks, and how often it grows.
+        First proximal coefficient; factor of its growth and reduction; failures in a row until the model is reset.
     crowd
-        Columns that have ended leave the batch when they are this share of it: each time everything is copied.
+        Fraction of ended load cases at which they leave the batch: this copies all arrays.
     """
 
     forcing: float = 0.03
@@ -44,4 +44,4 @@ class ContactLimits:
     crowd: float = 0.125
 
 
-CONTACT = ContactLimits()
+CONTACT = ContactLimits()  # Default.

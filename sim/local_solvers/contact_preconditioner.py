@@ -1,8 +1,8 @@
-"""A preconditioner that knows what is touched: the rest stiffness and the curvature of a barrier on few nodes.
+"""Preconditioner with contact: the undeformed stiffness plus the curvature of a barrier on few nodes.
 
     (K0 + E D E')^-1 = H - H E (1 + D C)^-1 D E' H,    H = K0^-1,  C = E' H E:
 
-Woodbury 1950, with D positive semi-definite. A factor knows nothing of contact, a thousand times as stiff.
+Woodbury 1950, with D positive semi-definite. A factor of K0 alone lacks contact, which is a thousand times as stiff.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from .contact_forces import FORCES
 
 
 class ContactPreconditioner:
-    """A Preconditioner of batches of one column; of wider ones it is the rest's alone.
+    """Preconditioner with contact for a single load case; for larger batches it is that of the undeformed mesh.
 
     Parameters
     ----------
     rest
-        Of the problem at rest.
+        Preconditioner of the undeformed problem.
     compliance
-        What that does at the nodes that can be touched.
+        Its compliance at the touchable nodes.
     barrier
-        What touches them.
+        Barrier of the tools.
     """
 
     on_device = False
@@ -41,13 +41,13 @@ class ContactPreconditioner:
         self._felt: tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Take D where the problem was last linearised."""
+        """Compute D where the problem was last linearised."""
         self._rest.prepare(problem, columns)
         self._felt = None
         if columns == 1:
             nodes, curvature = self._barrier.pressed()
             if 0 < len(nodes) <= FORCES.most:
-                # Threads of BLAS wait for one another, ages where something else runs on their cores.
+                # BLAS threads wait for one another, very long where other processes use their cores.
                 with limit_to_one_thread():
                     rows = (3 * nodes[:, None] + np.arange(3)).ravel()
                     own = self._compliance.between(np.isin(np.arange(len(self._compliance.rows) // 3), nodes))
@@ -55,7 +55,7 @@ class ContactPreconditioner:
                     self._felt = nodes, curvature, lu_factor(whole)
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """What the rest does, less what the touched nodes are kept from."""
+        """Apply the undeformed inverse, and subtract the Woodbury correction for the touched nodes."""
         self._rest.apply(r, live, out)
         if self._felt is not None:
             z, (nodes, curvature, whole) = out.numpy(), self._felt
@@ -69,9 +69,9 @@ class ContactPreconditioner:
 def build_contact_preconditioner(
     problem: Problem, rest: Preconditioner, contact: ContactDescent | None
 ) -> Preconditioner:
-    """Return a preconditioner that knows what tools touch: as `contact` does where that is, or beside another barrier.
+    """Build a preconditioner with the contact of tools, from `contact`, or from a tool barrier next to another one.
 
-    Where a skull lets go too, the rest counts it as half shut, and tools are as stiff as ever.
+    If the skull can separate too, the undeformed stiffness includes half of its contact stiffness.
     """
     if contact is not None:
         return ContactPreconditioner(rest, contact.compliance, contact.barrier)

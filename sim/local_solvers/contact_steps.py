@@ -1,6 +1,6 @@
-"""Steps of single columns under tools in fixed arrays, which CUDA replays as captured graphs.
+"""Contact steps of single load cases in fixed arrays, which CUDA replays as captured graphs.
 
-They are those of `contact_descent.py`, where all that is decided between them is decided.
+The steps are those of `contact_descent.py`, which makes all decisions between them.
 """
 
 from collections.abc import Callable
@@ -30,17 +30,17 @@ from .contact_structs import Ends
 from .press_kernel import press_of
 from .strained_part import StrainedModel
 
-# A product is divided among so many threads a row.
+# Threads that share one row of a matrix product.
 PARTS = 16
-# What goes up: how exact forces are to be, the drag, and the length of a step that was cut.
+# Slots of the input: tolerance of the tools' forces, proximal coefficient, length of a shortened step; their number.
 TOLERANCE, DRAG, LENGTH, GIVEN = 0, 1, 2, 3
-# What comes down.
+# Slots of the output: status, step length, predicted decrease, slope, largest square norm, sums; their number.
 STATUS, TRIED, PROMISED, AHEAD, LOUD, WHOLE_SUM, FREE_SUM, SAID = range(8)
 
 
 @dataclass(frozen=True)
 class ContactStepKernels:
-    """What stands between products, in one scalar type."""
+    """Kernels between the matrix products of a step, in one scalar type."""
 
     look: wp.Kernel
     change: wp.Kernel
@@ -51,7 +51,7 @@ class ContactStepKernels:
 
 @cache
 def build_kernels(device: Device) -> ContactStepKernels:
-    """Kernels of a device's scalar type, for one column."""
+    """Build the kernels for a device's scalar type, for one load case."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -64,7 +64,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         here: wp.array2d(dtype=wp.float64),
         there: wp.array2d(dtype=wp.float64),
     ):
-        """Where nodes are, and where they would go under the forces that are known."""
+        """Compute the present positions of nodes, and those under the known forces."""
         i = wp.tid()
         here[i, 0] = wp.float64(u[rows[i], 0])
         there[i, 0] = here[i, 0] - wp.float64(rest[rows[i], 0]) - wp.float64(more[i, 0])
@@ -76,7 +76,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """By how much forces have changed."""
+        """Compute the change of the forces."""
         i = wp.tid()
         out[i, 0] = scalar(found[i, 0] - force[i, 0])
 
@@ -86,7 +86,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         # outputs
         length: wp.array(dtype=scalar),
     ):
-        """The length that is given."""
+        """Read the step length from the input."""
         length[0] = scalar(given[LENGTH])
 
     @forward_kernel(module="unique")
@@ -96,7 +96,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_rows(i) += f_i."""
+        """Add forces to their rows: out_rows(i) += f_i."""
         i = wp.tid()
         out[rows[i], 0] += scalar(force[i, 0])
 
@@ -111,7 +111,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """All that the host wants to know."""
+        """Write the results for the host to one array."""
         out[STATUS] = wp.float64(status[0])
         out[TRIED] = wp.float64(length[0])
         out[PROMISED] = -promised[0]
@@ -127,9 +127,9 @@ def build_kernels(device: Device) -> ContactStepKernels:
 
 
 def read_step_result(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Length, slope ahead [J], free force [N] and its scale [N] of a step, (1,) each, of what `ContactSteps` said.
+    """Return length, slope ahead [J], residual [N] and its scale [N] of a step, (1,) each, from `ContactSteps` output.
 
-    square (1,) is as `Judge` has it.
+    `square` (1,) is `Judge.square`.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         free = np.sqrt(said[[FREE_SUM]])
@@ -139,16 +139,16 @@ def read_step_result(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, 
 
 
 class ContactSteps:
-    """One column's steps, in arrays that stay. Where it is may be written to between steps, by the views of `hold`.
+    """Contact steps of one load case, in fixed arrays. The views of `hold` may be written to between steps.
 
     Parameters
     ----------
     problem, preconditioner
-        As a `ContactDescent` has them.
+        As in `ContactDescent`.
     barrier
-        The problem's.
+        Tool barrier of the problem.
     compliance
-        At the nodes that can be touched, all known, and at others after them.
+        Compliance at the touchable nodes, all computed, and at other nodes after them.
     size
         Rows 3k of the largest model of strained tissue.
     """
@@ -191,7 +191,7 @@ class ContactSteps:
         self._graphs: dict[str, wp.Graph] = {}
 
     def load(self, model: StrainedModel) -> None:
-        """Know strained tissue as a model of one column does."""
+        """Load a model of strained tissue for one load case."""
         for array in (self._nodes, self._matrix, self._model.own):
             array.zero_()
         if model.wide:
@@ -201,26 +201,26 @@ class ContactSteps:
             view(self._model.own)[:] = model.own
 
     def aim(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
-        """Solve for the tools' forces under a proximal term, and their direction and longest step: `SAID` numbers.
+        """Solve for the tools' forces with a proximal term, their direction and longest step: (`SAID`,) results.
 
-        The model need not be convex where it is `bent`. Where no forces were `FOUND` all else means nothing. What is
-        returned is written over by what comes next.
+        With `bent` the model need not be convex. If the status is not `FOUND`, the other results are invalid. The
+        returned array is overwritten by the next call.
         """
         self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, drag
         ends = allocate_ends(BENT if bent else FORCES, FORCES.few)
         return self._run("bent" if bent else "aim", lambda: self._aim(ends))
 
     def again(self, length: float) -> np.ndarray:
-        """Return the same of a shorter step."""
+        """Evaluate a shorter step; return its results."""
         self._up.numpy()[LENGTH] = length
         return self._run("again", self._again)
 
     def move_to_last_step(self) -> None:
-        """Go where the last step led."""
+        """Accept the last step."""
         self._run("accept", self._accept)
 
     def set_tools(self, constant: wp.array) -> bool:
-        """Tools are where the problem has them, beside constant gradients (3N, 1) [N]; False where there is none."""
+        """Load the tools' poses from the problem, and constant gradients (3N, 1) [N]; False if there are no tools."""
         reduction = self._barrier.reduced(np.zeros(1, int))
         if reduction is None:
             return False
@@ -230,7 +230,7 @@ class ContactSteps:
         return True
 
     def hold(self, now: ContactState, force: Any, rest: Any) -> tuple[ContactState, Any, Any, Any]:
-        """Begin at a state under forces, where the body at rest moves so: views on what stands still, and on `x`."""
+        """Load a state, forces, and linear response; return views on them, and on the direction `x`."""
         here = [view(array) for array in (self._u, self._smooth, self._whole, self._force, self._rest, self._x)]
         for mine, its in zip(here, (now.u, now.smooth, now.whole, force, rest), strict=False):
             mine[:] = its
@@ -290,7 +290,7 @@ class ContactSteps:
         self._try()
 
     def _try(self) -> None:
-        """Take the step, see what is out of balance there, and how the body at rest would move under it."""
+        """Evaluate the trial step: its residual, and the linear response to it."""
         device, problem, k = self._device, self._problem, build_kernels(self._device)
         inputs = [self._u, self._length, self._x]
         device.launch(columns_kernels_of(device).combine, self._u.shape, inputs, [self._new_u])
@@ -319,24 +319,24 @@ class ContactSteps:
             wp.copy(to, new)
 
     def _press(self) -> None:
-        """What the model adds under the motions near the tools."""
+        """Multiply the motions near the tools by the matrix of the model."""
         self._own.zero_()
         inputs = [self._matrix, self._nodes, self._near]
         dim = (PARTS, 1, self._matrix.shape[2])
         self._device.launch(press_of(self._device, wp.float64, wp.float64, PARTS), dim, inputs, [self._own])
 
     def _give(self, force: wp.array, out: wp.array, rows: int) -> None:
-        """Add to the first `rows` how they move under forces."""
+        """Add the motion under forces to the first `rows` of `out`."""
         inputs = [self._compliance, self._every, force]
         self._device.launch(press_of(self._device, wp.float64, wp.float64, PARTS), (PARTS, 1, rows), inputs, [out])
 
     def _answered(self, out: wp.array) -> None:
-        """How the body at rest moves under the pull."""
+        """Compute the linear response of the undeformed mesh to the forces in `_pull`."""
         self._problem.constraint.project_nodes(self._pull)
         self._preconditioner.apply(self._pull, self._live, out)
         self._problem.constraint.project_nodes(out)
 
     def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:
-        """So many numbers on the device, and as many on the host, from where a card reads without asking."""
+        """Allocate `count` values on the device, and as many in pinned host memory for direct transfer."""
         there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
         return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

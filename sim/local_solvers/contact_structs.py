@@ -1,18 +1,18 @@
-"""What the kernel that finds tools' forces is given, and what it needs meanwhile."""
+"""Structs and status codes of the kernel for contact forces."""
 
 import warp as wp
 
 OPEN, FOUND, NONE, CROWDED, UNKNOWN = (wp.constant(number) for number in range(5))
-"""What a column is: to be done, found, without an equilibrium, with too many touched nodes, or lacking a compliance."""
+"""Status of a load case: open; solved; no equilibrium; too many touched nodes; compliance not yet computed."""
 
 
 @wp.struct
 class ComplianceModel:
-    """How nodes give way: the compliance at rest, transposed (3n, 3n), and what b columns have learnt since.
+    """Compliance of nodes: that of the undeformed mesh, transposed (3n, 3n), and the updates of b load cases.
 
-    `known` (n,): whether a node's column is; `learnt` (b, p, 3n), `middle` (b, p, p). `own` (b, 3n, 3n) is what
-    strained tissue changes of the compliance, or (b, 0, 0). One between touched nodes is `rounded`: that share of its
-    mean makes it definite.
+    `known` (n,): 1 if a node's column is computed. L-BFGS update: `learnt` (b, p, 3n), `middle` (b, p, p). `own`
+    (b, 3n, 3n) is the change by strained tissue, or (b, 0, 0). `rounded` is the shift of the matrix between touched
+    nodes, relative to its mean diagonal, that makes it positive definite.
     """
 
     rest: wp.array2d(dtype=wp.float64)
@@ -25,7 +25,7 @@ class ComplianceModel:
 
 @wp.struct
 class Ends:
-    """When it ends: as `contact_forces.ForceLimits`, and with room for so many touched nodes."""
+    """Limits of the iteration, as `contact_forces.ForceLimits`; `room` is the capacity for touched nodes."""
 
     iterations: wp.int32
     cuts: wp.int32
@@ -35,10 +35,10 @@ class Ends:
 
 @wp.struct
 class Scratch:
-    """What b columns need meanwhile; n nodes, m touched ones at most.
+    """Scratch arrays of b load cases; n nodes, at most m touched ones.
 
-    `forces`, .., `held`: (3n, b). `place`, `acts` (n, b): where a node stands in `touched`, `acting` (b, n).
-    `counts` (b, 2): of both lists. Matrices (b, 3m, 3m), vectors (b, 3m).
+    `force`, .., `held`: (3n, b). `place`, `acts` (n, b): index of a node in `touched`, `acting` (b, n), or -1.
+    `counts` (b, 2): lengths of both lists. Matrices (b, 3m, 3m), vectors (b, 3m).
     """
 
     force: wp.array2d(dtype=wp.float64)

@@ -1,7 +1,7 @@
-"""The outer loop of nonlinear elimination: local problem, whole body, local problem, until the whole is in equilibrium.
+"""Outer loop of nonlinear elimination: local subproblem and whole problem alternate until equilibrium.
 
-Cai, Keyes 2002, "Nonlinearly preconditioned inexact Newton algorithms", SIAM J. Sci. Comput. 24:183-200. What one cycle
-does is the local solver's own; when cycles end is decided here, for each column of a batch by itself.
+Cai, Keyes 2002, "Nonlinearly preconditioned inexact Newton algorithms", SIAM J. Sci. Comput. 24:183-200. The local
+solver defines one cycle; this module decides for each load case of a batch when cycles end.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from ..runtime.columns import scatter_columns
 
 @dataclass(frozen=True)
 class CycleLimits:
-    """When cycles end, and how exactly each solves its local problem.
+    """Limits of the cycles, and accuracy of the local solution.
 
     Parameters
     ----------
     cycles
-        Most.
+        Maximum number of cycles.
     patience
-        A column whose free force was not halved in so many cycles is left to another solver.
+        Cycles within which the residual must be halved; otherwise another solver takes over.
     rise
-        Hard loads pass through states whose free force is so many times the start's. Beyond that they have exploded.
+        Largest residual relative to the start's. Strong loads pass through large residuals; beyond this they diverge.
     forcing, enough
-        The local problem is solved to this share of the whole free force, or of the tolerance: more would not be felt.
+        Residual of the local solution: fraction of the whole residual, or of the tolerance if larger.
     """
 
     cycles: int = 20
@@ -42,18 +42,18 @@ class CycleLimits:
     enough: float = 0.3
 
 
-USUAL = CycleLimits()
+USUAL = CycleLimits()  # Default.
 Cycle = Callable[[Judge, ResidualState, np.ndarray], ResidualState]
-"""The next states (b columns), of these; the local problem may keep free forces (b,) [N]. A column that finds no way
-on has a free force that is not finite."""
+"""Function that returns the next states of b load cases; the local solution may keep residuals (b,) [N]. A load case
+without an accepted step gets a residual that is not finite."""
 
 
 def run_cycles(
     problem: Problem, start: wp.array, tolerance: np.ndarray, most: int, limits: CycleLimits, cycle: Cycle
 ) -> Descended:
-    """Go on from start (3N, b) [m], as `Lbfgs.descend`, in at most `most` cycles; nothing is learnt.
+    """Iterate from start (3N, b) [m], as `Lbfgs.descend`, in at most `most` cycles; returns no L-BFGS history.
 
-    Each column is left where its free force was least, or where it came within its tolerance (b,).
+    Each load case ends in the state with its smallest residual, or within its tolerance (b,).
     """
     device, count = problem.device, start.shape[1]
     judge = build_judge(problem, start)
@@ -63,7 +63,7 @@ def run_cycles(
     last = min(limits.cycles, most)
     for number in range(last + 1):
         sane = now.finite & ~(now.free > limits.rise * first[live])
-        # Forces that explode lower the relative residual.
+        # Diverging forces raise the scale, and so lower the relative residual.
         done = sane & (now.free <= first[live]) & (now.relative <= tolerance[live])
         better = done | (sane & (now.free <= np.fmin(first, least)[live]))
         scatter_columns(device, now.u, live[better], result, np.flatnonzero(better))

@@ -1,4 +1,4 @@
-"""The kernel that multiplies motions of some nodes by a symmetric matrix between them."""
+"""Kernel that multiplies motions of some nodes by a symmetric matrix between them."""
 
 from functools import cache
 from typing import Any
@@ -10,9 +10,9 @@ from ..runtime.device import Device, forward_kernel
 
 @cache
 def press_of(device: Device, entry: Any, number: Any, parts: int = 1) -> wp.Kernel:
-    """Return the kernel that multiplies by each column's matrix, over (part, column, row).
+    """Build the kernel that multiplies by each load case's matrix, over (part, load case, row).
 
-    `entry` and `number` are the types of the matrix and of its products; a row is divided among so many threads.
+    `entry` and `number` are the types of the matrix and of its products; `parts` threads share a row.
     """
     scalar = device.scalar
 
@@ -24,7 +24,7 @@ def press_of(device: Device, entry: Any, number: Any, parts: int = 1) -> wp.Kern
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out = E M E' motion; M is symmetric, and read along its columns."""
+        """Add E M E' motion to out; M is symmetric, and read along its columns."""
         part, c, i = wp.tid()
         count = matrix.shape[2]
         chunk = (count + parts - 1) // parts

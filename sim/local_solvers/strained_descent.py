@@ -1,9 +1,9 @@
-"""Single loads on the CPU: L-BFGS from a stiffness that knows which tissue is strained, and how stiff it is there.
+"""L-BFGS for single loads on the CPU, from a stiffness that includes the strain stiffening of tissue.
 
     (K0 + E D E')^-1 g = z - H E (1 + D C)^-1 D E' z,    z = H g,    H = K0^-1,  C = E' H E
 
-Woodbury 1950, with D as in `strained_part.py`. From the stiffness at rest alone L-BFGS takes four times as many steps.
-Tissue that was strained in one frame mostly is in the next, whose descent begins with the same D.
+Woodbury 1950, with D as in `strained_part.py`. From the undeformed stiffness L-BFGS takes four times as many steps.
+Most tissue that is strained in one frame is strained in the next, whose descent begins with the same D.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from .batch_elimination import open_vertices
 from .strained_part import StrainedPart, StrainLimits
 
 SINGLE = StrainLimits(nodes=320, cut=np.inf)
-"""A single model takes its room from nobody, and need not be right everywhere: L-BFGS learns the rest."""
+"""Limits for a single model, which has all the memory, and may be incomplete: L-BFGS corrects the remainder."""
 
 
 @dataclass(frozen=True)
 class Renewal:
-    """When a model is made anew.
+    """Limits after which a model is recomputed.
 
     Parameters
     ----------
     served
-        One with which a descent ended in so many steps serves the next.
+        Maximum steps of a descent whose model is handed on to the next.
     evaluations
-        After so many that did not do, it is made where they led.
+        L-BFGS evaluations without convergence, after which the model is recomputed at the present state.
     """
 
     served: int = 4
@@ -50,10 +50,10 @@ class Renewal:
 
 @dataclass(frozen=True, eq=False)
 class StiffnessUpdate:
-    """What tissue is stiffer than at rest.
+    """Stiffness of strained tissue in excess of the undeformed one.
 
-    rows (n,) of the 3N; added (n, n) D [N/m]; factor (n, n) and pivots (n,) of 1 + D C, as LAPACK has them. All but the
-    rows in single precision.
+    rows (n,) of the 3N; added (n, n) D [N/m]; factor (n, n) and pivots (n,) of 1 + D C, from LAPACK. Matrices are in
+    single precision.
     """
 
     rows: np.ndarray
@@ -62,20 +62,21 @@ class StiffnessUpdate:
     pivots: np.ndarray
 
     def pull(self, motion: np.ndarray) -> np.ndarray:
-        """Return forces (n,) [N] that a motion (3N,) [m] of the body at rest misses."""
+        """Compute the correcting forces (n,) [N] for a linear response (3N,) [m] of the undeformed mesh."""
         return -lu_solve((self.factor, self.pivots), self.added @ motion[self.rows], check_finite=False)
 
     @property
     def learnt(self) -> dict[str, np.ndarray]:
-        """As an answer's `warm` has it."""
+        """Entries for the `warm` data of a solution."""
         return {name: getattr(self, field)[None] for field, name in LEARNT.items()}
 
 
+# Keys of warm-start data, by field of `StiffnessUpdate`.
 LEARNT = {field: f"stiffening's {field}" for field in ("rows", "added", "factor", "pivots")}
 
 
 class StiffenedPreconditioner:
-    """A Preconditioner of single columns: a factor of the rest stiffness, and what was stiffer than at rest."""
+    """Preconditioner of single load cases: factor of the undeformed stiffness, with the update of strained tissue."""
 
     on_device = False
 
@@ -84,10 +85,10 @@ class StiffenedPreconditioner:
         self.stiffening: StiffnessUpdate | None = None
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Both serve every state."""
+        """Do nothing: factor and update are valid for every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """A sweep of the factor, and another one for what that misses, unless the whole would not be positive there."""
+        """Apply the factor, then the Woodbury correction, unless this would not give a descent direction."""
         self._rest.apply(r, live, out)
         if self.stiffening is None:
             return
@@ -103,16 +104,16 @@ class StiffenedPreconditioner:
 
 
 class StrainedDescent:
-    """A descent for single loads on one problem, on the CPU.
+    """Solver for single loads on one problem, on the CPU.
 
     Parameters
     ----------
     problem, factor
-        The whole body, and its rest stiffness.
+        Whole problem, and the factor of its undeformed stiffness.
     part
-        Finds what is strained.
+        Finder of strained tissue.
     renewal
-        When a model is made anew.
+        Limits after which a model is recomputed.
     """
 
     def __init__(self, problem: Problem, factor: Factor, part: StrainedPart, renewal: Renewal = Renewal()):
@@ -123,7 +124,7 @@ class StrainedDescent:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """As `Lbfgs.descend`, of one column; what is learnt is the model. The first takes half a second to prepare."""
+        """Solve as `Lbfgs.descend`, for one load case; `learnt` is the model. The first call takes 0.5 s to prepare."""
         self._part.prepare()
         u, left, steps = start, most, 0
         self._preconditioner.stiffening = self.known(learnt) or self._stiffening(u)
@@ -140,7 +141,7 @@ class StrainedDescent:
         return replace(found, steps=np.array([steps]), learnt=stiffening.learnt if stiffening and serves else {})
 
     def _stiffening(self, u: wp.array) -> StiffnessUpdate | None:
-        """At u (3N, 1) [m]; None where nothing is strained."""
+        """Compute the update at u (3N, 1) [m]; None if no tissue is strained."""
         found = self._part.stiffening(u, np.arange(1))
         if found is None or not found[0].shape[1]:
             return None
@@ -156,7 +157,7 @@ class StrainedDescent:
             return StiffnessUpdate(compliance.rows[place], added, *lu_factor(system, True, check_finite=False))
 
     def known(self, learnt: Mapping[str, np.ndarray] | None) -> StiffnessUpdate | None:
-        """What an earlier descent of this problem left warm; None if that does not fit."""
+        """Read the update of an earlier descent of this problem from warm-start data; None if it does not fit."""
         if learnt is None or any(name not in learnt for name in LEARNT.values()):
             return None
         rows, added, factor, pivots = (np.asarray(learnt[name]) for name in LEARNT.values())
@@ -176,7 +177,7 @@ class StrainedDescent:
 def build_strained_part(
     problem: Problem, preconditioner: Preconditioner, space: Discretisation, strains: StrainLimits = SINGLE
 ) -> StrainedPart:
-    """On a body with a small opening: models have the nodes that are nearest to it."""
+    """Build the finder of strained tissue for a mesh with a small opening: models use the nodes nearest to it."""
     distance, _ = KDTree(space.nodes[open_vertices(space, problem.constraint)]).query(space.nodes)
     near = np.sort(np.argsort(distance, kind="stable")[: strains.near])
     return StrainedPart(problem, Compliance(problem, preconditioner, near), 0, strains)

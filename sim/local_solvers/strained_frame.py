@@ -1,6 +1,6 @@
-"""What live frames on a device know of strained tissue: a model in fixed arrays, which is made anew between frames.
+"""Model of strained tissue for live frames on a device: fixed arrays, recomputed between frames.
 
-As `strained_descent.py` has it, but with the matrix M = -(1 + D C)^-1 D at hand: a captured graph multiplies by it.
+It is that of `strained_descent.py`, with the matrix M = -(1 + D C)^-1 D explicit: a captured graph multiplies by it.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from ..runtime.views import cast_like, get_library, run_in_order, solve_dense, t
 from .press_kernel import press_of
 from .strained_part import StrainedPart
 
-# Names in an answer's `warm`.
+# Keys of warm-start data.
 NODES, MATRIX = "bent nodes", "bent matrix"
-# A product is divided among so many threads a row.
+# Threads that share one row of a matrix product.
 PARTS = 16
 
 
 @dataclass(frozen=True, eq=False)
 class UpdatedModel:
-    """A model on the device, to which nobody writes: nodes (1, n) of all, matrix (1, 3n, 3n) float32 M [N/m].
+    """Model on the device, never modified: nodes (1, n) of the mesh, matrix (1, 3n, 3n) float32 M [N/m].
 
-    Zeros fill what is not needed.
+    Unused entries are zero.
     """
 
     nodes: wp.array
@@ -38,16 +38,14 @@ class UpdatedModel:
 
     @property
     def learnt(self) -> dict[str, np.ndarray]:
-        """As an answer's `warm` has it."""
+        """Entries for the `warm` data of a solution."""
         return {NODES: self.nodes.numpy(), MATRIX: self.matrix.numpy()}
 
 
 def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel | None:
-    """Return the model at u (3N, 1) [m], which the problem has begun, of a part that is prepared.
+    """Compute the model at u (3N, 1) [m], which the problem has begun, of a prepared part.
 
-    None where there is none.
-
-    A card is not waited for.
+    None if strained tissue does not fit. The host does not wait for the GPU.
     """
     with run_in_order(device):
         found = part.stiffening(u, np.arange(1), full=True)
@@ -71,7 +69,7 @@ def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedM
 
 
 def restore_updated_model(warm: Mapping[str, np.ndarray], device: Device, count: int, size: int) -> UpdatedModel | None:
-    """What an answer on so many nodes left warm; None if there is nothing, or it does not fit models of 3n = `size`."""
+    """Read a model for `count` nodes from warm-start data; None if there is none, or it does not have 3n = `size`."""
     if NODES not in warm or MATRIX not in warm:
         return None
     nodes, matrix = np.asarray(warm[NODES]), np.asarray(warm[MATRIX])
@@ -83,14 +81,14 @@ def restore_updated_model(warm: Mapping[str, np.ndarray], device: Device, count:
 
 
 class UpdatedPreconditioner:
-    """A Preconditioner of single columns: the rest's, and what the model in its arrays adds.
+    """Preconditioner of single load cases: that of the undeformed mesh, with the update of the loaded model.
 
     Parameters
     ----------
     rest
-        The inverse of the rest stiffness.
+        Inverse of the undeformed stiffness.
     problem
-        Whose it is.
+        Problem of this stiffness.
     size
         Rows 3n of the models.
     """
@@ -103,7 +101,7 @@ class UpdatedPreconditioner:
         self._pull, self._more = (problem.device.zeros(problem.rows, 1) for _ in range(2))
 
     def load(self, bent: UpdatedModel | None) -> None:
-        """Take another model, or none."""
+        """Load another model, or none."""
         if bent is None:
             self._matrix.zero_()
         else:
@@ -111,11 +109,11 @@ class UpdatedPreconditioner:
             wp.copy(self._matrix, bent.matrix)
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """As the rest."""
+        """Prepare the preconditioner of the undeformed mesh."""
         self._rest.prepare(problem, columns)
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """The rest's twice: of a force, and of what the model adds to it."""
+        """Apply the undeformed inverse to r, and again to the forces that the model adds."""
         device = self._problem.device
         self._rest.apply(r, live, out)
         self._pull.zero_()

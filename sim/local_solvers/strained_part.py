@@ -1,9 +1,9 @@
-"""A model that is right where tissue is strained: there as stiff as it is now, elsewhere as at rest.
+"""Model of the inverse stiffness with strained tissue: tangent stiffness there, undeformed stiffness elsewhere.
 
     (K0 + E D E')^-1 = H + H E M E' H,    M = -(1 + D C)^-1 D,    H = K0^-1,  C = E' H E:
 
-Woodbury 1950. D is by how much strained elements are stiffer than at rest, on their nodes alone. K0 takes tissue under
-a deep press for a third as stiff as it is, and a step that follows K0 goes three times too far.
+Woodbury 1950. D is the excess of the tangent stiffness of strained elements over the undeformed one, on their nodes
+alone. Under a deep press K0 has a third of the true stiffness, and a step with K0 is three times too long.
 """
 
 from __future__ import annotations
@@ -34,25 +34,24 @@ from .press_kernel import press_of
 
 @dataclass(frozen=True)
 class StrainLimits:
-    """Which tissue counts as strained.
+    """Limits of a model of strained tissue.
 
     Parameters
     ----------
     least
-        |H|, H the displacement gradient: tissue that is strained less is as stiff as at rest.
+        |H|, H the displacement gradient: below it the undeformed stiffness is used.
     nodes
-        Most nodes that have it, those with the largest |H| first.
+        Maximum number of nodes of a model, those with the largest |H| first.
     cut
-        Where the room leaves out tissue that is strained by more than this there is no model: it would be right in
-        patches only.
+        If nodes beyond this number are strained more than this, there is no model: it would be incomplete.
     near
-        Most nodes that are looked at: those that can be touched, and the nearest to them. Their compliance has three
-        times as many rows.
+        Maximum number of candidate nodes: the touchable ones, and the nearest to them. Their compliance has three times
+        as many rows.
     columns
-        Wider batches have no models, but learn from their steps. They are not faster with them: a launch lasts as long
-        as its slowest column, and the better model makes the forces of tools harder to find.
+        Largest batch with models; larger ones use L-BFGS pairs. Models would not be faster there: a launch lasts as
+        long as its slowest load case, and the better model makes contact forces harder to solve for.
     bytes
-        Of the matrices that are inverted at once.
+        Memory of the matrices inverted at once [bytes].
     """
 
     least: float = 0.15
@@ -63,17 +62,17 @@ class StrainLimits:
     bytes: int = 2**31
 
 
-STRAINS = StrainLimits()
+STRAINS = StrainLimits()  # Default.
 ON_CARD = StrainLimits(least=0.1, nodes=480, cut=0.5, near=1600)
-"""A card inverts a larger model in less time than the steps take that it spares."""
+"""Limits on a GPU, which inverts a larger model in less time than the saved steps take."""
 
 
 @dataclass(frozen=True, eq=False)
 class StrainedModel:
-    """What b columns have beside the rest: arrays of `views.library`.
+    """Models of b load cases, as updates of the undeformed compliance: arrays of `views.get_library`.
 
-    nodes (b, k) are places in the compliance, matrix (b, 3k, 3k) is M [N/m], of zeros where a column has fewer nodes.
-    own (b, 3n, 3n) [m/N] is what it changes of the compliance between the n nodes that can be touched.
+    nodes (b, k) are indices into the compliance, matrix (b, 3k, 3k) is M [N/m], zero where a load case has fewer nodes.
+    own (b, 3n, 3n) [m/N] is the change of the compliance between the n touchable nodes.
     """
 
     nodes: Any
@@ -82,24 +81,24 @@ class StrainedModel:
 
     @property
     def wide(self) -> bool:
-        """Whether any column has strained nodes."""
+        """True if any load case has strained nodes."""
         return self.nodes.shape[1] > 0
 
     @property
     def bent(self) -> np.ndarray:
-        """Which columns (b,) have."""
+        """True (b,) where a load case has strained nodes."""
         return to_host((self.matrix != 0.0).any(-1).any(-1))
 
     def rows(self, columns: np.ndarray) -> StrainedModel:
-        """Of some columns (k,)."""
+        """Return the models of some load cases (k,)."""
         return StrainedModel(self.nodes[columns], self.matrix[columns], self.own[columns])
 
     def forget(self, columns: np.ndarray) -> None:
-        """Of some columns (k,) only the rest is left."""
+        """Reset the models of some load cases (k,) to the undeformed stiffness."""
         self.matrix[columns], self.own[columns] = 0.0, 0.0
 
     def merge_columns(self, columns: np.ndarray, other: StrainedModel) -> StrainedModel:
-        """With another model's as some columns (k,)."""
+        """Return the models with those of some load cases (k,) replaced by another's."""
         most = max(self.nodes.shape[1], other.nodes.shape[1])
         mine, its = self._widened(most), other._widened(most)
         for one, two in ((mine.nodes, its.nodes), (mine.matrix, its.matrix), (mine.own, its.own)):
@@ -107,13 +106,13 @@ class StrainedModel:
         return mine
 
     def _widened(self, most: int) -> StrainedModel:
-        """With places for so many nodes."""
+        """Return the models with capacity for `most` nodes."""
         missing = most - self.nodes.shape[1]
         nodes, matrix = pad_zeros(self.nodes, (missing,)), pad_zeros(self.matrix, (3 * missing, 3 * missing))
         return StrainedModel(nodes, matrix, self.own)
 
     def pressed(self, device: Device, motion: wp.array) -> wp.array:
-        """E M E' motion (3n, b) [N], of motions (3n, b) [m] of the nodes of the compliance."""
+        """Compute E M E' motion (3n, b) [N] of motions (3n, b) [m] of the compliance's nodes."""
         out, (count, size) = wp.zeros_like(motion), self.matrix.shape[:2]
         inputs = [from_view(device, self.matrix), from_view(device, self.nodes), motion]
         device.launch(press_of(device, wp.float64, wp.float64), (1, count, size), inputs, [out])
@@ -121,9 +120,9 @@ class StrainedModel:
 
 
 def choose_strained(device: Device, strain: Any, least: float, most: int) -> tuple[Any, Any, Any]:
-    """Of strains (n, b) the `most` rows of each column that are largest, and above the `least`: ascending, (m, b).
+    """Choose the `most` rows of each load case with the largest strains (n, b) above `least`: ascending, (m, b).
 
-    n stands where a column has fewer. With them the limit (b,) that they lie above, and how many they are (b,).
+    n marks unused places. Return also the strain (b,) above which rows are chosen, and their number (b,).
     """
     lib, count = get_library(device), len(strain)
     columns, order = to_library(device, np.arange(strain.shape[1])), order_by_size(strain)
@@ -135,18 +134,18 @@ def choose_strained(device: Device, strain: Any, least: float, most: int) -> tup
 
 
 class StrainedPart:
-    """Makes models for the columns of one problem.
+    """Builder of models of strained tissue for one problem.
 
     Parameters
     ----------
     problem
-        Whose body it is.
+        Problem of the tissue.
     compliance
-        At the nodes near what can be touched: those that can be come first.
+        Compliance at the touchable nodes, followed by the nearest others.
     touchable
-        How many these are.
+        Number of touchable nodes.
     strains
-        Which tissue counts as strained.
+        Limits of a model.
     """
 
     def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: StrainLimits = STRAINS):
@@ -161,19 +160,19 @@ class StrainedPart:
         self._elements = [(term, device.array(some, wp.int32)) for term, some in found]
 
     def model(self, u: wp.array, columns: np.ndarray) -> StrainedModel | None:
-        """Of some columns (k,) of those at u (3N, b) [m], which the problem has begun; None where there is none."""
+        """Build models of load cases (k,) of the begun batch at u (3N, b) [m]; None if strained tissue does not fit."""
         found = self.stiffening(u, columns)
         return None if found is None else self._bent(*found)
 
     def prepare(self) -> None:
-        """Find how all nodes give way to forces on each of them, unless that is known."""
+        """Compute the compliance at all nodes, unless that is done."""
         self.compliance.ensure_known(np.ones(len(self.compliance.nodes), bool))
 
     def stiffening(self, u: wp.array, columns: np.ndarray, full: bool = False) -> tuple[Any, Any] | None:
-        """Places in the compliance (k, n) of the nodes that are strained most, and D (k, 3n, 3n) [N/m] between them.
+        """Select the most strained nodes, as indices into the compliance (k, n); assemble their D (k, 3n, 3n) [N/m].
 
-        D has zeros where a column has fewer nodes. If it is to be `full`, n is the most that there may be, and a card
-        is not waited for. None where the room leaves out what is strained by more than `cut`.
+        D is zero where a load case has fewer nodes. With `full`, n is the maximum, and the host does not wait for the
+        GPU. None if tissue that does not fit is strained more than `cut`.
         """
         device, count, strains = self._problem.device, len(columns), self._strains
         picked = device.array(columns, wp.int32)
@@ -196,15 +195,15 @@ class StrainedPart:
         return cast_like(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
 
     def soft(self, rows: Any) -> Any:
-        """C (b, n, n) [m/N] between some rows (b, n) of the compliance, which are known: symmetric."""
+        """Return C (b, n, n) [m/N] between some computed rows (b, n) of the compliance, symmetrised."""
         between = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
         return 0.5 * (between + between.mT)
 
     def _bent(self, nodes: Any, stiffer: Any) -> StrainedModel:
-        """Of D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
+        """Build models from D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
         self.prepare()
         device, count, size = self._problem.device, len(nodes), stiffer.shape[1]
-        # One more row and column take what is of nodes that cannot be touched.
+        # One more row and column collect the entries of nodes that cannot be touched.
         shape = count, 3 * self._touchable + 1, 3 * self._touchable + 1
         own = view(wp.zeros(shape, dtype=wp.float32, device=device.name))
         matrix, axes = 0.0 * stiffer, to_library(device, np.arange(3))
@@ -219,9 +218,9 @@ class StrainedPart:
             try:
                 found = get_library(device).linalg.solve(system, stiffer[some])
             except get_library(device).linalg.LinAlgError:
-                continue  # as stiff as at rest
+                continue  # keep the undeformed stiffness
             matrix[some] = -0.5 * (found + found.mT)
-            # Those that can be touched come first in every list of nodes.
+            # Touchable nodes come first in every list of nodes.
             most = 3 * int((nodes[some] < self._touchable).sum(-1).max())
             reach = soft[:, :, :most]
             place = rows[:, :most].clip(max=own.shape[1] - 1)

@@ -1,1 +1,1 @@
-"""Newton-CG, L-BFGS, line search, residuals and power series: they know no particular term."""
+"""Newton-CG, L-BFGS, line search, residuals and power series, independent of particular terms."""

@@ -1,8 +1,8 @@
-"""What L-BFGS learns of a curvature, added to the inverse that it began with.
+"""Compact representation of the L-BFGS inverse Hessian, relative to the initial inverse H0.
 
     H = H0 + [S, H0 Y] M [S, H0 Y]',    M = [[R^-T (D + Y' H0 Y) R^-1, -R^-T], [-R^-1, 0]],
 
-with steps S and changes Y of the gradient as columns, R the upper triangle of S' Y and D its diagonal. Byrd, Nocedal,
+with steps S and gradient changes Y as columns, R the upper triangle of S' Y and D its diagonal. Byrd, Nocedal,
 Schnabel 1994, "Representations of quasi-Newton matrices and their use in limited memory methods", Math. Program.
 63:129-156, theorem 2.2.
 """
@@ -22,7 +22,7 @@ from .lbfgs_kernels import PAIRS
 
 @dataclass(frozen=True, eq=False)
 class CurvaturePairs:
-    """s and w = H0 y (m, 3N), oldest first; products s_i . y_j and y_i . w_j (m, m)."""
+    """Curvature pairs of one load case: s, w = H0 y (m, 3N), oldest first; products s_i . y_j and y_i . w_j (m, m)."""
 
     s: np.ndarray
     w: np.ndarray
@@ -31,38 +31,38 @@ class CurvaturePairs:
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """M (2m, 2m)."""
+        """Middle matrix M (2m, 2m) of the compact representation."""
         return compute_middle(self.sy, self.yw)
 
     def weights(self, force: np.ndarray) -> np.ndarray:
-        """M [S, W]' force (2m,), of a force (3N,)."""
+        """Compute the coefficients M [S, W]' force (2m,) for a force (3N,)."""
         force = force.astype(self.s.dtype)
         return self.middle @ np.concatenate([self.s @ force, self.w @ force])
 
     def motion(self, weights: np.ndarray) -> np.ndarray:
-        """[S, W] weights (3N,)."""
+        """Compute the displacement [S, W] weights (3N,)."""
         some, others = np.split(weights.astype(self.s.dtype), 2)
         return some @ self.s + others @ self.w
 
     def add_pair(self, s: np.ndarray, y: np.ndarray, w: np.ndarray) -> CurvaturePairs:
-        """With a newer pair (3N,), and the oldest forgotten where there are too many."""
+        """Return the history with a newer pair (3N,) added; drop the oldest pair if there are more than `PAIRS`."""
         some = slice(max(0, len(self.s) - PAIRS + 1), None)
         steps, ways = (np.vstack([old[some], new.astype(old.dtype)]) for old, new in ((self.s, s), (self.w, w)))
         sy, yw = np.zeros((2, len(steps), len(steps)))
         sy[:-1, :-1], yw[:-1, :-1] = self.sy[some, some], self.yw[some, some]
-        # y . H0 y' = y' . H0 y: what the new change is worth along old ones, and old changes along the new step.
+        # y . H0 y' = y' . H0 y: products of the new change with old ones, and of old changes with the new step.
         sy[:, -1], yw[:, -1] = steps @ y.astype(steps.dtype), ways @ y.astype(steps.dtype)
         yw[-1] = yw[:, -1]
         return CurvaturePairs(steps, ways, sy, yw)
 
 
 def build_empty_history(rows: int, kind: str) -> CurvaturePairs:
-    """Nothing learnt yet of a column of `rows`, kept as numbers of a `kind`."""
+    """Build an empty L-BFGS history for one load case of `rows` unknowns, dtype `kind`."""
     return CurvaturePairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
 
 
 def compute_middle(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
-    """M (..., 2m, 2m) of products s_i . y_j and y_i . w_j (..., m, m), oldest first; pairs of zeros count nothing."""
+    """Compute the middle matrix M (..., 2m, 2m) from s_i . y_j and y_i . w_j (..., m, m); zero pairs have no effect."""
     upper, eye = np.triu(sy), np.eye(sy.shape[-1])
     own = np.diagonal(upper, axis1=-2, axis2=-1)[..., None] * eye
     inverse = np.linalg.inv(upper + np.where(own == 0.0, eye, 0.0))
@@ -71,42 +71,42 @@ def compute_middle(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
 
 
 class PairsOfColumns:
-    """The same for the b columns of a batch, each with pairs of its own, where the batch lives.
+    """L-BFGS histories of the b load cases of a batch, on the device of the batch.
 
     Parameters
     ----------
     device
-        Where that is.
+        Device of the arrays.
     rows, columns
-        3N and b.
+        Numbers of unknowns 3N and load cases b.
     """
 
     def __init__(self, device: Device, rows: int, columns: int):
         self._device = device
-        # Steps and w, and in host's numbers their products; pair i of a column stands in place i modulo PAIRS.
+        # s and w on the device, their products on the host in float64; pair i of a load case is in slot i modulo PAIRS.
         self._sw = view(device.zeros(columns * 2 * PAIRS, rows)).reshape(columns, 2 * PAIRS, rows)
         self._sy, self._yw = np.zeros((2, columns, PAIRS, PAIRS))
         self.count = np.zeros(columns, int)
         self._asked: tuple[np.ndarray, LbfgsHistory] | None = None
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these columns (k,): the others have left the batch."""
+        """Keep these load cases (k,): the others have left the batch."""
         self._asked = None
         self._sw = self._sw[columns]
         self._sy, self._yw, self.count = self._sy[columns], self._yw[columns], self.count[columns]
 
     def forget(self, columns: np.ndarray) -> None:
-        """Of some columns (k,) nothing is known any more."""
+        """Clear the history of some load cases (k,)."""
         self._asked = None
         self._sw[columns], self._sy[columns], self._yw[columns], self.count[columns] = 0.0, 0.0, 0.0, 0
 
     @property
     def most(self) -> int:
-        """How many pairs the column with the most of them has."""
+        """Largest number of pairs of any load case."""
         return min(int(self.count.max(initial=0)), PAIRS)
 
     def of(self, columns: np.ndarray) -> LbfgsHistory:
-        """What some columns (k,) have learnt; asked again, nothing is worked out again."""
+        """Return the history of some load cases (k,); a repeated call with the same ones returns the cached result."""
         if self._asked is not None and np.array_equal(self._asked[0], columns):
             return self._asked[1]
         order = (self.count[columns, None] + np.arange(PAIRS)) % PAIRS  # oldest first
@@ -121,12 +121,12 @@ class PairsOfColumns:
         return learnt
 
     def update_history(self, columns: np.ndarray, s: Any, y: Any, w: Any) -> None:
-        """A newer pair of some columns (k,): s, y and w (3N, k); the oldest is forgotten where there are too many."""
+        """Add a newer pair s, y, w (3N, k) of some load cases (k,), and drop the oldest pair beyond `PAIRS`."""
         self._asked = None
         place, some = self.count[columns] % PAIRS, select_columns(self._device, columns, len(self.count))
         own, at = to_library(self._device, columns), to_library(self._device, place)
         self._sw[own, at], self._sw[own, PAIRS + at] = s.T, w.T
-        # y . H0 y' = y' . H0 y: what the new change is worth along old ones, and old changes along the new step.
+        # y . H0 y' = y' . H0 y: products of the new change with old ones, and of old changes with the new step.
         change = cast_like(self._sw, y.T[:, :, None])
         worth = to_host(self._sw[some] @ change)[:, :, 0].astype(np.float64)
         self._sy[columns, place] = 0.0
@@ -137,15 +137,15 @@ class PairsOfColumns:
 
 @dataclass(frozen=True, eq=False)
 class LbfgsHistory:
-    """[S, W]' (k, 2m, 3N) and M (k, 2m, 2m) of k columns."""
+    """Compact L-BFGS representation of k load cases: [S, W]' (k, 2m, 3N) and the middle matrix M (k, 2m, 2m)."""
 
     sw: Any
     middle: Any
 
     def weights(self, force: Any) -> Any:
-        """M [S, W]' force (k, 2m, 1), of forces (3N, k) [N]."""
+        """Compute the coefficients M [S, W]' force (k, 2m, 1) for forces (3N, k) [N]."""
         return self.middle @ (self.sw @ force.T[:, :, None])
 
     def motion(self, weights: Any) -> Any:
-        """[S, W] weights (3N, k) [m]."""
+        """Compute the displacements [S, W] weights (3N, k) [m]."""
         return (weights.mT @ self.sw)[:, 0].T

@@ -1,8 +1,8 @@
-"""L-BFGS from the rest stiffness on a batch of load cases, steered where the numbers are: the host only counts.
+"""L-BFGS on a batch of load cases, with the undeformed stiffness as initial Hessian; decisions are made on the device.
 
-One iteration evaluates the gradient of every column at its own trial, accepts or cuts that, applies the preconditioner,
-and aims anew. The launches are always the same, so that a graphics card replays them as one captured graph. Between
-iterations the host drops the columns that have ended.
+One iteration evaluates the gradient of each load case at its own trial step, accepts the step or backtracks, applies
+the preconditioner and computes the next direction. The launches are always the same, so that a GPU replays them as one
+captured graph. Between iterations the host removes the load cases that have ended.
 """
 
 from __future__ import annotations
@@ -21,35 +21,34 @@ from ..runtime.columns import EXACT, find_workspace_width, scatter_columns
 from .lbfgs_kernels import LEFT, LIVE, PAIRS
 from .lbfgs_state import Workspace, allocate_ground
 
-# What a descent has learnt about the curvature, on the host, rows first: s and w (b, m, 3N), their products (b, m, m),
-# the newest pair and how many there are (b,).
+# L-BFGS history of a descent on the host, load cases first: s and w (b, m, 3N), products (b, m, m), slot of the newest
+# pair and number of pairs (b,).
 LEARNT = ("s", "w", "sy", "yw", "head", "known")
-# Learnt curvature travels with the answers of so few load cases: a larger batch has no next frame.
-CARRIED = EXACT
+CARRIED = EXACT  # Largest batch [load cases] that hands its history on: a larger one has no next frame.
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How often the host looks, and when columns that go on move to a narrower workspace.
+    """Interval of the host's checks, and when live load cases move to a narrower workspace.
 
     Parameters
     ----------
     between
-        Iterations between two looks.
+        Iterations between two checks.
     smaller
-        They move where that is at most this share as wide.
+        They move if the narrower width is at most this fraction of the present one.
     """
 
     between: int = 1
     smaller: float = 0.85
 
 
-ON_CUDA = Schedule(between=2, smaller=0.75)
+ON_CUDA = Schedule(between=2, smaller=0.75)  # A check stalls the GPU.
 
 
 @dataclass(frozen=True, eq=False)
 class Descended:
-    """u (3N, b) [m] on the device; (b,) on the host: status, accepted steps, relative residuals; what was `LEARNT`."""
+    """End of a descent: u (3N, b) [m] on the device; status, steps, relative residuals (b,) on the host; history."""
 
     u: wp.array
     status: np.ndarray
@@ -59,21 +58,21 @@ class Descended:
 
     @property
     def left(self) -> np.ndarray:
-        """(k,): columns whose descent did not end, and another may go on with."""
+        """Load cases (k,) that did not end, so that another method can continue them."""
         return np.flatnonzero((self.status == LIVE) | (self.status == LEFT))
 
 
 class Lbfgs:
-    """L-BFGS on one problem. What the widest batch worked in is kept for the next ones.
+    """L-BFGS on one problem. The memory of the widest batch is kept for later ones.
 
     Parameters
     ----------
     problem
-        Whose potential is minimised.
+        Problem whose potential is minimised.
     preconditioner
-        Of this problem at rest.
+        Preconditioner of this problem in the undeformed configuration.
     schedule
-        Of the host; None: as serves the device.
+        Checks by the host; None: default of the device.
     """
 
     def __init__(self, problem: Problem, preconditioner: Preconditioner, schedule: Schedule | None = None):
@@ -85,7 +84,7 @@ class Lbfgs:
 
     @property
     def held(self) -> int:
-        """Bytes that are kept."""
+        """Size of the memory that is kept [bytes]."""
         return sum(array.capacity for array in self._ground.values())
 
     def descend(
@@ -100,12 +99,12 @@ class Lbfgs:
     ) -> Descended:
         """Minimise the potential of the batch that the problem has begun, from start (3N, b) [m], in `most` iterations.
 
-        The start satisfies the constraints, and no footprint is moved. A column ends at its tolerance (b,), relative as
-        `Problem.residual` has it, or where the free gradient's 2-norm is at most force (b,) [N]. `learnt` is what an
-        earlier descent of the same problem found out, near here it is hoped, if any; None: the next one learns nothing
-        from this one either. The descent stops where at most the share `stragglers` of all columns is still on its way.
-        `ahead` is what is known of the start: the free gradient and, preconditioned, the same (3N, b). Every u is the
-        last accepted state of its column.
+        The start satisfies the constraints, and no footprint moves. A load case ends at its tolerance (b,), relative as
+        in `Problem.residual`, or where the 2-norm of the residual is at most force (b,) [N]. `learnt` is the history of
+        an earlier descent of the same problem near this state, if any; with None this descent returns no history
+        either. The descent stops when at most the fraction `stragglers` of all load cases is live. `ahead` holds the
+        residual at the start and its preconditioned form (3N, b), if they are available. Each returned u is the last
+        accepted state of its load case.
         """
         device, count = self._problem.device, start.shape[1]
         u, place = wp.clone(start), np.arange(count)
@@ -141,10 +140,10 @@ class Lbfgs:
                 workspace.take(before, stay)
 
     def _workspace(self, count: int) -> Workspace:
-        """For so many columns or a few more."""
+        """Return a workspace for `count` load cases or slightly more."""
         width = self._width(count)
         if width > max(self._workspaces, default=0):
-            self._workspaces, self._ground = {}, {}  # what is there is given back before more is taken
+            self._workspaces, self._ground = {}, {}  # free the old memory before more is allocated
             self._ground = allocate_ground(self._problem, width)
         if width not in self._workspaces:
             self._workspaces[width] = Workspace(self._problem, self._preconditioner, width, self._ground)
@@ -156,13 +155,13 @@ class Lbfgs:
 
 def to_rows_first(array: wp.array) -> np.ndarray:
     """Return a copy (b, ...) on the host of an array (..., b) in a workspace."""
-    return np.moveaxis(array.numpy(), -1, 0).copy()  # what stands in a workspace is written over
+    return np.moveaxis(array.numpy(), -1, 0).copy()  # the workspace will be overwritten
 
 
 def restore_history(cases: Cases, rows: int) -> dict[str, np.ndarray]:
-    """What an earlier descent on as many rows = 3N left warm; nothing if that does not fit these cases.
+    """Read the L-BFGS history of an earlier descent on `rows` = 3N unknowns; empty if it does not fit these cases.
 
-    It only shortens the way: what holds numbers that are not finite is forgotten.
+    The history only saves iterations, so one with values that are not finite is dropped.
     """
     if any(name not in cases.warm for name in LEARNT):
         return {}
@@ -175,7 +174,7 @@ def restore_history(cases: Cases, rows: int) -> dict[str, np.ndarray]:
         ((found[name] >= 0) & (found[name] <= last)).all() for name, last in most.items()
     ):
         return {}
-    # Other places hold whatever stood in the workspace.
+    # Other slots hold arbitrary values.
     used = (found["head"][:, None] - np.arange(PAIRS)) % PAIRS < found["known"][:, None]
     places = {"s": used, "w": used} | dict.fromkeys(("sy", "yw"), used[:, :, None] & used[:, None, :])
     return found if all(is_all_finite(found[name][place]) for name, place in places.items()) else {}

@@ -1,8 +1,8 @@
-"""The kernels of L-BFGS on many columns: what every load case does next is decided where its numbers are.
+"""Kernels of L-BFGS on many load cases; each kernel thread decides the next action of its load case on the device.
 
-Every pair (s, y) of a column, a step and the change of the gradient along it, is kept as s and w = M^-1 y, with M^-1
-the preconditioner. The two loops of Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4 then need inner
-products with s and w alone, and the direction is a sum of these. That is one pass over the pairs for each.
+Each curvature pair (s, y), a step and the change of the gradient along it, is stored as s and w = M^-1 y, with M^-1
+the preconditioner. The two-loop recursion of Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4 then needs
+inner products with s and w alone, and the direction is a linear combination of these: one pass over the pairs for each.
 """
 
 from dataclasses import dataclass
@@ -14,29 +14,27 @@ from ..runtime.columns import CHUNK
 from ..runtime.device import Device, forward_kernel
 
 LIVE, DONE, LEFT, BROKEN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
-"""What a column is: on its way, in equilibrium, not brought farther here, never finite."""
-# Pairs that each column keeps.
-PAIRS = 8
-# The slope ahead may rise to this share of the promised decrease: a step that overshoots more is cut.
-OVERSHOOT = 0.5
-# A cut keeps at least and at most this share of a step; one that left the numbers keeps the middle share.
-LEAST_KEPT, KEPT, MOST_KEPT = 0.1, 0.25, 0.7
-CUTS = 12
-# Rows, or nodes, that one thread takes, so that what it must know of their column is read once.
-SOME = 16
-# A pair along which the gradient hardly changes, or against the step, says nothing of a positive definite curvature.
+"""Status of a load case: iterating; converged; stopped without convergence; start not finite."""
+PAIRS = 8  # Curvature pairs (s, y) that each load case keeps.
+OVERSHOOT = 0.5  # A step is accepted if phi'(t) <= OVERSHOOT |phi'(0)|, with phi the energy along the direction.
+LEAST_KEPT = 0.1  # Backtracking factor: lower bound.
+KEPT = 0.25  # Backtracking factor where the trial is not finite.
+MOST_KEPT = 0.7  # Backtracking factor: upper bound.
+CUTS = 12  # Maximum number of backtracking steps in a row.
+SOME = 16  # Rows, or nodes, per thread, so that the data of their load case are read once.
+# Smallest change of the slope along a step, relative to |phi'(0)|, for a pair of positive curvature to be stored.
 LEAST_CURVATURE = 1e-3
-# Rows of sums that one evaluation gives each column.
+# Rows of `sums`: |g - constant|^2, |g|^2, |residual|^2, residual . d, with g the gradient.
 OWN, WHOLE, FREE, SLOPE = 0, 1, 2, 3
-SUMS = 4
-# Rows of products after the 2 m with the pairs.
+SUMS = 4  # Number of rows of `sums`.
+# Rows of `products` after the 2 m with the pairs: g' . z', g' . z, y . w.
 GZ, GOLD, YW = 0, 1, 2
-PRODUCTS = 3
+PRODUCTS = 3  # Number of these rows.
 
 
 @dataclass(frozen=True)
 class LbfgsKernels:
-    """Arithmetic of one scalar type and number of pairs."""
+    """L-BFGS kernels for one scalar type and number of pairs."""
 
     absorb: wp.Kernel
     multiply: wp.Kernel
@@ -47,13 +45,13 @@ class LbfgsKernels:
 
 
 def get_rows_per_thread(device: Device) -> int:
-    """Rows that one thread takes where it keeps much of each."""
+    """Return the rows per thread of a kernel that keeps several values of each row."""
     return 1 if device.on_cuda else 4
 
 
 @cache
 def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
-    """Kernels of a device's scalar type for columns that keep so many pairs."""
+    """Build the kernels for a device's scalar type and the number of pairs of a load case."""
     scalar = device.scalar
     several, few_scalars = (
         wp.types.vector(length=length, dtype=scalar) for length in (SOME, get_rows_per_thread(device))
@@ -73,7 +71,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         total: wp.array2d(dtype=scalar),
         square: wp.array(dtype=wp.float64),
     ):
-        """total += own, own = 0, and its square norm."""
+        """Add `own` to `total`, set it to zero, and add its squared norm to `square`."""
         block, c = wp.tid()
         squares = wp.float64(0.0)
         for r in range(block * chunk, wp.min((block + 1) * chunk, own.shape[0])):
@@ -95,7 +93,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         # outputs
         products: wp.array2d(dtype=wp.float64),
     ):
-        """Products of the new gradient g' with every s, every w, z' and z; and y . w of the pair that opens now."""
+        """Compute inner products: of the new gradient g' with each s and w, with z' and z (z = M^-1 g); y . w."""
         block, c = wp.tid()
         last = g.shape[0] - 1
         own = several()
@@ -138,7 +136,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         slot: wp.array(dtype=wp.int32),
         aiming: wp.array(dtype=wp.int32),
     ):
-        """Accept the trial, or cut the step; the first trial is the start itself. Aiming are those that go on."""
+        """Accept the trial step, or backtrack; the first trial is the start. `aiming` marks a due direction."""
         c = wp.tid()
         accepted[c] = 0
         slot[c] = -1
@@ -203,10 +201,10 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         along_s: wp.array2d(dtype=scalar),
         along_w: wp.array2d(dtype=scalar),
     ):
-        """Take the pair of the accepted step in, and weigh the pairs: d = -M^-1 g + sum of (a_i s_i + b_i w_i).
+        """Add the pair of the accepted step, and run the two-loop recursion: d = -M^-1 g + sum of (a_i s_i + b_i w_i).
 
-        The first `known` slots are filled; from slot m - 1 the head goes on to slot 0. The next trial is as long as the
-        last step should have been by the slopes at its ends: where tissue stiffens, whole steps would all be cut.
+        The first `known` slots are filled; slot 0 follows slot m - 1. The first trial length is the secant step of the
+        last line search: where tissue stiffens, unit steps would all be shortened.
         """
         c = wp.tid()
         if aiming[c] == 0:
@@ -218,7 +216,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         if rise > zero and wp.isfinite(promised[c]):
             length = wp.clamp(gone[c] * promised[c] / rise, wp.float64(least_kept), wp.float64(1.0))
         n = int(-1)
-        # Also false of the first trial, whose promise is infinite.
+        # Also false at the start, where `promised` is infinite.
         if rise > wp.float64(least_curvature) * promised[c] and products[yw_row, c] > zero:
             n = (head[c] + 1) % m
             for i in range(m):
@@ -235,7 +233,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         for i in range(m):
             sg[i, c] = wp.where(i == n, gone[c] * slope, products[i, c])
             wg[i, c] = wp.where(i == n, gz - products[gold_row, c], products[m + i, c])
-        # By age, in registers: from here on every number waits for the one before it.
+        # Sorted by age, in registers: the recursion is sequential.
         by_s, by_w, along, across = weights(), weights(), weights(), weights()
         curved, crossed = products_of_pairs(), products_of_pairs()
         for a in range(m):
@@ -247,14 +245,14 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
                     j = (head[c] - b + m) % m
                     curved[a, b] = sy[i, j, c]
                     crossed[a, b] = yw[i, j, c]
-        for a in range(m):  # from the newest pair to the oldest
+        for a in range(m):  # first loop, newest pair to oldest
             if a < size:
                 value = along[a]
                 for b in range(m):
                     if b < a:
                         value -= by_w[b] * curved[a, b]
                 by_w[a] = value / curved[a, a]
-        for k in range(m):  # and back
+        for k in range(m):  # second loop, oldest pair to newest
             a = m - 1 - k
             if a < size:
                 value = across[a]
@@ -269,7 +267,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         for a in range(m):
             if a < size:
                 decrease -= by_w[a] * across[a] + by_s[a] * along[a]
-        if not decrease > zero:  # round-off: begin anew
+        if not decrease > zero:  # no descent direction, by round-off: restart from -M^-1 g
             decrease = gz
             known[c] = 0
             head[c] = m - 1
@@ -302,7 +300,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         s: wp.array3d(dtype=scalar),
         w: wp.array3d(dtype=scalar),
     ):
-        """Where accepted: u += t d, the new pair takes its slot, g = g', z = z', and the next direction."""
+        """Update load cases with an accepted step: u += t d, store the pair, g = g', z = z', and the new d."""
         block, c = wp.tid()
         if accepted[c] == 0:
             return
@@ -316,7 +314,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
                 s[n, r, c] = step[k]
                 w[n, r, c] = new_z[r, c] - z[r, c]
         size = known[c]
-        for i in range(m):  # unrolled: addresses cost more than numbers
+        for i in range(m):  # unrolled: address arithmetic dominates
             if i < size:
                 for k in range(few):
                     r = wp.min(few * block + k, last)
@@ -337,7 +335,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         bound: wp.array(dtype=scalar),
         t: wp.array(dtype=wp.float64),
     ):
-        """t = min(t, bound), and the bound is one again."""
+        """Limit t to `bound`, and reset the bound to 1."""
         c = wp.tid()
         t[c] = wp.min(t[c], wp.float64(bound[c]))
         bound[c] = scalar(1.0)

@@ -1,4 +1,4 @@
-"""Everything that the columns of a batch carry from turn to turn of L-BFGS, and the turn itself."""
+"""State of the load cases of a batch between L-BFGS iterations, and the iteration itself."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from .lbfgs_kernels import DONE, PAIRS, PRODUCTS, SOME, SUMS, build_kernels, get
 from .lbfgs_trial_kernels import multiply_of
 from .residual import Balance, compute_balance, compute_constant_gradients
 
-Shapes = Mapping[str, tuple[int, ...]]
+Shapes = Mapping[str, tuple[int, ...]]  # Array shapes by name, without the axis of load cases.
 
 
 def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
-    """By kind of number: its type, the arrays that move with their columns, and those that a turn writes anew."""
+    """Return, by number type, the dtype, the shapes of arrays that move with load cases, and of recomputed ones."""
     vector, pairs, terms = (problem.rows,), (PAIRS, problem.rows), (len(problem.terms),)
     return {
         "scalar": (
@@ -53,7 +53,7 @@ def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
 
 
 def allocate_ground(problem: Problem, width: int) -> dict[str, wp.array]:
-    """Memory, by kind of number, for rooms of at most this width: they stand in the same place, one at a time."""
+    """Allocate memory, by number type, that workspaces of at most this width share: only one is in use at a time."""
     return {
         kind: wp.zeros((_rows(moved) + _rows(written), width), dtype=dtype, device=problem.device.name)
         for kind, (dtype, moved, written) in describe_layout(problem).items()
@@ -62,15 +62,15 @@ def allocate_ground(problem: Problem, width: int) -> dict[str, wp.array]:
 
 @dataclass(frozen=True, eq=False)
 class LbfgsState:
-    """Arrays of `width` columns by name, and by kind of number all those that move with them, where both stand."""
+    """L-BFGS arrays of `width` load cases by name; those that move with load cases, by number type; the memory."""
 
     columns: Mapping[str, wp.array]
     moved: Mapping[str, wp.array]
-    ground: Mapping[str, wp.array]  # arrays that stand on it do not keep it
+    ground: Mapping[str, wp.array]  # kept alive here: its views hold no reference
 
 
 def allocate_state(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> LbfgsState:
-    """Return the state of so many columns on a ground that `allocate_ground` made for at least this width."""
+    """Build the state of `width` load cases on memory that `allocate_ground` made for at least this width."""
     columns: dict[str, wp.array] = {}
     together: dict[str, wp.array] = {}
     for kind, (_, moved, written) in describe_layout(problem).items():
@@ -83,16 +83,16 @@ def allocate_state(problem: Problem, width: int, ground: Mapping[str, wp.array])
 
 
 class Workspace:
-    """Columns last, on the ground that rooms share. On a graphics card the turn is captured once.
+    """Workspace of L-BFGS, load cases last, on shared memory. On a GPU the iteration is captured once as a graph.
 
     Parameters
     ----------
     problem, preconditioner
-        Whose turns these are.
+        Problem to solve, and its preconditioner.
     width
-        How many columns there is workspace for.
+        Capacity [load cases].
     ground
-        As `allocate_ground` makes it, for at least this width.
+        Memory from `allocate_ground`, for at least this width.
     """
 
     def __init__(self, problem: Problem, preconditioner: Preconditioner, width: int, ground: Mapping[str, wp.array]):
@@ -108,7 +108,7 @@ class Workspace:
     def begin(
         self, start: wp.array, tolerance: np.ndarray, force: np.ndarray, learnt: Mapping[str, np.ndarray]
     ) -> None:
-        """Take a batch of at most as many columns, about to judge its start (3N, b)."""
+        """Load a batch of at most `width` load cases; the first iteration evaluates its start (3N, b)."""
         a, device, spare = self.columns, self._problem.device, self.width - start.shape[1]
         for array in (a["d"], a["g"], a["z"], self.state.moved["double"], self.state.moved["whole"]):
             array.zero_()
@@ -120,7 +120,7 @@ class Workspace:
             wp.copy(a["u"], start)
         for name, value in (("promised", np.inf), ("residual", np.inf), ("head", PAIRS - 1)):
             a[name].fill_(value)
-        # What is there to fill the workspace ends at once.
+        # Load cases that only fill the workspace converge at once.
         a["tolerance"].assign(np.append(tolerance, np.full(spare, np.inf)))
         a["force"].assign(np.append(force, np.full(spare, np.inf)))
         constant, loud = compute_constant_gradients(self._problem, a["u"])
@@ -131,7 +131,7 @@ class Workspace:
         self.prepare()
 
     def aim(self, g: wp.array, z: wp.array) -> None:
-        """The first trial goes along -z (3N, b) from a start that has the free gradient g (3N, b)."""
+        """Set the first direction to -z (3N, b), from a start with residual g (3N, b)."""
         a, device, count = self.columns, self._problem.device, g.shape[1]
         index = device.array(self._padded(np.arange(count)), wp.int32)
         gather_columns(device, g, index, a["g"])
@@ -143,7 +143,7 @@ class Workspace:
         self._clamp()
 
     def take(self, other: Workspace, stay: np.ndarray) -> None:
-        """Go on with these columns (k,) of another workspace's batch."""
+        """Continue with these load cases (k,) of another workspace's batch."""
         index = self._padded(stay)
         self._problem.keep(index)
         there = self._problem.device.array(index, wp.int32)
@@ -154,11 +154,11 @@ class Workspace:
         self.prepare()
 
     def _padded(self, stay: np.ndarray) -> np.ndarray:
-        """Return the last of them again, until the workspace is full."""
+        """Repeat the last index until the workspace is full."""
         return np.append(stay, np.full(self.width - len(stay), stay[-1]))
 
     def prepare(self) -> None:
-        """Be ready to turn with what stands here."""
+        """Clear temporary arrays, and prepare a preconditioner on the host for the present batch."""
         self.columns["part"].zero_()
         self.columns["bound"].fill_(1.0)
         if self._preconditioner.on_device:
@@ -168,16 +168,16 @@ class Workspace:
         self._preconditioner.prepare(self._problem, u.shape[1])
 
     def turn(self, times: int) -> None:
-        """Turn so many times."""
+        """Run this number of L-BFGS iterations."""
         device = self._problem.device
         if not (device.on_cuda and self._preconditioner.on_device):
             for _ in range(times):
                 self.once()
             return
         if self._graph is None:
-            self.once()  # loads what a capture cannot
+            self.once()  # loads modules, which a capture cannot
             if not self.columns["aiming"].numpy().any():
-                self._aim()  # nor can it load what no column wanted
+                self._aim()  # loads those that no load case has used
             with wp.ScopedCapture(device.name, force_module_load=False) as capture:
                 self.once()
             self._graph = capture.graph
@@ -186,7 +186,7 @@ class Workspace:
             wp.capture_launch(self._graph)
 
     def once(self) -> None:
-        """Turn; as a graphics card captures it, unless the preconditioner is the host's."""
+        """Run one iteration; a GPU captures it unless the preconditioner runs on the host."""
         a, k = self.columns, self._kernels
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
@@ -207,12 +207,12 @@ class Workspace:
         self._clamp()
 
     def _aim(self) -> None:
-        """The next direction of the columns that go on, from their new gradients."""
+        """Compute the next direction of the load cases whose step was accepted, from their new gradients."""
         a, k = self.columns, self._kernels
         problem, device, g = self._problem, self._problem.device, self._trial.g
         rows, count = a["u"].shape
         live = np.ones(count, bool)
-        if not self._preconditioner.on_device:  # the host's time is better not spent on trials that failed
+        if not self._preconditioner.on_device:  # the host skips load cases that backtrack
             live = a["aiming"].numpy() != 0
         if live.any():
             self._preconditioner.apply(g, live, a["new_z"])
@@ -237,7 +237,7 @@ class Workspace:
 
 
 def _placed(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
-    """Return the numbers from the first on, as an array of any shape: views of Warp cannot skip 2^31 numbers."""
+    """View the memory from element `first` on with a shape: slices of Warp arrays cannot skip 2^31 elements."""
     address = ground.ptr + first * wp.types.type_size_in_bytes(ground.dtype)
     return wp.array(ptr=address, dtype=ground.dtype, shape=shape, device=ground.device)
 

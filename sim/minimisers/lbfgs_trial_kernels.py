@@ -1,8 +1,8 @@
-"""The kernels of a trial of L-BFGS: where it goes, and what the gradient is there.
+"""Kernels of a trial step of L-BFGS: the trial point and its projected gradient.
 
-With many columns neighbouring threads take neighbouring columns, and each a few rows. With one column that leaves a
-card idle, and its few threads far apart in memory: there neighbouring threads take neighbouring rows, and sum before
-they add.
+With many load cases, neighbouring threads take neighbouring load cases, and each a few rows. With one load case that
+would leave a GPU idle and its few threads far apart in memory, so neighbouring threads take neighbouring rows, and sum
+before the atomic addition.
 """
 
 from dataclasses import dataclass
@@ -14,24 +14,24 @@ from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
 from .lbfgs_kernels import FREE, GOLD, GZ, OWN, SLOPE, SOME, WHOLE, YW
 
-# Rows, or nodes, of one column that one thread takes: on CUDA, on the CPU.
-EACH, EACH_ON_CPU = 2, 1024
+EACH = 2  # Rows, or nodes, of a single load case per thread on CUDA.
+EACH_ON_CPU = 1024  # The same on the CPU.
 
 
 @dataclass(frozen=True)
 class ThreadSpread:
-    """How threads share rows, or nodes: a group takes neighbouring ones in turn, `each` of its threads so many."""
+    """Distribution of rows, or nodes: groups of `lanes` neighbouring threads, `each` rows per thread."""
 
     lanes: int
     each: int
 
     def threads(self, count: int) -> int:
-        """Threads for so many rows, or nodes."""
+        """Return the number of threads for `count` rows, or nodes."""
         return -(-count // (self.lanes * self.each)) * self.lanes
 
 
 def spread_of(device: Device, columns: int) -> ThreadSpread:
-    """How the threads of a device share the rows of so many columns."""
+    """Choose how the threads of a device share the rows of a batch of this many load cases."""
     if columns > 1:
         return ThreadSpread(1, SOME)
     return ThreadSpread(get_warp_width(device), EACH if device.on_cuda else EACH_ON_CPU)
@@ -39,19 +39,19 @@ def spread_of(device: Device, columns: int) -> ThreadSpread:
 
 @wp.func
 def first_of(thread: int, lanes: int, each: int):
-    """Return the first of the rows that a thread takes; the others follow at steps of one group of neighbours."""
+    """Return the first row of a thread; its next rows follow at intervals of `lanes`."""
     return thread // lanes * lanes * each + thread % lanes
 
 
 @wp.func
 def alone(value: wp.float64) -> wp.float64:
-    """What `summed` is where no neighbour has a share of the same sum."""
+    """Return the value itself: replaces `summed` where no neighbouring thread has part of the same sum."""
     return value
 
 
 @dataclass(frozen=True)
 class LbfgsTrialKernels:
-    """Arithmetic of one scalar type and spread, launched over (threads of rows or nodes, columns)."""
+    """Trial kernels for one scalar type and spread, launched over (threads of rows or nodes, load cases)."""
 
     step: wp.Kernel
     finish: wp.Kernel
@@ -59,7 +59,7 @@ class LbfgsTrialKernels:
 
 @cache
 def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
-    """Kernels of a device's scalar type."""
+    """Build the trial kernels for a device's scalar type."""
     scalar, vec = device.scalar, device.vector
     lanes, each = spread.lanes, spread.each
     together = summed if lanes > 1 else alone
@@ -73,7 +73,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
         # outputs
         v: wp.array2d(dtype=scalar),
     ):
-        """v = u + t_c d."""
+        """Compute the trial point v = u + t_c d."""
         thread, c = wp.tid()
         length, first = scalar(t[c]), first_of(thread, lanes, each)
         for k in range(each):
@@ -91,7 +91,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
         total: wp.array2d(dtype=scalar),
         sums: wp.array2d(dtype=wp.float64),
     ):
-        """Project the gradient; sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
+        """Project the gradient; add to sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
         thread, c = wp.tid()
         own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         first = first_of(thread, lanes, each)
@@ -119,7 +119,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
 
 @cache
 def multiply_of(device: Device, pairs: int) -> wp.Kernel:
-    """Return the kernel for a column that keeps so many pairs, launched over (products, threads of rows)."""
+    """Build the kernel `multiply` for a single load case, launched over (products, threads of rows)."""
     scalar, m, spread = device.scalar, pairs, spread_of(device, 1)
     lanes, each = spread.lanes, spread.each
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
@@ -136,11 +136,11 @@ def multiply_of(device: Device, pairs: int) -> wp.Kernel:
         # outputs
         products: wp.array2d(dtype=wp.float64),
     ):
-        """Products of the new gradient g' with every s, every w, z' and z; and y . w of the pair that opens now."""
+        """Compute inner products: of the new gradient g' with each s and w, with z' and z (z = M^-1 g); y . w."""
         product, thread = wp.tid()
         pair = product % m
         if product < 2 * m and pair >= known[0]:
-            return  # the others in step too
+            return  # uniform over the warp, so `summed` below stays valid
         total, first = wp.float64(0.0), first_of(thread, lanes, each)
         for k in range(each):
             r = first + lanes * k

@@ -1,6 +1,6 @@
 """Line search on the directional derivative.
 
-Energies are not compared: in single precision their differences drown in round-off long before the gradient does.
+Energies are not compared: in single precision round-off hides their differences long before those of the gradient.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from .newton_cg import Direction
 
 @dataclass(frozen=True)
 class Search:
-    """When a search along a line ends.
+    """Settings of the line search.
 
     Parameters
     ----------
     undershoot, refinements
-        A step that was cut and still descends more steeply than this share is lengthened again, so often at most.
+        A shortened step whose slope is still steeper than this fraction of the initial one is lengthened again, at most
+        this number of times.
     trials
-        Most lengths that are tried.
+        Maximum number of trial lengths.
     shortest
-        A shorter step leads nowhere.
+        Smallest accepted step length; a shorter one counts as failure.
     """
 
     undershoot: float = 0.5
@@ -38,12 +39,12 @@ class Search:
 
 
 def is_step_too_long(ahead: Any, promised: Any) -> Any:
-    """Whether the slopes `ahead` of steps, which promised so much decrease, have risen too far; or are no numbers."""
+    """Return True for steps whose slope `ahead` exceeds `OVERSHOOT` times the predicted decrease, or is not finite."""
     return ~(np.asarray(ahead) <= OVERSHOOT * np.abs(promised))
 
 
 def backtrack_by_slopes(ahead: Any, promised: Any) -> Any:
-    """Return the shares of steps that went too far to be tried next: where the line through both slopes is zero."""
+    """Return the backtracking factors of rejected steps: zero of the secant through both slopes, within bounds."""
     with np.errstate(invalid="ignore", divide="ignore"):
         kept = np.divide(promised, np.add(promised, ahead))
     known = np.greater(promised, 0.0) & np.isfinite(ahead)
@@ -51,11 +52,11 @@ def backtrack_by_slopes(ahead: Any, promised: Any) -> Any:
 
 
 def search(problem: Problem, u: wp.array, direction: Direction, settings: Search = Search()) -> np.ndarray:
-    """Step lengths (b,) in (0, 1] along a direction from u (3N, b); zero where none was found.
+    """Find step lengths (b,) in (0, 1] along a direction from u (3N, b); zero if none is found.
 
-    A length is accepted when phi'(t) <= 0.5 x the promised decrease: the energy still falls, or its minimum along
-    the line is not far behind. The search keeps the longest such length and the shortest that goes too far; the
-    secant through the slopes at both gives the next trial.
+    A length is accepted when phi'(t) <= 0.5 x the predicted decrease: the energy still falls, or its minimum along the
+    line is close behind. The search keeps the longest such length and the shortest rejected one; the secant through the
+    slopes at both gives the next trial.
     """
     t = problem.longest_step(u, direction.d)
     promised = direction.promised

@@ -1,6 +1,6 @@
-"""The outer iteration: a direction times a search, until the accuracy or the budget is reached.
+"""Newton iteration: search direction and line search, until the tolerance or the iteration limit is reached.
 
-Knows terms only by their protocol. Cases that are done leave the batch, so that the rest costs less.
+It uses terms only through their protocol. Load cases that have ended leave the batch, to save time.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from .residual import compute_relative
 
 @dataclass(frozen=True)
 class Newton:
-    """How exactly linear systems are solved, and what counts as round-off.
+    """Accuracy of the linear solves, and criteria for stalling and round-off.
 
     Parameters
     ----------
     largest_forcing
-        Inexact Newton: the linear residual is never larger than this share.
+        Inexact Newton: upper bound of the relative linear residual.
     patience
-        A residual that was not lowered by a tenth in this number of iterations is held against round-off.
+        If the residual has not fallen by a tenth in this number of iterations, it is compared with round-off.
     still
-        A case stalls after this number of such iterations in a row whose steps are below the last digit of u. Fewer may
-        be a radius that a short step left small, and that doubles.
+        A load case stalls after this number of such iterations in a row with steps below the last digit of u. Fewer may
+        come from a trust radius that a short step made small, and that doubles again.
     round_off
-        What the last digit of every displacement does to the residual, times this, is round-off.
+        Factor on the change of the residual by the last digit of every displacement: below it, the residual is
+        round-off.
     stress_free
-        Where every term's force at every node is below so many times the same, a body is free of stress.
+        Factor on the change of nodal forces by that digit: with each term's forces below it, the model is stress-free.
     """
 
     largest_forcing: float = 0.25
@@ -48,7 +49,7 @@ class Newton:
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
-    """Where the iteration ended: u (3N, B) [m] on the device; outcomes, outer steps, relative residuals (B,)."""
+    """Final states u (3N, B) [m] on the device; outcomes, outer iterations, relative residuals (B,)."""
 
     u: wp.array
     outcome: np.ndarray
@@ -62,8 +63,8 @@ def find_equilibrium(
 ) -> Equilibrium:
     """Minimise the potential of a problem that has begun a batch, from start (3N, B) [m].
 
-    The last finite, accepted state of every case is returned, whatever its outcome. A case whose forces all vanish
-    beside those of its start is at rest again: no share of them is left to measure a residual against.
+    The last finite, accepted state of every load case is returned, whatever its outcome. A load case whose forces all
+    vanish compared with those of its start counts as converged: its relative residual is undefined.
     """
     device, count = problem.device, start.shape[1]
     outcome = np.full(count, Outcome.BUDGET, object)
@@ -78,7 +79,7 @@ def find_equilibrium(
     for step in range(accuracy.outer + 1):
         g, free, scale = problem.residual(u)
         first[live] = scale if step == 0 else first[live]
-        if step and open_gap.any():  # what is closed stays closed: directions are projected
+        if step and open_gap.any():  # projected directions keep closed constraints closed
             gap, open_gap = problem.gap(u)
         vanished = scale <= last_digit**2 * first[live]
         share = compute_relative(free, np.where(vanished, 0.0, scale))
@@ -122,16 +123,16 @@ def find_equilibrium(
         linear_iterations += found.iterations
         length = search(problem, u, found)
         before, u = u, combine_columns(device, u, length, found.d, wp.empty_like(u))
-        # A search that fails is repeated once along a direction of positive definite curvature.
+        # A failed search is repeated once along a direction of positive definite curvature.
         failed = (length == 0.0) & (taken == 0.0)
         taken = length
     return Equilibrium(result, outcome, iterations, residual, linear_iterations)
 
 
 def round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
-    """How much (b,) [N] the free gradient g (3N, b) at u (3N, b) changes with the last digit of every displacement.
+    """Compute the change (b,) [N] of the residual g (3N, b) at u (3N, b) by the last digit of every displacement.
 
-    Below this no residual falls: the displacements that it would take are not among the type's numbers.
+    The residual cannot fall below this: the required displacements are not representable in the floating-point type.
     """
     device = problem.device
     near = problem.gradient(_nearest(device, u))
@@ -140,10 +141,10 @@ def round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
 
 
 def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
-    """Return the columns (b,) bool in which the forces of each term at each node are round-off at u (3N, b).
+    """Return the load cases (b,) bool in which the forces of each term at each node are round-off at u (3N, b).
 
-    Round-off is `factor` times what the last digit of every displacement does there, or at the median node: a sliver's
-    nodes do not speak for the others.
+    Round-off is `factor` times the force change by the last digit of every displacement, at that node or at the median
+    node, whichever is larger: the large round-off of a sliver counts at its own nodes alone.
     """
 
     def at_nodes(force: wp.array) -> np.ndarray:
@@ -161,7 +162,7 @@ def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
 
 
 def _nearest(device: Device, u: wp.array) -> wp.array:
-    """Displacements u (3N, b) with the last digit of each changed, up or down at random."""
+    """Return displacements u (3N, b) with the last digit of each changed, up or down at random."""
     values = u.numpy()
     sign = np.random.default_rng(0).choice([-1.0, 1.0], (len(values), 1))
     return device.array(values * (1.0 + sign * np.finfo(device.precision).eps))

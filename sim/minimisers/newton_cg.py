@@ -1,4 +1,4 @@
-"""Search directions of the outer iteration that the host steers."""
+"""Search directions of the Newton iteration, which runs on the host."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..runtime.device import Device
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """d (3N, b) [m]; the decrease (b,) [J] that the linear model promises along it; linear iterations spent."""
+    """Search direction d (3N, b) [m]; decrease (b,) [J] that the linear model predicts along it; linear iterations."""
 
     d: wp.array
     promised: np.ndarray
@@ -24,34 +24,34 @@ class Direction:
 
 
 class Descent(Protocol):
-    """Where to go next, for b load cases at once; it remembers what it has learnt from a batch."""
+    """Method that computes search directions of b load cases at once; it may keep a state for the batch."""
 
     def begin(self) -> None:
-        """Forget: another batch begins."""
+        """Reset the state: another batch begins."""
         ...
 
     def keep(self, device: Device, columns: np.ndarray) -> None:
-        """Keep these columns (k,): the others have left the batch."""
+        """Keep these load cases (k,): the others have left the batch."""
         ...
 
     def find(
         self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
     ) -> Direction:
-        """Direction at u (3N, b) with free gradient g (3N, b) [N].
+        """Compute the direction at u (3N, b) with residual g (3N, b) [N].
 
         `gap` (3N, b) [m], if any, is the motion that closes the constraints; the free nodes follow it. `forcing` (b,):
-        the linear residual that may be left, relative to the right-hand side. `taken` (b,): the share of the last
-        direction that was gone; where it was none, the curvature at rest stands in for one that misled. Nobody changes
-        g after the call, nor d.
+        allowed linear residual, relative to the right-hand side. `taken` (b,): accepted length of the last direction;
+        where it is zero, the undeformed stiffness replaces the tangent stiffness, whose direction failed. The caller
+        changes neither g nor d afterwards.
         """
         ...
 
 
 class NewtonCG:
-    """Inexact Newton: K d = -g by truncated conjugate gradients, within a radius that follows the steps taken.
+    """Inexact Newton: K d = -g by truncated conjugate gradients, with a trust radius that follows the accepted steps.
 
-    The radius is in the preconditioner's norm, and infinite until a step has been cut: Steihaug 1983. The next step may
-    be `growth` times as long as the one that was taken.
+    The radius is in the preconditioner's norm, and infinite until a step has been shortened: Steihaug 1983. The next
+    step may be `growth` times as long as the accepted one.
     """
 
     def __init__(self, preconditioner: Preconditioner, most: int, growth: float = 2.0):
@@ -59,12 +59,12 @@ class NewtonCG:
         self.begin()
 
     def begin(self) -> None:
-        """No radius yet."""
+        """Remove the trust radius."""
         self._radius: np.ndarray | None = None
         self._size, self._truncated = np.zeros(0), np.zeros(0, bool)
 
     def keep(self, device: Device, columns: np.ndarray) -> None:
-        """Keep the radii of these columns (k,)."""
+        """Keep the trust radii of these load cases (k,)."""
         if self._radius is not None:
             self._radius, self._size = self._radius[columns], self._size[columns]
             self._truncated = self._truncated[columns]
@@ -72,13 +72,13 @@ class NewtonCG:
     def find(
         self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
     ) -> Direction:
-        """As `Descent`."""
+        """Compute the direction; see `Descent.find`."""
         device, columns = problem.device, u.shape[1]
         definite = taken == 0.0
         problem.linearise(u, definite)
         self._preconditioner.prepare(problem, columns)
         rhs, pulled = compute_right_hand_side(problem, g, gap)
-        # What follows a gap must follow it whole, and the curvature at rest misleads no one.
+        # No radius where a gap must be closed in full, or where the curvature is that of the undeformed stiffness.
         self._radius = np.where(pulled | definite, np.inf, self._followed(taken))
         tolerance = forcing * compute_norms(device, rhs)
         found = solve_conjugate_gradients(
@@ -96,7 +96,7 @@ class NewtonCG:
 
 
 def compute_right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None) -> tuple[wp.array, np.ndarray]:
-    """-P (g + K gap) (3N, b) [N] at the last linearisation, and which columns (b,) have a gap to close."""
+    """Compute -P (g + K gap) (3N, b) [N] at the last linearisation, and which load cases (b,) have a gap to close."""
     device, columns = problem.device, g.shape[1]
     rhs = combine_columns(device, device.zeros(*g.shape), -1.0, g, wp.empty_like(g))
     if gap is None:
@@ -108,5 +108,5 @@ def compute_right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None)
 
 
 def close_constraints(device: Device, x: wp.array, gap: wp.array | None) -> wp.array:
-    """x (3N, b) and, if any, the motion that closes the constraints, in place."""
+    """Add the motion that closes the constraints, if any, to x (3N, b), in place."""
     return x if gap is None else combine_columns(device, x, 1.0, gap, x)

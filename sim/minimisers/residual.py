@@ -1,4 +1,4 @@
-"""What is out of balance in a state: the free gradient of the potential, and what it is measured against."""
+"""Residual: the gradient of the potential at the free unknowns, and the force scale that it is relative to."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from .lbfgs_kernels import FREE, OWN, PAIRS, SUMS, WHOLE, build_kernels
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """What is out of balance: the free gradient g (3N, b) [N] on the device, and the `sums` (SUMS, b) that steer.
+    """Residual g (3N, b) [N] on the device, and the `sums` (SUMS, b) that L-BFGS decides by.
 
-    Square norms own (b last) of the gradients of the terms that are not constant. `part` (3N, b) is zero between.
+    `own` holds square norms (terms, b) of the gradients of the terms that are not constant. `part` (3N, b) is
+    workspace, zero between calls.
     """
 
     g: wp.array
@@ -28,7 +29,7 @@ class Balance:
 
 
 def allocate_balance(problem: Problem, count: int) -> Balance:
-    """Arrays for the balance of so many columns."""
+    """Allocate the arrays of a `Balance` for `count` load cases."""
     device = problem.device
     sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
     return Balance(device.zeros(problem.rows, count), device.zeros(problem.rows, count), sums, own)
@@ -37,9 +38,9 @@ def allocate_balance(problem: Problem, count: int) -> Balance:
 def compute_balance(
     problem: Problem, v: wp.array, constant: wp.array, d: wp.array | None = None, workspace: Balance | None = None
 ) -> Balance:
-    """The balance at v (3N, b) [m] of a batch with `constant` gradients (3N, b) [N], and its slope along d (3N, b).
+    """Compute the residual at v (3N, b) [m] of a batch with `constant` gradients (3N, b) [N], and its product with d.
 
-    In the arrays of `workspace`, if it is given.
+    The result is written to `workspace`, if it is given.
     """
     device, (rows, count) = problem.device, v.shape
     workspace = workspace or allocate_balance(problem, count)
@@ -67,7 +68,7 @@ def compute_balance(
 
 
 def compute_constant_gradients(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
-    """The summed gradient (3N, b) [N] of the terms that are constant, and the square norm (terms, b) of each one's."""
+    """Sum the gradients (3N, b) [N] of the constant terms, and compute the square norm (terms, b) of each."""
     device = problem.device
     total = device.zeros(*u.shape)
     square = wp.zeros((len(problem.terms), u.shape[1]), dtype=wp.float64, device=device.name)
@@ -82,9 +83,9 @@ def compute_constant_gradients(problem: Problem, u: wp.array) -> tuple[wp.array,
 
 @dataclass(frozen=True, eq=False)
 class ResidualState:
-    """Where b columns are: u (3N, b) [m], free gradients g (3N, b) [N], their 2-norms `free` (b,), and `scale` (b,).
+    """State of b load cases: u (3N, b) [m], residuals g (3N, b) [N], their 2-norms `free` (b,), and `scale` (b,).
 
-    The scale [N] is what free gradients are measured against.
+    The scale [N] is the largest 2-norm of a term's own gradient or of the reaction at constrained nodes.
     """
 
     u: wp.array
@@ -94,25 +95,25 @@ class ResidualState:
 
     @property
     def relative(self) -> np.ndarray:
-        """The relative residuals (b,)."""
+        """Relative residuals (b,)."""
         return compute_relative(self.free, self.scale)
 
     @property
     def finite(self) -> np.ndarray:
-        """(b,) bool: whether each is a state at all. Forces that overflow have no scale."""
+        """True (b,) where residual and scale are finite; forces may overflow."""
         return np.isfinite(self.free) & np.isfinite(self.scale)
 
     def rows(self, device: Device, stay: np.ndarray) -> ResidualState:
-        """Return some of the columns (k,)."""
+        """Return the state of some load cases (k,)."""
         u, g = (gather_columns(device, array, stay) for array in (self.u, self.g))
         return ResidualState(u, g, self.free[stay], self.scale[stay])
 
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Measures states of the batch that a problem has begun.
+    """Callable that evaluates the residuals of the batch that a problem has begun.
 
-    The gradient (3N, b) [N] of its terms that are constant, and the largest square norm (b,) of one of these.
+    `constant` (3N, b) [N] is the summed gradient of the constant terms, `square` (b,) the largest square norm of one.
     """
 
     problem: Problem
@@ -120,7 +121,7 @@ class Judge:
     square: np.ndarray
 
     def __call__(self, u: wp.array) -> ResidualState:
-        """Return the states u (3N, b) [m]."""
+        """Return the residuals of states u (3N, b) [m]."""
         found = compute_balance(self.problem, u, self.constant)
         sums = found.sums.numpy()
         with np.errstate(invalid="ignore", over="ignore"):
@@ -129,25 +130,25 @@ class Judge:
             return ResidualState(u, found.g, np.sqrt(sums[FREE]), np.sqrt(largest))
 
     def rows(self, stay: np.ndarray) -> Judge:
-        """Of some of the columns (k,), which are all that the problem keeps from now on."""
+        """Keep only some load cases (k,), in the problem too, and return their judge."""
         self.problem.keep(stay)
         return Judge(self.problem, gather_columns(self.problem.device, self.constant, stay), self.square[stay])
 
 
 def build_judge(problem: Problem, u: wp.array) -> Judge:
-    """Of the batch that the problem has begun, about to start at u (3N, b) [m]."""
+    """Build the judge of the batch that the problem has begun, with start u (3N, b) [m]."""
     constant, loud = compute_constant_gradients(problem, u)
     return Judge(problem, constant, loud.numpy().max(axis=0, initial=0.0))
 
 
 def compute_relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Free gradients (b,) [N] over the norms that they are measured against (b,); zero where nothing acts."""
+    """Divide residual norms (b,) [N] by their scales (b,) [N]; zero where no force acts."""
     with np.errstate(invalid="ignore"):  # forces that overflowed
         return np.divide(free, scale, out=np.zeros_like(free), where=scale != 0.0)
 
 
 def measure_residual(problem: Problem, u: wp.array) -> np.ndarray:
-    """The relative residual (b,) of u (3N, b) under the whole load, or the share of imposed motion that is missing."""
+    """Compute the relative residual (b,) of u (3N, b) under the full load, or the relative constraint gap if larger."""
     _, free, scale = problem.residual(u)
     gap, size = problem.constraint.close_gap(u)
     largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)

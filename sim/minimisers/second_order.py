@@ -1,8 +1,9 @@
-"""The second order of a body's answer to nodal forces, for every pair of them: exact, without differences.
+"""Second-order response of a model to nodal forces, for each pair of components, exact to rounding.
 
-With internal forces f(u) = K u + Q(u, u) + ..., Q(u, v) = integral of B^T P2(Bu, Bv), forces F move the body by
-K^-1 F - K^-1 Q(K^-1 F, K^-1 F) + ... P2 is half the second derivative of the stress at rest. Here the second term is
-had for pairs of unit forces, element by element. It is what `power_series` has of the second order for one load.
+With internal forces f(u) = K u + Q(u, u) + ..., Q(u, v) = integral of B^T P2(Bu, Bv), forces F displace the model by
+K^-1 F - K^-1 Q(K^-1 F, K^-1 F) + ... P2 is half the second derivative of the stress in the undeformed state. This
+module computes the second term for pairs of unit forces, element by element. `power_series` computes it for one load
+only.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from ..discretisation.term import Strained
 from ..runtime.threads import choose_threads, run_together
 from ..runtime.views import run_in_order, to_host, to_library
 
-# Elements that are worked on together: what they need of a pair stays in a core's cache, or fills a card.
-FEW, MANY = 256, 4096
+FEW = 256  # Elements of one batch on the CPU: the data of a pair fit into the cache of a core.
+MANY = 4096  # The same on CUDA: they fill a GPU.
 
 
 @dataclass(frozen=True, eq=False)
 class _Some:
-    """Elements of one tissue: all of them, which (k,), and P2 (9, 81) float32 from a strain to a stiffness."""
+    """Batch of elements of one tissue: indices (k,), and P2 (9, 81) float32 that maps a strain to a stiffness."""
 
     elements: Elements
     chosen: np.ndarray
@@ -42,22 +43,22 @@ def second_order(
     near: np.ndarray,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (P, 2) of force components, the first not above the second, and what each does (P, r) float32 [1/N^2].
+    """List pairs (P, 2) of force components p <= q, and compute the response (P, r) float32 [1/N^2] to each.
 
-    Under forces F (3m,) the second order is the sum over pairs of F_p F_q times their row.
+    Under forces F (3m,) the second order is the sum over pairs (p, q) of F_p F_q times their row.
 
     Parameters
     ----------
     problem
-        Whose elasticity counts.
+        Problem whose elastic terms are used.
     moved
-        (3m, 3N) [m/N]: motions under unit forces on m nodes, at rest.
+        (3m, 3N) [m/N]: undeformed compliance, displacements under unit forces on m nodes.
     answers
-        (r, 3N): as `Reading.answers`, of what is asked for.
+        (r, 3N): as `SeriesReading.answers`, of the requested functionals.
     near
-        (m, m) bool, symmetric: nodes whose pairs are wanted.
+        (m, m) bool, symmetric: nodes whose pairs are requested.
     progress
-        Hears how many groups of elements are done, and of how many.
+        Called with the number of finished batches of elements, and with their total.
     """
     device = problem.device
     first, second = np.nonzero(np.triu(np.repeat(np.repeat(near, 3, axis=0), 3, axis=1)))
@@ -93,7 +94,7 @@ def second_order(
 
 
 def _some(elements: Elements, tensors: np.ndarray, kind: np.ndarray, most: int) -> list[_Some]:
-    """All of a term's elements, at most so many at a time."""
+    """List all elements of a term by tissue, in batches of at most `most`."""
     found = []
     for each, tensor in enumerate(tensors):
         chosen = np.flatnonzero(kind == each)
@@ -103,7 +104,7 @@ def _some(elements: Elements, tensors: np.ndarray, kind: np.ndarray, most: int) 
 
 
 def _gradients(elements: Elements, chosen: np.ndarray) -> sp.csr_array:
-    """From motions (3N,) to displacement gradients (9 k q,) of some elements (k,), row by row."""
+    """Build the matrix from displacements (3N,) to gradients (9 k q,) in some elements (k,), row by row."""
     table, slope = elements.table[chosen], elements.gradient[chosen]
     count, points, most = slope.shape[:3]
     row = np.arange(9 * count * points).reshape(count, points, 1, 3, 3)

@@ -1,1 +1,1 @@
-"""What every part runs on: devices, columns of numbers, threads, memory, time, files. No mechanics."""
+"""Common infrastructure without mechanics: devices, batch arithmetic, threads, memory, time, files."""

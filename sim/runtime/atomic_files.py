@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Atomic writing of files and folders: they appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from .partial_files import STALE, list_partials, remove_left_overs, to_partial_p
 
 
 def explain_error(error: OSError) -> str:
-    """Why a file cannot be had, in the system's own words and not a library's."""
+    """Return the reason of an OSError in the system's words, not those of a library."""
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
 
 
 def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: bool = True) -> Path:
-    """Return the path of a file that can be written, its folder made; asked before long work, so that none is lost.
+    """Return a path that can be written, with its folder created; called before long work, so that no result is lost.
 
-    What an earlier run of the same output left behind when it was killed is removed, unless not to `sweep` saves
-    listing a folder of very many files. Another machine's unfinished file is such a left-over after `stale` seconds.
+    Left-overs of killed runs with the same output are removed; `sweep` False saves listing a folder with very many
+    files. Another machine's unfinished file counts as a left-over after `stale` seconds.
 
     Raises
     ------
@@ -31,19 +31,19 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: boo
     """
     path = Path(path)
     if path.suffix != suffix:
-        raise InputError(f"{path}: this file is written as {suffix}; give a name that ends so.")
+        raise InputError(f"{path}: this file is written as {suffix}: give a name with this extension.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"{path}: its folder cannot be made ({explain_error(error)}). Choose another folder."
+            f"{path}: its folder cannot be created ({explain_error(error)}). Choose another folder."
         ) from error
     if path.is_dir():
         raise InputError(f"{path}: cannot be written, it is a folder. Choose another name.")
     if sweep:
         remove_left_overs(path.parent, path.name, stale)
     probe = to_partial_path(path)
-    try:  # permissions alone do not tell: a file system may be read-only, or make no files
+    try:  # permissions are not enough: the file system may be read-only or full
         probe.touch()
     except OSError as error:
         raise InputError(f"{path}: cannot be written there ({explain_error(error)}). Choose another folder.") from error
@@ -54,22 +54,20 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: boo
 
 @contextmanager
 def write_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Path]:
-    """Yield a name beside `path`, of the same ending, to write under.
-
-    It takes the name `path` when the block ends well.
+    """Yield a temporary name next to `path`, of the same suffix, which is renamed to `path` when the block succeeds.
 
     `sweep` is that of `check_output`.
 
     Raises
     ------
     InputError
-        As `check_output`; and where writing fails.
+        As `check_output`; and if writing fails.
     """
     path = check_output(path, suffix, sweep=sweep)
     partial = to_partial_path(path)
     try:
         yield partial
-        with partial.open("rb") as file:  # whole on the disk, before it takes a name that says so
+        with partial.open("rb") as file:  # complete on the disk before it is renamed
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
@@ -80,15 +78,16 @@ def write_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Itera
 
 @contextmanager
 def write_folder_atomically(path: Path, size: int = 0, kept: Callable[[Path], bool] | None = None) -> Iterator[Path]:
-    """Yield a hidden folder next to `path`, which takes its name when the block ends well, and is removed if not.
+    """Yield a hidden folder next to `path`, which is renamed to it when the block succeeds, and removed otherwise.
 
     Parameters
     ----------
     size
-        Bytes that it will hold, about.
+        Expected size of its content [bytes].
     kept
-        True of a hidden folder that stays all the same, as the same work resumes from it. Several processes may then
-        write one folder: the first that is done gives it. Without `kept` a second process is rejected.
+        Function that returns True if a hidden folder stays after a failure, so that the same work can resume from it.
+        Then several processes may write one folder, and the first to finish renames it. Without `kept` a second process
+        is rejected.
 
     Raises
     ------
@@ -98,15 +97,15 @@ def write_folder_atomically(path: Path, size: int = 0, kept: Callable[[Path], bo
     target = path.resolve()
     partial = to_partial_path(target)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{path}: is there and not empty. Choose another name, or remove it.")
+        raise InputError(f"{path}: exists and is not empty. Choose another name, or remove it.")
     if kept is None:
         remove_left_overs(target.parent, target.name)
-        shutil.rmtree(partial, ignore_errors=True)  # of a dead process that had the same number
+        shutil.rmtree(partial, ignore_errors=True)  # left by a dead process with the same number
         others = list_partials(target)
         if others:
             raise InputError(
                 f"{path}: another run is writing it, in {others[0].name}. Wait for it, or choose another --out; if no "
-                "run is at work, remove that folder."
+                "run is active, remove that folder."
             )
     check_disk_space(target, size)
     with remove_empty_parents(target):
@@ -126,7 +125,7 @@ def write_folder_atomically(path: Path, size: int = 0, kept: Callable[[Path], bo
 
 @contextmanager
 def remove_empty_parents(path: Path) -> Iterator[None]:
-    """Remove the folders above `path` that were made in the block and stayed empty."""
+    """Remove the folders above `path` that the block created and left empty."""
     missing = [folder for folder in path.parents if not folder.exists()]
     try:
         yield
@@ -138,7 +137,7 @@ def remove_empty_parents(path: Path) -> Iterator[None]:
 
 @contextmanager
 def write_stream_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Stream]:
-    """As `write_atomically`, but an open binary file; for HDF5, which ends the process where a write of its own fails.
+    """Yield an open binary file, else as `write_atomically`; for HDF5, which ends the process if its own write fails.
 
     Raises
     ------
@@ -149,7 +148,7 @@ def write_stream_atomically(path: str | Path, suffix: str, sweep: bool = True) -
         stream = Stream(raw)
         try:
             yield stream
-        except (OSError, RuntimeError):  # what HDF5 makes of the failure when it reads again
+        except (OSError, RuntimeError):  # raised by HDF5 when it reads after a failure
             if stream.failure is None:
                 raise
         if stream.failure is not None:
@@ -157,14 +156,14 @@ def write_stream_atomically(path: str | Path, suffix: str, sweep: bool = True) -
 
 
 class Stream:
-    """A binary file whose first failure to write is kept in `failure`, and stated when all is done."""
+    """Binary file that keeps its first write failure in `failure`, to be raised at the end."""
 
     def __init__(self, raw: BinaryIO) -> None:
         self.failure: OSError | None = None
         self._raw = raw
 
     def write(self, data: bytes) -> int:
-        """Write all of the data; nothing any more after a failure."""
+        """Write all of the data; after a failure, do nothing."""
         left = memoryview(data).cast("B")
         try:
             while self.failure is None and len(left):
@@ -174,46 +173,46 @@ class Stream:
         return len(data)
 
     def truncate(self, size: int) -> None:
-        """Make the file so long."""
+        """Set the length of the file [bytes]."""
         try:
             self._raw.truncate(size)
         except OSError as error:
             self.failure = self.failure or error
 
     def read(self, size: int) -> bytes:
-        """Read what was written."""
+        """Read bytes that were written."""
         return self._raw.read(size)
 
     def readinto(self, buffer: memoryview) -> int:
-        """Read what was written."""
+        """Read bytes that were written into a buffer."""
         return self._raw.readinto(buffer)  # pyright: ignore[reportAttributeAccessIssue]
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place."""
+        """Set the position in the file."""
         return self._raw.seek(offset, whence)
 
     def tell(self) -> int:
-        """Return the place."""
+        """Return the position in the file."""
         return self._raw.tell()
 
     def flush(self) -> None:
-        """Nothing: no byte waits."""
+        """Do nothing: the file is not buffered."""
 
 
 def check_disk_space(path: str | Path, size: int, largest: int | None = None) -> None:
-    """Refuse to begin what cannot end: `size` bytes beside `path`, in files of which the `largest` has so many.
+    """Check that `size` bytes fit next to `path`, in files of at most `largest` bytes.
 
     Raises
     ------
     InputError
-        A disk with less room, or a limit on the size of files below the largest.
+        Too little free space, or a limit on the file size below `largest`.
     """
     path = Path(path)
     existing = next(folder for folder in (path.parent, *path.absolute().parents) if folder.is_dir())
     free = shutil.disk_usage(existing).free
     if free < size:
         raise InputError(
-            f"{path}: needs {_megabytes(size)}, and the disk has {_megabytes(free)} left. Free some, or choose "
+            f"{path}: needs {_megabytes(size)}, and the disk has {_megabytes(free)} left. Free space, or choose "
             "another folder."
         )
     allowed, largest = _longest_file(), size if largest is None else largest
@@ -225,7 +224,7 @@ def check_disk_space(path: str | Path, size: int, largest: int | None = None) ->
 
 
 def _longest_file() -> int | None:
-    """Bytes that a file of this process may have, or None: as many as fit."""
+    """Return the maximum size of a file of this process [bytes]; None: no limit."""
     try:
         import resource
     except ImportError:  # a system without such limits
@@ -234,7 +233,7 @@ def _longest_file() -> int | None:
     return None if soft == resource.RLIM_INFINITY else soft
 
 
-REMEDY = "Choose another folder, or make room there."
+REMEDY = "Choose another folder, or free space there."  # Ends messages on failed writes.
 
 
 def _megabytes(size: int) -> str:

@@ -1,4 +1,4 @@
-"""Columns that a block of threads has to itself: what its threads do together. On the CPU a block is one thread."""
+"""Collective operations of a block of threads that shares one load case. On the CPU a block is one thread."""
 
 from typing import Any
 
@@ -15,12 +15,12 @@ from .device import Device
 """
 )
 def wait():
-    """Until all threads of the block are here, and see what all have written."""
+    """Wait until all threads of the block have arrived, and their writes are visible."""
     ...
 
 
 def folded(fold: str) -> str:
-    """C++ for a fold over the threads, of the same bits in each of them: `fold` joins `value` and `other`."""
+    """Return C++ code of a reduction over the threads, bitwise equal in each: `fold` combines `value` and `other`."""
     return f"""
 #if defined(__CUDA_ARCH__)
     __shared__ double shares[32];
@@ -79,12 +79,12 @@ def before(value: wp.int32) -> wp.int32:
 
 
 def get_block_shape(device: Device) -> tuple[int, int]:
-    """How many threads a block has, as rows and columns: on a card whole warps."""
+    """Return the number of threads of a block, as rows and columns: on a GPU whole warps."""
     return (16, 32) if device.on_cuda else (1, 1)
 
 
 def launch(device: Device, kernel: wp.Kernel, columns: int, inputs: list[Any], outputs: list[Any]) -> None:
-    """Launch a kernel over (column, thread)."""
+    """Launch a kernel over (load case, thread)."""
     rows, along = get_block_shape(device)
     if columns:
         wp.launch(

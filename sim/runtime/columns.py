@@ -1,4 +1,4 @@
-"""Arithmetic on batches of columns: arrays (rows, b) on the device, one column per load case, and on some rows."""
+"""Arithmetic on batches: arrays (rows, b) on the device, one column per load case; also on selected rows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,17 +10,15 @@ import warp as wp
 
 from .device import Device, forward_kernel
 
-# Rooms of L-BFGS fit batches of so few columns exactly: what these learn goes from one to the next.
-EXACT = 4
-# On CUDA rooms are so wide, or multiples of the widest. Arrays of these widths are kept: graphs know them.
+EXACT = 4  # Batches up to this size have workspaces of exactly their width: their L-BFGS history is handed on.
+# Widths of workspaces on CUDA; larger ones are multiples of the last. Arrays of these widths are kept for graphs.
 WIDTHS = (*range(1, EXACT + 1), *(share * 2**k for k in range(5, 13) for share in (2, 3)), 16384)
-# Rows that one thread sums before it adds to the column's total.
-CHUNK = 64
+CHUNK = 64  # Rows that one thread sums before its atomic addition to the column's total.
 
 
 @dataclass(frozen=True)
 class ColumnKernels:
-    """Column arithmetic of one scalar type, and what moves rows."""
+    """Kernels of column arithmetic, and of row copies, for one scalar type."""
 
     dot: wp.Kernel
     dot_alone: wp.Kernel
@@ -34,7 +32,7 @@ class ColumnKernels:
 
 @cache
 def build_kernels(device: Device) -> ColumnKernels:
-    """Kernels of a device's scalar type."""
+    """Build the kernels for a device's scalar type."""
     scalar = device.scalar
     chunk, lanes = CHUNK, get_warp_width(device)
 
@@ -45,7 +43,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """out_c += sum over a chunk of rows of x_rc y_rc, in double precision."""
+        """Add x_rc y_rc over a chunk of rows to out_c, in double precision."""
         block, c = wp.tid()
         total = wp.float64(0.0)
         for r in range(block * chunk, wp.min((block + 1) * chunk, x.shape[0])):
@@ -59,7 +57,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """The same for one column, one row a thread."""
+        """Add x . y to out for a single column, with one row per thread."""
         r = wp.tid()
         total = wp.float64(0.0)
         if r < x.shape[0]:
@@ -76,7 +74,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out = x + factor_c y."""
+        """Compute out = x + factor_c y."""
         r, c = wp.tid()
         out[r, c] = x[r, c] + factor[c] * y[r, c]
 
@@ -88,7 +86,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out = x + factor y."""
+        """Compute out = x + factor y."""
         r, c = wp.tid()
         out[r, c] = x[r, c] + factor * y[r, c]
 
@@ -99,7 +97,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """out_cnk = x_(3 node(n) + k)c."""
+        """Copy vectors at nodes: out_cnk = x_(3 node(n) + k)c."""
         c, n = wp.tid()
         for k in range(3):
             out[c, n, k] = wp.float64(x[3 * nodes[n] + k, c])
@@ -111,7 +109,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_ic = x_rows(i)c."""
+        """Copy selected rows: out_ic = x_rows(i)c."""
         i, c = wp.tid()
         out[i, c] = x[rows[i], c]
 
@@ -122,7 +120,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_rows(i)c = x_ic."""
+        """Copy to selected rows: out_rows(i)c = x_ic."""
         i, c = wp.tid()
         out[rows[i], c] = x[i, c]
 
@@ -133,7 +131,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_rows(i)c += x_ic."""
+        """Add to selected rows: out_rows(i)c += x_ic."""
         i, c = wp.tid()
         out[rows[i], c] += x[i, c]
 
@@ -142,7 +140,7 @@ def build_kernels(device: Device) -> ColumnKernels:
 
 @cache
 def build_moving_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
-    """Kernels that take columns out of arrays of any type, and put them back."""
+    """Build the kernels that copy columns out of arrays of a type, and back."""
 
     @forward_kernel(module="unique")
     def gather(
@@ -151,7 +149,7 @@ def build_moving_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
         # outputs
         out: wp.array2d(dtype=dtype),
     ):
-        """out_rc = x_r,columns(c)."""
+        """Copy selected columns: out_rc = x_r,columns(c)."""
         r, c = wp.tid()
         out[r, c] = x[r, columns[c]]
 
@@ -163,7 +161,7 @@ def build_moving_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
         # outputs
         out: wp.array2d(dtype=dtype),
     ):
-        """out_r,columns(c) = x_r,some(c)."""
+        """Copy to selected columns: out_r,columns(c) = x_r,some(c)."""
         r, c = wp.tid()
         out[r, columns[c]] = x[r, some[c]]
 
@@ -171,33 +169,33 @@ def build_moving_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
 
 
 def find_workspace_width(device: Device, count: int) -> int:
-    """How wide a room of L-BFGS for so many columns is."""
+    """Return the width of the L-BFGS workspace for `count` load cases."""
     if not device.on_cuda:
         return count
     return next((width for width in WIDTHS if width >= count), -(-count // WIDTHS[-1]) * WIDTHS[-1])
 
 
 def find_widest_workspace(device: Device, count: int) -> int:
-    """How wide a room of at most so many columns is; 0 where there is none."""
+    """Return the largest workspace width of at most `count` load cases; 0 if there is none."""
     if not device.on_cuda or count < 1:
         return count
     return max(count // WIDTHS[-1] * WIDTHS[-1], *(width for width in WIDTHS if width <= count))
 
 
 def is_kept(width: int) -> bool:
-    """Whether a room may be so wide."""
+    """Return True if a workspace may have this width."""
     return width in WIDTHS or width % WIDTHS[-1] == 0
 
 
 class Workspaces:
-    """Arrays of so many columns; of a width that rooms of L-BFGS may have always the same, as graphs want them."""
+    """Arrays by number of columns; for workspace widths always the same array, as captured graphs require."""
 
     def __init__(self, make: Callable[[int], wp.array], device: Device):
         self._make, self._device = make, device
         self._arrays: dict[int, wp.array] = {}
 
     def of(self, columns: int) -> wp.array:
-        """Return the array of this width: whoever asks writes it anew. On the CPU only the last one is kept."""
+        """Return the array of this width, to be overwritten by the caller. On the CPU only the last one is kept."""
         if columns not in self._arrays:
             graphs = self._device.on_cuda
             self._arrays = {width: array for width, array in self._arrays.items() if graphs and is_kept(width)}
@@ -228,7 +226,7 @@ def compute_norms(device: Device, x: wp.array) -> np.ndarray:
 
 
 def combine_columns(device: Device, x: wp.array, factor: np.ndarray | float, y: wp.array, out: wp.array) -> wp.array:
-    """out = x + factor y; factor (b,) from the host, or one for all columns; out may be x."""
+    """Compute out = x + factor y; factor (b,) from the host, or one for all columns; out may be x."""
     kernels = build_kernels(device)
     if isinstance(factor, (int, float)):
         device.launch(kernels.add_multiple, x.shape, [x, factor, y], [out])
@@ -260,7 +258,7 @@ def scatter_columns(
 
 
 def unstack_columns(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
-    """Vectors (b, n, 3) at some nodes (n,) of x (3N, b), in double precision on the host."""
+    """Return the vectors (b, n, 3) at nodes (n,) of x (3N, b), in double precision on the host."""
     out = wp.empty((x.shape[1], len(nodes), 3), dtype=wp.float64, device=device.name)
     device.launch(build_kernels(device).unstack, out.shape[:2], [x, device.array(nodes, wp.int32)], [out])
     return out.numpy()
@@ -302,13 +300,13 @@ def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None
 """
 )
 def summed(value: wp.float64) -> wp.float64:
-    """Return the sum over the threads that run in step, valid in the first of them; on the CPU the value itself.
+    """Return the sum over the threads of a warp, valid in the first of them; on the CPU the value itself.
 
-    All of them must be here, which launches over multiples of `get_warp_width` see to.
+    All of them must take part, which a launch over a multiple of `get_warp_width` guarantees.
     """
     ...
 
 
 def get_warp_width(device: Device) -> int:
-    """How many threads run in step."""
+    """Return the number of threads of a warp."""
     return 32 if device.on_cuda else 1

@@ -1,4 +1,4 @@
-"""A dense matrix times columns, by the library that is fastest at it: torch on CUDA, NumPy's BLAS on the CPU."""
+"""Product of a dense matrix with columns, by the fastest library: torch on CUDA, NumPy's BLAS on the CPU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .threads import limit_to_one_thread
 
 
 def build_product(matrix: np.ndarray, device: Device, rough: bool = False) -> Callable[[wp.array, wp.array], None]:
-    """(x, out) -> out (m, b) = matrix (m, n) x (n, b); `rough` lets CUDA round every number to eight bits."""
+    """Build (x, out) -> out (m, b) = matrix (m, n) x (n, b); `rough` lets CUDA round values to eight bits."""
     return _on_cuda(matrix, device, rough) if device.on_cuda else _on_cpu(matrix, device)
 
 
@@ -20,7 +20,7 @@ def _on_cpu(matrix: np.ndarray, device: Device) -> Callable[[wp.array, wp.array]
     kept = matrix.astype(device.precision)
 
     def multiply(x: wp.array, out: wp.array) -> None:
-        # Its threads wait for one another, ages where something else runs on their cores.
+        # BLAS threads wait for one another, very long where other processes use their cores.
         with limit_to_one_thread():
             np.matmul(kept, x.numpy(), out=out.numpy())
 

@@ -1,4 +1,4 @@
-"""Where arrays live and how wide their numbers are."""
+"""Device and precision of arrays."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ..errors import InputError
 from .kernel_cache import ensure_writable_cache
 
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
-"""`wp.kernel` without adjoint, which nobody asks for, and launched as wide as the work, which saves registers."""
+"""`wp.kernel` without adjoint, which is not used, and launched without grid-stride loop, which saves registers."""
 
 EVERY = "all"
-"""What every graphics card is called in a list of devices."""
+"""Name of all GPUs in a list of devices."""
 
-SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}
+SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}  # Warp's scalar types.
 
 
 @dataclass(frozen=True)
 class Device:
-    """A Warp device by name and the scalar type of every array on it."""
+    """Warp device by name, and the scalar type of the arrays on it."""
 
     name: str
     precision: Precision
@@ -47,7 +47,7 @@ class Device:
 
     @property
     def on_cuda(self) -> bool:
-        """Whether arrays live on a graphics card."""
+        """True if arrays are on a GPU."""
         return self.name.startswith("cuda")
 
     def zeros(self, *shape: int) -> wp.array:
@@ -55,35 +55,35 @@ class Device:
         return wp.zeros(shape, dtype=self.scalar, device=self.name)
 
     def array(self, values: np.ndarray, dtype: Any = None) -> wp.array:
-        """Return a copy of `values` on the device, of the scalar type unless `dtype` says otherwise."""
+        """Return a copy of `values` on the device, of the scalar type unless `dtype` is given."""
         return wp.array(np.ascontiguousarray(values), dtype=dtype or self.scalar, device=self.name)
 
     def launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel here, unless there is nothing to do."""
+        """Launch a kernel on the device; an empty launch is skipped."""
         if min(dim) > 0:
             if not self.on_cuda:
                 load(kernel.module)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.name, record_tape=False)
 
 
-_loading, _loaded = Lock(), set[wp.Module]()
+_loading, _loaded = Lock(), set[wp.Module]()  # Lock of compilation; modules that are loaded on the CPU.
 
 
 def load(module: wp.Module) -> None:
     """Load a kernel's module on the CPU; if Warp has not cached it, it is compiled.
 
-    One thread does it at a time, and others wait: Warp alone would compile a module once for each that launches it.
+    One thread at a time loads, and others wait: Warp alone would compile a module once for each thread.
     """
     if module not in _loaded:
         with _loading:
-            wp.load_module(module, device="cpu")  # nothing is left to do where another thread had the lock first
+            wp.load_module(module, device="cpu")  # does nothing if another thread was first
             _loaded.add(module)
 
 
 def find_device(name: str, precision: Precision) -> Device:
-    """Return the device called "cpu", "cuda", "cuda:1", or "auto": CUDA when there is one.
+    """Return the device called "cpu", "cuda", "cuda:1", or "auto": CUDA if there is one.
 
-    Starts Warp, and silences the notes that it prints by default.
+    Starts Warp, and suppresses its default notes.
 
     Raises
     ------
@@ -92,7 +92,8 @@ def find_device(name: str, precision: Precision) -> Device:
     """
     if "," in name or name == EVERY:
         raise InputError(
-            f"{name!r} names several devices, and one is wanted here: choose {' or '.join(['auto', *_present()])}."
+            f"{name!r} names several devices, but only one is allowed here: choose "
+            f"{' or '.join(['auto', *_present()])}."
         )
     present = _present()
     if name == "auto":
@@ -105,42 +106,41 @@ def find_device(name: str, precision: Precision) -> Device:
 
 
 def parse_device_names(words: str) -> tuple[str, ...]:
-    """The devices that `words` list, as this machine calls them: "cuda:0,cuda:1", "cpu,cpu", "all", or a single one.
+    """Parse a list of devices into Warp's names: "cuda:0,cuda:1", "cpu,cpu", "all", or a single one.
 
-    "all" are the graphics cards. A device may stand there twice: then two processes share it.
+    "all" are the GPUs. A device that occurs twice is shared by two processes.
 
     Raises
     ------
     InputError
-        A device that this machine does not have, "all" where it has no card or beside others, an empty name, processors
-        beside cards.
+        A device that this machine does not have, "all" without GPUs or with other names, an empty name, CPU and GPUs
+        together.
     """
     if words.strip() == EVERY:
         cards = tuple(name for name in _present() if name.startswith("cuda"))
         if not cards:
             raise InputError(
-                f"'all' means every graphics card, and there is none here{_no_card()}: choose auto, or name devices "
-                "with commas between, as in cpu,cpu."
+                f"'all' means every GPU, and there is none here{_no_card()}: choose auto, or name devices separated by "
+                "commas, as in cpu,cpu."
             )
         return cards
     asked = [name.strip() for name in words.split(",")]
     if EVERY in asked:
-        raise InputError(f"{words!r} names devices beside 'all', which means every graphics card: give it alone.")
+        raise InputError(f"{words!r} lists devices together with 'all', which means every GPU: give 'all' alone.")
     if not any(asked):
         raise InputError(f"{words!r} names no device: choose auto, or {' or '.join(_present())}.")
     if not all(asked):
-        raise InputError(f"{words!r} names a device that has no name: leave the comma out, or name one.")
+        raise InputError(f"{words!r} contains an empty device name: remove the comma, or add a name.")
     names = tuple(find_device(name, "float32").name for name in asked)
     if len({name.split(":")[0] for name in names}) > 1:
         raise InputError(
-            f"{words!r} names processors beside graphics cards, whose answers differ in their last digits: choose "
-            "devices of one kind."
+            f"{words!r} mixes CPU and GPUs, whose results differ in their last digits: choose devices of one kind."
         )
     return names
 
 
 def _present() -> list[str]:
-    if wp.config.log_level == wp.LOG_INFO:  # its start-up notes would stand among a command's own lines
+    if wp.config.log_level == wp.LOG_INFO:  # its start-up notes would mix with a command's output
         wp.config.log_level = wp.LOG_ERROR
     if wp.config.kernel_cache_dir is None:
         ensure_writable_cache()
@@ -149,4 +149,4 @@ def _present() -> list[str]:
 
 
 def _no_card() -> str:
-    return "" if wp.is_cuda_available() else ", as no NVIDIA driver with a card was found"
+    return "" if wp.is_cuda_available() else ", as no NVIDIA driver with a GPU was found"

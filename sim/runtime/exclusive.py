@@ -1,4 +1,4 @@
-"""One thread at a time in what works on arrays of its own."""
+"""Mutual exclusion of threads in methods that work on their object's arrays."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ R = TypeVar("R")
 
 
 class Locked(Protocol):
-    """Who has a lock, which a thread may take again while it has it."""
+    """Object with a reentrant lock."""
 
     lock: RLock
 
 
 def lock_method(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
-    """Return a method of a `Locked`, in which its lock is held: other threads wait until it returns."""
+    """Return a method of a `Locked` that holds its lock: other threads wait until it returns."""
 
     @wraps(method)
     def held(self: Locked, *args: P.args, **kwargs: P.kwargs) -> R:

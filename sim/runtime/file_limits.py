@@ -1,4 +1,4 @@
-"""How much a file may hold before it is refused: a file from outside decides nothing about memory."""
+"""Size limits of files from outside, so that a malicious or damaged file cannot exhaust the memory."""
 
 from __future__ import annotations
 
@@ -9,37 +9,35 @@ from pathlib import Path
 
 from ..errors import InputError
 
-# Deflate, the packing of .npz, .nii.gz, .vtu and HDF5, makes at most 1,032 bytes of one: more is declared, not stored.
+# Maximum inflation of deflate (.npz, .nii.gz, .vtu, HDF5): a file that declares more is invalid.
 INFLATION = 1032
-# Bytes that a small file of bzip2 may inflate to, whose packing has no limit: 512 x 512 x 512 voxels of 16 bits.
+# Allowed inflated size of a small bzip2 file [bytes], which has no such maximum: 512 x 512 x 512 voxels of 16 bits.
 LITTLE = 2**28
-# One array [bytes]: quadratic tetrahedra (10 numbers of 8 bytes) of the finest brain meshes in use, 10 million, take
-# 0.8 GB.
+# Maximum size of one array [bytes]: quadratic tetrahedra (10 numbers of 8 bytes) of the finest brain meshes in use, 10
+# million, take 0.8 GB.
 LARGEST_ARRAY = 2 * 1024**3
-# All arrays of a model file, inflated [bytes]: the shipped one, of five learners, has 0.04 GB.
+# Maximum inflated size of a model file's arrays [bytes]: the shipped file, of five models, has 0.04 GB.
 LARGEST_MODEL = 2 * 1024**3
-# What is true of a film, inflated [bytes]: an hour at 25 images a second of a tumour of 500 vertices has 0.5 GB.
+# Maximum inflated size of a video's ground truth [bytes]: an hour at 25 images/s of 500 tumour vertices has 0.5 GB.
 LARGEST_FILM = 2**29
-# Text that heads a model file [bytes]: the shipped one has 0.02 MB.
+# Maximum size of a model file's text header [bytes]: the shipped one has 0.02 MB.
 LARGEST_HEADER = 16 * 1024**2
-# Coordinates of what lies in or near a head [m].
-FARTHEST = 10.0
-# Voxels of one volume: a head of 200 mm at 0.25 mm has as many.
-MOST_VOXELS = 2**29
+FARTHEST = 10.0  # Largest coordinate in or near a head [m].
+MOST_VOXELS = 2**29  # Maximum number of voxels of a volume: that of a head of 200 mm at 0.25 mm.
 
 
 @dataclass(frozen=True)
 class MeshBytes:
-    """How many bytes the arrays of a mesh file may inflate to.
+    """Limits of the inflated size of a mesh file's arrays.
 
     Parameters
     ----------
     largest
-        [bytes] Of all arrays together: nodes, cells, and a few fields beside them.
+        Maximum size of all arrays together [bytes]: nodes, cells, and a few fields.
     inflation
-        Times the file's size. What inflates further is no mesh: its coordinates hardly repeat.
+        Maximum ratio to the file's size; a mesh does not inflate further, because its coordinates hardly repeat.
     small
-        [bytes] A small file may inflate to so many all the same.
+        Size that every file may inflate to [bytes].
     """
 
     largest: int = 4 * 1024**3
@@ -47,46 +45,46 @@ class MeshBytes:
     small: int = 2**28
 
     def of(self, size: int) -> int:
-        """Bytes to which the arrays of a file of `size` bytes may inflate.
+        """Return the inflated size [bytes] that is allowed for a file of `size` bytes.
 
         Raises
         ------
         InputError
-            A file that is larger itself.
+            A file that is larger than the limit itself.
         """
         if size > self.largest:
             raise InputError(
-                f"it is of {size / 1e9:,.3g} GB, and {self.largest / 1e9:.3g} GB are the most. Mesh coarser."
+                f"its size is {size / 1e9:,.3g} GB: at most {self.largest / 1e9:.3g} GB are allowed. Mesh coarser."
             )
         return min(self.largest, max(self.small, self.inflation * size))
 
 
 MESH_BYTES = MeshBytes()
-"""Four gigabytes, and a hundred times a file's size."""
+"""Default limits: four gigabytes, and a hundred times a file's size."""
 
 
 def build_too_large_error(most: int) -> InputError:
-    """What is said of a mesh file that asks for more than `most` bytes."""
+    """Build the error for a mesh file whose arrays take more than `most` bytes."""
     return InputError(
-        f"its arrays take more than {most / 1e9:.3g} GB: a file of its size holds no such mesh of a brain. "
-        "Write it anew, or mesh coarser."
+        f"its arrays take more than {most / 1e9:.3g} GB: too much for a brain mesh in a file of this size. "
+        "Write it again, or use a coarser mesh."
     )
 
 
 @contextmanager
 def limit_memory(most: int) -> Iterator[None]:
-    """Refuse a block that takes more than `most` bytes beyond what the process has, where the system counts them.
+    """Limit the memory that a block may take in addition, to `most` bytes, where the system supports it.
 
-    For what a library reads: no count in a file's header is believed, whatever its format. The limit is the whole
-    process's, so that other threads should ask for little meanwhile.
+    For reading with libraries, which trust sizes in a file's header. The limit applies to the whole process, so other
+    threads should allocate little meanwhile.
 
     Raises
     ------
     InputError
-        More was asked for.
+        The block asked for more.
     """
     try:
-        import resource  # of Unix alone
+        import resource  # on Unix only
 
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     except (ImportError, OSError):

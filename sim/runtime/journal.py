@@ -1,8 +1,8 @@
-"""Records of a run as they come, in a file that neither a kill nor damage can make wrong.
+"""Journal of a run: records are appended to a file that stays valid after a kill or damage.
 
-A run that resumes its rows or batches does so by this file (docs/architecture.md).
-Every record proves itself: its digest is keyed with what the run is, so that a torn record, a damaged one and one of
-another run are none. They follow each other; behind one that is none, the next is found by its mark.
+A run that resumes its rows or batches does so from this file (docs/architecture.md).
+Each record has a digest keyed with the run's description, so that torn, damaged or foreign records are detected.
+Records follow each other; after an invalid one, the next is found by its mark.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from typing import Any, BinaryIO, TypeVar
 from ..errors import InputError
 from .atomic_files import explain_error, write_atomically
 
-MARK = b"sulcus\r\n"
-# Mark, group, first row, length of the payload that follows, digest of all that is not the mark.
+MARK = b"sulcus\r\n"  # First bytes of every record.
+# Header of a record: mark, group, first row, length of the payload that follows, digest of all but the mark.
 HEAD = struct.Struct("<8s8sQQ16s")
-# The group of the first record, which describes the run; it has no key, so that another run can read it.
+# Group of the first record, which describes the run; its digest has no key, so that another run can read it.
 RUN = "run"
-Batch = tuple[str, int]
-Held = bytes | mmap.mmap
+Batch = tuple[str, int]  # Group and first row.
+Held = bytes | mmap.mmap  # Contents of a journal.
 R = TypeVar("R")
 LONGEST = 1 << 16
-"""Bytes of a description that are read of a file."""
+"""Maximum number of bytes that are read for a description."""
 
 
 class DamageWarning(UserWarning):
-    """Work that was done is lost to damage, and is done anew."""
+    """Warning that finished work was lost to damage, and is repeated."""
 
 
 class Journal:
-    """The whole records of one run, by group and first row, open while the run goes on."""
+    """Valid records of one run, by group and first row, open during the run."""
 
     def __init__(self, path: Path, file: BinaryIO, key: bytes, places: dict[Batch, tuple[int, int]]) -> None:
         self._path, self._file, self._key, self._places = path, file, key, places
@@ -51,12 +51,12 @@ class Journal:
         return len(self._places)
 
     def add(self, batch: Batch, payload: bytes) -> None:
-        """Append a record; then a kill of this process does not lose it.
+        """Append a record, which then survives a kill of this process.
 
         Raises
         ------
         InputError
-            A disk that takes no more; what was added before stays.
+            A full disk; earlier records stay.
         """
         try:
             start = self._file.seek(0, os.SEEK_END)
@@ -64,12 +64,13 @@ class Journal:
             self._file.flush()
         except OSError as error:
             raise InputError(
-                f"{self._path}: takes no more ({explain_error(error)}). Make room there: the same command goes on."
+                f"{self._path}: cannot be extended ({explain_error(error)}). Free space there, then run the "
+                "same command again to resume."
             ) from error
         self._places[batch] = start, HEAD.size + len(payload)
 
     def read(self, batch: Batch) -> bytes:
-        """What was added.
+        """Return the payload of a record.
 
         Raises
         ------
@@ -81,24 +82,24 @@ class Journal:
         record = self._file.read(size)
         if _proved(record, 0, self._key) != batch:
             raise InputError(
-                f"{self._path}: rows from {batch[1]} on of `{batch[0]}` were damaged just now: give the same command "
-                "again, and they are solved anew."
+                f"{self._path}: rows from {batch[1]} on of `{batch[0]}` are corrupted: run the same command again to "
+                "recompute them."
             )
         return record[HEAD.size :]
 
     def append(self, row: Any) -> None:
-        """Add a dataclass of plain numbers and texts as the next row; InputError as `add`."""
+        """Append a dataclass of plain numbers and texts as the next row; InputError as `add`."""
         _, last = next(reversed(self._places), ("row", -1))
         self.add(("row", last + 1), json.dumps(asdict(row)).encode())
 
     def rows(self, kind: type[R]) -> list[R]:
-        """Rows that were appended, as dataclasses of one kind; InputError as `read`."""
+        """Return the appended rows, as dataclasses of one kind; InputError as `read`."""
         return [kind(**json.loads(self.read(batch))) for batch in sorted(self._places)]
 
 
 @contextmanager
 def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
-    """Yield the journal of the run that `stated` describes, begun or gone on with; the file stays.
+    """Yield the journal of the run that `stated` describes, new or resumed; the file stays.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
     Warns
     -----
     DamageWarning
-        Records that are damaged, which are left out.
+        Damaged records, which are left out.
     """
     opening = _record((RUN, 0), json.dumps(dict(stated)).encode(), b"")
     key = hashlib.sha256(opening).digest()
@@ -125,7 +126,7 @@ def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
 
 
 def run_of(path: Path) -> dict[str, str]:
-    """Return description of the run whose journal a file is; empty where none can be read."""
+    """Return the description of the run that a journal belongs to; empty if it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         head = file.read(LONGEST)
         if _proved(head, 0, b"") == (RUN, 0):
@@ -134,15 +135,15 @@ def run_of(path: Path) -> dict[str, str]:
 
 
 def _payload(held: Held) -> bytes:
-    """Payload of the first record, which is whole."""
+    """Return the payload of the first record, which must be valid."""
     return held[HEAD.size : HEAD.size + HEAD.unpack(held[: HEAD.size])[3]]
 
 
 def _taken_up(
     path: Path, file: BinaryIO, opening: bytes, key: bytes, stated: Mapping[str, str]
 ) -> dict[Batch, tuple[int, int]]:
-    """Start and size of the whole records, after the last of which the file is cut."""
-    foreign = f"{path}: is no unfinished run, or its beginning is damaged: delete it, and the same command begins anew."
+    """Return start and size of the valid records, and truncate the file after the last."""
+    foreign = f"{path}: is not an unfinished run, or its beginning is damaged: delete it, and run the command again."
     if not file.seek(0, os.SEEK_END):
         raise InputError(foreign)
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as held:
@@ -156,8 +157,8 @@ def _taken_up(
     names = ([] if whole else ["its beginning"]) + [name for start, name in damaged if start < end]
     if names:
         warnings.warn(
-            f"{path}: {', '.join(names[:5])}{' and more' if names[5:] else ''}: damaged. What was lost is solved anew, "
-            "and all else goes on.",
+            f"{path}: {', '.join(names[:5])}{' and more' if names[5:] else ''}: damaged. The lost part is recomputed, "
+            "the remainder is kept.",
             DamageWarning,
             stacklevel=4,
         )
@@ -170,12 +171,12 @@ def _taken_up(
 def check_same_description(
     path: Path, before: Mapping[str, str], stated: Mapping[str, str], verb: str = "begun", remedy: str = "delete it, "
 ) -> None:
-    """Reject a file whose description `before` differs from what is `stated` now.
+    """Reject a file whose description `before` differs from the present one, `stated`.
 
     Raises
     ------
     InputError
-        The first name whose text differs; a finished file says "made" in place of the `verb`, and has no `remedy`.
+        The first name with another text; for a finished file the `verb` is "made", and there is no `remedy`.
     """
     for name, wanted in stated.items():
         found = before.get(name, "nothing")
@@ -187,7 +188,7 @@ def check_same_description(
 
 
 def _records(held: Held, start: int, key: bytes) -> tuple[dict[Batch, tuple[int, int]], list[tuple[int, str]]]:
-    """Start and size of the whole records from `start` on; start and name of what is none."""
+    """Return start and size of the valid records from `start` on; start and name of the invalid ones."""
     places: dict[Batch, tuple[int, int]] = {}
     damaged: list[tuple[int, str]] = []
     while start < len(held):
@@ -209,7 +210,7 @@ def _record(batch: Batch, payload: bytes, key: bytes) -> bytes:
 
 
 def _proved(held: Held, start: int, key: bytes) -> Batch | None:
-    """Return the batch of the record at a place, or None where no whole record of this key is."""
+    """Return the batch of the record at `start`, or None if there is no valid record with this key."""
     head = held[start : start + HEAD.size]
     if len(head) < HEAD.size:
         return None
@@ -223,23 +224,23 @@ def _proved(held: Held, start: int, key: bytes) -> Batch | None:
 
 
 def _name(held: Held, start: int) -> str:
-    """What a damaged record was, where it can be read."""
+    """Return the name of a damaged record, if it can be read."""
     head = held[start : start + HEAD.size]
     if len(head) == HEAD.size and head.startswith(MARK):
         _, group, first, _, _ = HEAD.unpack(head)
         if group.rstrip(b"\0").isalpha():
             return f"rows from {first} on of `{group.rstrip(bytes(1)).decode()}`"
-    return "rows whose number is lost"
+    return "rows with an unreadable number"
 
 
 def _digest(head: bytes, payload: bytes, key: bytes) -> bytes:
-    state = hashlib.sha256(key + head)  # processors have instructions for it
+    state = hashlib.sha256(key + head)  # fast, by instructions of the processor
     state.update(payload)
     return state.digest()[:16]
 
 
 def _lock(path: Path, file: BinaryIO) -> None:
-    """Keep other runs out until the file is closed, where the system can."""
+    """Lock the file against other runs until it is closed, where the system can."""
     try:
         import fcntl
     except ImportError:

@@ -1,4 +1,4 @@
-"""Folder that Warp compiles kernels into: a private temporary one where the user's cannot be written."""
+"""Folder in which Warp compiles kernels: a private temporary one if the user's cannot be written."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from tempfile import TemporaryFile, gettempdir, mkdtemp
 
 from ..errors import InputError
 
-VARIABLE = "WARP_CACHE_PATH"
-NAME = "sulcus-kernels"
-REMEDY = f"Set {VARIABLE} to a folder that can be written."
+VARIABLE = "WARP_CACHE_PATH"  # Environment variable with Warp's folder.
+NAME = "sulcus-kernels"  # Prefix of the temporary folder.
+REMEDY = f"Set {VARIABLE} to a folder that can be written."  # Ends the messages below.
 
 
 def ensure_writable_cache() -> None:
-    """Set `WARP_CACHE_PATH` to a private temporary folder, with a warning, where Warp's own choice cannot be written.
+    """Set `WARP_CACHE_PATH` to a private temporary folder, with a warning, if Warp's own choice cannot be written.
 
-    Processes that are started later inherit it. Warp reads it when it is first used.
+    Child processes inherit it. Warp reads it when it is first used.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def ensure_writable_cache() -> None:
 
 
 def _usual_folder() -> Path:
-    """Return the folder that Warp chooses by itself."""
+    """Return Warp's default folder."""
     number = version("warp-lang")
     if chosen := os.environ.get(VARIABLE):
         return Path(chosen).absolute() / number
@@ -52,7 +52,7 @@ def _usual_folder() -> Path:
 
 
 def _is_writable(folder: Path) -> bool:
-    """Return True if a file can be written in a folder, which is made; a home that is not known is none."""
+    """Return True if a file can be written in a folder, which is created; False for an unknown home folder."""
     try:
         if not folder.is_absolute():
             return False
@@ -65,12 +65,12 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _private_folder() -> Path:
-    """A folder that this user alone can read and write: the same one in later runs, unless another user took its name.
+    """Create a folder that only this user can access: the same in later runs, unless another user took its name.
 
     Raises
     ------
     OSError
-        No folder can be made.
+        No folder can be created.
     """
     own = os.getuid() if hasattr(os, "getuid") else 0
     folder = Path(gettempdir()) / f"{NAME}-{own}"

@@ -1,4 +1,4 @@
-"""Packages of an extra: a command that needs one says which, in one line."""
+"""Import of optional packages, with a one-line error that names the missing one."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from ..errors import InputError
 
 
 def install_hint(extra: str) -> str:
-    """Sentence that says how to install an extra of this package: from its checkout, as no index has it."""
+    """Return a sentence on how to install an extra of this package: from its checkout, as no index has it."""
     return f"Install it in the checkout: pip install -e '.[{extra}]'."
 
 
 @contextmanager
 def require_extra(extra: str, what: str) -> Iterator[None]:
-    """Import packages of an extra in a block, for `what` needs them: "these environments need".
+    """Import packages of an extra in a block; `what` needs them: "these environments need".
 
     Raises
     ------
     InputError
-        In place of ModuleNotFoundError: which package is not installed, and how to install the extra.
+        Replaces ModuleNotFoundError: names the missing package, and how to install the extra.
     """
     try:
         yield

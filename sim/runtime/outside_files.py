@@ -1,4 +1,4 @@
-"""Files that come from outside: whatever is wrong with them is said in one sentence of ours."""
+"""Reading of files from outside: every failure becomes an error message of one sentence."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ import numpy as np
 from ..errors import InputError
 
 LOCKED = "Close it there, then give the same command again."
-"""What to do about a file that another program holds."""
+"""Remedy for a file that another program has open."""
 
 CUT_OFF = re.compile(r"truncated file: eof = (\d+),.* stored_eof = (\d+)")
-"""What HDF5 says of a file that ends too early: how many bytes it has, and should have."""
+"""Pattern of HDF5's message on a truncated file: its size, and the size it should have [bytes]."""
 
 
 def to_path(path: object) -> Path:
-    """What names a file.
+    """Convert text or a path to a Path.
 
     Raises
     ------
     InputError
-        Anything but text or a path.
+        Any other type.
     """
     if not isinstance(path, str | os.PathLike):
         raise InputError(f"{path!r} names no file: give its path as text, or as a pathlib.Path.")
@@ -34,22 +34,22 @@ def to_path(path: object) -> Path:
 
 @contextmanager
 def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
-    """Turn whatever a block raises while it reads `path` into a sentence.
+    """Turn any exception of a block that reads `path` into an InputError of one sentence.
 
     Parameters
     ----------
     kind
-        What the file should be, with its article: "a mesh".
+        Expected kind of file, with its article: "a mesh".
     remedy
-        A sentence that says what to do.
+        Sentence with the remedy.
 
     Raises
     ------
     InputError
-        In place of every exception but an interruption; those that are sentences already begin with the path.
+        Replaces every exception but an interruption; an InputError that already begins with the path is unchanged.
     """
     try:
-        with np.errstate(all="ignore"):  # of numbers that damage made
+        with np.errstate(all="ignore"):  # damaged numbers
             yield
     except InputError as error:
         if str(error).startswith(str(path)):
@@ -57,12 +57,12 @@ def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
         raise InputError(f"{path}: {error}") from error
     except BlockingIOError as error:
         raise InputError(f"{path}: is locked: another program has it open for writing. {LOCKED}") from error
-    except (Exception, SystemExit) as error:  # a damaged byte leads a library to raise anything, or to exit
+    except (Exception, SystemExit) as error:  # a damaged file may cause any exception
         raise InputError(f"{path}: cannot be read as {kind}: {_reason(error)}. {remedy}") from error
 
 
 def _reason(error: BaseException) -> str:
-    """Why, in words that are not a library's."""
+    """Return the reason in plain words, not those of a library."""
     match error:
         case MemoryError():
             return "it asks for more memory than there is"

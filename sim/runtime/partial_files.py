@@ -1,4 +1,4 @@
-"""Hidden names of files and folders that are being written, and removal of those that killed processes left."""
+"""Hidden names of files and folders during writing, and removal of those left by killed processes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 STALE = 24 * 3600.0
-"""Another machine's unfinished file is a left-over after so long [s]: whoever writes, writes every few minutes."""
+"""Age [s] after which another machine's unfinished file is a left-over: active runs write every few minutes."""
 
 
 def remove_left_overs(
@@ -22,16 +22,16 @@ def remove_left_overs(
     stale: float = STALE,
     kept: Callable[[str], bool] = lambda wanted: False,
 ) -> None:
-    """Remove what dead processes of this machine left unfinished in a folder, and what others have not touched lately.
+    """Remove unfinished files of dead processes of this machine in a folder, and old ones of other machines.
 
     Parameters
     ----------
     name
-        Of the file whose left-overs are meant; None means all files.
+        Name of the file whose left-overs are removed; None: all files.
     stale
-        How long others need not have touched theirs [s].
+        Age at which those of other machines are removed [s].
     kept
-        Whether what was to become the file of a name stays all the same, as somebody may go on with it.
+        Function that returns True if the unfinished file for a name stays, because a run may resume from it.
     """
     form = _partial_form(name)
     try:
@@ -44,41 +44,38 @@ def remove_left_overs(
                 shutil.rmtree(left, ignore_errors=True)
             elif dead:
                 left.unlink(missing_ok=True)
-    except OSError:  # a folder that may not be listed, or a left-over that may not be removed, stops no work
+    except OSError:  # removal is optional: missing permissions do not stop the work
         return
 
 
 def _host() -> str:
-    """Return a name of 8 characters for the machine: process numbers tell nothing of another's."""
+    """Return an identifier of 8 characters for the machine: process numbers are valid on one machine only."""
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
 def to_unfinished_path(path: Path) -> Path:
-    """Where a run that goes on keeps what it has done so far of `path`."""
+    """Return the path of the unfinished work on `path`, from which a run resumes."""
     return path.with_name(path.name + ".partial")
 
 
 def to_partial_path(path: Path) -> Path:
-    """Return the hidden name under which this process writes `path`, a file or a folder.
-
-    `remove_left_overs` knows it.
-    """
+    """Return the hidden name under which this process writes `path`, a file or a folder; see `remove_left_overs`."""
     return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
 
 
 def list_partials(path: Path) -> list[Path]:
-    """Return the hidden names under which any process of any machine writes `path`, or has left it unfinished."""
+    """List the hidden names under which any process of any machine writes `path`, or has left it unfinished."""
     form = _partial_form(path.name)
     return sorted(left for left in path.parent.glob(f".sulcus-*-{glob.escape(path.name)}") if form.fullmatch(left.name))
 
 
 def _partial_form(name: str | None) -> re.Pattern[str]:
-    """Of hidden names: machine, process, and the name that is to be; None: any."""
+    """Build the pattern of hidden names: machine, process, and final name; None: any name."""
     return re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-({'.+' if name is None else re.escape(name)})")
 
 
 def _alive(process: int) -> bool:
-    """Whether a process of this number runs; where that cannot be found out, it may."""
+    """Return True if a process with this number runs, or if that cannot be determined."""
     if os.name != "posix" or process == os.getpid():
         return True
     try:

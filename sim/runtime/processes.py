@@ -1,4 +1,4 @@
-"""Spawned processes: one that runs a function, and a pool with one on each device that does task after task."""
+"""Spawned processes: a single one that runs a function, and a pool with one per device that runs tasks."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ from typing import Any, TypeVar
 from ..errors import InputError
 
 Task = TypeVar("Task")
-# How long a process that has closed its pipe may take to end [s].
-PATIENCE = 5.0
+PATIENCE = 5.0  # Maximum time for a process to end after it has closed its pipe [s].
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-"""Variable of the cards that a process sees."""
+"""Environment variable with the GPUs that a process can use."""
 
 
 class LostError(InputError):
-    """A process that was ended, or whose card failed; what others did stays."""
+    """Process that was killed, or whose GPU failed; results of the other processes are kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Child:
-    """A process that works on a device, and the pipe to it."""
+    """Process that works on a device, and the pipe to it."""
 
     device: str
     process: BaseProcess
-    pipe: Any  # its class is another on Windows
+    pipe: Any  # its class differs on Windows
 
 
 def start_process(
@@ -41,8 +40,8 @@ def start_process(
 ) -> BaseProcess:
     """Start a spawned process that calls `target(*given)`, a function of a module.
 
-    It ends with this process, however that ends, and ignores Ctrl-C, which the terminal gives to all: this process ends
-    it. It finds the `variables` in its environment before it imports anything.
+    It ends with this process in any case, and ignores Ctrl-C, which the terminal sends to all: this process ends it.
+    The `variables` are in its environment before it imports anything.
     """
     process = get_context("spawn").Process(target=_run, args=(target, given), name=name, daemon=True)
     with _environment(variables or {}), _interrupts_ignored():
@@ -52,16 +51,16 @@ def start_process(
 
 @contextmanager
 def process_pool(devices: Sequence[str], make: Callable[..., Any], *given: Any) -> Iterator[tuple[Child, ...]]:
-    """Start a process on each of the devices, which calls `make(device, *given)`; all are killed at the end.
+    """Start a process on each device, which calls `make(device, *given)`; all are killed at the end.
 
-    Each sees its own card alone, as "cuda:0". `make` is a function of a module.
+    Each can use its own GPU alone, as "cuda:0". `make` is a function of a module.
 
     Raises
     ------
     InputError
-        What `make` raises.
+        Raised by `make`.
     LostError
-        A process that was ended.
+        A process that was killed.
     """
     with ExitStack() as closing:
         children = [_started(device, make, given, closing) for device in devices]
@@ -71,7 +70,7 @@ def process_pool(devices: Sequence[str], make: Callable[..., Any], *given: Any) 
 
 
 def map_apart(function: Callable[[Task], Any], tasks: Sequence[Task], count: int = 1) -> Iterator[tuple[Task, Any]]:
-    """Yield each task with its result, as they come, from at most `count` processes that end with the last task.
+    """Yield each task with its result, in order of completion, from at most `count` processes, killed at the end.
 
     Raises
     ------
@@ -85,21 +84,21 @@ def map_apart(function: Callable[[Task], Any], tasks: Sequence[Task], count: int
 def map_unordered(
     children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Iterable[Task]
 ) -> Iterator[tuple[Task, Any]]:
-    """Yield each task with `work(made, task)`, as they come: the next task goes to the process that is free.
+    """Yield each task with `work(made, task)`, in order of completion: the next task goes to the next idle process.
 
     Raises
     ------
     InputError
-        What `work` raises.
+        Raised by `work`.
     LostError
-        A process that was ended. What others had ready is given before.
+        A process that was killed. Finished results of the others are yielded first.
     """
     waiting, busy = iter(tasks), {}
     lost: Exception | None = None
 
     def busied(child: Child) -> None:
         for task in waiting:
-            with suppress(BrokenPipeError, ConnectionResetError):  # to be noticed where its answer is read
+            with suppress(BrokenPipeError, ConnectionResetError):  # reported when its result is read
                 child.pipe.send((work, task))
             busy[child.pipe] = child, task
             return
@@ -125,7 +124,7 @@ def map_unordered(
 
 
 def run_on_each(children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
-    """Return result of each process for its own of the tasks; all of them begin together.
+    """Return the result of each process for its own task; all of them begin together.
 
     Raises
     ------
@@ -147,12 +146,12 @@ def run_on_each(children: Sequence[Child], work: Callable[[Any, Task], Any], tas
 
 
 def _receive(child: Child) -> Any:
-    """Next answer of a process.
+    """Receive the next result of a process.
 
     Raises
     ------
     LostError
-        A process that was ended, or a card that failed.
+        A process that was killed, or a GPU that failed.
     """
     try:
         answer = child.pipe.recv()
@@ -164,7 +163,7 @@ def _receive(child: Child) -> Any:
         ) from None
     if not isinstance(answer, Exception):
         return answer
-    if isinstance(answer, RuntimeError) and child.device.startswith("cuda"):  # what Warp and torch make of a card's
+    if isinstance(answer, RuntimeError) and child.device.startswith("cuda"):  # raised by Warp and torch for a GPU
         reason = (str(answer).strip() or type(answer).__name__).splitlines()[0]
         raise LostError(
             f"{child.device} failed: {reason}. If that happens again, give --device one {child.device} less."
@@ -173,7 +172,7 @@ def _receive(child: Child) -> Any:
 
 
 def to_gpu_variables(device: str) -> dict[str, str]:
-    """Environment in which a process sees the card of a device alone, as "cuda:0"; none of another device."""
+    """Return the environment in which a process can use the GPU of a device alone, as "cuda:0"; empty for the CPU."""
     kind, _, number = device.partition(":")
     if kind != "cuda":
         return {}
@@ -194,7 +193,7 @@ def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], clos
 
 @contextmanager
 def _environment(more: Mapping[str, str]) -> Iterator[None]:
-    """Set variables for the time of the block."""
+    """Set environment variables during the block."""
     before = {name: os.environ.get(name) for name in more}
     os.environ.update(more)
     try:
@@ -209,7 +208,7 @@ def _environment(more: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C for the time of the block: a process that is started there inherits that."""
+    """Ignore Ctrl-C during the block: a process started in it inherits this."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -227,7 +226,7 @@ def _end(child: Child) -> None:
 
 
 def _serve(pipe: Any, device: str, make: Callable[..., Any], given: tuple[Any, ...]) -> None:
-    """Make, and do tasks until the pipe ends; errors are answers too."""
+    """Call `make`, then run tasks until the pipe closes; exceptions are sent as results."""
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         made = _tried(make, device, *given)
         pipe.send(made if isinstance(made, Exception) else None)
@@ -245,7 +244,7 @@ def _call(function: Callable[[Task], Any], task: Task) -> Any:
 
 
 def _tried(function: Callable[..., Any], *given: Any) -> Any:
-    """What a function gives, or what it raises, with its traceback as a note."""
+    """Return the result of a function, or the exception that it raises, with its traceback as a note."""
     try:
         return function(*given)
     except Exception as error:
@@ -267,10 +266,10 @@ def _end_with_parent() -> None:
 
 
 def _why(code: int | None) -> str:
-    """How a process ended, in brackets."""
+    """Return how a process ended, in brackets."""
     if code is None or code == 0:
         return ""
     if code > 0:
         return f" (exit code {code})"
     name = signal.strsignal(-code) or f"signal {-code}"
-    return f" ({name}), for want of memory most likely" if -code == signal.SIGKILL else f" ({name})"
+    return f" ({name}), probably out of memory" if -code == signal.SIGKILL else f" ({name})"

@@ -1,4 +1,4 @@
-"""Threads: BLAS held to one, where several would wait for one another, and native loops on several cores at once."""
+"""Control of threads: BLAS limited to one, where several would wait for one another; native loops on several cores."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from threading import Lock, Thread
 
 from threadpoolctl import ThreadpoolController
 
-# Who is inside, as the limit is the whole process's: a page and its finite elements are two threads of it.
+# Active blocks of all threads: the limit applies to the whole process, for example to a page and its FEM solver.
 _lock, _inside = Lock(), []
 
 
 @cache
 def _loaded() -> ThreadpoolController:
-    """Return the libraries that are loaded: to look for them takes a millisecond, to tell them a hundredth."""
+    """Return the controller of the loaded libraries, cached: finding them takes 1 ms, limiting them 0.01 ms."""
     return ThreadpoolController()
 
 
 @contextmanager
 def limit_to_one_thread() -> Iterator[None]:
-    """While anyone is in it, the libraries that were loaded when it was first entered use one thread.
+    """Limit BLAS to one thread while any block is active, in the libraries loaded when this was first called.
 
-    The first who enters tells them, the last who leaves gives them back what they had: what is computed inside has the
-    same bits whoever else comes and goes.
+    The first block sets the limit, and the last restores the previous one: results inside are bitwise the same,
+    whatever other threads do.
     """
     with _lock:
         _inside.append(_inside[0] if _inside else _loaded().limit(limits=1, user_api="blas"))
@@ -40,19 +40,19 @@ def limit_to_one_thread() -> Iterator[None]:
                 limit.restore_original_limits()
 
 
-Task = Callable[[], object]
+Task = Callable[[], object]  # Function to run on a thread.
 
 
 @dataclass(frozen=True)
 class Sharing:
-    """When native loops are divided among threads.
+    """Limits for dividing native loops among threads.
 
     Parameters
     ----------
     most
-        Threads; more share one memory, and were not measured.
+        Maximum threads; more share the memory bandwidth, and were not measured.
     least
-        Elements or unknowns: to hand fewer over takes longer, a tenth of a millisecond, than they do.
+        Minimum elements or unknowns: with fewer, the hand-over (0.1 ms) takes longer than the loop.
     """
 
     most: int = 2
@@ -60,7 +60,7 @@ class Sharing:
 
 
 def choose_threads(work: int, sharing: Sharing = Sharing()) -> int:
-    """How many threads native loops over so many elements or unknowns are divided among."""
+    """Choose the number of threads for a native loop over `work` elements or unknowns."""
     if work < sharing.least:
         return 1
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -68,9 +68,9 @@ def choose_threads(work: int, sharing: Sharing = Sharing()) -> int:
 
 
 def run_together(tasks: Sequence[Task]) -> None:
-    """Run tasks at the same time, the first on this thread; back when all have ended. None may call this in its turn.
+    """Run tasks at the same time, the first on this thread, and wait for all. No task may call this function.
 
-    Threads stay, waiting at a queue: a pool's futures cost four times as long, which a task of a millisecond feels.
+    Threads wait at a queue for reuse: the futures of a pool cost four times as long, which matters for tasks of 1 ms.
     """
     ended: SimpleQueue[BaseException | None] = SimpleQueue()
     for number, task in enumerate(tasks[1:]):
@@ -91,7 +91,7 @@ def _waiting(number: int) -> SimpleQueue[tuple[Task, SimpleQueue[BaseException |
     return queue
 
 
-# A forked process has the queues without the threads that wait at them.
+# A forked process inherits the queues without their threads.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_waiting.cache_clear)
 
@@ -101,7 +101,7 @@ def _serve(queue: SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]) -
         task, ended = queue.get()
         try:
             task()
-        except BaseException as error:  # whoever waits raises it
+        except BaseException as error:  # raised by the waiting thread
             ended.put(error)
         else:
             ended.put(None)

@@ -1,4 +1,4 @@
-"""Where the time goes: seconds by stage, for whoever listens."""
+"""Wall time by stage, for active listeners."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_listening: list[dict[str, float]] = []
+_listening: list[dict[str, float]] = []  # Seconds by stage of each active listener.
 
 
 @contextmanager
 def time_stage(name: str) -> Iterator[None]:
-    """Add the wall time [s] of the block to the stage `name` of every listener; stages do not lie in each other."""
+    """Add the wall time [s] of the block to the stage `name` of every listener; stages are not nested."""
     began = time.perf_counter()
     try:
         yield
@@ -22,7 +22,7 @@ def time_stage(name: str) -> Iterator[None]:
 
 @contextmanager
 def listen_to_stages() -> Iterator[dict[str, float]]:
-    """Yield the seconds of the stages inside the block, in the order in which they end first."""
+    """Yield the seconds of the stages inside the block, in the order in which they first end."""
     seconds: dict[str, float] = {}
     _listening.append(seconds)
     try:

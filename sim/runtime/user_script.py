@@ -1,4 +1,4 @@
-"""A user's own Python file: run as it stands, with the rights of whoever runs it; a failure is stated in a sentence."""
+"""Execution of a user's Python file with the user's rights; failures become one-sentence errors."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ..errors import InputError
 
 
 def run_script(path: str | Path) -> ModuleType:
-    """Return the module that a Python file makes; modules beside the file can be imported from it.
+    """Run a Python file and return its module; it can import modules from its folder.
 
-    The same text at the same place is run once a process, so that its classes are the same for all who ask.
+    The same text at the same path runs once per process, so that its classes are the same for all callers.
 
     Raises
     ------
     InputError
-        A file that is missing, is no Python, or raises an exception: with its line.
+        A file that is missing, is not valid Python, or raises an exception: with the line.
     """
     path = Path(path).absolute()
     try:
@@ -35,13 +35,13 @@ def run_script(path: str | Path) -> ModuleType:
     except (SyntaxError, ValueError) as error:  # a null byte is a ValueError in some versions
         line = getattr(error, "lineno", None)
         where = f"{path}, line {line}" if line else f"{path}"
-        raise InputError(f"{where}: is no Python ({getattr(error, 'msg', error)}). Mend the file.") from error
+        raise InputError(f"{where}: is not valid Python ({getattr(error, 'msg', error)}). Correct the file.") from error
     module = ModuleType(name)
     module.__file__ = str(path)
-    sys.modules[name] = module  # dataclasses and Warp look their module up
+    sys.modules[name] = module  # needed by dataclasses and Warp
     folder = str(path.parent)
     if folder not in sys.path:
-        sys.path.append(folder)  # last: no file beside it stands in for a library's
+        sys.path.append(folder)  # last: a file next to it cannot replace a library
     try:
         exec(code, module.__dict__)
     except (Exception, SystemExit) as error:
@@ -54,9 +54,9 @@ def run_script(path: str | Path) -> ModuleType:
 
 
 def format_script_error(path: Path, error: BaseException) -> str:
-    """What a user's file raised, and in which of its lines."""
+    """Describe the exception that a user's file raised, with its last line in that file."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
     where = f"{path}, line {lines[-1]}" if lines else str(path)
     if isinstance(error, InputError):
         return f"{where}: {error}"
-    return f"{where}: raised {type(error).__name__}: {error}. Mend the file."
+    return f"{where}: raised {type(error).__name__}: {error}. Correct the file."

@@ -1,4 +1,4 @@
-"""Versions of installed packages, and the name under which package indexes know this one."""
+"""Versions of installed packages, and this package's name on package indexes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DISTRIBUTION = "sulcus-ar"
 
 @cache
 def get_version(package: str) -> str:
-    """Version of a package; "sulcus" is this one, which may be a checkout that is not installed."""
+    """Return the version of a package; "sulcus" is this one, which may be a checkout that is not installed."""
     if package != "sulcus":
         return version(package)
     try:

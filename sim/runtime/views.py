@@ -1,4 +1,4 @@
-"""Arrays of Warp as arrays of the library that is at home where they live: NumPy on the CPU, torch on a card."""
+"""Warp arrays as arrays of the library for their device: NumPy on the CPU, torch on a GPU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .threads import limit_to_one_thread
 
 
 def get_library(device: Device) -> Any:
-    """It: `linalg.solve` and the arrays' own methods mean the same in both."""
+    """Return the library, NumPy or torch: `linalg.solve` and array methods have the same meaning in both."""
     if device.on_cuda:
         import torch
 
@@ -23,28 +23,28 @@ def get_library(device: Device) -> Any:
 
 
 def view(array: wp.array) -> Any:
-    """Return the same numbers, not a copy of them."""
+    """Return the array as the library's, without a copy."""
     return wp.to_torch(array) if array.device.is_cuda else array.numpy()
 
 
 def from_view(device: Device, values: Any) -> wp.array:
-    """Warp's array of the same numbers."""
+    """Return the library's array as Warp's, without a copy unless it is not contiguous."""
     values = values if device.on_cuda else np.ascontiguousarray(values)
     return wp.from_torch(values.contiguous()) if device.on_cuda else wp.array(values, device=device.name, copy=False)
 
 
 def to_double(values: Any) -> Any:
-    """Return the same in double precision."""
+    """Convert to double precision."""
     return values.astype(np.float64) if isinstance(values, np.ndarray) else values.double()
 
 
 def cast_like(other: Any, values: Any) -> Any:
-    """Return the same in another array's precision."""
+    """Convert to another array's precision."""
     return values.astype(other.dtype) if isinstance(values, np.ndarray) else values.to(other.dtype)
 
 
 def pad_zeros(values: Any, more: tuple[int, ...]) -> Any:
-    """Return the same with so many more zeros at the end of each of the last axes."""
+    """Append this many zeros at the end of each of the last axes."""
     shape = (
         *values.shape[: -len(more)],
         *(old + new for old, new in zip(values.shape[-len(more) :], more, strict=True)),
@@ -55,19 +55,19 @@ def pad_zeros(values: Any, more: tuple[int, ...]) -> Any:
 
 
 def order_by_size(values: Any) -> Any:
-    """Return the rows in the order in which each column (n, b) falls."""
+    """Return the row indices that sort each column of values (n, b) in descending order."""
     if isinstance(values, np.ndarray):
         return np.argsort(-values, axis=0, kind="stable")
     return values.argsort(dim=0, descending=True, stable=True)
 
 
 def sort_columns(values: Any) -> Any:
-    """Each column (n, b) sorted."""
+    """Sort each column of values (n, b) in ascending order."""
     return np.sort(values, axis=0) if isinstance(values, np.ndarray) else values.sort(dim=0).values
 
 
 def solve_dense(matrix: Any, right: Any) -> Any:
-    """matrix^-1 right; not finite where that is singular. A card is not waited for."""
+    """Solve matrix x = right; not finite where the matrix is singular. The host does not wait for the GPU."""
     if not isinstance(matrix, np.ndarray):
         import torch
 
@@ -79,28 +79,28 @@ def solve_dense(matrix: Any, right: Any) -> Any:
 
 
 def to_library(device: Device, values: np.ndarray) -> Any:
-    """Return the library's array with the same numbers; on the CPU they are these themselves."""
+    """Copy a NumPy array to the library's; on the CPU it is returned itself."""
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values
 
 
 def select_columns(device: Device, some: np.ndarray, count: int) -> Any:
-    """What picks some columns (k,), ascending, of `count`: all of them by a slice, so that nothing is copied.
+    """Return an index of columns (k,), ascending, of `count`: a slice for all of them, so that nothing is copied.
 
-    A card is not waited for where it stands for many arrays: each index of NumPy's would go up by itself.
+    On a GPU it is uploaded once for use with several arrays; NumPy indices would be uploaded each time.
     """
     return slice(None) if len(some) == count else to_library(device, some)
 
 
 def to_host(values: Any) -> np.ndarray:
-    """Either library's numbers as NumPy's."""
+    """Return the library's array as NumPy's."""
     return values if isinstance(values, np.ndarray) else values.cpu().numpy()
 
 
 @contextmanager
 def run_in_order(device: Device) -> Iterator[None]:
-    """While in it the library's work takes turns with Warp's, and its BLAS keeps to one thread on the CPU.
+    """Run the library's work in Warp's stream, and on the CPU with BLAS limited to one thread.
 
-    Threads of BLAS wait for one another, ages where something else runs on their cores.
+    BLAS threads wait for one another, very long where other processes use their cores.
     """
     if device.on_cuda:
         import torch

@@ -1,1 +1,1 @@
-"""Which solver is tried, in which order; load steps, time steps and live frames."""
+"""Solver selection, load steps, time steps and live frames."""

@@ -1,4 +1,4 @@
-"""Tools that stand on bone: nothing is solved for them, the body stays as it was."""
+"""Load cases whose tools overlap bone: they are not solved, and the mesh stays as it was."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .time_steps import NoMotionStep
 def solve_off_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
     """Solve as `Strategy.solve` the cases whose tools overlap no bone; the others stay at the last of their guesses.
 
-    Against bone no tissue gives way: a solution would be that of the barrier's stiffness, and take long.
+    Bone does not yield: a solution would depend on the barrier stiffness alone, and take long.
     """
     problem, device, count = strategy.problem, strategy.problem.device, len(cases.loads)
     if isinstance(strategy, NoMotionStep) or not problem.barriers:

@@ -1,7 +1,7 @@
-"""One frame of a live tool on the device: a push, its footprint, and L-BFGS from where the last frame ended.
+"""One frame of a live tool on the device: a push, its footprint, and L-BFGS from the state of the last frame.
 
-Everything stands in fixed arrays, so that CUDA replays the frame as one captured graph. A few numbers go up, the answer
-comes down, and what lies between, the state that it starts from included, stays.
+All arrays are fixed, so that CUDA replays the frame as one captured graph. A few values are uploaded and the result is
+downloaded; all other arrays, the start included, stay on the device.
 """
 
 from collections.abc import Mapping
@@ -22,20 +22,18 @@ from ..minimisers.lbfgs_state import LbfgsState, Workspace, allocate_ground, all
 from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
 
-# A frame that takes more evaluations is not one of a tool that moves smoothly.
-FRAME_EVALUATIONS = 60
-# A model of strained tissue that served in so many steps stays: to make one takes as long as twenty.
+FRAME_EVALUATIONS = 60  # Maximum residual evaluations of a frame: a tool that moves smoothly needs fewer.
+# Steps within which a frame must converge for its model of strained tissue to be kept: a new one costs twenty steps.
 SERVED = 12
-# What goes up: point and radius, force, and how far to move on.
-GIVEN = 8
-# What comes down before the displacements; the sums are those of the footprint.
+GIVEN = 8  # Length of the input: point (3) and radius [m], force (3) [N], extrapolation factor.
+# Slots of the output before the displacements; from SUMS on, the four sums of the footprint.
 STATUS, STEPS, RESIDUAL, INVERTED, SUMS = 0, 1, 2, 3, 4
-HEAD = 8
+HEAD = 8  # Number of these slots.
 
 
 @dataclass(frozen=True)
 class FrameKernels:
-    """What stands around the iterations of a frame, in one scalar type."""
+    """Kernels before, between and after the L-BFGS iterations of a frame, in one scalar type."""
 
     pull: wp.Kernel
     move_on: wp.Kernel
@@ -46,7 +44,7 @@ class FrameKernels:
 
 @cache
 def build_kernels(device: Device) -> FrameKernels:
-    """Kernels of a device's scalar type, for one column."""
+    """Build the kernels for a device's scalar type, for one load case."""
     scalar, most, m, head, lanes = device.scalar, FRAME_EVALUATIONS, PAIRS, HEAD, get_warp_width(device)
 
     @forward_kernel(module="unique")
@@ -59,7 +57,7 @@ def build_kernels(device: Device) -> FrameKernels:
         constant: wp.array2d(dtype=scalar),
         loud: wp.array2d(dtype=wp.float64),
     ):
-        """Gradient -w_i / (sum of w) F of the push, and its square norm."""
+        """Write the gradient -w_i / (sum of w) F of the push, and add its square norm."""
         i = wp.tid()
         square = wp.float64(0.0)
         if i < nodes.shape[0]:
@@ -82,7 +80,7 @@ def build_kernels(device: Device) -> FrameKernels:
         g: wp.array2d(dtype=scalar),
         z: wp.array2d(dtype=scalar),
     ):
-        """u += a (u - past), and u was the past; no direction is known."""
+        """Extrapolate u += a (u - past), store the old u as past, and clear direction and gradients."""
         r = wp.tid()
         last = u[r, 0]
         u[r, 0] = last + scalar(given[7]) * (last - past[r, 0])
@@ -107,7 +105,7 @@ def build_kernels(device: Device) -> FrameKernels:
         going: wp.array(dtype=wp.int32),
         inverted: wp.array(dtype=wp.int32),
     ):
-        """About to judge the start; the pairs stay."""
+        """Reset the iteration, so that it evaluates the start first; the L-BFGS history stays."""
         t[0] = wp.float64(0.0)
         promised[0] = wp.float64(wp.inf)
         residual[0] = wp.float64(wp.inf)
@@ -129,7 +127,7 @@ def build_kernels(device: Device) -> FrameKernels:
         tried: wp.array(dtype=wp.int32),
         going: wp.array(dtype=wp.int32),
     ):
-        """Whether to go on."""
+        """Count the evaluation, and clear `going` if the descent has ended."""
         tried[0] = tried[0] + 1
         going[0] = wp.where(status[0] == LIVE and tried[0] < most, 1, 0)
 
@@ -144,7 +142,7 @@ def build_kernels(device: Device) -> FrameKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """All that the host wants to know, in one row."""
+        """Write status, counts, footprint sums and displacements to one array for the host."""
         r = wp.tid()
         out[head + r] = wp.float64(u[r, 0])
         if r == 0:
@@ -159,20 +157,20 @@ def build_kernels(device: Device) -> FrameKernels:
 
 
 class CapturedFrame:
-    """Answers one push from the state that stands here, which then is that of the answer.
+    """Solver of one push from the state on the device, which it replaces with the solution.
 
     Parameters
     ----------
     problem, preconditioner
-        Of a body that nothing but pushes load here. The preconditioner serves every state.
+        Problem with pushes as the only loads. The preconditioner is valid for every state.
     inversion
-        Of the same discretisation.
+        Inverted-element check of the same discretisation.
     skin
-        Where tools push.
+        Surface on which tools push.
     tolerance
-        As `Accuracy` has it.
+        Relative residual, as in `Accuracy`.
     part
-        Finds strained tissue, if frames are to know it.
+        Finder of strained tissue, for updates of the preconditioner; None: no updates.
     """
 
     def __init__(
@@ -186,7 +184,7 @@ class CapturedFrame:
     ):
         self._device, self._inversion, self._skin, self.part = problem.device, inversion, skin, part
         self.bent: UpdatedModel | None = None
-        """What the next frame knows of strained tissue."""
+        """Model of strained tissue for the next frame."""
         self._knowing: UpdatedPreconditioner | None = None
         if part is not None:
             part.prepare()
@@ -205,23 +203,23 @@ class CapturedFrame:
 
     @property
     def state(self) -> LbfgsState:
-        """Of the last answer."""
+        """State of the last solution."""
         return self._workspace.state
 
     @property
     def u(self) -> wp.array:
-        """Displacements (3N, 1) [m] of the last answer."""
+        """Displacements (3N, 1) [m] of the last solution."""
         return self._workspace.columns["u"]
 
     @property
     def before(self) -> LbfgsState:
-        """What the last answer started from."""
+        """State that the last solution started from."""
         return self._before
 
     def take(
         self, u: np.ndarray, past: np.ndarray | None, learnt: Mapping[str, np.ndarray], bent: UpdatedModel | None = None
     ) -> None:
-        """Another state: displacements u (3N, 1) [m], those before them, and what was learnt, if anything."""
+        """Load another state: displacements u (3N, 1) [m], the ones before them, and the L-BFGS history, if any."""
         columns = self._workspace.columns
         self._know(bent)
         columns["u"].assign(u)
@@ -233,10 +231,10 @@ class CapturedFrame:
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
 
     def update_model(self, steps: float) -> None:
-        """After an answer in so many steps: know what is strained there, unless what was known has served."""
+        """Recompute the model of strained tissue at the solution, if this took more than `SERVED` steps."""
         if self.part is not None and steps > SERVED:
             self._know(update_model_at(self.part, self._device, self._workspace.columns["u"]))
-            self._workspace.columns["known"].zero_()  # pairs belong to the model that they were learnt with
+            self._workspace.columns["known"].zero_()  # curvature pairs are valid for their own model only
 
     def _know(self, bent: UpdatedModel | None) -> None:
         if self._knowing is not None:
@@ -244,10 +242,10 @@ class CapturedFrame:
             self._knowing.load(bent)
 
     def push(self, point: np.ndarray, radius: float, force: np.ndarray, share: float) -> np.ndarray:
-        """Return the answer (HEAD + 3N,) to a push at point (3,) with a footprint's radius [m] and a force (3,) [N].
+        """Solve for a push at point (3,) with a footprint's radius [m] and a force (3,) [N]; return (HEAD + 3N,).
 
-        From the state that stands here, moved on by a share of the way from the one before. What is returned is
-        written over by the next frame.
+        The start is the present state, extrapolated by `share` times its change from the one before. The returned array
+        is overwritten by the next frame.
         """
         self._up.numpy()[:] = (*point, radius, *force, share)
         device = self._device
@@ -257,7 +255,7 @@ class CapturedFrame:
             self._once()
         if device.on_cuda:
             wp.synchronize_stream(wp.get_stream(device.name))
-            # What a capture cannot load has been loaded, once there was a step.
+            # Modules that a capture cannot load are loaded once a step has been taken.
             if self._graph is None and self._down.numpy()[STEPS] > 0:
                 with wp.ScopedCapture(device.name, force_module_load=False) as capture:
                     self._once()
@@ -290,6 +288,6 @@ class CapturedFrame:
         self._device.launch(build_kernels(self._device).look, (1,), inputs, [self._tried, self._going])
 
     def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:
-        """So many numbers on the device, and as many on the host, from where a card reads without asking."""
+        """Allocate `count` values on the device, and as many in pinned host memory for direct transfer."""
         there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
         return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

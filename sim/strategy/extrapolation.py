@@ -1,8 +1,8 @@
-"""Where pushes go on to: a frame starts from its last answer, moved on along the way from the one before that.
+"""Extrapolated starts of frames: the last solution plus a multiple of its change from the one before.
 
-Between neighbouring loads the answer is nearly linear in them. Loads q, p with the answers v, u are followed by p' from
-u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2. This goes as far as the load goes on the way that it came. It is
-nothing where the load stands still or turns aside, and back on that way where it returns.
+Between neighbouring loads the solution is nearly linear in them. Loads q, p with the solutions v, u are followed by p'
+from u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2: the component of the new load step along the last one. It is
+zero if the load stays the same or turns at a right angle, and negative if the load returns.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import numpy as np
 from ..arguments import is_all_finite
 from ..loads import Loads, Pushed
 
-# Keys of what is warm: the answer's own loads (B, 2, 7), last those before them; displacements (B, 3N) [m] before it.
+# Warm-start keys: loads of the solution and of the one before (B, 2, 7); displacements (B, 3N) [m] of the latter.
 PUSHES, BEFORE = "pushes", "before"
-# A way is followed back to where it began, and on for at most as long again twice.
-BACK, ON = -1.0, 2.0
+BACK = -1.0  # Lower bound of a: back to the solution before.
+ON = 2.0  # Upper bound of a: twice the last step.
 
 
 def as_pushes(loads: Loads) -> np.ndarray | None:
-    """Point [m], force [N] and footprint [m] (B, 7) of each load; None where anything but a push acts."""
+    """Return point [m], force [N] and footprint [m] (B, 7) of each load; None if anything but a push acts."""
     push = loads.only(Pushed)
     if push is None:
         return None
@@ -30,7 +30,7 @@ def as_pushes(loads: Loads) -> np.ndarray | None:
 
 
 def compute_shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Return a (B,) for three pushes (B, 7) in turn; zero where one of them has no force, or the last two are the same.
+    """Compute the factors a (B,) of three successive pushes (B, 7); zero without force, or if the last two are equal.
 
     Lengths are measured against the last footprint, forces against the last force.
     """
@@ -47,7 +47,7 @@ def compute_shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.
 
 
 def has_warm_state(warm: Mapping[str, Any], last: np.ndarray) -> bool:
-    """Whether what is warm says how answers (3N, B) came about."""
+    """Return True if the warm-start data hold the state before the solutions (3N, B), with finite values."""
     if BEFORE not in warm or PUSHES not in warm:
         return False
     fits = warm[BEFORE].shape == last.T.shape and warm[PUSHES].shape == (last.shape[1], 2, 7)
@@ -66,7 +66,7 @@ def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -
 def compute_directions(
     now: np.ndarray | None, last: np.ndarray | None, warm: Mapping[str, Any]
 ) -> dict[str, np.ndarray]:
-    """What the answers to pushes (B, 7) hand on, whose last answers (3N, B) were left with it, if there were any."""
+    """Collect the warm-start entries of solutions to pushes (B, 7); they started from the solutions `last` (3N, B)."""
     if now is None:
         return {}
     if last is None or PUSHES not in warm or warm[PUSHES].shape != (len(now), 2, 7):

@@ -1,7 +1,7 @@
-"""One push after another, each from where the last one ended: what a frame starts from is still on the device.
+"""Sequence of pushes, each started from the solution of the last one, which is still on the device.
 
-Whether it is there or comes from the host makes no difference to the answer. Whatever does not go well is left to who
-asked.
+A start that must be uploaded from the host gives the same solution. Loads that are not solved well return None, for
+the caller to solve otherwise.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from .captured_frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, Captu
 from .extrapolation import BEFORE, PUSHES, as_pushes, compute_directions, compute_shares, has_warm_state
 from .strategy import Strategy
 
-# Components of a cross product, a fifth of the time that NumPy's takes.
+# Cyclic permutations, left and right, for a cross product in a fifth of the time of NumPy's.
 TURNED, BACK = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class Kept(Mapping[str, Any]):
-    """What is warm in an answer: curvature pairs stay on the device until they are read, or about to be written over.
+    """Warm-start data of a solution, whose L-BFGS history stays on the device until it is read or overwritten.
 
-    `bent` is what the next frame knows of strained tissue. `lock` is that of who answers: another thread may read while
-    the next frame is about to be made.
+    `bent` is the next frame's model of strained tissue. `lock` is that of the `FrameSequence`: another thread may read
+    while the next frame begins.
     """
 
     def __init__(self, own: Mapping[str, np.ndarray], state: LbfgsState, lock: RLock, bent: UpdatedModel | None = None):
@@ -49,7 +49,7 @@ class Kept(Mapping[str, Any]):
         self.bent = bent
 
     def copy_to_host(self) -> None:
-        """Bring to the host what is still on the device."""
+        """Copy to the host what is still on the device."""
         with self._lock:
             if self.state is not None:
                 self._own |= {name: to_rows_first(self.state.columns[name]) for name in LEARNT}
@@ -71,20 +71,20 @@ class Kept(Mapping[str, Any]):
 
 
 class FrameSequence:
-    """Answers single pushes that have a start, on meshes whose vertices are the discretisation's nodes.
+    """Solver of single pushes that have a start, on meshes whose vertices are the discretisation's nodes.
 
     Parameters
     ----------
     problem, inversion
-        What the frame solves, and who counts its tetrahedra.
+        Problem of the frames, and its inverted-element check.
     frame
-        Where that is done.
+        Solver on the device.
     diagnostics
-        Marks equilibria that are not of tissue.
+        Check of the equilibria for excessive strain.
     lock
-        Held by who asks for an answer.
+        Lock that the caller of `answer` holds.
     source
-        What the answers call their solver.
+        Name of the solver in the results.
     """
 
     def __init__(
@@ -101,17 +101,17 @@ class FrameSequence:
         self._source = source
         self._nodes = np.arange(problem.rows // 3)
         self._last: Callable[[], Deformation | None] = _gone
-        # Those whose pairs stand where the frame ended, and where it began.
+        # Warm-start data whose history is in the frame's present state, and in the state that it started from.
         self._here: Callable[[], Kept | None] = _gone
         self._there: Callable[[], Kept | None] = _gone
 
     def answer(self, loads: Loads, start: Deformation, guess: Callable[[], np.ndarray]) -> Deformation | None:
-        """Return the answer to a push from a start.
+        """Solve for a push from a start.
 
-        `guess` looks at it closely and makes displacements (3N, 1) [m] of it.
+        `guess` checks the start and returns its displacements (3N, 1) [m].
 
-        None where this is not the place: anything but one push with some force, a start off the constraints or inside
-        out, a descent that does not end well.
+        Return None if this solver does not apply or fails: anything but one push with some force, a start that violates
+        the constraints or has inverted elements, a descent that does not converge.
         """
         clock = time.perf_counter()
         now = as_pushes(loads)
@@ -139,7 +139,7 @@ class FrameSequence:
         warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEAD:].reshape(1, -1, 3).copy()
-        displacement.setflags(write=False)  # as a start, the device's own stands in for it
+        displacement.setflags(write=False)  # a later start uses the copy on the device
         inverted, fields = found[INVERTED : INVERTED + 1].astype(int), self._diagnostics.strains(self._frame.u)
         outcome = self._diagnostics.outcomes(np.array([Outcome.CONVERGED]), inverted, fields["strained"])
         answer = Deformation(
@@ -162,7 +162,7 @@ class FrameSequence:
         return answer
 
     def _take(self, loads: Loads, start: Deformation, last: np.ndarray) -> bool:
-        """Bring a start to the device, if it is fit for that."""
+        """Load a start onto the device; return False if it is not usable."""
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
         u = self._problem.device.array(last)
@@ -183,7 +183,7 @@ class FrameSequence:
         return None if part is None else restore_updated_model(warm, self._problem.device, len(self._nodes), part.size)
 
     def _make_way(self) -> None:
-        """What stands where the last frame ended is about to move to where it began."""
+        """Update warm-start data before the next frame: the present state will become the one that it starts from."""
         there, here = self._there(), self._here()
         if there is not None:
             there.copy_to_host()
@@ -195,7 +195,7 @@ class FrameSequence:
 def build_frame_sequence(
     strategy: Strategy, space: Discretisation, skin: ContactSurface, diagnostics: Diagnostics, lock: RLock, source: str
 ) -> FrameSequence:
-    """By the solvers of a plan that follows frames, on the tissue under a skin."""
+    """Build the frame solver from the strategy of a plan that follows frames, for pushes on a surface."""
     problem, preconditioner, inversion = strategy.problem, strategy.preconditioner, strategy.inversion
     part = build_strained_part(problem, preconditioner, space) if strategy.plan.strained else None
     frame = CapturedFrame(problem, preconditioner, inversion, skin, strategy.accuracy.tolerance, part)
@@ -203,4 +203,4 @@ def build_frame_sequence(
 
 
 def _gone() -> None:
-    """What nobody knows any more."""
+    """Return None: no solution is on the device."""

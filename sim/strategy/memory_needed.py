@@ -1,4 +1,4 @@
-"""What finite elements will take of a card's memory, foreseen from their mesh before anything is made."""
+"""GPU memory that FEM will need, estimated from the mesh before anything is allocated."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ from ..runtime.memory import (
 )
 
 PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900}
-"""Bytes of single precision that each node of an element takes: tables of the elements, and levels of multigrid. The
+"""Memory per node in single precision [bytes]: element tables and multigrid levels. The
 arrays were counted on the CPU, on 49,239 nodes (p1, smoothed) and 123,508 (p2), 2026-11-24."""
 FIXED = 2**30
-"""Bytes that the libraries' own buffers, kernels and the last level take, about."""
+"""Memory of library buffers, kernels and the last multigrid level [bytes], approximate."""
 BUDGET = MemoryBudget()
-"""What of a card's memory is taken, unless another budget is given."""
+"""Default share of a GPU's memory."""
 
 
 @dataclass(frozen=True)
 class Needed:
-    """What so many loads together take of a device, in bytes.
+    """Device memory for a number of loads [bytes].
 
     Parameters
     ----------
     nodes, element
-        Of the finite elements.
+        Number of mesh nodes, and element type.
     device
-        Where they are.
+        Device of the FEM.
     set_up, kept, column
-        At the peak of set-up; from then on; of each load that is solved together with others.
+        Peak during set-up; constant part afterwards; further part per load of a batch.
     batch
-        Loads that are solved together.
+        Loads solved together.
     free
-        Of the device, for one process.
+        Free memory of the device for one process.
     """
 
     nodes: int
@@ -60,7 +60,7 @@ class Needed:
 
     @property
     def peak(self) -> int:
-        """The most at any time: a batch stands in a room that may be wider."""
+        """Peak memory [bytes]; the workspace of a batch may be wider than the batch."""
         return max(self.set_up, self.kept + find_workspace_width(self.device, self.batch) * self.column)
 
     def __str__(self) -> str:
@@ -69,12 +69,12 @@ class Needed:
         return f"{self.nodes:,} nodes ({self.element}), {loads}: about {taken} of {self.device.name}, {free} free"
 
     def demand(self, budget: MemoryBudget = BUDGET) -> Needed:
-        """Itself, if it fits.
+        """Return itself if it fits.
 
         Raises
         ------
         InputError
-            Naming what it takes, what is free, and what would fit.
+            Too little free memory; the message names the demand, the free memory, and what would fit.
         """
         room = budget.share * self.free
         if self.peak <= room:
@@ -93,14 +93,14 @@ def estimate_needed(
     loads: int,
     share: int = 1,
 ) -> Needed | None:
-    """What `Fem` with these takes of a card for so many loads; None on the CPU, whose memory is asked batch by batch.
+    """Estimate the GPU memory of `Fem` for a number of loads; None on the CPU, where each batch is checked instead.
 
-    Without a `batch` it is as large as fits. `share` processes have a part of the card each.
+    Without a `batch`, the largest one that fits is taken. `share` processes share the GPU equally.
 
     Raises
     ------
     InputError
-        An element or a device that cannot be had.
+        Unknown element, or a device that is not available.
     """
     where = find_device(device, accuracy.precision)
     if not where.on_cuda:
@@ -120,7 +120,7 @@ def compute_needed(
     free: int,
     budget: MemoryBudget = BUDGET,
 ) -> Needed:
-    """Return the same of elements whose preconditioner inverts so many unknowns, on a card with `free` bytes."""
+    """Compute the memory for a discretisation whose preconditioner inverts `inverted` unknowns, with `free` bytes."""
     rows, width = 3 * space.count, wp.types.type_size_in_bytes(device.scalar)
     tables = FIXED + PER_NODE[space.element] * space.count * width // 4
     taken, left = _inverse_bytes(inverted, device)
@@ -133,13 +133,13 @@ def compute_needed(
 
 
 def _unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
-    """How many a preconditioner may invert, the most first: of all nodes, or of the corners alone."""
+    """List the numbers of unknowns that a preconditioner may invert, largest first: of all nodes, or of the corners."""
     corners = int((~anatomy.held).sum())
     return (int((~space.held(anatomy.held)).sum()), corners) if space.element == "p2" else (corners,)
 
 
 def _inverted(unknowns: tuple[int, ...], device: Device) -> int:
-    """How many of them the card inverts, if any."""
+    """Return the largest of these numbers that the GPU can invert, else the size of the last multigrid level."""
     from ..linalg.dense_inverse import can_invert
 
     last = 6 * Preconditioning().largest_last
@@ -147,7 +147,7 @@ def _inverted(unknowns: tuple[int, ...], device: Device) -> int:
 
 
 def _inverse_bytes(unknowns: int, device: Device) -> tuple[int, int]:
-    """What an inverse takes while it is made, and what is left of that."""
+    """Estimate the memory of a dense inverse [bytes]: peak during construction, and afterwards."""
     from ..linalg.block_inverse import exchange_bytes
     from ..linalg.dense_inverse import estimate_inverse_bytes
 

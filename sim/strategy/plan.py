@@ -1,4 +1,4 @@
-"""Which solvers answer a load, and in which order: one table, which can be read as sentences."""
+"""Selection and order of solvers for a load: one table, with a description in sentences."""
 
 from __future__ import annotations
 
@@ -24,48 +24,47 @@ from ..local_solvers.strained_descent import StrainedDescent, build_strained_par
 from .captured_frame import FRAME_EVALUATIONS
 
 Alone = ClampedElimination | StrainedDescent
-"""What solves a single load by itself."""
-# So many load cases are worth the set-up of a local problem that they share.
-WORTH = 16
-# Evaluations of the whole body before Newton. On CUDA, where few columns cost hardly less than one, it comes last.
-EVALUATIONS, EVALUATIONS_ON_CUDA = 60, 800
-# A budget of fewer outer iterations is Newton's alone: its steps lead farther.
-FEWEST = 10
+"""Local solver for a single load."""
+WORTH = 16  # Load cases from which the set-up of a shared local subproblem pays.
+EVALUATIONS = 60  # Maximum residual evaluations before Newton-CG on the CPU.
+# The same on CUDA, where a small batch costs almost as much as one load case, so that Newton-CG comes late.
+EVALUATIONS_ON_CUDA = 800
+FEWEST = 10  # With a smaller budget of outer iterations only Newton-CG is used: its steps are longer.
 
 
 class SolverStep(Enum):
-    """What may be tried for a load; the value says what it is."""
+    """Solvers that may be tried for a load, with their descriptions."""
 
-    NEAR = "nonlinear elimination: the tissue near the opening, which all loads share, is solved by itself"
-    STRAINED = "L-BFGS from a stiffness that knows the few hundred nodes that the load strains most"
-    CLAMPED = "nonlinear elimination: the tissue near the load, clamped at its rim, is solved by itself"
-    CONTACT = "proximal quasi-Newton: the nodes that tools touch are solved apart from the tissue"
-    FRAME = "a live frame: one graph that was captured on the card"
-    LBFGS = "L-BFGS from the stiffness at rest"
+    NEAR = "nonlinear elimination: the tissue near the opening, shared by all loads, is a local subproblem"
+    STRAINED = "L-BFGS from a stiffness that is updated at the few hundred nodes with the largest strain"
+    CLAMPED = "nonlinear elimination: the tissue near the load, clamped at its boundary, is a local subproblem"
+    CONTACT = "proximal quasi-Newton: the nodes in contact with tools are solved separately from the tissue"
+    FRAME = "a live frame, one captured graph on the GPU"
+    LBFGS = "L-BFGS from the undeformed stiffness"
     NEWTON = "Newton-CG in a trust region"
 
 
 @dataclass(frozen=True)
 class SolverPlan:
-    """How loads on one body are solved.
+    """Solvers for the loads on one mesh, and their limits.
 
     Parameters
     ----------
     preconditioner
-        What `name_of` calls the stiffness at rest as it is inverted.
+        Name of the preconditioner, from `name_of`.
     many, single
-        What is tried first of `WORTH` loads or more, and of one; None: nothing is solved by itself.
+        Local solver that is tried first for `WORTH` loads or more, and for one; None: no local solver.
     contact
-        What is tried first of loads whose tools are moved by pose; None where no tool is.
+        Solver that is tried first for loads with tools moved by pose; None without such tools.
     quick
-        Whether L-BFGS is tried before Newton-CG.
+        True if L-BFGS is tried before Newton-CG.
     frames, strained
-        Whether loads that follow another are answered by a captured graph on the card; whether it knows strained
-        tissue.
+        True if a load that follows another is solved by a captured graph on the GPU; True if this graph updates the
+        stiffness of strained tissue.
     evaluations, outer, load_steps
-        Most evaluations of the body's forces before Newton-CG, iterations of that, and load steps.
+        Limits: residual evaluations before Newton-CG, Newton iterations, load steps.
     batch
-        Most loads that are solved together.
+        Maximum number of loads solved together.
     """
 
     preconditioner: str
@@ -81,25 +80,25 @@ class SolverPlan:
     batch: int
 
     def local(self, count: int) -> SolverStep | None:
-        """What is tried first of so many loads together."""
+        """Return the local solver that is tried first for `count` loads together, if any."""
         return self.many if count >= WORTH else self.single if count == 1 else None
 
     def steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
-        """What is tried for so many loads together, in this order; `imposed` if they prescribe motion."""
+        """List the solvers for `count` loads together, in order; `imposed` if the loads prescribe motion."""
         if imposed or not self.quick:
             return (SolverStep.NEWTON,)
         first = self.local(count)
         return (*([] if first is None else [first]), SolverStep.LBFGS, SolverStep.NEWTON)
 
     def explain(self) -> tuple[str, ...]:
-        """Return the same in sentences."""
-        lines = [f"The stiffness at rest is prepared once ({self.preconditioner}); every solver starts from it."]
+        """Describe the plan in sentences."""
+        lines = [f"The undeformed stiffness is prepared once ({self.preconditioner}); every solver starts from it."]
         if self.frames:
-            knows = ". It knows which tissue the last load strained" if self.strained else ""
-            lines.append(f"A load that follows another is {SolverStep.FRAME.value}{knows}.")
+            knows = ". It updates the stiffness of the tissue that the last load strained" if self.strained else ""
+            lines.append(f"A load that follows another is solved as {SolverStep.FRAME.value}{knows}.")
         if self.contact:
             lines.append(f"Tools are moved by pose. Every load begins with {self.contact.value}.")
-            lines.append(f"{SolverStep.NEWTON.value} takes what that leaves, load by load.")
+            lines.append(f"{SolverStep.NEWTON.value} solves the loads that remain.")
         elif not self.quick:
             lines.append(f"Every load is solved by {SolverStep.NEWTON.value}, in at most {self.outer} iterations.")
         else:
@@ -108,11 +107,11 @@ class SolverPlan:
             if self.single:
                 lines.append(f"A single load begins with {self.single.value}.")
             lines.append(f"{SolverStep.LBFGS.value} takes what is left, in at most {self.evaluations} evaluations.")
-            lines.append(f"{SolverStep.NEWTON.value} takes what that leaves, in at most {self.outer} iterations.")
-            lines.append(f"Loads that prescribe motion go to {SolverStep.NEWTON.value} at once.")
+            lines.append(f"{SolverStep.NEWTON.value} solves what remains, in at most {self.outer} iterations.")
+            lines.append(f"Loads that prescribe motion are solved by {SolverStep.NEWTON.value} alone.")
         if self.load_steps:
             lines.append(
-                "A load that ends without equilibrium is tried again from rest, and then in load steps: at most "
+                "A load without equilibrium is solved again from the undeformed state, and then in load steps: at most "
                 f"{self.load_steps}."
             )
         together = f"Up to {self.batch} loads are" if self.batch > 1 else "One load is"
@@ -129,13 +128,13 @@ def plan_for(
     live: bool = False,
     avoid: Collection[SolverStep] = (),
 ) -> SolverPlan:
-    """Choose the solvers of a problem: the one place where this is decided.
+    """Choose the solvers of a problem; no other place decides this.
 
-    `batch` loads are solved together where nothing solves them one by one; `live` ones come one at a time. What is to
-    be avoided is not tried; Newton-CG always is.
+    `batch` loads are solved together unless a solver takes them one by one; `live` loads come one at a time. Solvers in
+    `avoid` are not used, except Newton-CG, which always remains.
     """
     cuda, exact = problem.device.on_cuda, is_exact(preconditioner)
-    elastic = problem.plain  # what is solved by itself is elastic, and nothing else
+    elastic = problem.plain  # local solvers handle elastic terms only
     small = elastic and has_small_opening(space, problem.constraint)
     strained = small and exact and space.element == "smoothed" and SolverStep.STRAINED not in avoid
     single = None
@@ -146,7 +145,7 @@ def plan_for(
             single = SolverStep.STRAINED
     contact = None
     if problem.barriers:
-        # The model of contact knows one barrier, and needs a preconditioner that is alike at every state.
+        # The contact model supports one barrier, and a preconditioner that is the same for every state.
         alike = not isinstance(preconditioner, BlockJacobi)
         one = len(problem.barriers) == 1 and isinstance(problem.barriers[0], Local)
         contact = SolverStep.CONTACT if one and alike else SolverStep.NEWTON
@@ -166,19 +165,19 @@ def plan_for(
         evaluations=most,
         outer=accuracy.outer,
         load_steps=accuracy.steps,
-        batch=1 if single is SolverStep.CLAMPED else batch,  # each load has a part of its own
+        batch=1 if single is SolverStep.CLAMPED else batch,  # each load has its own local subproblem
     )
 
 
 def can_follow(space: Discretisation, accuracy: Accuracy) -> bool:
-    """Whether frames can be captured: of nodes that are the mesh's own, with a budget to be spent elsewhere."""
+    """Return True if frames can be captured: nodes are mesh vertices, and the iteration budget admits L-BFGS."""
     return not len(space.edges) and accuracy.outer >= FEWEST
 
 
 def build_local_solvers(
     plan: SolverPlan, problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> tuple[Callable[[], BatchElimination | None], Alone | None]:
-    """What a plan solves by itself: for many loads, made when it is asked for first, and for a single one."""
+    """Build a plan's local solvers: a function that builds the one for many loads at its first call; that for one."""
     near = cache(
         partial(build_batch_elimination, problem, preconditioner, effects, space) if plan.many else lambda: None
     )

@@ -1,4 +1,4 @@
-"""How load steps grow and shrink, and how the gaps of tools are opened for a long way."""
+"""Control of load steps, and of the gap of tools on a long path."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 
 @dataclass(frozen=True)
 class LoadStepping:
-    """How load steps grow, shrink and end.
+    """Control of load steps.
 
     Parameters
     ----------
     first, least, cut
-        Shares of the load: of the first step, of the shortest, and what is left of a step that failed.
+        Fractions of the load: first step, smallest step; factor on a step that failed.
     aimed, most
-        The next step is as long as lets expect so many outer iterations. One that takes more than the most is too long.
+        Outer iterations per step: target that sets the length of the next step; maximum.
     patience
-        Steps end when the batch has spent so many times the linear iterations that one outer iteration may take.
+        Steps end when the batch has spent this number of times `Accuracy.inner` linear iterations per successful step.
     """
 
     first: float = 1.0 / 4.0
@@ -30,23 +30,24 @@ class LoadStepping:
     patience: int = 4
 
 
-STEPPING = LoadStepping()
+STEPPING = LoadStepping()  # Default.
 
 
 @dataclass(frozen=True)
 class GapContinuation:
-    """How the gap of tools is opened for a long way, and closed again.
+    """Control of the tools' gap, which is widened for a long path and closed again.
 
     Parameters
     ----------
     wide_enough, closing
-        Tools that go farther than so many gaps at once begin with a gap that is wider by a power of the closing.
+        Tools that move more than this number of gaps at once start with a gap widened by a power of `closing`.
     tolerance
-        To which tissue is solved until the gap is the tools' own.
+        Relative residual until the gap has its own width.
     wider
-        A step that failed is tried again, shorter, from a gap so many times as wide.
+        Factor on the gap after a step that failed, which is tried again, shorter.
     alone, nearly
-        Contact is solved apart in so many iterations first. Where that ends so near, Newton goes on in as many.
+        Maximum iterations of the contact solver before Newton. If it ends with a residual of at most `nearly`, Newton
+        continues from there with the same maximum.
     """
 
     wide_enough: float = 8.0
@@ -57,19 +58,19 @@ class GapContinuation:
     nearly: float = 0.1
 
 
-GAPS = GapContinuation()
+GAPS = GapContinuation()  # Default.
 
 
 @dataclass(frozen=True, eq=False)
 class Shares:
-    """Cases that are raised, or whose tools are moved, in steps: all arrays are changed in place.
+    """Progress of cases whose load, or whose tools' motion, is applied in steps; all arrays are changed in place.
 
     Parameters
     ----------
     reached, step
-        (b,) shares: where an equilibrium was found, and how long the next step is.
+        (b,) fractions: last equilibrium, and length of the next step.
     gaps
-        (b,) gaps of their tools that the whole way measures, at least.
+        (b,) length of the tools' whole path [gaps], at least.
     """
 
     reached: np.ndarray
@@ -78,26 +79,26 @@ class Shares:
 
     @classmethod
     def at_rest(cls, first: float, gaps: np.ndarray) -> Self:
-        """Cases at the share 0, whose `first` step is so long."""
+        """Return cases at the fraction 0, with a `first` step of this length."""
         return cls(np.zeros(len(gaps)), np.full(len(gaps), first), gaps)
 
     def limit(self, longest: np.ndarray, stepping: LoadStepping) -> tuple[np.ndarray, np.ndarray]:
-        """Limit steps to the `longest` (b,) at once; which (b,) bool are shorter than that, and which cases go on."""
+        """Limit steps to the `longest` (b,); return which (b,) bool were shorter, and which cases continue."""
         shorter = self.step < longest
         np.minimum(self.step, longest, out=self.step)
         long_enough = self.step >= stepping.least * np.minimum(1.0, 4.0 * longest)
         return shorter, (self.reached < 1.0) & long_enough
 
     def propose_shares(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
-        """Shares (k,) that some rows (k,) step to, and the most gaps that their tools go."""
+        """Propose the next fractions (k,) of some rows (k,); return them and the longest path of their tools [gaps]."""
         aim = np.minimum(self.reached[rows] + self.step[rows], 1.0)
         return aim, float(((aim - self.reached[rows]) * self.gaps[rows]).max())
 
     def take(self, rows: np.ndarray, aim: np.ndarray, good: np.ndarray) -> None:
-        """Take the steps of those rows (k,) that are `good`: they reach their aim (k,)."""
+        """Accept the steps of those rows (k,) that are `good`: they reach their aim (k,)."""
         self.reached[rows[good]] = aim[good]
 
     def resize(self, rows: np.ndarray, good: np.ndarray, growth: np.ndarray, cut: float, wider: float) -> None:
-        """Let steps of rows (k,) that are `good` grow; the others are `cut`, and begin from a gap so much `wider`."""
+        """Grow the steps of rows (k,) that are `good`; shorten the others by `cut`, and widen their gaps by `wider`."""
         self.gaps[rows] *= np.where(good, 1.0, wider)
         self.step[rows] *= np.where(good, np.clip(growth, 0.5, 2.0), cut)

@@ -1,4 +1,4 @@
-"""What a plan (`plan.py`) says is tried for a load, one solver after the other: from the start, from rest, in steps."""
+"""Execution of a plan (`plan.py`): its solvers in order, from the start, from the undeformed state, in load steps."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from ..runtime.views import run_in_order, to_host, view
 from .plan import Alone, SolverPlan, SolverStep
 from .stepping import GAPS, STEPPING, GapContinuation, LoadStepping, Shares
 
-NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})
+NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS history.
 
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, shares of the load reached, inverted tets.
+    """Solution u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, load fractions, inverted elements.
 
-    The linear iterations of the batch; what of the curvature the next frame may know. Where tools move, shares (B,) of
-    their way at which they are, and (B,) bool whose way began at rest.
+    Linear iterations of the batch; L-BFGS history for the next frame. With moving tools: `gone` (B,), the fraction of
+    their path reached, and `anew` (B,) bool, True if the solution began undeformed.
     """
 
     u: wp.array
@@ -55,11 +55,11 @@ class SolverResult:
 
     @property
     def good(self) -> np.ndarray:
-        """(B,) bool."""
+        """True (B,) for good outcomes."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
     def put(self, index: np.ndarray, other: SolverResult, device: Device) -> None:
-        """Write the answer of other cases over some of these (k,); outer steps add up."""
+        """Overwrite the results of some cases (k,) with those of `other`; outer steps add up."""
         scatter_columns(device, other.u, index, self.u)
         self.iterations[index] += other.iterations
         for name in ("outcome", "residual", "reached", "inverted"):
@@ -68,24 +68,24 @@ class SolverResult:
 
 @dataclass(frozen=True, eq=False)
 class Strategy:
-    """The solvers of a plan: each takes what the one before it did not bring to equilibrium.
+    """Solvers of a plan in order: each continues with the cases that the one before did not bring to equilibrium.
 
     problem
-        What the cases are posed on.
+        Problem of the cases.
     preconditioner
-        Of the problem: L-BFGS starts from it, Newton's linear systems are solved with it.
+        Initial inverse Hessian of L-BFGS, and preconditioner of Newton's linear systems.
     inversion
-        Of the discretisation that the problem is posed on.
+        Inverted-element check of the problem's discretisation.
     accuracy
-        Tolerance and budgets.
+        Tolerance and iteration limits.
     plan
-        Which solvers are tried, and in which order.
+        Solvers to try, in order.
     near
-        Makes, or has made, what `plan` solves by itself for many loads.
+        Function that returns the plan's local solver for many loads, built at the first call.
     alone
-        What it solves by itself for one.
+        Local solver for one load.
     stepping, gaps
-        How load steps go, and the gaps of tools.
+        Control of load steps, and of the tools' gaps.
     """
 
     problem: Problem
@@ -100,12 +100,12 @@ class Strategy:
 
     @cached_property
     def lbfgs(self) -> Lbfgs:
-        """L-BFGS on the whole body, with what it keeps from batch to batch."""
+        """L-BFGS on the whole mesh; its memory is kept from batch to batch."""
         return Lbfgs(self.problem, self.preconditioner)
 
     @cached_property
     def contact(self) -> ContactDescent | None:
-        """What solves the nodes that tools touch apart from the tissue; None where the plan does not."""
+        """Solver that treats nodes in contact separately from the tissue; None if the plan has none."""
         if self.plan.contact is not SolverStep.CONTACT:
             return None
         (barrier,) = self.problem.barriers
@@ -114,28 +114,28 @@ class Strategy:
         return replace(found, strains=ON_CARD, replays=True) if self.problem.device.on_cuda else found
 
     def local(self, count: int) -> BatchElimination | Alone | None:
-        """What solves a part by itself for so many loads, if anything does."""
+        """Return the local solver for `count` loads, if there is one."""
         step = self.plan.local(count)
         return None if step is None else self.near() if step is SolverStep.NEAR else self.alone
 
     @cached_property
     def _touched(self) -> Preconditioner:
-        """The preconditioner that knows contact: on CUDA half precision is rougher than contact is stiff."""
+        """Preconditioner that includes contact; not on CUDA, where half precision is coarser than contact is stiff."""
         if self.problem.device.on_cuda:
             return self.preconditioner
         return build_contact_preconditioner(self.problem, self.preconditioner, self.contact)
 
     @property
     def held(self) -> int:
-        """Bytes that L-BFGS keeps for the next batch to stand in."""
+        """Memory that L-BFGS keeps for the next batch [bytes]."""
         return self.lbfgs.held
 
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
-        """Solve for the equilibria of B cases, each from its first usable guess (3N, B) [m], or from rest.
+        """Solve for the equilibria of B cases, each from its first usable guess (3N, B) [m], or undeformed.
 
-        A start that lies inside out is left alone, and so is a state that does to which a start led. A body turned over
-        or collapsed may be in equilibrium with itself. From rest such a state is taken as the load's doing. Where
-        nothing acts it stays at rest: the answer is exactly zero.
+        A start with too many inverted elements is not used, and a solution with them that came from a start is
+        discarded: a mesh that is turned over or collapsed may be in equilibrium too. From the undeformed state such a
+        solution is accepted as an effect of the load. Cases without any load have a solution of exactly zero.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
@@ -166,7 +166,7 @@ class Strategy:
         return replace(answer, gone=answer.reached, anew=astray) if problem.barriers else answer
 
     def _acts(self, count: int) -> np.ndarray:
-        """Which cases (b,) of the batch that has begun any force or imposed motion acts on at rest."""
+        """Return the cases (b,) of the begun batch on which a force or imposed motion acts in the undeformed state."""
         rest = self.problem.device.zeros(self.problem.rows, count)
         loud = wp.zeros_like(rest)
         for term in self.problem.terms:
@@ -179,7 +179,7 @@ class Strategy:
         return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
 
     def _rested(self, start: wp.array) -> wp.array:
-        """Start (3N, b) [m], or rest where nothing acts there: in float32 no descent would end in letting go."""
+        """Return the start (3N, b) [m], zero where no load acts: a float32 descent would not reach zero."""
         acts = self._acts(start.shape[1])
         if not acts.all():
             with run_in_order(self.problem.device):
@@ -187,7 +187,7 @@ class Strategy:
         return start
 
     def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Of some guesses (3N, B) [m] each case's first of the fewest inside out; which cases (B,) have none."""
+        """Select each case's first guess (3N, B) [m] with the fewest inverted elements; which cases (B,) have none."""
         device = self.problem.device
         guess, inverted = guesses[0], self.inversion.count(device.array(guesses[0]))
         for other in guesses[1:]:
@@ -197,24 +197,24 @@ class Strategy:
         return guess, self.inversion.doubtful(inverted)
 
     def _lost(self, answer: SolverResult) -> np.ndarray:
-        """Which cases (B,) another solver may save: at round-off none is nearer to equilibrium."""
+        """Return the cases (B,) that another solver may solve; at round-off none comes closer to equilibrium."""
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
     def _whole(
         self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = NOTHING
     ) -> SolverResult:
-        """The whole load at once, of a batch that has begun: eliminations, L-BFGS, Newton, each from where one ended.
+        """Solve for the whole load of the begun batch: local solvers, L-BFGS, Newton, each from the last one's end.
 
-        From rest without a start; `learnt` on the way to it, if anything was. Motions that are imposed are left
-        to Newton: it knows how the free nodes follow them. So are steep terms.
+        Without a start it begins undeformed; `learnt` is the L-BFGS history of the start, if any. Imposed motions and
+        steep terms are left to Newton, which moves the free nodes with them.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
-        # Rest satisfies whatever the batch does not move.
+        # The undeformed state satisfies the constraints, unless the batch imposes motion.
         imposed = problem.constraint.imposes or (start is not None and bool(problem.gap(start)[1].any()))
         start = device.zeros(problem.rows, count) if start is None else start
         if problem.barriers:
             return self._moved(cases, start)
-        if problem.paced:  # the next frame would gain nothing
+        if problem.paced:  # history would not help the next frame
             learnt = None
         if SolverStep.LBFGS not in self.plan.steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
@@ -243,9 +243,9 @@ class Strategy:
         return replace(answer, learnt=gained)
 
     def _touching(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
-        """Of cases whose tools have gone so many times their gap: what touches and what gives apart, then Newton.
+        """Solve for cases whose tools have moved by `gaps` times their gap: separate contact solver, then Newton.
 
-        On the CPU Newton has them one by one: the preconditioner of a single one knows what it touches.
+        On the CPU Newton takes them one by one, because the contact preconditioner is for a single case.
         """
         problem, touch, device = self.problem, self.contact, self.problem.device
         problem.begin(cases)
@@ -270,9 +270,9 @@ class Strategy:
         return answer
 
     def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
-        """Newton, of cases whose tools have gone so many times their gap: it is opened first, and closed step by step.
+        """Solve by Newton for cases whose tools have moved by `gaps` times their gap, which is widened, then closed.
 
-        In a narrow gap tissue would be thrown out of a tool, and caught again, node by node; a wide one leads it.
+        In a narrow gap nodes would be pushed out of the tool, and enter it again, one by one; a wide gap guides them.
         """
         iterations, linear = np.zeros(start.shape[1], int), 0
         widest = int(np.ceil(np.log(max(gaps / self.gaps.wide_enough, 1.0)) / np.log(self.gaps.closing)))
@@ -288,7 +288,7 @@ class Strategy:
         return replace(found, iterations=iterations + found.iterations, linear_iterations=linear)
 
     def _thorough(self, start: wp.array, outer: int, tolerance: float | None = None) -> SolverResult:
-        """Newton, in at most so many outer steps, of a batch that has begun."""
+        """Solve the begun batch by Newton, in at most `outer` iterations."""
         newton = NewtonCG(self._touched, self.accuracy.inner)
         accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
         found = find_equilibrium(self.problem, newton, start, accuracy)
@@ -301,9 +301,9 @@ class Strategy:
         return SolverResult(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
 
     def _in_steps(self, cases: Cases, failed: SolverResult, index: np.ndarray) -> SolverResult:
-        """From rest, the load raised in steps that grow and shrink; the equilibrium under the largest share found.
+        """Raise the load from the undeformed state in adaptive steps; return the equilibrium at the largest fraction.
 
-        Of cases that are the rows `index` (k,) of what failed; where no larger share is found that stands.
+        The cases are the rows `index` (k,) of `failed`, whose result stays where no larger fraction is found.
         """
         problem, device = self.problem, self.problem.device
         cases = replace(cases, anew=np.ones(len(index), bool))
@@ -321,9 +321,9 @@ class Strategy:
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
     def _moved(self, cases: Cases, start: wp.array) -> SolverResult:
-        """From start (3N, b), where the tools were, as far as they may go at once again and again.
+        """Move the tools from start (3N, b), where they were, in steps of the allowed length.
 
-        A body at rest on which nothing acts where they end is there, whatever they met on their way.
+        An undeformed mesh on which nothing acts where the tools end is the solution, whatever they met on their path.
         """
 
         def moved(part: Cases, share: np.ndarray) -> Cases:
@@ -348,11 +348,11 @@ class Strategy:
         first: float,
         most: int,
     ) -> SolverResult:
-        """From start (3N, b), cases at growing shares: the equilibrium at the largest share found.
+        """Solve for cases at growing fractions from start (3N, b); return the equilibrium at the largest one found.
 
-        `aimed` makes cases at shares (b,); the `first` step is so long, and none longer than tools may go at once.
-        Those that are as long do not count among the `most`. Outcomes are good where the share is 1; on the way
-        round-off will do.
+        `aimed` builds cases at fractions (b,). Steps begin with the length `first`, and are limited to what tools may
+        move at once; at most `most` of them may be shorter than that limit. A good outcome requires the fraction 1; on
+        the way round-off is accepted as well.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         gaps = np.maximum.reduce([np.zeros(count), *(term.gaps(cases) for term in problem.barriers)])
@@ -384,7 +384,7 @@ class Strategy:
         return self._arrived(cases, aimed, answer)
 
     def _arrived(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], answer: SolverResult) -> SolverResult:
-        """Judge cases that went as far as they could, in place: those that tools pierce, and those that fell short."""
+        """Finish cases after their last step, in place: mark those that tools pierce, and those that fell short."""
         problem, u, outcome, reached = self.problem, answer.u, answer.outcome, answer.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]

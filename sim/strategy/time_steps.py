@@ -1,4 +1,4 @@
-"""Steps in time: which preconditioner serves them, and what is left to do where nothing moves."""
+"""Time steps: choice of their preconditioner, and the step of zero length."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from .strategy import SolverResult
 
 @dataclass(frozen=True, eq=False)
 class NoMotionStep:
-    """Stands in for a `Strategy`: what has mass does not move at once, whatever pulls at it, nor do tools."""
+    """Replacement of a `Strategy` for time steps of zero length: neither masses nor tools move, whatever acts."""
 
     problem: Problem
     inversion: Inversion
 
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
-        """Where the bodies were (3N, B) [m], the last of the guesses; at rest without."""
+        """Return the last of the guesses (3N, B) [m] unchanged; undeformed without guesses."""
         device, count = self.problem.device, len(cases.loads)
         u = device.array(guesses[-1]) if guesses else device.zeros(self.problem.rows, count)
         outcome, none = np.full(count, Outcome.CONVERGED, object), np.zeros(count, int)
@@ -31,17 +31,16 @@ class NoMotionStep:
         )
 
 
-# Longer steps [s] have the preconditioner of statics. Brain in its skull sways at 1 Hz or faster: beside its stiffness
-# inertia is then less than a thousandth.
+# Steps from this length on [s] use the static preconditioner. The brain in its skull oscillates at 1 Hz or faster, so
+# that inertia is then less than a thousandth of its stiffness.
 LONGEST = 8.0
-# So many preconditioners are kept: each is as large as that of statics.
-KEPT = 3
+KEPT = 3  # Preconditioners that are cached; each is as large as the static one.
 
 
 def quantise(steps: np.ndarray) -> np.ndarray:
     """Return the powers of two (B,) [s] nearest to steps (B,) [s], by ratio.
 
-    Infinite for long steps, zero for none at all.
+    Steps of `LONGEST` or more become infinite; zero steps stay zero.
     """
     within = (steps > 0.0) & (steps < LONGEST)
     powers = np.exp2(np.round(np.log2(np.where(within, steps, 1.0))))
@@ -49,7 +48,7 @@ def quantise(steps: np.ndarray) -> np.ndarray:
 
 
 def group_alike(steps: np.ndarray, most: int) -> list[tuple[float, np.ndarray]]:
-    """Batches of at most so many cases, of steps (B,) [s] as good as alike: the step, and the rows (k,) of each."""
+    """Group steps (B,) [s] of about equal length into batches of at most `most`: the step and the rows (k,) of each."""
     paces = quantise(steps)
     return [
         (float(pace), rows[first : first + most])
