@@ -1,4 +1,4 @@
-"""Points, lines and curves that 3D Slicer wrote as `.mrk.json`, and points as `.fcsv`."""
+"""Reader for 3D Slicer markups: points, lines and curves in `.mrk.json`, and points in `.fcsv`."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from ..runtime.file_limits import FARTHEST
 from ..runtime.outside_files import read_as, to_path
 
 SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
-"""What coordinates become in RAS. Slicer writes LPS, and means it where a file does not say."""
+"""Sign of each coordinate in the conversion to RAS. Slicer writes LPS, the default of its files."""
 NUMBERED = {"0": "RAS", "1": "LPS"}
-"""What older files say in place of these words."""
+"""Codes of the coordinate system in older files."""
 REMEDY = "Save a point, a line or a closed curve from 3D Slicer's Markups."
-# Bytes of a file, points of a curve, and points that a curve is drawn with.
+# Maximum file size [bytes], maximum points of a markup, and points of a sampled curve.
 LARGEST, MOST, DRAWN = 2**22, 5000, 256
-# In a row of `.fcsv` after a number or name: the coordinates, and whether they are placed, if it is said.
+# In a row of `.fcsv`: the coordinates, the column of the optional position status, and its value for a placed point.
 PLACE, STATUS, DEFINED = slice(1, 4), 14, "2"
 
 
 @dataclass(frozen=True, eq=False)
 class Markup:
-    """What a file holds: its kind in Slicer's words, and its points (n, 3) [m, RAS] that are placed."""
+    """Markup of a file: its kind as named by Slicer, and its placed points (n, 3) [m, RAS]."""
 
     path: Path
     kind: str
     points: np.ndarray
 
     def curve(self) -> np.ndarray:
-        """Points (256, 3) [m] of the smooth closed curve through the points of a `ClosedCurve`.
+        """Sample points (256, 3) [m] of the smooth closed curve through the points of a `ClosedCurve`.
 
         Raises
         ------
         InputError
-            Fewer than three points, or two that coincide.
+            Fewer than three points, or coincident consecutive points.
         """
         points = np.concatenate([self.points, self.points[:1]])
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -57,8 +57,8 @@ def read_markup(path: str | Path) -> Markup:
     Raises
     ------
     InputError
-        A file that is none, or that has several markups. Another unit than mm, another system than LPS or RAS. No
-        point that is placed, or coordinates that are no numbers.
+        A file that is not a markup file, or has several markups. Units other than mm, a coordinate system other than
+        LPS or RAS. No placed points, or coordinates that are not finite.
     """
     path = to_path(path)
     with read_as(path, "markups of 3D Slicer", REMEDY):
@@ -80,7 +80,7 @@ def read_markup(path: str | Path) -> Markup:
 
 
 def _json(text: str) -> tuple[str, str, list[list[float]]]:
-    """Kind, coordinate system, and placed points [mm] of the one markup in a `.mrk.json` file."""
+    """Parse kind, coordinate system, and placed points [mm] of the only markup in a `.mrk.json` file."""
     markups = json.loads(text)["markups"]
     if len(markups) != 1:
         raise InputError(f"has {len(markups)} markups, and one is read. Save each to a file of its own.")
@@ -94,10 +94,10 @@ def _json(text: str) -> tuple[str, str, list[list[float]]]:
 
 
 def _fcsv(text: str) -> tuple[str, str, list[list[float]]]:
-    """Kind, coordinate system (empty: not stated), and placed points [mm] of a `.fcsv` file.
+    """Parse kind, coordinate system (empty if not given), and placed points [mm] of a `.fcsv` file.
 
-    Its columns are id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID, and of Slicer 5 the status of the
-    point, before which Slicer for Windows leaves a carriage return.
+    Its columns are id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID, and in Slicer 5 the position
+    status, before which Slicer for Windows writes a carriage return.
     """
     stated = re.search(r"^# *CoordinateSystem *= *(\w+)", text, re.MULTILINE)
     lines = (line for line in text.replace("\r", "").split("\n") if line.strip() and not line.startswith("#"))
