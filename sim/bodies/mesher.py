@@ -32,7 +32,7 @@ class Meshing:
     Parameters
     ----------
     tolerance, farthest
-        Relative deviations from the requested number of nodes: the search ends within the first, fails beyond the other.
+        Relative deviations from the requested number of nodes: the search ends within the first, fails beyond the last.
     trials
         Maximum number of lattices in the search.
     fine

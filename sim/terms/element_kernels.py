@@ -1,4 +1,4 @@
-"""The compiled loops over elements: energy, forces, curvature and bounds of any law on any element."""
+"""Warp kernels over elements: energy, forces, tangent stiffness and step bounds of any law on any element."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -10,13 +10,13 @@ from .element_functions import build_functions
 from .laws.invariants import cofactor
 from .laws.law import Law
 
-# A step must leave every volume above this share of what it was: the logarithm and its curvature stay moderate.
+# Minimum J after a step, as a fraction of J before: bounds the logarithm and its second derivative.
 VOLUME_KEPT = 0.1
 
 
 @dataclass(frozen=True)
 class ElementKernels:
-    """The compiled loops over elements of one law."""
+    """Kernels over the elements of one law."""
 
     add_energy: wp.Kernel
     add_gradient: wp.Kernel
@@ -28,7 +28,7 @@ class ElementKernels:
 
 @cache
 def build_spreading_kernel(device: Device) -> wp.Kernel:
-    """Kernel that gives every point in every case its element's coefficients."""
+    """Build the kernel that copies each element's coefficients to every point and load case."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -46,10 +46,10 @@ def build_spreading_kernel(device: Device) -> wp.Kernel:
 
 @cache
 def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKernels:
-    """Kernels for elements of `size` nodes and laws of `count` coefficients.
+    """Build kernels for elements of `size` nodes and laws of `count` coefficients.
 
-    Each launches over (element, column). Elements of `size` 0 have as many nodes as `sizes` says, each its own number.
-    Coefficients are of elements (T,), or where they vary numbers (T, q, count, b) at every point of every case.
+    Each launches over (element, load case). If `size` is 0, the number of nodes per element is in `sizes`.
+    Coefficients are per element (T,), or if they vary numbers (T, q, count, b) per point and load case.
     """
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
@@ -129,7 +129,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f_a += sum over points of w dP(H; D) grad N_a; `definite` columns take the curvature at rest."""
+        """f_a += sum over points of w dP(H; D) grad N_a; `definite` columns use the undeformed tangent."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             k = at(coefficients, e, q, c)
@@ -211,12 +211,12 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
             floor = scalar(kept) * a0
             t = out[c]
             zero = scalar(0.0)
-            # Most steps are so short that nothing has to be looked at closely.
+            # Fast path: a lower bound of the cubic already exceeds the limit for most steps.
             if a0 + t * (wp.min(a1, zero) + t * (wp.min(a2, zero) + t * wp.min(a3, zero))) >= floor:
                 continue
             for _ in range(40):
                 low = a0 + t * (a1 + t * (a2 + t * a3))
-                # Stationary points of the cubic inside (0, t), by the root formula that does not cancel.
+                # Stationary points of the cubic in (0, t), by the root formula without cancellation.
                 root = a2 * a2 - scalar(3.0) * a1 * a3
                 if root > scalar(0.0):
                     s = -(a2 + wp.where(a2 >= scalar(0.0), one, -one) * wp.sqrt(root))

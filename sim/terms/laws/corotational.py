@@ -1,9 +1,9 @@
-"""Corotational law: Hooke's law in the frame of the rotation nearest to F.
+"""Corotational law: Hooke's law in the coordinates of the rotation nearest to F.
 
     psi = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2, F = R S
 
 Sifakis, Barbic 2012, "FEM Simulation of 3D Deformable Solids", SIGGRAPH course, section 3.4. R is a rotation for
-inverted elements too: the least singular value carries the sign.
+inverted elements too: the smallest singular value carries the sign.
 """
 
 from typing import Any

@@ -1,6 +1,6 @@
-"""What isotropic laws share: invariants of F = I + H, written in H so that nothing cancels at small strain.
+"""Invariants of F = I + H for isotropic laws, written in H to avoid cancellation at small strain.
 
-Shakeri et al. 2024, "Stable numerics for finite-strain elasticity": with F formed first, single precision stalls
+Shakeri et al. 2024, "Stable numerics for finite-strain elasticity": if F is formed first, single precision stalls
 near 3e-4 of the load; from H it reaches 1e-5.
 """
 
@@ -30,7 +30,7 @@ def volume_change(H: Any):
 
 @wp.func
 def log_one_plus(j: Any):
-    """ln(1 + j), exact in the last digits for small j too (Kahan's quotient)."""
+    """ln(1 + j), accurate to round-off for small j too (Kahan's quotient)."""
     J = type(j)(1.0) + j
     change = J - type(j)(1.0)
     if change == type(j)(0.0):
@@ -47,7 +47,7 @@ def cofactor_excess(H: Any):
 
 @wp.func
 def cofactor_change(F: Any, D: Any):
-    """Return derivative of cof F in the direction D."""
+    """Return the derivative of cof F in the direction D."""
     return wp.matrix_from_rows(
         wp.cross(D[1], F[2]) + wp.cross(F[1], D[2]),
         wp.cross(D[2], F[0]) + wp.cross(F[2], D[0]),
@@ -63,7 +63,7 @@ def green_strain(H: Any):
 
 @wp.func
 def exp_less_one(t: Any):
-    """exp(t) - 1 = 2 sinh(t/2) exp(t/2); far below zero the first of these is too large for its number."""
+    """exp(t) - 1 = 2 sinh(t/2) exp(t/2); for t < -1 evaluated directly, as sinh would overflow."""
     if t < type(t)(-1.0):
         return wp.exp(t) - type(t)(1.0)
     half = t / type(t)(2.0)

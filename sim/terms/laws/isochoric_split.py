@@ -1,4 +1,4 @@
-"""How a law parts shape, which relaxes, from volume, which does not; and the strain that its overstress works on."""
+"""Split of a law into a deviatoric part, which relaxes, and a volumetric part, for viscoelasticity."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -13,7 +13,7 @@ from .law import Law
 
 @wp.func
 def isochoric(H: Any):
-    """Fb - I = J^(-1/3) (I + H) - I, exact at small strain."""
+    """Fb - I = J^(-1/3) (I + H) - I, accurate at small strain."""
     k = exp_less_one(-log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
     return H + k * (wp.identity(n=3, dtype=type(k)) + H)
 
@@ -34,10 +34,10 @@ def inverse_transpose(H: Any):
 
 @dataclass(frozen=True)
 class LawSplit:
-    """Of a law with coefficients k, at a displacement gradient H and along a change D of it.
+    """Warp functions of a split law with coefficients k, at a displacement gradient H with an increment D.
 
-    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain that a stress A [Pa] works on. stress and
-    stress_change(H, D, ...): its derivatives. overstress(H, k) -> S [Pa]: on that strain, the stress of shape.
+    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain conjugate to a stress A [Pa]. stress and
+    stress_change(H, D, ...): its derivatives. overstress(H, k) -> S [Pa]: deviatoric stress, conjugate to E.
     """
 
     energy: wp.Function
@@ -48,13 +48,13 @@ class LawSplit:
 
 
 def split_of(law: Law, device: Device) -> LawSplit:
-    """As the law itself has it, or by the isochoric part of F."""
+    """Return the law's own split if it has one, else the split by the isochoric part of F."""
     return build_isochoric_split(law, device) if law.of_shape is None else build_own_split(law, law.of_shape, device)
 
 
 @cache
 def build_isochoric_split(law: Law, device: Device) -> LawSplit:
-    """Shape is psi(F) - psi(J^(1/3) I), and E = (Fb^T Fb - I) / 2 with Fb = J^(-1/3) F."""
+    """Build the split with deviatoric part psi(F) - psi(J^(1/3) I) and E = (Fb^T Fb - I) / 2, Fb = J^(-1/3) F."""
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
 
@@ -77,7 +77,7 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
     @wp.func
     def stress_change(H: mat, D: mat, k: Any, less: scalar, A: mat):
-        """dP for dF = D: the derivative of `stress`, factor by factor."""
+        """dP for dF = D: derivative of `stress` by the product rule."""
         three = scalar(3.0)
         identity = wp.identity(n=3, dtype=scalar)
         F, V, G = identity + H, dilated(H), inverse_transpose(H)
@@ -107,10 +107,10 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
 @cache
 def build_own_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit:
-    """Shape is the law itself with its coefficients `of_shape`, and E = (F^T F - I) / 2.
+    """Build the split whose deviatoric part is the law with coefficients `of_shape`, and E = (F^T F - I) / 2.
 
-    The potential is infinite nowhere that the law is not; the overstress is where J is exactly 0. Tissue that has
-    relaxed to its end obeys the law itself, its shear modulus less and its bulk modulus as it was.
+    The potential is finite wherever the law's is; the overstress is infinite at J = 0. Fully relaxed tissue
+    follows the same law with a smaller shear modulus and the same bulk modulus.
     """
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change

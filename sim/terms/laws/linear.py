@@ -1,4 +1,4 @@
-"""Hooke's law on the small strain tensor: the first-order answer, for small rotations only.
+"""Hooke's law on the small strain tensor, for small rotations only.
 
 psi = mu eps : eps + lambda/2 (tr eps)^2, eps = (H + H^T)/2
 """

@@ -1,7 +1,7 @@
-"""Stable neo-Hookean law: finite for every deformation, inverted elements included.
+"""Stable neo-Hookean law, finite for every deformation including inversion.
 
 Smith, de Goes, Kim 2018, "Stable Neo-Hookean Flesh Simulation", ACM Trans. Graph. 37(2), without the logarithm and
-with Lamé's constants re-mapped so that the law meets Hooke's at small strain:
+with Lamé's constants re-mapped so that the law agrees with Hooke's at small strain:
 
     psi = mu/2 (I1 - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2
 """
@@ -45,7 +45,7 @@ def stress_change(H: Any, D: Any, c: Any):
 
 @wp.func
 def of_shape(c: Any):
-    """Lame's constants of bulk modulus 0: the rest of psi is K/2 (J - 1)^2, K = lambda + 2/3 mu."""
+    """Lamé constants with bulk modulus 0: the remainder of psi is K/2 (J - 1)^2, K = lambda + 2/3 mu."""
     k = c
     k[1] = -type(c[0])(2.0) / type(c[0])(3.0) * c[0]
     return k
