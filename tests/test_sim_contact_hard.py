@@ -213,7 +213,7 @@ def skewed() -> np.ndarray:
         (lambda: solver(Hard((), (BALL, BALL))).deform(touching(DOWN)), "poses of 1 tools, but ToolContact has 2"),
         (
             lambda: Fem(BLOCK, [Elasticity(SOFT), Held()], TRAIN, "cpu", element="p1").deform(touching(DOWN)),
-            "loads hold Touching, which nothing answers: add the effect ToolContact",
+            "loads hold Touching, which no effect uses: add the effect ToolContact",
         ),
         (
             lambda: Fem(

@@ -118,7 +118,7 @@ def test_a_head_is_the_same_in_every_format(tmp_path, name, axes):
     ("change", "reason"),
     [
         ({"leave_out": ("space",)}, "does not state its space, so its left side is unknown"),
-        ({"space": "scanner-xyz"}, "its space is stated as 'scanner-xyz'"),
+        ({"space": "scanner-xyz"}, "its space is 'scanner-xyz'"),
         ({"leave_out": ("space origin",)}, "does not state its space origin"),
         ({"leave_out": ("space directions",)}, "does not state its space directions"),
         ({"leave_out": ("endian",)}, "does not state its endian"),

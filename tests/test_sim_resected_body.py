@@ -287,7 +287,7 @@ class TestHardCases:
             compile_problem((*EFFECTS, STEPS), BODY, find_device("cpu", "float64"))
         with pytest.raises(InputError, match="asked for 2 times"):
             finite_elements(BODY, (*EFFECTS, STEPS, STEPS))
-        with pytest.raises(InputError, match="Resected, which nothing answers: add the effect Resection"):
+        with pytest.raises(InputError, match="Resected, which no effect uses: add the effect Resection"):
             Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(lying([1]))
 
     def test_without_a_resection_it_is_the_plain_solver(self) -> None:

@@ -15,7 +15,7 @@ class Body:
     """Discretised body with N nodes; the mesh vertices come first.
 
     `space.count` is N; `space.nodes` (N, 3) [m] are undeformed; `skin` is the surface for tools; `device` allocates
-    arrays and launches kernels. Resection creates a new body with the same vertices. Preconditioners may request another
+    arrays and launches kernels. Resection creates a new body with the same vertices. Preconditioners may use another
     element.
     """
 

@@ -23,7 +23,7 @@ LEAST_REACH, REACHES = 5e-3, 2.0
 # Margin of the grid beyond that distance [nodes]; displacement not inverted [m]; guard against division by 0.
 EDGE, STILL, TINY = 3, 1e-5, 1e-30
 FAINT, SHARE = 2e-5, 2.5e-3
-"""Limits below which displacement is set to 0: absolute [m], and fraction of the maximum; above twice, it is unchanged."""
+"""Limits below which displacement is set to 0: absolute [m], and fraction of the maximum; unchanged above twice it."""
 
 
 @dataclass(frozen=True, eq=False)
