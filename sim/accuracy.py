@@ -9,7 +9,7 @@ from typing import Literal
 from .arguments import check_at_least
 from .errors import InputError
 
-Precision = Literal["float32", "float64"]
+Precision = Literal["float32", "float64"]  # scalar types of a solver
 FLOOR: dict[str, float] = {"float32": 2e-5, "float64": 1e-11}
 """Smallest relative residual that each scalar type reaches reliably (round-off of the internal forces)."""
 

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from .discretisation.body import Body
     from .discretisation.term import Term
 
-# Amplitudes of `Pulsation` [volume fraction]: the exposed cortex of the template moves as observed in patients.
-CARDIAC, RESPIRATORY = 4.5e-4, 4.5e-4
+# With these amplitudes of `Pulsation`, the exposed cortex of the template moves as observed in patients.
+CARDIAC = 4.5e-4  # amplitude of the heartbeat [volume fraction]
+RESPIRATORY = 4.5e-4  # amplitude of respiration [volume fraction]
 LARGEST_WAVE = 0.3  # maximum amplitude [volume fraction]
 
 

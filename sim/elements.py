@@ -1,6 +1,6 @@
 """Available finite elements, by name."""
 
-ELEMENTS = {
+ELEMENTS = {  # descriptions by name
     "p1": "linear tetrahedra: the fastest, and too stiff, the more so the less tissue can be compressed",
     "p2": "quadratic tetrahedra: the most accurate, seven times as many nodes",
     "smoothed": "linear tetrahedra with strains averaged over edges and nodes: nearly as accurate as p2 on p1's nodes",

@@ -102,7 +102,7 @@ class OwnCause(Protocol):
 
 
 BuiltIn = Pushed | Displaced | Nodal | Prescribed | Posture | Resected | Touching | Retracted  # causes of this package
-Cause = BuiltIn | OwnCause
+Cause = BuiltIn | OwnCause  # all causes
 C = TypeVar("C", bound=Cause)
 # Array of each cause that scales with the load; the others give its location. Tools move with `Cases.share`.
 MAGNITUDE = {
@@ -114,8 +114,8 @@ MAGNITUDE = {
 }
 # arrays with one number per load case
 SCALARS = ("footprint", "csf_level", "share", "done")
-# Limits of footprint radii [m]: blunter than a needle's tip, and large enough to cover a brain.
-SMALLEST_FOOTPRINT, LARGEST_FOOTPRINT = 1e-4, 0.1
+SMALLEST_FOOTPRINT = 1e-4  # minimum footprint radius [m], below a needle's tip
+LARGEST_FOOTPRINT = 0.1  # maximum footprint radius [m], covers a brain
 # Minimum length of a vector, so that its square does not underflow.
 SHORTEST = 1e-100
 # Maximum deviation of a pose's 3 x 3 block from a rotation.

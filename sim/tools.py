@@ -119,7 +119,7 @@ class OwnTool(Protocol):
         ...
 
 
-Tool = BuiltIn | OwnTool
+Tool = BuiltIn | OwnTool  # all tools
 
 
 def parse_tool(text: str) -> BuiltIn:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 
-SOLID = re.compile(r"[AD]?C3D(4|5|6|8|10|13|15|20|27)(?!\d)")
+SOLID = re.compile(r"[AD]?C3D(4|5|6|8|10|13|15|20|27)(?!\d)")  # types of solid elements, by number of nodes
 # meshio's names of solid elements by their number of nodes.
 SOLIDS = {4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 13: "pyramid13", 15: "wedge15",
           20: "hexahedron20", 27: "hexahedron27"}  # fmt: skip

@@ -16,10 +16,12 @@ from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
 
 SEPTA = ("falx", "tentorium")
 """Names of the septa."""
-# Sample points per mesh edge in the test against a sheet: minimum and maximum.
-FEWEST, MOST = 5, 200
-SHALLOWEST, DEEPEST = 10e-3, 60e-3
-"""Minimum and maximum depth of a synthetic falx [m]."""
+FEWEST = 5  # minimum sample points per mesh edge, in the test against a sheet
+MOST = 200  # maximum sample points per mesh edge
+SHALLOWEST = 10e-3
+"""Minimum depth of a synthetic falx [m]."""
+DEEPEST = 60e-3
+"""Maximum depth of a synthetic falx [m]."""
 SPACING = 1e-3
 """Point spacing of a synthetic falx [m]."""
 

@@ -12,8 +12,9 @@ from ..runtime.outside_files import read_as
 FRAME, POINTS, TRIANGLES = 3112, 3105, 3106
 """Tag kinds: coordinate system, vertices and triangles of a surface."""
 MRI = 5  # FIF code of the MRI coordinate system
-FLOATS, INTEGERS = (0x40000004, ">f4"), (0x40000003, ">i4")
-"""Type code and NumPy dtype of dense matrices: data row by row, then columns, rows and number of axes."""
+# Dense matrices: data row by row, then columns, rows and number of axes.
+FLOATS = 0x40000004, ">f4"  # type code and NumPy dtype of float matrices
+INTEGERS = 0x40000003, ">i4"  # type code and NumPy dtype of integer matrices
 
 
 def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ INNER_SKULL = Path("data", "fsaverage", "fsaverage-inner_skull-bem.fif")
 """Path of the inner skull surface in the package mne."""
 VOXEL = 1e-3
 """Voxel edge for the voxelised skull [m]."""
-REMEDY = install_hint("heads")
+REMEDY = install_hint("heads")  # remedy of messages about the package mne
 
 
 def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> HealthyHead:

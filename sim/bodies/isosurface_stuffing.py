@@ -33,6 +33,7 @@ TURN = np.array(
         [5, 4, 3, 2, 1, 0],
     ]
 )
+# Tetrahedra of a prism whose third quadrilateral is split along nodes 1-5, or along 2-4.
 SPLIT_15 = np.array([[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
 SPLIT_24 = np.array([[0, 1, 2, 4], [0, 4, 2, 5], [0, 4, 5, 3]])
 

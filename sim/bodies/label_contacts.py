@@ -13,8 +13,9 @@ from .label_map import LabelMap
 
 # Minimum oedema volume, as a fraction of all labelled voxels; smaller ones are noise.
 SPECK = 0.02
-# Fraction of an oedema's surface at unlabelled tissue: > SURE in every tumour, < HIDDEN in none.
-HIDDEN, SURE = 0.2, 0.4
+# Fraction of an oedema's surface at unlabelled tissue.
+HIDDEN = 0.2  # below it in no tumour
+SURE = 0.4  # above it in every tumour
 # Significant difference between two such fractions.
 MARGIN = 0.1
 # Fraction of the enhancing tumour's surface at necrosis above which the necrosis lies outside.

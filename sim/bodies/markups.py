@@ -20,10 +20,12 @@ SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
 NUMBERED = {"0": "RAS", "1": "LPS"}
 """Codes of the coordinate system in older files."""
 REMEDY = "Save a point, a line or a closed curve from 3D Slicer's Markups."
-# Maximum file size [bytes], maximum points of a markup, and points of a sampled curve.
-LARGEST, MOST, DRAWN = 2**22, 5000, 256
-# In a row of `.fcsv`: the coordinates, the column of the optional position status, and its value for a placed point.
-PLACE, STATUS, DEFINED = slice(1, 4), 14, "2"
+LARGEST = 2**22  # maximum file size [bytes]
+MOST = 5000  # maximum points of a markup
+DRAWN = 256  # points of a sampled curve
+PLACE = slice(1, 4)  # columns of the coordinates in a row of `.fcsv`
+STATUS = 14  # column of the optional position status
+DEFINED = "2"  # position status of a placed point
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,8 @@ UNITS = {"m": 1.0, "mm": 1e-3}  # length units [m]
 CELLS = {4: "tetra", 10: "tetra10"}
 
 REMEDY = "Convert it to .vtu or .msh."
-# Maximum length of meshio's reason in a message, and of a VTK title line [characters].
-LONGEST, TITLE = 200, 400
+LONGEST = 200  # maximum length of meshio's reason in a message [characters]
+TITLE = 400  # maximum length of a VTK title line [characters]
 REASONS = {
     r"Incompatible cell data '([^']+)'": (
         "its `{}` is given of some cells only: put every volume into a group, and save it again."
@@ -53,8 +53,8 @@ REASONS = {
 """Messages by a pattern in meshio's reason, or in a line that meshio cannot read."""
 UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")  # lines that meshio cannot read
 
-# Limits of an anatomy's longest side [m]: a mouse brain has 15 mm, a whole head 0.3 m.
-SMALLEST, LARGEST = 5e-3, 1.0
+SMALLEST = 5e-3  # minimum of an anatomy's longest side [m]; a mouse brain has 15 mm
+LARGEST = 1.0  # maximum of an anatomy's longest side [m]; a whole head has 0.3 m
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ SIGNS = {
 """Sign of each coordinate in the conversion to RAS, for each anatomical space."""
 SHORT = {"".join(word[0] for word in space.split("-")): space for space in SIGNS}  # spaces by their initials
 METRES = {"mm": 1e-3, "": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6}  # length units [m]
-TYPES = {
+TYPES = {  # NumPy types by NRRD names, without byte order
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
     **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
     **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
@@ -38,8 +38,8 @@ TYPES = {
     "double": "f8",
 }
 ENDIAN = {"little": "<", "big": ">"}  # NumPy byte order
-# Maximum length of a header line [characters], and maximum lines: 100 segments take 1,000.
-LONGEST, MOST_LINES = 2**16, 2**14
+LONGEST = 2**16  # maximum length of a header line [characters]
+MOST_LINES = 2**14  # maximum header lines; 100 segments take 1,000
 ONE_FILE = "Save it as one file (.nrrd), with its header and voxels together."
 
 

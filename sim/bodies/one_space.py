@@ -11,8 +11,8 @@ from ..errors import InputError
 from .label_map import Mask
 from .voxels import LPS, VoxelGrid
 
-# Fractions of points inside: below AMISS the spaces differ; above EXPLAINED after negating x and y, LPS is the cause.
-AMISS, EXPLAINED = 0.5, 0.9
+AMISS = 0.5  # fraction of points inside, below which the spaces differ
+EXPLAINED = 0.9  # fraction inside after negating x and y, above which LPS is the cause
 SAMPLED = 500  # approximate number of tested points
 ONE_OF_BOTH = "one of the two states LPS as RAS. Export that one again."
 

@@ -37,7 +37,7 @@ def _patterns() -> dict[tuple[int, ...], list[list[int]]]:
     return found
 
 
-PATTERNS = _patterns()
+PATTERNS = _patterns()  # children by halved edges
 
 
 def _closed() -> np.ndarray:
@@ -47,7 +47,7 @@ def _closed() -> np.ndarray:
     return known[(sets[:, None] <= known).all(axis=2).argmax(axis=1)]
 
 
-CLOSED = _closed()
+CLOSED = _closed()  # smallest pattern by the bit mask of halved edges
 
 
 def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:

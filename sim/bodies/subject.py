@@ -20,10 +20,12 @@ from .placement import Piece, Placement, find_within_outline
 from .refine import refined
 from .signed_distance import Field
 
-FEWEST_NODES, MOST_NODES = 2_000, 250_000  # limits of the number of mesh nodes
+FEWEST_NODES = 2_000  # minimum mesh nodes
+MOST_NODES = 250_000  # maximum mesh nodes
 # Barycentric coordinates (20, 4) of sample points in a tetrahedron.
 SPREAD = np.array([corners for corners in product(range(4), repeat=4) if sum(corners) == 3]) / 4.0 + 1.0 / 16.0
-SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # diameter limits [m]
+SMALLEST_CRANIOTOMY = 0.015  # minimum diameter [m]
+LARGEST_CRANIOTOMY = 0.120  # maximum diameter [m]
 
 
 @dataclass(frozen=True)

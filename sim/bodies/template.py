@@ -27,9 +27,11 @@ SITES = {
 }
 """Named points on the right hemisphere's convexity, seen from `MIDDLE`: MNI152 coordinates [mm]."""
 
-Shape = Literal["sphere", "lobed"]
-SMALLEST_RADIUS, LARGEST_RADIUS = 3e-3, 35e-3  # tumour radius [m]
-SMALLEST_COVER, LARGEST_COVER = 1e-3, 60e-3  # depth of the tumour's top under the cortex [m]
+Shape = Literal["sphere", "lobed"]  # tumour shapes
+SMALLEST_RADIUS = 3e-3  # minimum tumour radius [m]
+LARGEST_RADIUS = 35e-3  # maximum tumour radius [m]
+SMALLEST_COVER = 1e-3  # minimum depth of the tumour's top under the cortex [m]
+LARGEST_COVER = 60e-3  # maximum depth of the tumour's top under the cortex [m]
 
 
 @dataclass(frozen=True)

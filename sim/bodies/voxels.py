@@ -18,8 +18,8 @@ from ..errors import InputError
 REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd, .seg.nrrd or .nhdr)."
 LPS = np.array([-1.0, -1.0, 1.0])
 """Signs of the conversion between LPS and RAS."""
-# Maximum trailing data read for the checksum [bytes], and block size of reading [bytes].
-SURPLUS, PIECE = 2**24, 2**20
+SURPLUS = 2**24  # maximum data after the voxels, read for a checksum [bytes]
+PIECE = 2**20  # block size of reading [bytes]
 # Maximum decompressed size of a file whose suffix does not show its compression [bytes].
 MOST_UNPACKED = 2**31
 

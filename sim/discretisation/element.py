@@ -13,7 +13,7 @@ from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh
 # Quadrature of degree 3 with eight points, the corners and the face centres. With the four points that suffice
 # for small strain, elements under a tool fold at their corners, where there is no point.
 EIGHT_POINTS = np.vstack([np.eye(4), (np.ones((4, 4)) - np.eye(4)) / 3.0])
-EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)
+EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)  # fractions of the volume
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,10 @@ from scipy.spatial import KDTree
 from ..geometry.closest_point import find_closest_points
 from ..geometry.tetmesh import find_single_faces
 
-# Candidate triangles for the closest point, and points per block.
-NEAR, TOGETHER = 16, 4096
-# Maximum extrapolated change as a fraction of the surface value (zero stays zero), and guard against division by 0.
-SHARE, TINY = 0.5, 1e-30
+NEAR = 16  # candidate triangles for the closest point
+TOGETHER = 4096  # points per block
+SHARE = 0.5  # maximum extrapolated change, as a fraction of the surface value: zero stays zero
+TINY = 1e-30  # guard against division by 0
 
 
 def extrapolate_beyond_surface(

@@ -8,14 +8,17 @@ from scipy.optimize import minimize
 
 from .extension import smooth
 
-# Jacobian determinant below which a cell is corrected, and target of the correction.
-TIGHT, WANTED = 0.05, 0.15
-# Margin of movable nodes around such a cell, maximum attempts, and maximum iterations per attempt.
-ROUND, TIMES, STEPS = 2, 12, 200
-# Attempt from which folds are smoothed first, to leave local minima, and its smoothing iterations.
-STUCK, SWEEPS = 4, 3
-# Weight of a node's squared move [spacings] relative to a cell's squared volume deficit: in body, collar, outside.
-STIFF, COLLAR, SOFT = 1.0, 0.1, 1e-4
+TIGHT = 0.05  # Jacobian determinant below which a cell is corrected
+WANTED = 0.15  # target determinant of the correction
+ROUND = 2  # margin of movable nodes around such a cell
+TIMES = 12  # maximum attempts
+STEPS = 200  # maximum iterations per attempt
+STUCK = 4  # attempt from which folds are smoothed first, to leave local minima
+SWEEPS = 3  # smoothing iterations of such an attempt
+# Weights of a node's squared move [spacings] relative to a cell's squared volume deficit.
+STIFF = 1.0  # in the body
+COLLAR = 0.1  # in the collar
+SOFT = 1e-4  # elsewhere
 # Relative edge change below which no corner of a cell can fold.
 GENTLE = 0.15
 # Slices per block, to limit memory.

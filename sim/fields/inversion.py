@@ -6,8 +6,9 @@ import numpy as np
 
 from .grid import Grid
 
-# Tolerance [m], maximum iterations, and maximum Newton step [spacings].
-EXACT, STEPS, LONGEST = 1e-6, 25, 2.0
+EXACT = 1e-6  # tolerance [m]
+STEPS = 25  # maximum iterations
+LONGEST = 2.0  # maximum Newton step [spacings]
 # Required contraction of fixed-point steps; points that miss it use Newton's method.
 SHORTER = 0.6
 

@@ -17,16 +17,19 @@ from .grid import Grid
 
 # Interpolation error above which tetrahedra are fitted [m].
 ENOUGH = 2e-5
-# Points per grid spacing along a tetrahedron's longest edge, for the error test and for the fit; maximum per edge.
-LOOKED, FITTED, MOST = 1.0, 1.5, 10
-# Points per grid spacing along a triangle's edge, and weight of a cell face of surface relative to a cell's volume.
-ON_SURFACE, SURFACE = 2.0, 10.0
+LOOKED = 1.0  # points per grid spacing along a tetrahedron's longest edge, in the error test
+FITTED = 1.5  # the same in the fit
+MOST = 10  # maximum subdivisions of an edge
+ON_SURFACE = 2.0  # points per grid spacing along a surface triangle's longest edge
+SURFACE = 10.0  # weight of a cell face of surface, relative to a cell's volume
 # Points per block, to limit memory.
 TOGETHER = 200_000
-# Weights relative to the squared error: of the change, of its differences between nodes, of the collar's curvature.
-SMALL, EVEN, STRAIGHT = 1e-3, 1e-2, 3e-3
-# Relative tolerance and maximum iterations of the linear solver.
-EXACT, STEPS = 1e-3, 300
+# Penalty weights relative to the squared error.
+SMALL = 1e-3  # change of the field
+EVEN = 1e-2  # differences of the change between nodes
+STRAIGHT = 3e-3  # second differences of the field in the collar
+EXACT = 1e-3  # relative tolerance of the linear solver
+STEPS = 300  # maximum iterations of the linear solver
 
 
 @dataclass(frozen=True, eq=False)

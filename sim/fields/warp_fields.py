@@ -18,12 +18,15 @@ from .in_tetrahedra import interpolate_in_tetrahedra
 from .inversion import invert_field
 from .projection import NodalField, project
 
-# Distance over which the field fades to zero: constant part [m], and multiple of the maximum displacement.
-LEAST_REACH, REACHES = 5e-3, 2.0
-# Margin of the grid beyond that distance [nodes]; displacement not inverted [m]; guard against division by 0.
-EDGE, STILL, TINY = 3, 1e-5, 1e-30
-FAINT, SHARE = 2e-5, 2.5e-3
-"""Limits below which displacement is set to 0: absolute [m], and fraction of the maximum; unchanged above twice it."""
+LEAST_REACH = 5e-3  # constant part of the distance over which the field fades to zero [m]
+REACHES = 2.0  # variable part of that distance [maximum displacements]
+EDGE = 3  # margin of the grid beyond that distance [nodes]
+STILL = 1e-5  # displacement below which no inverse is computed [m]
+TINY = 1e-30  # guard against division by 0
+FAINT = 2e-5
+"""Displacement below which it is set to 0 [m]; above twice the limit it is unchanged."""
+SHARE = 2.5e-3
+"""Maximum of that limit, as a fraction of the maximum displacement."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,7 +101,7 @@ ENDS = {
 }
 # A prism between the triangles 0, 1, 2 and 3, 4, 5 consists of three tetrahedra.
 PRISM = np.array([[0, 1, 2, 5], [0, 1, 4, 5], [0, 3, 4, 5]])
-PARTS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}
+PARTS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}  # tetrahedra of the part, by number of corners below
 
 
 def cut_below_plane(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,9 +13,10 @@ from ..discretisation.term import Cases
 from ..runtime.columns import CHUNK, Workspaces
 from ..runtime.device import Device, forward_kernel
 
-# Mass fractions of a quadratic tetrahedron's corner and mid-edge nodes: diagonal of the consistent mass matrix, scaled
-# to the total mass. Row sums would be negative at corners.
-CORNER, MIDDLE = 1.0 / 36.0, 4.0 / 27.0
+# Mass fractions of a quadratic tetrahedron's nodes: diagonal of the consistent mass matrix, scaled to the total mass.
+# Row sums would be negative at corners.
+CORNER = 1.0 / 36.0  # each corner
+MIDDLE = 4.0 / 27.0  # each midpoint
 
 
 @dataclass(frozen=True)

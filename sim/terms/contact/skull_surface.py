@@ -21,8 +21,9 @@ from ...geometry.surface import (
 
 # Distance [m] inside the craniotomy assigned to nodes under bone, so that these stay covered wherever they move.
 UNDER_BONE = -1.0
-# Area fractions of a quadratic triangle's corner and mid-edge nodes: all positive, so that every node has an area.
-CORNER, MIDDLE = 1.0 / 12.0, 1.0 / 4.0
+# Area fractions of a quadratic triangle's nodes: all positive, so that every node has an area.
+CORNER = 1.0 / 12.0  # each corner
+MIDDLE = 1.0 / 4.0  # each midpoint
 
 
 @dataclass(frozen=True)
