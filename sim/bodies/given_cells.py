@@ -196,10 +196,7 @@ def _named(
 ) -> tuple[np.ndarray, tuple[str]]:
     """Return regions renumbered to match the group `names`, and a note; `free` numbers are not from the file.
 
-    Raises
-    ------
-    InputError
-        Names of which some are of regions, and others not, where the numbers contradict them.
+    Without contradiction between numbers and known names, numbers of the file are kept.
     """
     known = {number: SPELT.get(names.get(number, "").strip().lower()) for number in np.unique(region).tolist()}
     wrong = [number for number, name in known.items() if name and REGION_NAMES[name] != number]

@@ -13,7 +13,7 @@ from .label_map import LabelMap
 
 # Minimum oedema volume, as a fraction of all labelled voxels; smaller ones are noise.
 SPECK = 0.02
-# Fraction of an oedema's surface at unlabelled tissue.
+# Fraction of an oedema's surface that faces neither tumour nor oedema.
 HIDDEN = 0.2  # below it in no tumour
 SURE = 0.4  # above it in every tumour
 # Significant difference between two such fractions.

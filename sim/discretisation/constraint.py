@@ -56,7 +56,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         v: wp.array2d(dtype=scalar),
     ):
-        """v_i -= n (n . v_i); held components of v are zero."""
+        """Project onto the admissible motions: v_i -= n (n . v_i); fixed components of v are zero."""
         i, c = wp.tid()
         x = vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c])
         n = normal[i]
@@ -74,7 +74,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         gap: wp.array2d(dtype=scalar),
     ):
-        """gap_i = value - u if fixed, n (drag . value - n . u) if sliding, zero elsewhere."""
+        """Compute gap_i = value - u if fixed, n (drag . value - n . u) if sliding, zero elsewhere."""
         i, c = wp.tid()
         x = vec(u[3 * i, c], u[3 * i + 1, c], u[3 * i + 2, c])
         n = normal[i]
@@ -91,7 +91,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_kc += sum over a chunk of nodes of w_ic v_(3i+k)c."""
+        """Add the weighted mean over a chunk of nodes: out_kc += sum of w_ic v_(3i+k)c."""
         block, c = wp.tid()
         total = vec()
         for i in range(block * chunk, wp.min((block + 1) * chunk, weight.shape[0])):
@@ -106,7 +106,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         v: wp.array2d(dtype=scalar),
     ):
-        """v_(3i+k)c += w_ic amount_kc."""
+        """Distribute amounts to nodes: v_(3i+k)c += w_ic amount_kc."""
         i, c = wp.tid()
         for k in range(3):
             v[3 * i + k, c] += weight[i, c] * amount[k, c]

@@ -25,7 +25,7 @@ def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Ker
         # outputs
         out: wp.array(dtype=wp.int32),
     ):
-        """n += 1 if det F <= least at some point, F = I + sum over nodes of u_a (x) grad N_a."""
+        """Add 1 to n if det F <= least at some point, F = I + sum over nodes of u_a (x) grad N_a."""
         e, c = wp.tid()
         for q in range(points):
             F = wp.identity(n=3, dtype=scalar)

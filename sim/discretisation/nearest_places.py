@@ -106,7 +106,7 @@ def _nearest(
     distance: wp.array(dtype=wp.float64),
     normal: wp.array(dtype=wp.vec3d),
 ):
-    """y = x + (t - 1) / t' (x - x'), x the triangle point nearest to the box point nearest to y; t' = (1 + r) / 2."""
+    """Iterate y = x + (t - 1) / t' (x - x'), x the triangle point nearest to the box point nearest to y."""
     face = wp.tid()
     a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
     one, pace = wp.float64(1.0), wp.float64(1.0)

@@ -37,7 +37,7 @@ def build_kernels(device: Device) -> DeadForceKernels:
         # outputs
         force: wp.array2d(dtype=scalar),
     ):
-        """f_(3i+k)c += w_ic / (sum of w)_c F_ck."""
+        """Distribute tool forces F by footprint weights w: f_(3i+k)c += w_ic / (sum of w)_c F_ck."""
         i, c = wp.tid()
         for k in range(3):
             force[3 * i + k, c] += scalar(weight[i, c] / sums[c][0] * whole[c, k])
@@ -49,7 +49,7 @@ def build_kernels(device: Device) -> DeadForceKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """g -= f."""
+        """Subtract the loads from the gradient: g -= f."""
         i, c = wp.tid()
         for k in range(3):
             out[3 * nodes[i] + k, c] -= force[3 * i + k, c]
@@ -62,7 +62,7 @@ def build_kernels(device: Device) -> DeadForceKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E_c -= sum over a chunk of nodes of f . u, in double precision."""
+        """Subtract the work in double precision: E_c -= sum over a chunk of nodes of f . u."""
         block, c = wp.tid()
         total = wp.float64(0.0)
         for i in range(block * chunk, wp.min((block + 1) * chunk, nodes.shape[0])):
@@ -152,14 +152,14 @@ class DeadForce:
             self._forces = Forces(self._forces.nodes, gather_columns(self._device, self._forces.force, columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E -= f . u."""
+        """Add the energy: E -= f . u."""
         if self._forces is not None:
             dim = (-(-len(self._forces.nodes) // CHUNK), u.shape[1])
             inputs = [self._forces.nodes, self._forces.force, u]
             self._device.launch(build_kernels(self._device).subtract_work, dim, inputs, [out])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """g -= f."""
+        """Add the gradient: g -= f."""
         if self._forces is not None:
             dim = (len(self._forces.nodes), u.shape[1])
             inputs = [self._forces.nodes, self._forces.force]

@@ -141,7 +141,7 @@ class ElasticTerm:
             self.begin(self._cases.rows(columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E += sum of w psi(H)."""
+        """Add the elastic energy: E += sum of w psi(H)."""
         self._launch(self._kernels.add_energy, [u], out, u.shape[1])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:

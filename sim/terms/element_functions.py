@@ -56,7 +56,7 @@ def build_functions(law: Law, device: Device, size: int, count: int) -> ElementF
         q: int,
         c: int,
     ):
-        """H = sum over nodes of (u_a - u_0) (x) grad N_a."""
+        """Return the displacement gradient H = sum over nodes of (u_a - u_0) (x) grad N_a."""
         H = mat()
         i = 3 * table[e, 0]
         origin = vec(u[i, c], u[i + 1, c], u[i + 2, c])

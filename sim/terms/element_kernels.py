@@ -37,7 +37,7 @@ def build_spreading_kernel(device: Device) -> wp.Kernel:
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
-        """n_eqic = k_ei."""
+        """Copy coefficients to all points and load cases: n_eqic = k_ei."""
         e, q, i, c = wp.tid()
         out[e, q, i, c] = coefficients[e, i]
 
@@ -69,7 +69,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         c: int,
         out: wp.array2d(dtype=scalar),
     ):
-        """f_a += P grad N_a; they sum to zero."""
+        """Add element forces f_a += P grad N_a, whose sum is zero."""
         total = vec()
         for a in range(1, size if size else sizes[e]):
             i = 3 * table[e, a]
@@ -92,7 +92,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E += sum over points of w psi(H)."""
+        """Add the energy: E += sum over points of w psi(H)."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             H = gradient_of(u, sizes, table, gradient, e, q, c)
@@ -109,7 +109,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f_a += sum over points of w P(H) grad N_a."""
+        """Add the internal forces: f_a += sum over points of w P(H) grad N_a."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             H = gradient_of(u, sizes, table, gradient, e, q, c)
@@ -129,7 +129,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f_a += sum over points of w dP(H; D) grad N_a; `definite` columns use the undeformed tangent."""
+        """Add K D: f_a += sum over points of w dP(H; D) grad N_a; `definite` columns use the undeformed tangent."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             k = at(coefficients, e, q, c)
@@ -144,7 +144,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
 
     @wp.func
     def along(H: mat, of: constants, k: int, m: int):
-        """dP for dF = e_k (x) e_m."""
+        """Return dP for dF = e_k (x) e_m."""
         D = mat()
         D[k, m] = scalar(1.0)
         return stress_change(H, D, of)
@@ -162,7 +162,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """K_aa += sum over points of w dP(H; e_j (x) grad N_a) grad N_a, column j of the block.
+        """Add the diagonal blocks K_aa += sum over points of w dP(H; e_j (x) grad N_a) grad N_a, column j of the block.
 
         Nine stress changes serve all nodes of a point.
         """
@@ -242,7 +242,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array3d(dtype=mat),
     ):
-        """H at every point."""
+        """Compute the displacement gradient H at every point."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             out[e, q, c] = gradient_of(u, sizes, table, gradient, e, q, c)

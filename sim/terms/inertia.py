@@ -43,7 +43,7 @@ def build_kernels(device: Device) -> InertiaKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E_c += w_c / 2 sum over a chunk of nodes of m_i |u_i - a_i|^2, in double precision."""
+        """Add the energy in double precision: E_c += w_c / 2 sum over a chunk of nodes of m_i |u_i - a_i|^2."""
         block, c = wp.tid()
         total = wp.float64(0.0)
         for i in range(block * chunk, wp.min((block + 1) * chunk, mass.shape[0])):
@@ -62,7 +62,7 @@ def build_kernels(device: Device) -> InertiaKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f_i += m_i w_c (x_i - aimed a_i); `aimed` is 0 or 1."""
+        """Add inertial forces f_i += m_i w_c (x_i - aimed a_i); `aimed` is 0 or 1."""
         i, c = wp.tid()
         for k in range(3):
             out[3 * i + k, c] += mass[i] * weight[c] * (x[3 * i + k, c] - aimed * aim[3 * i + k, c])
@@ -74,7 +74,7 @@ def build_kernels(device: Device) -> InertiaKernels:
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """K_ii += m_i w_c I."""
+        """Add the diagonal blocks K_ii += m_i w_c I."""
         i, c = wp.tid()
         out[i, c] += mass[i] * weight[c] * wp.identity(n=3, dtype=scalar)
 
@@ -149,12 +149,12 @@ class InertiaTerm:
         self.begin(self._cases.rows(columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E += w/2 |u - a|^2_M."""
+        """Add the energy: E += w/2 |u - a|^2_M."""
         inputs = [self._mass, self._weight.of(u.shape[1]), self._aim.of(u.shape[1]), u]
         self._device.launch(self._kernels.add_energy, (-(-len(self._mass) // CHUNK), u.shape[1]), inputs, [out])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """f += w M (u - a)."""
+        """Add the gradient: f += w M (u - a)."""
         self._add_force(u, self._aim.of(u.shape[1]), 1.0, out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:

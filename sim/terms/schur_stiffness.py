@@ -44,12 +44,12 @@ class Exterior:
         """Do nothing: F is the same in all load cases."""
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E += u . F u / 2."""
+        """Add the energy: E += u . F u / 2."""
         x, force = self._multiplied(u)
         add_dots(self._device, combine_columns(self._device, x, -0.5, x, x), force, out)
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """f += F u."""
+        """Add the gradient: f += F u."""
         _, force = self._multiplied(u)
         add_rows(self._device, force, self._rows, out)
 

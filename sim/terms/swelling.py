@@ -33,24 +33,24 @@ def build_swollen_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def elastic(H: mat, c: whole):
-        """F_e - I = (H - r I) / (1 + r)."""
+        """Return the elastic displacement gradient F_e - I = (H - r I) / (1 + r)."""
         return (H - c[count] * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + c[count])
 
     @wp.func
     def energy(H: mat, c: whole):
-        """(1 + r)^3 psi(F_e) [Pa]."""
+        """Return the energy density (1 + r)^3 psi(F_e) [Pa]."""
         s = scalar(1.0) + c[count]
         return s * s * s * own_energy(elastic(H, c), of_law(c))
 
     @wp.func
     def stress(H: mat, c: whole):
-        """P = (1 + r)^2 P(F_e) [Pa]."""
+        """Return the stress P = (1 + r)^2 P(F_e) [Pa]."""
         s = scalar(1.0) + c[count]
         return s * s * own_stress(elastic(H, c), of_law(c))
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
-        """dP [Pa] for dF = D: (1 + r) dP(F_e; D)."""
+        """Return dP [Pa] for dF = D: (1 + r) dP(F_e; D)."""
         return (scalar(1.0) + c[count]) * own_change(elastic(H, c), D, of_law(c))
 
     @wp.func
@@ -92,7 +92,7 @@ def build_kernels(device: Device) -> SwellingKernels:
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
-        """r_eqc = s_e r_c."""
+        """Write the swelling ratio r_eqc = s_e r_c."""
         e, q, c = wp.tid()
         out[e, q, place, c] = swells[e] * wider[c]
 
@@ -103,7 +103,7 @@ def build_kernels(device: Device) -> SwellingKernels:
         # outputs
         strain: wp.array3d(dtype=mat),
     ):
-        """H <- F_e - I = (H - r I) / (1 + r)."""
+        """Replace H by its elastic part F_e - I = (H - r I) / (1 + r)."""
         e, q, c = wp.tid()
         r = swells[e] * wider[c]
         strain[e, q, c] = (strain[e, q, c] - r * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + r)

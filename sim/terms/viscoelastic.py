@@ -66,17 +66,17 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def energy(H: mat, c: whole):
-        """psi + (f - 1) psi_shape + A : E [Pa]."""
+        """Return the step's energy density psi + (f - 1) psi_shape + A : E [Pa]."""
         return own_energy(H, of_law(c), c[count], pull(c))
 
     @wp.func
     def stress(H: mat, c: whole):
-        """P + (f - 1) P_shape + the derivative of A : E."""
+        """Return the stress P + (f - 1) P_shape + the derivative of A : E."""
         return own_stress(H, of_law(c), c[count], pull(c))
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
-        """dP for dF = D: the derivative of `stress`."""
+        """Return dP for dF = D, the derivative of `stress`."""
         return own_change(H, D, of_law(c), c[count], pull(c))
 
     @wp.func
@@ -116,7 +116,7 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
-        """f - 1, and A; past (b, points, 6 (n + 1)): S, then each H_i."""
+        """Compute f - 1 and A; past (b, points, 6 (n + 1)): S, then each H_i."""
         e, q, c = wp.tid()
         p = e * out.shape[1] + q
         less = scalar(0.0)
@@ -141,7 +141,7 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
         # outputs
         out: wp.array3d(dtype=scalar),
     ):
-        """S at H, and H_i <- exp(-dt / tau) H_i + g exp(-dt / (2 tau)) (S - its last value)."""
+        """Update the history: S at H, and H_i <- exp(-dt / tau) H_i + g exp(-dt / (2 tau)) (S - its last value)."""
         e, q, c = wp.tid()
         p = e * strain.shape[1] + q
         S = overstress(strain[e, q, c], coefficients[e])

@@ -17,7 +17,7 @@ RELAXED = wp.constant(0.01)
 
 @wp.func
 def barrier(d: Any, g: Any):
-    """b(d) / k [m^2]."""
+    """Return the barrier function b(d) / k [m^2] at distance d with gap g."""
     zero = type(d)(0.0)
     if d >= g:
         return zero
@@ -31,7 +31,7 @@ def barrier(d: Any, g: Any):
 
 @wp.func
 def barrier_slope(d: Any, g: Any):
-    """b'(d) / k [m], never positive: contact is purely repulsive."""
+    """Return the first derivative b'(d) / k [m], never positive: contact is purely repulsive."""
     if d >= g:
         return type(d)(0.0)
     low = type(d)(RELAXED) * g
@@ -44,7 +44,7 @@ def barrier_slope(d: Any, g: Any):
 
 @wp.func
 def barrier_curvature(d: Any, g: Any):
-    """b''(d) / k: never negative."""
+    """Return the second derivative b''(d) / k, never negative."""
     if d >= g:
         return type(d)(0.0)
     e = wp.max(d, type(d)(RELAXED) * g)

@@ -26,7 +26,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """out += half the solid angle [sr] of a triangle seen from points (p, b)."""
+        """Add half the solid angle [sr] of a triangle seen from points (p, b)."""
         s, c = wp.tid()
         corners = wp.mat33d()
         for row in range(3):

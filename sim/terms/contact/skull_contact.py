@@ -78,7 +78,7 @@ class Wall:
 
 @wp.func
 def place(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
-    """(h + R, r + R); if the barrier is widened, the bone recedes by the same distance."""
+    """Return (h + R, r + R) of node s at displacement x; a widened barrier makes the bone recede by as much."""
     gap = wall.gap + (wall.times - wp.float64(1.0)) * wall.felt[s]
     h = gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.bend[s] * x)
     return wp.vec2d(h + wall.edge, wall.inside[s] + wp.dot(wall.way[s], x) + wall.edge)
@@ -86,7 +86,7 @@ def place(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
 
 @wp.func
 def share(p: wp.vec2d) -> wp.vec2d:
-    """Gradient of d with respect to (h, r): a unit vector away from the bone."""
+    """Return the gradient of d with respect to (h, r): a unit vector away from the bone."""
     if wp.max(p[0], p[1]) > wp.float64(0.0):
         return wp.normalize(wp.vec2d(wp.max(p[0], wp.float64(0.0)), wp.max(p[1], wp.float64(0.0))))
     if p[0] >= p[1]:
@@ -96,32 +96,32 @@ def share(p: wp.vec2d) -> wp.vec2d:
 
 @wp.func
 def distance(wall: Wall, p: wp.vec2d) -> wp.float64:
-    """d."""
+    """Return the distance d to the bone [m]."""
     return wp.dot(share(p), p) - wall.edge
 
 
 @wp.func
 def turned(wall: Wall, s: int, x: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.vec3d:
-    """Displacement direction that reduces h by `along` and increases r by `across`."""
+    """Return the displacement direction that reduces h by `along` and increases r by `across`."""
     return along * (wall.normal[s] + wall.bend[s] * x) + across * wall.way[s]
 
 
 @wp.func
 def slope(wall: Wall, s: int, x: wp.vec3d, p: wp.vec2d) -> wp.vec3d:
-    """m = -grad d: d decreases by m . du."""
+    """Return m = -grad d: d decreases by m . du."""
     at = share(p)
     return turned(wall, s, x, at[0], -at[1])
 
 
 @wp.func
 def stiffness(wall: Wall, s: int) -> wp.float64:
-    """Stiffness w k = w mu / (activation distance) [N/m^2]."""
+    """Return the stiffness w k = w mu / (activation distance) [N/m^2]."""
     return wall.area[s] * wall.shear / (wall.times * wall.felt[s])
 
 
 @wp.func
 def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
-    """w k (b'' m (x) m + b' d''); if `definite`, without the edge curvature, which may be negative."""
+    """Return the block w k (b'' m (x) m + b' d''); if `definite`, without the edge curvature, which may be negative."""
     p = place(wall, s, x)
     d, m, at = distance(wall, p), slope(wall, s, x, p), share(p)
     felt = wall.times * wall.felt[s]
@@ -135,7 +135,7 @@ def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
 
 @wp.func
 def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
-    """Largest t <= 1 for which distance - t falls - t^2 bends / 2 keeps 1 - ROOM_KEPT of the distance; bends >= 0."""
+    """Return the largest t <= 1 with distance - t falls - t^2 bends / 2 >= (1 - ROOM_KEPT) distance; bends >= 0."""
     lost = wp.float64(ROOM_KEPT) * distance
     root = falls + wp.sqrt(falls * falls + wp.float64(2.0) * lost * bends)
     if root > wp.float64(2.0) * lost:
@@ -150,7 +150,7 @@ def build_kernels(device: Device) -> SkullKernels:
 
     @wp.func
     def motion(u: wp.array2d(dtype=scalar), i: int, c: int) -> wp.vec3d:
-        """u_i in double precision."""
+        """Return the displacement u_i of a node in double precision."""
         return wp.vec3d(wp.float64(u[3 * i, c]), wp.float64(u[3 * i + 1, c]), wp.float64(u[3 * i + 2, c]))
 
     @forward_kernel(module="unique")
@@ -160,7 +160,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E += sum over nodes of w k b(d)."""
+        """Add the energy: E += sum over nodes of w k b(d)."""
         s, c = wp.tid()
         d, felt = distance(wall, place(wall, s, motion(u, wall.nodes[s], c))), wall.times * wall.felt[s]
         if d < felt:
@@ -173,7 +173,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """g -= w k b'(d) m."""
+        """Add the gradient: g -= w k b'(d) m."""
         s, c = wp.tid()
         x = motion(u, wall.nodes[s], c)
         p = place(wall, s, x)
@@ -191,7 +191,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f += K_ii p_i."""
+        """Add the tangent stiffness times p: f += K_ii p_i."""
         s, c = wp.tid()
         f = block_of(wall, s, motion(u, wall.nodes[s], c), definite[c]) * motion(p, wall.nodes[s], c)
         for k in range(3):
@@ -205,7 +205,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """K_ii."""
+        """Add the diagonal blocks K_ii."""
         s, c = wp.tid()
         K = block_of(wall, s, motion(u, wall.nodes[s], c), definite[c])
         block = mat()
@@ -222,7 +222,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array(dtype=scalar),
     ):
-        """t with d(u + t du) >= (1 - kept) d: no node crosses the bone; d is convex in h and r."""
+        """Bound t by d(u + t du) >= (1 - kept) d: no node crosses the bone; d is convex in h and r."""
         s, c = wp.tid()
         x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
         p = place(wall, s, x)

@@ -68,7 +68,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """f_a += sum over points of w k b'(d) n N_a; stores the near pairs at x."""
+        """Add forces f_a += sum over points of w k b'(d) n N_a; stores the near pairs at x."""
         tools, gap = stage.tools.radius.shape[0], stage.scale.gap
         for item in range(me, look(x, gap, stage, near, c, me), threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows
@@ -94,7 +94,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """K_ab += sum over points of w k H N_a N_b between nodes with `place` >= 0, over the stored near pairs."""
+        """Add K_ab += sum over points of w k H N_a N_b between nodes with `place` >= 0, over the stored near pairs."""
         tools = stage.tools.radius.shape[0]
         for item in range(me, stage.rows * near.count[c], threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows

@@ -58,7 +58,7 @@ class ToolDistance:
 
 @wp.func
 def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
-    """Distance to a core: d = |v| - r, v from its nearest point to p; n = v / |v|; dn = (M - n (x) n) / |v|.
+    """Return distance d = |v| - r to a core, v from its nearest point to p; n = v / |v|; dn = (M - n (x) n) / |v|.
 
     M selects the components in which p lies outside the core.
     """
@@ -88,7 +88,7 @@ def clear(room: wp.float64, pace: wp.float64, most: int) -> int:
 
 @wp.func
 def curvature_at(touch: ToolDistance, gap: wp.float64, definite: int) -> wp.mat33d:
-    """b'' n (x) n + b' dn; if `definite`, only the first term, which is positive semi-definite."""
+    """Return b'' n (x) n + b' dn; if `definite`, only the first term, which is positive semi-definite."""
     out = barrier_curvature(touch.distance, gap) * wp.outer(touch.normal, touch.normal)
     if definite == 0:
         out += barrier_slope(touch.distance, gap) * touch.bend
@@ -136,7 +136,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def shape_of(i: int, j: int, n: int) -> shares:
-        """Shape functions at the centroid of the j-th part of the i-th row; odd parts are rotated by 180 degrees."""
+        """Return shape functions at the centroid of the j-th part of the i-th row; odd parts are turned upside down."""
         third, turned = wp.float64(1.0) / wp.float64(3 * n), j % 2
         y = wp.float64(3 * i + 1 + turned) * third
         z = wp.float64(3 * (j // 2) + 1 + turned) * third
@@ -152,7 +152,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def motion_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
-        """Displacements of a triangle's nodes (size, 3)."""
+        """Return the displacements of a triangle's nodes (size, 3)."""
         out = forces()
         for a in range(size):
             for k in range(3):
@@ -161,7 +161,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def nodes_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
-        """Deformed positions of a triangle's nodes (size, 3)."""
+        """Return the deformed positions of a triangle's nodes (size, 3)."""
         out = motion_of(surface, u, s, c)
         for a in range(size):
             for k in range(3):
@@ -170,7 +170,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def seen(at: forces, tools: Tools, k: int, c: int) -> forces:
-        """Positions relative to a core's centre, along its axes."""
+        """Return positions relative to a core's centre, along its axes."""
         R = tools.rotation[k, c]
         start = tools.origin[k, c] + R * tools.centre[k]
         out = forces()
@@ -180,19 +180,19 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def spread(surface: Surface, total: forces, s: int, c: int, out: wp.array2d(dtype=scalar)):
-        """f_a += total_a."""
+        """Add nodal forces of a triangle: f_a += total_a."""
         for a in range(size):
             for k in range(3):
                 wp.atomic_add(out, 3 * surface.table[s, a] + k, c, scalar(total[a, k]))
 
     @wp.func
     def weight_of(surface: Surface, scale: Scale, s: int) -> wp.float64:
-        """Stiffness times the area per sample point of a triangle [N/m]."""
+        """Return stiffness times the area per sample point of a triangle [N/m]."""
         return scale.stiffness * surface.area[s] / wp.float64(surface.pieces[s] * surface.pieces[s])
 
     @wp.func
     def reach_of(along: forces) -> wp.float64:
-        """Bound of the norm over a triangle, from nodal vectors (size, 3)."""
+        """Return a bound of the norm over a triangle, from nodal vectors (size, 3)."""
         out = wp.float64(0.0)
         for a in range(size):
             out = wp.max(out, wp.length(along[a]))
@@ -200,7 +200,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def around(at: forces) -> forces:
-        """Nodes (size, 3) relative to the centroid of their corners."""
+        """Return the nodes (size, 3) relative to the centroid of their corners."""
         middle, out = wp.vec3d(), at
         for a in range(3):
             middle += at[a] / wp.float64(3.0)
@@ -210,7 +210,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def pace_of(at: forces, n: int) -> wp.float64:
-        """Bound of the distance between neighbouring points of a row.
+        """Return a bound of the distance between neighbouring points of a row.
 
         Barycentric coordinates change by 1, 1 and 2 thirds of a piece between them.
         """
@@ -218,7 +218,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def least_distance(at: forces, times: wp.float64, half: wp.vec3d, radius: wp.float64) -> wp.float64:
-        """Lower bound of a core's distance from a triangle scaled by `times` about its centroid."""
+        """Return a lower bound of a core's distance from a triangle scaled by `times` about its centroid."""
         arms = around(at)
         return touch_of(at[0] - arms[0], half, radius).distance - times * reach_of(arms)
 
@@ -229,7 +229,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def energy_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
-        """Sum over points of b(d)."""
+        """Return the sum over points of a row of b(d)."""
         total, pace, most, j = wp.float64(0.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             d = touch_of(shape_of(i, j, n) * at, half, radius).distance
@@ -239,7 +239,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def force_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> forces:
-        """Sum over points of N_a b'(d) n."""
+        """Return the sum over points of a row of N_a b'(d) n."""
         total, pace, most, j = forces(), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             N = shape_of(i, j, n)
@@ -263,7 +263,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         c: int,
         out: wp.array3d(dtype=wp.float64),
     ):
-        """K_ab += sum over points of w k H N_a N_b between the nodes with `place` >= 0."""
+        """Add K_ab += sum over points of a row of w k H N_a N_b, between the nodes with `place` >= 0."""
         n, half, radius = surface.pieces[s], tools.half[k], tools.radius[k]
         total, felt, pace, most, j = blocks(), wp.bool(False), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
@@ -295,7 +295,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def share_in_row(at: forces, along: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64) -> wp.float64:
-        """Fraction of a motion, at most 1, that takes no point as far as the centre of a core."""
+        """Return the fraction of a motion, at most 1, that takes no point as far as the centre of a core."""
         out, pace, most, j = wp.float64(1.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         farthest = reach_of(along)
         while j < most:

@@ -84,7 +84,7 @@ def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
         stress: wp.array(dtype=mat),
         change: wp.array(dtype=mat),
     ):
-        """psi, P and dP."""
+        """Evaluate psi, P and dP."""
         i = wp.tid()
         energy[i] = density(H[i], c)
         stress[i] = stress_of(H[i], c)

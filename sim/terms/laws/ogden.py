@@ -18,7 +18,7 @@ from .spectral import principal_axes
 
 @wp.func
 def log_stretches(H: Any, e: Any, N: Any):
-    """ln lambda_k = log1p(2 e_k) / 2; under strong compression ln |F n_k|, as 1 + 2 e_k loses digits."""
+    """Return ln lambda_k = log1p(2 e_k) / 2; under strong compression ln |F n_k|, as 1 + 2 e_k loses digits."""
     one, two = type(e[0])(1.0), type(e[0])(2.0)
     x = type(e)()
     for k in range(3):
@@ -33,21 +33,21 @@ def log_stretches(H: Any, e: Any, N: Any):
 
 @wp.func
 def squares(x: Any):
-    """lambda_k^2 = exp(2 x_k)."""
+    """Return the squared stretches lambda_k^2 = exp(2 x_k)."""
     two = type(x[0])(2.0)
     return wp.vector(wp.exp(two * x[0]), wp.exp(two * x[1]), wp.exp(two * x[2]))
 
 
 @wp.func
 def isochoric(x: Any):
-    """y_k = ln l_k = x_k - mean x."""
+    """Return the isochoric part y_k = ln l_k = x_k - mean x."""
     mean = (x[0] + x[1] + x[2]) / type(x[0])(3.0)
     return x - wp.vector(mean, mean, mean)
 
 
 @wp.func
 def exp_excess(t: Any):
-    """exp(t) - 1 - t, by its series where the difference would cancel."""
+    """Return exp(t) - 1 - t; for small t by its series, against cancellation."""
     one = type(t)(1.0)
     if wp.abs(t) > one:
         return wp.exp(t) - one - t
@@ -59,7 +59,7 @@ def exp_excess(t: Any):
 
 @wp.func
 def sinh_ratio(z: Any):
-    """sinh(z) / z."""
+    """Return sinh(z) / z."""
     if z == type(z)(0.0):
         return type(z)(1.0)
     return wp.sinh(z) / z
@@ -67,7 +67,7 @@ def sinh_ratio(z: Any):
 
 @wp.func
 def kirchhoff(H: Any, y: Any, c: Any):
-    """Principal Kirchhoff stresses t_k [Pa] = a_k - mean a + K ln J, with a_k = sum_i c_i / m_i l_k^m_i."""
+    """Return principal Kirchhoff stresses t_k [Pa] = a_k - mean a + K ln J, with a_k = sum_i c_i / m_i l_k^m_i."""
     a = type(y)()
     for i in range(len(c) // 2):
         for k in range(3):
@@ -78,7 +78,7 @@ def kirchhoff(H: Any, y: Any, c: Any):
 
 @wp.func
 def energy(H: Any, c: Any):
-    """psi [Pa] = sum_i c_i / m_i^2 sum_k (exp(m_i y_k) - 1 - m_i y_k) + K/2 (ln J)^2; +inf where J <= 0."""
+    """Return psi [Pa] = sum_i c_i / m_i^2 sum_k (exp(m_i y_k) - 1 - m_i y_k) + K/2 (ln J)^2; +inf where J <= 0."""
     j = volume_change(H)
     if j <= -type(j)(1.0):
         return type(j)(wp.inf)
@@ -96,7 +96,7 @@ def energy(H: Any, c: Any):
 
 @wp.func
 def stress(H: Any, c: Any):
-    """P [Pa] = F S, with S = sum_k t_k / lambda_k^2 n_k (x) n_k."""
+    """Return the stress P [Pa] = F S, with S = sum_k t_k / lambda_k^2 n_k (x) n_k."""
     e, N = principal_axes(green_strain(H))
     x = log_stretches(H, e, N)
     t = kirchhoff(H, isochoric(x), c)
@@ -106,7 +106,7 @@ def stress(H: Any, c: Any):
 
 @wp.func
 def stiffness_between(k: int, l: int, e: Any, y: Any, c: Any):
-    """b_kl [Pa] = sum_i c_i exp(m_i (y_k + y_l) / 2) sinh(m_i d / 2) / (m_i d / 2) x d / tanh d.
+    """Return b_kl [Pa] = sum_i c_i exp(m_i (y_k + y_l) / 2) sinh(m_i d / 2) / (m_i d / 2) x d / tanh d.
 
     This is the divided difference of a in `kirchhoff` over the eigenvalues e, times the mean squared stretch. With
     tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), it is accurate for equal stretches too.
@@ -127,7 +127,7 @@ def stiffness_between(k: int, l: int, e: Any, y: Any, c: Any):
 
 @wp.func
 def stress_change(H: Any, D: Any, c: Any):
-    """dP [Pa] for dF = D: D S + F dS, dS in principal axes from the strain increment G = sym(F^T D) there.
+    """Return dP [Pa] for dF = D: D S + F dS, dS in principal axes from the strain increment G = sym(F^T D) there.
 
     lambda_k^2 lambda_l^2 dS_kl = (b_kl - t_k - t_l) G_kl, and each lambda_k^2 dS_kk has in addition the sum over l of
     (K + tr b / 9 - (b_kk + b_ll) / 3) G_ll / lambda_l^2.

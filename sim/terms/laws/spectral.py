@@ -11,7 +11,7 @@ import warp as wp
 
 @wp.func
 def principal_axes(A: Any):
-    """Eigenvalues e (3,), unsorted, and N (3, 3) whose rows are the eigenvectors: A = N^T diag(e) N."""
+    """Return eigenvalues e (3,), unsorted, and N (3, 3) whose rows are the eigenvectors: A = N^T diag(e) N."""
     zero, one, two = type(A[0, 0])(0.0), type(A[0, 0])(1.0), type(A[0, 0])(2.0)
     e = wp.get_diag(A)
     off = wp.vector(A[1, 2], A[2, 0], A[0, 1])  # off-diagonal entries, indexed by the rotation axis
