@@ -99,9 +99,9 @@ class Anatomy:
         count = len(mesh.tets)
         beyond = taken[(taken < 0) | (taken >= count)]
         if len(beyond):
-            raise InputError(f"the mesh has no tetrahedron {beyond[0]}: take some of 0 to {count - 1}.")
+            raise InputError(f"the mesh has no tetrahedron {beyond[0]}: choose from 0 to {count - 1}.")
         if len(taken) == count:
-            raise InputError(f"all {count} tetrahedra are taken: leave some of the body.")
+            raise InputError(f"all {count} tetrahedra are removed: some must remain.")
         left = np.ones(count, bool)
         left[taken] = False
         middles = None if mesh.middles is None else mesh.middles[left]

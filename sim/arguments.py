@@ -28,7 +28,9 @@ def as_array(name: str, values: object) -> np.ndarray:
     try:
         return np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
-        raise InputError(f"{name} makes no array: give numbers, and as many in every row.") from error
+        raise InputError(
+            f"{name} cannot be converted to an array: give numbers, the same count in every row."
+        ) from error
 
 
 def check_numbers_array(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
@@ -66,7 +68,7 @@ def check_whole_numbers(name: str, values: object) -> np.ndarray:
     """
     array = as_array(name, values)
     if array.dtype.kind == "b":
-        raise InputError(f"{name} is a mask of truth values: give vertex numbers, as np.flatnonzero(mask) finds them.")
+        raise InputError(f"{name} is a boolean mask: give vertex numbers, as np.flatnonzero(mask) finds them.")
     if array.ndim != 1 or (array.dtype.kind not in "iu" and array.size):
         raise InputError(
             f"{name} has shape {array.shape} and type {array.dtype}: give the numbers of vertices, (n,) integers."
@@ -85,7 +87,7 @@ def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
     vertices = check_whole_numbers(name, values)
     beyond = vertices[(vertices < 0) | (vertices >= count)]
     if len(beyond):
-        raise InputError(f"the mesh has no vertex {beyond[0]}: ask for some of 0 to {count - 1}.")
+        raise InputError(f"the mesh has no vertex {beyond[0]}: choose from 0 to {count - 1}.")
     return vertices
 
 

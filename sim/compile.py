@@ -159,16 +159,16 @@ def _compatible(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     effects = tuple(effects)
     for effect in effects:
         if isinstance(effect, type):
-            raise InputError(f"{effect.__name__} is a class, and no effect yet: write {effect.__name__}(...).")
+            raise InputError(f"{effect.__name__} is a class, not an instance: write {effect.__name__}(...).")
     kinds = [type(effect) for effect in effects]
     for kind in kinds:
         if kinds.count(kind) > 1:
-            raise InputError(f"the effect {kind.__name__} is asked for {kinds.count(kind)} times: once is enough.")
+            raise InputError(f"the effect {kind.__name__} occurs {kinds.count(kind)} times: give it once.")
     if Elasticity not in kinds:
         raise InputError("no effect resists deformation: add Elasticity.")
     skulls = [kind.__name__ for kind in (Bonded, Slide, SkullContact) if kind in kinds]
     if len(skulls) > 1:
-        raise InputError(f"{' and '.join(skulls)} contradict each other: each says what the skull does. Choose one.")
+        raise InputError(f"{' and '.join(skulls)} are alternative contact models of the skull: choose one.")
     return effects
 
 
@@ -177,9 +177,9 @@ def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:
     taken = {term.name for term in terms}
     for term in own:
         if not isinstance(term, Term):
-            raise InputError(f"an effect of your own made a {type(term).__name__}: let it make a sim.Term.")
+            raise InputError(f"a user-defined effect returned a {type(term).__name__}: must be a sim.Term.")
         if term.name in taken:
-            raise InputError(f"two terms are called {term.name!r}: give yours another name.")
+            raise InputError(f"two terms are called {term.name!r}: rename the user-defined one.")
         taken.add(term.name)
 
 
@@ -284,7 +284,7 @@ def _elasticity(
     swell = np.isin(mesh.region, labels if pulsation is None or pulsation.regions is None else pulsation.regions)
     absent = set() if pulsation is None else set(pulsation.regions or ()) - set(labels)
     if absent:
-        raise InputError(f"Pulsation is asked of region {min(absent)}, but the mesh has the regions {labels}.")
+        raise InputError(f"Pulsation is given for region {min(absent)}, but the mesh has the regions {labels}.")
     unknown = sorted(set(effect.regions) - set(effect.on(labels).regions))
     if unknown:
         raise InputError(f"a law is given for {describe_region(unknown[0])}, but the mesh has the regions {labels}.")

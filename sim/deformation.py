@@ -138,7 +138,7 @@ class Deformation:
             if given.shape != shape:
                 object.__setattr__(self, name, np.broadcast_to(given, shape))
         if not is_all_finite(self.displacement):
-            raise AssertionError("a deformer let a displacement pass that is not finite: a defect of the deformer")
+            raise AssertionError("a deformation model returned non-finite displacements: this is a defect of the model")
 
     def __len__(self) -> int:
         return len(self.displacement)
@@ -173,8 +173,7 @@ class Deformation:
         missing = ~np.isin(nodes, self.nodes)
         if missing.any():
             raise InputError(
-                f"this deformation does not know vertex {nodes[missing][0]}: ask for one of its {len(self.nodes)} "
-                "vertices."
+                f"this deformation lacks vertex {nodes[missing][0]}: choose from its {len(self.nodes)} vertices."
             )
         order = np.argsort(self.nodes)
         position = order[np.searchsorted(self.nodes, nodes, sorter=order)]

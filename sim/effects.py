@@ -125,7 +125,7 @@ class Gravity:
         if len(self.direction) != 3 or not given:
             raise InputError(f"Gravity.direction is {self.direction}: give three finite numbers, not all zero.")
         if math.isnan(self.csf_level):
-            raise InputError("Gravity.csf_level is no number: give a height [m], or infinity for a full skull.")
+            raise InputError("Gravity.csf_level is NaN: give a height [m], or infinity for a full skull.")
         for name, value in (("density", self.density), ("csf_density", self.csf_density)):
             if not 0.0 < value < math.inf:
                 raise InputError(f"Gravity.{name} is {value} kg/m^3: give a positive number.")
@@ -160,7 +160,7 @@ class Inertia:
         if not 0.0 < self.density < math.inf:
             raise InputError(f"Inertia.density is {self.density} kg/m^3: give a positive number.")
         if not 0.0 <= self.damping < math.inf:
-            raise InputError(f"Inertia.damping is {self.damping} 1/s: give a number that is not negative.")
+            raise InputError(f"Inertia.damping is {self.damping} 1/s: must be >= 0.")
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class Resection:
         taken: dict[int, int] = {}
         for number, step in enumerate(self.steps, start=1):
             if not step:
-                raise InputError(f"step {number} of Resection takes nothing: leave it out.")
+                raise InputError(f"step {number} of Resection is empty: remove it.")
             for element in step:
                 if element in taken:
                     raise InputError(
@@ -232,8 +232,8 @@ class Wave:
             raise InputError(f"Wave.frequency is {self.frequency} Hz: give a positive number.")
         if not 0.0 <= self.amplitude <= LARGEST_WAVE:
             raise InputError(
-                f"Wave.amplitude is {self.amplitude} of the volume: give a share from 0 to {LARGEST_WAVE}; "
-                "of brain, some thousandths."
+                f"Wave.amplitude is {self.amplitude}: must be a volume fraction from 0 to {LARGEST_WAVE}; "
+                "typical for brain: 0.0005."
             )
 
 
@@ -265,7 +265,7 @@ class Pulsation:
 
     def __post_init__(self) -> None:
         if self.regions is not None and not self.regions:
-            raise InputError("Pulsation swells no region: name some, give None for all, or leave the effect out.")
+            raise InputError("Pulsation has no regions: name some, give None for all, or remove the effect.")
 
     def swelling(self, times: np.ndarray) -> np.ndarray:
         """Return the relative volume change (B,) at times (B,) [s]."""

@@ -268,12 +268,12 @@ class Fem:
         if not self.problem.plain:
             raise InputError("a power series requires elastic bodies under forces only: remove the other effects.")
         if self.problem.device.precision != "float64":
-            raise InputError("a series of differences needs float64: ask for an Accuracy of that precision.")
+            raise InputError("a power series requires float64: use an Accuracy of that precision.")
         for cause in loads.causes:
             if not isinstance(cause, Pushed | Nodal):
                 raise InputError(f"a power series requires `Pushed` or `Nodal` loads, not `{type(cause).__name__}`.")
         if len(loads) % sizes:
-            raise InputError(f"{len(loads)} loads are no groups of {sizes}: give a multiple of that.")
+            raise InputError(f"{len(loads)} loads cannot be grouped by {sizes}: give a multiple of {sizes}.")
         widest = len(list_factors(sizes, orders))
         groups = min(len(loads) // sizes, max(1, self.batch // widest))
         columns = groups * widest

@@ -344,9 +344,9 @@ def _checked(cause: Cause) -> Cause:
                         f"{SMALLEST_FOOTPRINT:g} to {LARGEST_FOOTPRINT:g} (7 mm are 0.007)."
                     )
         if key == "done" and ((array < 0.0) | (array % 1.0 != 0.0)).any():
-            raise InputError(f"{name}.{key} is {array}: give how many steps are done, as whole numbers from 0 up.")
+            raise InputError(f"{name}.{key} is {array}: must be numbers of completed steps, integers >= 0.")
         if key == "direction" and not (np.abs(array).max(axis=1) >= SHORTEST).all():
-            raise InputError(f"{name}.{key} has a row of zeros: give every load case the way that gravity pulls.")
+            raise InputError(f"{name}.{key} has a row of zeros: give the direction of gravity for every load case.")
     return type(cause)(**arrays)
 
 

@@ -124,10 +124,10 @@ class Ogden:
             raise InputError("Ogden's law has no terms: give at least one pair (c, m).")
         for c, m in self.terms:
             if not (np.isfinite(c) and np.isfinite(m) and m != 0.0):
-                raise InputError(f"Ogden's term ({c}, {m}) is none: give a finite c [Pa] and a finite m that is not 0.")
+                raise InputError(f"Ogden's term ({c}, {m}) is invalid: give a finite c [Pa] and a finite, nonzero m.")
         total = sum(c for c, _ in self.terms)
         if total <= 0.0:
-            raise InputError(f"Ogden's c sum to {total} Pa, twice the shear modulus: let the sum be positive.")
+            raise InputError(f"Ogden's c sum to {total} Pa, twice the shear modulus: must be positive.")
         if not (np.isfinite(self.bulk) and self.bulk > 0.0):
             raise InputError(f"the bulk modulus is {self.bulk} Pa: give a positive number.")
         check_prony(self.prony, self.law)
@@ -243,15 +243,17 @@ def check_prony(prony: Pairs, law: str) -> None:
     """
     if prony and law not in HYPERELASTIC:
         raise InputError(
-            f"the law {law} cannot relax: its energy does not part shape from volume; "
+            f"the law {law} does not support relaxation, as its energy does not separate shape and volume: "
             f"choose one of {', '.join(HYPERELASTIC)}."
         )
     for g, tau in prony:
         if not (0.0 < g < 1.0 and 0.0 < tau < np.inf):
-            raise InputError(f"the Prony pair ({g}, {tau}) is none: give 0 < g < 1 and a positive tau [s].")
+            raise InputError(f"the Prony pair ({g}, {tau}) is invalid: give 0 < g < 1 and a positive tau [s].")
     total = sum(g for g, _ in prony)
     if total >= 1.0:
-        raise InputError(f"the Prony series' g sum to {total:g}: below 1, so that some stiffness is left in the end.")
+        raise InputError(
+            f"the Prony series' g sum to {total:g}: must be below 1, so that the long-term stiffness is positive."
+        )
 
 
 def to_tissue_json(tissue: Tissue) -> str:
@@ -311,7 +313,7 @@ def collect_coefficients(tissues: Sequence[Tissue], carries: str = "whole") -> n
     lengths = sorted({len(row) for row in rows})
     if len(lengths) > 1 and tissues[0].law != Ogden.law:
         raise InputError(
-            f"regions of the law {tissues[0].law} have {lengths[0]} and {lengths[-1]} coefficients: give all as many."
+            f"regions of the law {tissues[0].law} have {lengths[0]} and {lengths[-1]} coefficients: must be equal."
         )
     longest = lengths[-1]
     return np.array([row + (0.0, 1.0) * ((longest - len(row)) // 2) for row in rows])

@@ -111,7 +111,7 @@ def torn(
         raise InputError(f"{len(loads)} loads debond separately: give one at a time.")
     skull = next((effect for effect in effects if isinstance(effect, Bonded)), None)
     if skull is None:
-        raise InputError("nothing is bonded here: add Bonded, whose strengths count.")
+        raise InputError("there is no bond: add Bonded with its strengths.")
     others = tuple(effect for effect in effects if effect is not skull)
     covered = (anatomy.slide_normal != 0.0).any(axis=1)
     bonded, sliding = covered, np.zeros_like(covered)

@@ -82,7 +82,7 @@ class Spatula:
         if 2.0 * self.edge > min(self.width, self.length):
             raise InputError(
                 f"a Spatula of {1e3 * self.width:g} x {1e3 * self.length:g} mm has no room for round edges of "
-                f"{1e3 * self.edge:g} mm: make it wider, or them smaller."
+                f"{1e3 * self.edge:g} mm: increase its size, or reduce the radius."
             )
 
 
@@ -180,7 +180,7 @@ def check_tool(effect: str, tool: object) -> None:
         if not (np.isfinite([*core.centre, *core.half, core.radius]).all() and core.radius > 0.0):
             raise InputError(f"{tool!r} has a core that is not finite or has no radius: give a positive one in metres.")
     if not cores:
-        raise InputError(f"{tool!r} has no cores: give at least one, of which tissue touches the surface.")
+        raise InputError(f"{tool!r} has no cores: give at least one.")
 
 
 def list_cores(tool: Tool) -> tuple[Core, ...]:

@@ -223,7 +223,7 @@ def skewed() -> np.ndarray:
                 "cpu",
                 element="p1",
             ),
-            "finds no surface to touch: all of it is held or slides",
+            "finds no surface to touch: all of it is fixed or under the skull",
         ),
         (lambda: ToolContact(()), "ToolContact has no tool"),
         (lambda: ToolContact((7e-3,)), r"ToolContact has 0\.007 for a tool: choose from Ball, Capsule, Spatula"),  # type: ignore

@@ -98,7 +98,7 @@ class TestEffect:
                 made.name = "tool force"
                 return made
 
-        with pytest.raises(InputError, match=r"made a int: let it make a sim\.Term"):
+        with pytest.raises(InputError, match=r"returned a int: must be a sim\.Term"):
             answer(Elasticity(), Nothing((5,)))
         with pytest.raises(InputError, match=r"two terms are called 'tool force'"):
             answer(Elasticity(), Named((5,)))

@@ -162,7 +162,7 @@ def test_what_has_no_series_is_refused(box):
         series(fem, Loads((Displaced(POINT, 0.01 * FORCE, RADIUS),)), 3, box.tumour_nodes)
     with pytest.raises(InputError, match="no vertex 99999"):
         fem.reading(np.array([99999]), np.ones((1, 1, 3)))
-    with pytest.raises(InputError, match="2 loads are no groups of 3"):
+    with pytest.raises(InputError, match="2 loads cannot be grouped by 3"):
         series(fem, pushes(1.0), 3, box.tumour_nodes, 3)
 
 

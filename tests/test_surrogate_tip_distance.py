@@ -106,7 +106,7 @@ def test_of_a_pose_the_tip_is_where_the_pose_has_it(box, gauge):
     tip = pose[:, :3, 3] + 6e-3 * pose[:, :3, 2] + 6e-3 * open_cortex(box).axis
     away = trimesh.proximity.closest_point_naive(surface(box.mesh.nodes, box.tumour_surface), tip)[1]
     assert gauge.distances(loads, still, gauge.nodes, Ball(6e-3)) == pytest.approx(away, abs=1e-12)
-    with pytest.raises(InputError, match="no known tool"):
+    with pytest.raises(InputError, match="no tip"):
         gauge.distances(loads, still, gauge.nodes)
 
 

@@ -59,7 +59,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
     with path.open(encoding="utf-8-sig", errors="replace") as lines:
         for keyword, options, rows in _sections(lines):
             if keyword == "INCLUDE" or (keyword in ("NODE", "ELEMENT", "ELSET") and "INPUT" in options):
-                raise InputError("it includes another file. Join the two to one.")
+                raise InputError("it includes another file. Merge both into one file.")
             if keyword in GENERATORS or (keyword == "NODE" and options.get("SYSTEM", "R") != "R"):
                 raise InputError(f"its *{keyword} computes coordinates or elements: save it with all of them listed.")
             if keyword in ("ASSEMBLY", "INSTANCE", "END INSTANCE", "END ASSEMBLY"):

@@ -40,7 +40,9 @@ def check_cell_types(raw: Any, read: set[str]) -> None:
     others = {block.type for block in raw.cells if block.type.startswith(VOLUMES)} - read
     if others and read:
         counts = ", ".join(f"{sum(len(b.data) for b in raw.cells if b.type == one)} {one}" for one in sorted(others))
-        raise InputError(f"a part of its volume is {counts}: all of it must be tetrahedra. Split or mesh it so.")
+        raise InputError(
+            f"a part of its volume is {counts}: all of it must be tetrahedra. Split them, or mesh the volume again."
+        )
 
 
 def merge_nodes(

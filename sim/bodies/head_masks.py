@@ -293,7 +293,7 @@ def _convention(sources: Sources) -> Convention | None:
 def _demand_named(sources: Sources, convention: Convention | None) -> None:
     """Reject sources that do not define the brain and the tumour exactly once."""
     if sources.mask and sources.brain:
-        raise InputError("--mask says what is brain, and --brain does: leave one of them out.")
+        raise InputError("--mask and --brain both define the brain: give only one of them.")
     if sources.mask and sources.tumour_in:
         raise InputError(
             "--mask says what is brain and --tumour-in what is tumour: of the labels nothing is left. Give the "
@@ -302,7 +302,7 @@ def _demand_named(sources: Sources, convention: Convention | None) -> None:
     if convention is not None and convention.mask and not (sources.mask or sources.brain):
         raise InputError(
             f"{sources.labels}: labels of {convention.name} do not mark the brain. Give --mask BRAIN.nii.gz; "
-            "an image without its skull will do."
+            "a skull-stripped image is accepted."
         )
     if not (sources.brain or sources.mask or (convention and convention.brain)):
         raise InputError("name at least one label of the brain: --brain 1,2, or give --mask BRAIN.nii.gz.")

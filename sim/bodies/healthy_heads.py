@@ -40,7 +40,7 @@ def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None =
     read = read_volume(mask)
     brain = read.values != 0
     if not brain.any():
-        raise InputError(f"{mask}: has no voxel other than 0: give a mask of the brain.")
+        raise InputError(f"{mask}: all voxels are 0: give a mask of the brain.")
     notes = list(read.notes)
     masks = HeadMasks(str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, cut=count_on_border(brain))
     solid = fill_brain(masks, notes)
@@ -70,7 +70,7 @@ def read_fsaverage_head(volume: float) -> HealthyHead:
 def _skull_path() -> Path:
     found = find_spec("mne")
     if found is None or not found.submodule_search_locations:
-        raise InputError(f"fsaverage's skull is in the package mne, which is not there. {REMEDY}")
+        raise InputError(f"fsaverage's skull is in the package mne, which is not installed. {REMEDY}")
     path = Path(found.submodule_search_locations[0]) / INNER_SKULL
     if not path.is_file():
         raise InputError(f"{path}: no such file, so this mne holds no skull of fsaverage. {REMEDY}")

@@ -97,7 +97,7 @@ class Intensity:
         found = self.values[tuple(index[there].astype(int).T)].astype(np.float64)
         known = np.isfinite(found)
         if not known.any():
-            raise InputError("the T1 volume has no numbers in the brain: give one in the labels' own space.")
+            raise InputError("the T1 volume has no finite values in the brain: give one in the labels' own space.")
         found, size = found[known], mesh.volumes[there][known]
         order = np.argsort(found, kind="stable")
         share = (np.cumsum(size[order]) - 0.5 * size[order]) / size.sum()

@@ -217,7 +217,7 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
     voxels = float(np.prod(np.array(shape, float) + low + high))
     if voxels > MOST_VOXELS:
         raise InputError(
-            f"{other.path}: on the labels' grid it takes {voxels:.3g} voxels, and {MOST_VOXELS:.3g} are the most. "
+            f"{other.path}: on the labels' grid it takes {voxels:.3g} voxels; the maximum is {MOST_VOXELS:.3g}. "
             "Resample the labels more coarsely."
         )
     moved = affine.copy()

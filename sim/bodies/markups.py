@@ -47,7 +47,7 @@ class Markup:
         points = np.concatenate([self.points, self.points[:1]])
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if len(self.points) < 3 or steps.min() < 1e-6:
-            raise InputError(f"{self.path}: its curve needs three points or more, each at a place of its own. {REMEDY}")
+            raise InputError(f"{self.path}: its curve needs at least three distinct points. {REMEDY}")
         along = np.concatenate([[0.0], np.cumsum(steps)])
         spline = CubicSpline(along, points, bc_type="periodic")
         return spline(np.linspace(0.0, along[-1], DRAWN, endpoint=False))
@@ -70,12 +70,12 @@ def read_markup(path: str | Path) -> Markup:
         kind, system, placed = _fcsv(text) if path.name.lower().endswith(".fcsv") else _json(text)
         if system not in SIGNS:
             said = f"its coordinate system is {system!r}" if system else "it does not state its coordinate system"
-            raise InputError(f"{path}: {said}: LPS and RAS are known. {REMEDY}")
+            raise InputError(f"{path}: {said}: it must be LPS or RAS. {REMEDY}")
         if not 1 <= len(placed) <= MOST:
-            raise InputError(f"{path}: has {len(placed)} points that are placed; 1 to {MOST} are read. {REMEDY}")
+            raise InputError(f"{path}: has {len(placed)} placed points; must be 1 to {MOST}. {REMEDY}")
         points = np.array(placed, np.float64).reshape(-1, 3)
         if not np.isfinite(points).all():
-            raise InputError(f"{path}: has points whose coordinates are no numbers. {REMEDY}")
+            raise InputError(f"{path}: has points with non-finite coordinates. {REMEDY}")
         if np.abs(points).max() > 1e3 * FARTHEST:
             raise InputError(f"{path}: has points more than {FARTHEST:g} m away: coordinates are in mm. {REMEDY}")
         return Markup(path, kind, 1e-3 * points * SIGNS[system])
@@ -85,11 +85,11 @@ def _json(text: str) -> tuple[str, str, list[list[float]]]:
     """Parse kind, coordinate system, and placed points [mm] of the only markup in a `.mrk.json` file."""
     markups = json.loads(text)["markups"]
     if len(markups) != 1:
-        raise InputError(f"has {len(markups)} markups, and one is read. Save each to a file of its own.")
+        raise InputError(f"has {len(markups)} markups; only one is supported. Save each in a separate file.")
     (markup,) = markups
     units = markup.get("coordinateUnits", "mm")
     if set([units] if isinstance(units, str) else units) != {"mm"}:
-        raise InputError(f"its coordinates are in {units}, and mm are read. {REMEDY}")
+        raise InputError(f"its coordinates are in {units}; must be mm. {REMEDY}")
     controls = markup["controlPoints"]
     placed = [one["position"] for one in controls if one.get("positionStatus", "defined") == "defined"]
     return str(markup["type"]), str(markup.get("coordinateSystem", "LPS")), placed

@@ -167,7 +167,7 @@ def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[st
         edge *= float(np.clip((reached / count) ** 0.4, 0.5, 2.0))
     assert best is not None
     if abs(len(best.nodes) - count) > settings.farthest * count:
-        raise InputError(f"{count} nodes cannot be had for this anatomy ({len(best.nodes)} is next): ask for more.")
+        raise InputError(f"{count} nodes are not possible for this anatomy (closest: {len(best.nodes)}): request more.")
     return _finished(solids, best, settings)
 
 

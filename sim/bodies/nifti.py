@@ -133,7 +133,7 @@ def _demand_few(path: Path, shape: tuple[int, ...]) -> None:
     """Reject a file that declares more than `MOST_VOXELS` voxels, before memory is allocated."""
     voxels = math.prod(shape)
     if voxels > MOST_VOXELS:
-        raise InputError(f"{path}: has {voxels:.3g} voxels, and {MOST_VOXELS:.3g} are the most. Resample it.")
+        raise InputError(f"{path}: has {voxels:.3g} voxels; the maximum is {MOST_VOXELS:.3g}. Resample it.")
 
 
 def _demand_held(path: Path, needed: int) -> None:

@@ -62,7 +62,7 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
             raise InputError(f"{path}: its sizes do not match its dimension. Save it again.")
         if math.prod(sizes) > MOST_VOXELS:
             raise InputError(
-                f"{path}: has {math.prod(sizes):.3g} voxels, and {MOST_VOXELS:.3g} are the most. Resample it."
+                f"{path}: has {math.prod(sizes):.3g} voxels; the maximum is {MOST_VOXELS:.3g}. Resample it."
             )
         dtype = _dtype(path, fields)
         needed = math.prod(sizes) * dtype.itemsize
@@ -80,7 +80,7 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
 def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]:
     """Read the fields, by names in lower case, and the custom keys; the file is then positioned at its voxels."""
     if not re.fullmatch(rb"(\xef\xbb\xbf)?NRRD000[1-5]\s*", file.readline(LONGEST)):
-        raise InputError(f"{path}: does not begin as an NRRD file does. {REMEDY}")
+        raise InputError(f"{path}: does not begin with an NRRD header. {REMEDY}")
     fields, keys = {}, {}
     for _ in range(MOST_LINES):
         line = file.readline(LONGEST)
@@ -134,14 +134,14 @@ def _dtype(path: Path, fields: Mapping[str, str]) -> np.dtype:
         return np.dtype(TYPES[kind])
     endian = _field(path, fields, "endian").lower()
     if endian not in ENDIAN:
-        raise InputError(f"{path}: states its endian as {endian!r}: little or big are known. Save it again.")
+        raise InputError(f"{path}: states its endian as {endian!r}: must be little or big. Save it again.")
     return np.dtype(ENDIAN[endian] + TYPES[kind])
 
 
 def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) -> bytes:
     """Read all bytes of the voxels; memory is allocated only for data that the file can contain."""
     if any(float(fields.get(skip, 0)) for skip in ("byte skip", "byteskip", "line skip", "lineskip")):
-        raise InputError(f"{path}: skips a part of itself before its voxels. {ONE_FILE}")
+        raise InputError(f"{path}: skips bytes before its voxels. {ONE_FILE}")
     coding = _field(path, fields, "encoding").lower()
     if coding in ("gzip", "gz"):
         stream = gzip.GzipFile(fileobj=file)
@@ -150,7 +150,7 @@ def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) 
     elif coding == "raw":
         stream = file
     else:
-        raise InputError(f"{path}: its voxels are coded as {coding!r}: raw, gzip and bzip2 are read. Save it so.")
+        raise InputError(f"{path}: its voxels are coded as {coding!r}: must be raw, gzip or bzip2. Save it again.")
     size = path.stat().st_size
     if needed > (size if stream is file else max(LITTLE * (coding[0] == "b"), INFLATION * size)):
         raise InputError(f"{path}: is too short for its {needed:,} bytes of voxels. Copy or save it again.")
@@ -198,5 +198,5 @@ def _segments(path: Path, keys: Mapping[str, str], layers: int) -> tuple[Segment
         for number in numbers
     )
     if any(not 0 <= segment.layer < layers for segment in segments):
-        raise InputError(f"{path}: has a segment in a layer that is not there. Save it again.")
+        raise InputError(f"{path}: has a segment in a missing layer. Save it again.")
     return segments

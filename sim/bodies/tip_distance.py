@@ -87,7 +87,7 @@ class TipGauge:
             tumour, or a ball that misses the exposed cortex.
         """
         if not len(self.anatomy.tumour_nodes):
-            raise InputError("the anatomy has no tumour, from which a tip had a distance: make one that has.")
+            raise InputError("the anatomy has no tumour: use one with a tumour to measure the distance of a tip.")
         row = np.full(len(self.anatomy.mesh.nodes), -1)
         row[nodes] = np.arange(len(nodes))
         if (row[self.nodes] < 0).any():
@@ -113,7 +113,7 @@ class TipGauge:
             return find_foremost_points(tool, touching.pose[:, 0], axis)
         pushed = loads.of(Pushed)
         if pushed is None:
-            raise InputError("there is no tip where no tool pushes, and no known tool is moved.")
+            raise InputError("the loads have no tip: give pushing tools, or poses and their tool.")
         nodes, triangles = self._open
         rest, tips = self.anatomy.mesh.nodes[nodes], np.empty((len(loads), 3))
         for first in range(0, len(loads), self.together):

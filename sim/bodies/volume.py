@@ -39,7 +39,7 @@ def read_volume(path: str | Path, voxels: Voxels = OF_BRAINS, finite: bool = Tru
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {REMEDY}")
     ending = next((one for one in READERS if path.name.lower().endswith(one)), None)
     if ending is None:
-        raise InputError(f"{path}: is not called {', '.join(READERS)}. {REMEDY}")
+        raise InputError(f"{path}: unsupported file type; expected {', '.join(READERS)}. {REMEDY}")
     kind, read = READERS[ending]
     with read_as(path, kind, REMEDY):
         volume = read(path, voxels)

@@ -151,7 +151,7 @@ def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layer
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) <= 1e-6 * spacing.prod():
         raise InputError(
-            f"{path}: its affine is singular, so its voxels have no place. Export it with its orientation."
+            f"{path}: its affine is singular, so its voxels have no position. Export it with its orientation."
         )
     if spacing.min() < voxels.finest:
         raise InputError(
@@ -161,7 +161,7 @@ def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layer
     if spacing.max() > voxels.coarsest:
         voxel = " x ".join(f"{edge * 1e3:.3g}" for edge in spacing)
         raise InputError(
-            f"{path}: its voxels measure {voxel} mm; {voxels.coarsest * 1e3:g} mm is the most that shows a brain."
+            f"{path}: its voxels measure {voxel} mm; {voxels.coarsest * 1e3:g} mm is the maximum for a brain."
         )
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]

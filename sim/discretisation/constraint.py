@@ -161,7 +161,7 @@ class Constraint:
             share = np.linalg.eigvalsh(self._gram)[:, 0] / square.sum(axis=0)
             if (share < self._freedom.footprint).any():
                 raise InputError(
-                    f"load {np.argmin(share)} moves a footprint that is held, wholly or nearly: choose a free place."
+                    f"load {np.argmin(share)} moves a footprint that is (nearly) fixed: choose a free place."
                 )
 
     def keep(self, columns: np.ndarray) -> None:

@@ -162,7 +162,7 @@ def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     none = np.zeros((0, 2), np.int32)
     if mesh.middles is not None:
         if element != "p2":
-            raise InputError(f"the mesh has quadratic tetrahedra, which are no {element}: take p2, or a linear mesh.")
+            raise InputError(f"the mesh has quadratic tetrahedra, not {element}: use p2, or a linear mesh.")
         return Discretisation(mesh, element, mesh.table, none)
     if element != "p2":
         return Discretisation(mesh, element, mesh.tets, none)

@@ -102,9 +102,7 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
     normal = space.sliding(anatomy.slide_normal, anatomy.held)
     slides = (normal != 0.0).any(axis=1) & ~held
     if not slides.any():
-        raise InputError(
-            "SkullContact finds no node that could touch: this anatomy has no slide normals, or holds all."
-        )
+        raise InputError("SkullContact finds no node that can touch: all slide normals are zero, or their nodes fixed.")
     inside, way = np.full(space.count, UNDER_BONE), np.zeros_like(normal)
     felt = np.full(space.count, min(settings.felt, gap))
     edge, rim = 0.0, find_opening_edge(anatomy)

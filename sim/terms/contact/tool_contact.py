@@ -291,7 +291,7 @@ def build_tool_contact(
     name, tools = ("tool contact", effect.tools) if contact else ("retraction", (effect.blade,))
     triangles = space.surface[anatomy.bare]
     if not len(triangles):
-        raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
+        raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is fixed or under the skull.")
     touchable, reach = np.unique(triangles), _reach(space.nodes, triangles)
     points, normals = space.nodes[touchable], compute_vertex_normals(space.nodes, triangles[:, :3])[touchable]
 

@@ -134,12 +134,14 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
     count, step = strains.count, strains.short_step
     mu, lam = tissue.lame
     if not (mu > 0.0 and 3.0 * lam + 2.0 * mu > 0.0 and np.isfinite([mu, lam]).all()):
-        raise InputError(f"the law {tissue.law} has the Lamé constants {mu}, {lam} Pa: no tissue is at rest with them.")
+        raise InputError(
+            f"the law {tissue.law} has the Lamé constants {mu}, {lam} Pa: the undeformed state would be unstable."
+        )
     given, again = np.array(tissue.coefficients), np.array(tissue.coefficients_at(mu, lam))
     if given.shape != again.shape:
         raise InputError(
-            f"the law {tissue.law} has {len(given)} coefficients, but {len(again)} at other Lamé constants: "
-            "give as many."
+            f"the law {tissue.law} has {len(given)} coefficients, but {len(again)} at other Lamé parameters: "
+            "must be equal."
         )
     yield Finding("coefficients_at its own Lamé constants are its coefficients", _off(again, given), 1e-12)
     double, random = build_evaluator(tissue, "float64"), np.random.default_rng(3)
