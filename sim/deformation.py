@@ -15,9 +15,9 @@ from .errors import InputError
 from .loads import Loads
 
 ROWS = ("reached", "inverted", "leaked", "bond", "strained")
-"""Fields (B,) of a `Deformation` that some models do not compute."""
+"""Names of fields (B,) of a `Deformation` that some models do not compute."""
 COLUMNS = ("bound", "reaction_bound", "stretch")
-"""Fields (2, B) of a `Deformation` that some models do not compute."""
+"""Names of fields (2, B) of a `Deformation` that some models do not compute."""
 
 
 class Outcome(Enum):
@@ -96,7 +96,7 @@ class Deformation:
         Volume (B,) that passes outwards through the closed skull, as a fraction of the volume exchanged through the
         craniotomy. NaN if the model does not compute it, such as live frames on a GPU or surrogates.
     bond
-        Largest traction (B,) of a `Bonded` skull, as a fraction of the bond's strength. Above 1 the bond would debond,
+        Largest traction (B,) of a `Bonded` skull, as a fraction of the bond's strength. Above 1 the bond would fail,
         and the result is no longer valid. NaN without bond, or if the model does not compute it.
     bound
         Bounds (2, B) [m] on the error of all tumour vertices relative to the training reference, with probability 0.95

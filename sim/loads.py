@@ -91,7 +91,7 @@ class Retracted:
 
 
 class OwnCause(Protocol):
-    """Interface of causes for user-defined effects: a frozen dataclass (eq=False) of arrays (B, ...), row by case."""
+    """Interface of causes for user-defined effects: frozen dataclasses (eq=False) of arrays (B, ...) by load case."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 

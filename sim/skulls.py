@@ -54,7 +54,7 @@ class SkullContact:
     the craniotomy can rise through it, but touch bone beyond its edge, whose radius is set by the mesh size. The body
     needs fixed nodes of `Held`, since bone only limits its motion.
 
-    A volume of up to the gap may pass the closed skull, see `Deformation.leaked`: 0.1 mm around a brain are 6 ml.
+    The volume of the gap may pass the closed skull, see `Deformation.leaked`: 0.1 mm around a brain are 6 ml.
 
     Parameters
     ----------

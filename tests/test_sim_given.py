@@ -107,7 +107,7 @@ def cut() -> Any:
 
 VERTICES = [
     (np.ones(64, bool), "at is a boolean mask: give vertex numbers, as np.flatnonzero"),
-    ([True, False], "at is a mask"),
+    ([True, False], "at is a boolean mask"),
     ([1.5], r"at has shape \(1,\) and type float64: give the numbers of vertices"),
     (np.array([1.0, 2.0]), "type float64"),
     (np.array([[1, 2]]), r"shape \(1, 2\)"),

@@ -11,7 +11,7 @@ import warp as wp
 from ..runtime.device import forward_kernel, load
 from .footprint import on_triangle
 
-# Alternating projections between a triangle and an extended core.
+# Number of alternating projections between a triangle and an extended core.
 TURNS = 16
 
 
@@ -106,7 +106,10 @@ def _nearest(
     distance: wp.array(dtype=wp.float64),
     normal: wp.array(dtype=wp.vec3d),
 ):
-    """Iterate y = x + (t - 1) / t' (x - x'), x the triangle point nearest to the box point nearest to y."""
+    """Iterate y = x + (t - 1) / t' (x - x'), x the triangle point nearest to the box point nearest to y.
+
+    The momentum parameter is t' = (1 + sqrt(1 + 4 t^2)) / 2.
+    """
     face = wp.tid()
     a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
     one, pace = wp.float64(1.0), wp.float64(1.0)

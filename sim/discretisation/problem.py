@@ -68,7 +68,7 @@ class Problem:
 
     @property
     def steep(self) -> bool:
-        """True if a term is steep."""
+        """True if the tangent of a term may differ strongly from the undeformed stiffness."""
         return any(term.steep for term in self.terms)
 
     @property

@@ -40,7 +40,7 @@ class RemainingBody:
 
 
 def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
-    """Return `compute_remains` under effects with a `Resection`, without tissue that none of them fixes.
+    """Return the remaining bodies under effects with a `Resection`; `Anatomy.held` counts only if they include `Held`.
 
     Raises
     ------

@@ -306,7 +306,7 @@ class Local(Barrier, Protocol):
         ...
 
     def around(self, most: int) -> np.ndarray:
-        """Return at most `most` nodes (k,): the touchable ones, and then those nearest to them."""
+        """Return the touchable nodes, followed by the nearest others up to `most` in total: (k,)."""
         ...
 
     def reduced(self, columns: np.ndarray) -> Reduction | None:

@@ -277,7 +277,7 @@ class Skull:
         return np.ones(len(cases.loads))
 
     def gaps(self, cases: Cases) -> np.ndarray:
-        """Return the initial barrier width relative to its own (b,): larger if the start is undeformed."""
+        """Return the initial barrier width in units of its normal width (b,): larger if the start is undeformed."""
         known = np.zeros(len(cases.loads), bool)
         if cases.displacement is not None:
             known |= cases.displacement.any(axis=(1, 2))
