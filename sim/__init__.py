@@ -1,4 +1,4 @@
-"""What tissue does: meshes, laws, loads, and the finite elements that answer them."""
+"""Tissue mechanics: meshes, material laws, loads, and the FEM solver."""
 
 import lazy_loader
 

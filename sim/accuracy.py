@@ -1,4 +1,4 @@
-"""How exact an answer must be, and what it may cost."""
+"""Accuracy and cost limits of a solve."""
 
 from __future__ import annotations
 
@@ -9,38 +9,38 @@ from typing import Literal
 from .arguments import check_at_least
 from .errors import InputError
 
-Precision = Literal["float32", "float64"]
+Precision = Literal["float32", "float64"]  # scalar types of a solver
 FLOOR: dict[str, float] = {"float32": 2e-5, "float64": 1e-11}
 """Smallest relative residual that each scalar type reaches reliably (round-off of the internal forces)."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Tolerance and budgets of a solve.
+    """Tolerance and iteration limits of a solve.
 
     Parameters
     ----------
     tolerance
-        Converged: free gradient <= tolerance x the largest 2-norm among the terms' own gradients and the
-        reaction at constrained nodes.
+        Relative tolerance: converged if |residual| <= tolerance x the largest 2-norm among the gradients of the terms
+        and the reaction at constrained nodes.
     outer
-        Most Newton steps for one load, and for each of its load steps; all together at most outer x (1 + steps).
+        Maximum Newton steps for one load, and for each of its load steps; in total at most outer x (1 + steps).
     inner
-        Most conjugate-gradient iterations in one Newton step.
+        Maximum conjugate gradient iterations in one Newton step.
     precision
         Scalar type of the solver.
     steps
-        Most load steps that are tried when a load has no equilibrium within `outer`; zero gives up there.
+        Maximum load steps if a load does not converge within `outer`; 0 disables load stepping.
     evaluations
-        Most evaluations of the whole body's forces before Newton, which local solvers and L-BFGS share; 0: Newton
-        alone. None: as many as are worth it on the device. Few `outer` steps are Newton's alone, whatever this says.
+        Maximum force evaluations of the whole body before Newton, shared by local solvers and L-BFGS; 0: Newton
+        only. None: a device-dependent default. With few `outer` steps only Newton is used.
     limit_strain
-        Report equilibria with inverted tetrahedra, or strained beyond what was measured on brain, as not good.
+        Report equilibria as not good if tetrahedra are inverted, or strained beyond the range measured on brain.
 
     Raises
     ------
     InputError
-        A tolerance below the floor of the scalar type, budgets that allow no work or are no whole numbers.
+        A tolerance below the floor of the scalar type; limits that are not integers or too small.
     """
 
     tolerance: float = 1e-6
@@ -53,11 +53,11 @@ class Accuracy:
 
     @property
     def most(self) -> int:
-        """Most Newton steps for one load, all load steps and strides of tools together."""
+        """Maximum Newton steps for one load, over all load steps and tool strides."""
         return self.outer * (1 + self.steps)
 
     def __post_init__(self) -> None:
-        if self.precision not in tuple(FLOOR):  # which need not be hashable
+        if self.precision not in tuple(FLOOR):  # tuple, since `precision` may be unhashable
             raise InputError(f"no precision is called {self.precision!r}: choose one of {', '.join(FLOOR)}.")
         floor = FLOOR[self.precision]
         if not isinstance(self.tolerance, Real):
@@ -74,16 +74,16 @@ class Accuracy:
 
 
 DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32", steps=0)
-"""For a first look: three Newton steps at most, and no load steps for what does not converge."""
+"""For a quick preview: at most three Newton steps, and no load steps."""
 LIVE = Accuracy(tolerance=4e-3, outer=30, precision="float32", steps=8)
-"""For frames that start from the one before: the default of scenes.
+"""For frames that start from the previous frame: the default of scenes.
 
-Of 60 such frames the worst was 0.026 mm off while palpating, and 0.019 mm under a spatula
+Maximum error of 60 such frames: 0.026 mm in palpation, and 0.019 mm under a spatula
 (`python -m benchmarks live --frames 1000 --checked 60` on one H100, default tissue; `docs/notes/figures.md`).
 """
 TRAIN = Accuracy(tolerance=1e-4, precision="float32")
-"""For data sets that models learn from: the default of `Fem`."""
+"""For training data sets: the default of `Fem`."""
 STRAINED = replace(TRAIN, limit_strain=False)
-"""`TRAIN` for comparisons of solvers and models, in which equilibria of strained tissue count."""
+"""`TRAIN` for comparisons of solvers and models, which include equilibria of overstrained tissue."""
 REFERENCE = Accuracy(tolerance=1e-8)
-"""For comparisons, as the truth that others are held against; in double precision, which power series need too."""
+"""For reference solutions; in double precision, which power series require too."""

@@ -1,4 +1,4 @@
-"""A body to operate on: a mesh, its regions, and what holds it."""
+"""Anatomy: a mesh with regions and boundary conditions."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from .errors import InputError
 from .geometry.tetmesh import TetMesh, compute_digest
 
 BRAIN_LABEL, TUMOUR_LABEL, NECROSIS_LABEL = 1, 2, 5
-"""Region labels that the project's own anatomies use."""
+"""Region labels of anatomies made by this package."""
 TUMOUR_LABELS = (TUMOUR_LABEL, NECROSIS_LABEL)
-"""What together is the tumour, whose surface is followed."""
+"""Region labels that together are the tumour."""
 PART_LABELS = {"oedema": 3, "ventricles": 4, "necrosis": NECROSIS_LABEL}
-"""Region labels of parts that have a stiffness of their own, where an anatomy tells them: of brain, and of tumour."""
+"""Region labels of parts with their own stiffness, if an anatomy marks them: of the brain, and of the tumour."""
 
 REGION_NAMES = {"brain": BRAIN_LABEL, "tumour": TUMOUR_LABEL, **PART_LABELS}
 """Region labels by name."""
 
 
 def name_region(label: int) -> str:
-    """Return a region's name; "region 7" where it has none."""
+    """Return a region's name; "region 7" if it has none."""
     return next((name for name, number in REGION_NAMES.items() if number == label), f"region {label}")
 
 
 def describe_region(label: int) -> str:
-    """Return a region by its label, and by its name if it has one."""
+    """Return a region's label, with its name if it has one."""
     return f"region {label} ({name_region(label)})" if label in REGION_NAMES.values() else name_region(label)
 
 
 def describe_missing_region(mesh: TetMesh, label: int) -> str:
-    """That a mesh has no such region, and which it has, in words; empty where it has it."""
+    """Return a message that a mesh lacks a region, with the regions it has; empty if it has it."""
     if mesh.within(label).any():
         return ""
     has = ", ".join(map(describe_region, np.unique(mesh.region).tolist()))
@@ -41,24 +41,24 @@ def describe_missing_region(mesh: TetMesh, label: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """A mesh with its boundary conditions, in the volume's own RAS frame [m].
+    """Mesh with its boundary conditions, in RAS coordinates of the volume [m].
 
     Parameters
     ----------
     mesh
-        The tetrahedra; regions `BRAIN_LABEL`, `TUMOUR_LABELS` where there is a tumour, and those of `PART_LABELS`.
+        Tetrahedra; regions `BRAIN_LABEL`, `TUMOUR_LABELS` if there is a tumour, and those of `PART_LABELS`.
     held
-        (V, 3) bool: displacement components that are prescribed (zero, unless a load says otherwise).
+        Mask (V, 3) of displacement components that are prescribed (zero unless a load sets them).
     slide_normal
-        (V, 3): unit outward normal of nodes that a skull covers, zero elsewhere. `Bonded`, `Slide` and `SkullContact`
-        say what it does.
+        Unit outward normals (V, 3) of nodes under the skull, zero elsewhere. `Bonded`, `Slide` and `SkullContact`
+        define their contact with the skull.
     craniotomy
-        (V,) bool: free surface nodes that a tool may touch.
+        Mask (V,) of free surface nodes that a tool may touch.
 
     Raises
     ------
     InputError
-        Shapes that do not fit the mesh, or slide normals that are neither zero nor of unit length.
+        Shapes that do not match the mesh, or slide normals that are neither zero nor of unit length.
     """
 
     mesh: TetMesh
@@ -80,30 +80,28 @@ class Anatomy:
 
     @cached_property
     def orphaned(self) -> np.ndarray:
-        """(V,) bool: vertices that belong to no tetrahedron, any more or from the start."""
+        """Mask (V,) of vertices that belong to no tetrahedron."""
         orphaned = np.ones(len(self.mesh.nodes), bool)
         orphaned[self.mesh.table] = False
         return orphaned
 
     def without(self, elements: np.ndarray) -> Anatomy:
-        """Return the body without some tetrahedra `elements` (n,), under the same vertex numbers.
+        """Return the body without the tetrahedra `elements` (n,), with the same vertex numbers.
 
-        What they bared is free.
-
-        Vertices that lose their last tetrahedron are held, and neither slide nor may be touched.
+        New surfaces are free. Vertices that lose their last tetrahedron are fixed, and neither slide nor are touchable.
 
         Raises
         ------
         InputError
-            Tetrahedra that the mesh does not have, or all that it has.
+            Tetrahedra that the mesh does not have, or all of them.
         """
         mesh, taken = self.mesh, np.unique(elements)
         count = len(mesh.tets)
         beyond = taken[(taken < 0) | (taken >= count)]
         if len(beyond):
-            raise InputError(f"the mesh has no tetrahedron {beyond[0]}: take some of 0 to {count - 1}.")
+            raise InputError(f"the mesh has no tetrahedron {beyond[0]}: choose from 0 to {count - 1}.")
         if len(taken) == count:
-            raise InputError(f"all {count} tetrahedra are taken: leave some of the body.")
+            raise InputError(f"all {count} tetrahedra are removed: some must remain.")
         left = np.ones(count, bool)
         left[taken] = False
         middles = None if mesh.middles is None else mesh.middles[left]
@@ -121,7 +119,7 @@ class Anatomy:
 
     @cached_property
     def in_tumour(self) -> np.ndarray:
-        """(T,) bool: the tetrahedra of the tumour, with those of its necrosis."""
+        """Mask (T,) of tetrahedra of the tumour, including necrosis."""
         return self.mesh.within(*TUMOUR_LABELS)
 
     @cached_property
@@ -131,18 +129,18 @@ class Anatomy:
 
     @cached_property
     def tumour_surface(self) -> np.ndarray:
-        """Triangles (S, 3), outwards, of the tumour's surface; none between it and its necrosis."""
+        """Outward triangles (S, 3) of the tumour's surface, without its interface to the necrosis."""
         return self.mesh.find_boundary(*TUMOUR_LABELS)
 
     @cached_property
     def open_surface(self) -> np.ndarray:
-        """Surface triangles (S, 3), outwards, whose corners all lie in the craniotomy."""
+        """Outward surface triangles (S, 3) whose corners all lie in the craniotomy."""
         surface = self.mesh.surface
         return surface[self.craniotomy[surface].all(axis=1)]
 
     @cached_property
     def bare(self) -> np.ndarray:
-        """(S,) bool: the surface's triangles that are neither held nor slide whole: tools may touch them."""
+        """Mask (S,) of surface triangles with a corner that is neither fixed nor sliding: tools may touch them."""
         covered = np.logical_or(self.held.any(axis=1), self.slide_normal.any(axis=1))
         return np.logical_not(covered[self.mesh.surface].all(axis=1))
 

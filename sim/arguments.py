@@ -1,4 +1,4 @@
-"""What callers give, checked before anything is computed: arrays of numbers, numbers of vertices, counts."""
+"""Validation of arguments: numeric arrays, vertex numbers, counts."""
 
 from __future__ import annotations
 
@@ -8,45 +8,47 @@ import numpy as np
 
 from .errors import InputError
 
-# No length, force or time in SI units is greater; fourth powers stay finite in double precision.
+# Upper limit of any length, force or time in SI units; its fourth power is finite in double precision.
 LARGEST = 1e30
 
 
 def is_all_finite(array: np.ndarray) -> bool:
-    """Whether no number is infinite or NaN: in a third of the time that `.all()` takes of a few numbers."""
+    """Return True if no value is infinite or NaN; for small arrays three times as fast as `.all()`."""
     return np.count_nonzero(np.isfinite(array)) == array.size
 
 
 def as_array(name: str, values: object) -> np.ndarray:
-    """Values as an array of whatever type.
+    """Convert values to an array of any type.
 
     Raises
     ------
     InputError
-        Rows of different lengths, or what is no array.
+        Rows of different lengths, or values that do not form an array.
     """
     try:
         return np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
-        raise InputError(f"{name} makes no array: give numbers, and as many in every row.") from error
+        raise InputError(
+            f"{name} cannot be converted to an array: give numbers, the same count in every row."
+        ) from error
 
 
 def check_numbers_array(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
-    """Real, finite numbers as float64, of whatever shape they are given in; `name` says what they are.
+    """Return real, finite numbers as float64, in any shape; `name` identifies them in messages.
 
     Raises
     ------
     InputError
-        Text, truth values, complex numbers, objects, rows of different lengths; a number that is not finite, or beyond
+        Text, booleans, complex numbers, objects, rows of different lengths; a number that is not finite, or beyond
         `largest`.
     """
     array = as_array(name, values)
     if array.dtype != np.float64:
         if array.dtype.kind not in "fiu":
             raise InputError(f"{name} has the type {array.dtype}: give real numbers.")
-        with np.errstate(over="ignore"):  # of wider types
+        with np.errstate(over="ignore"):  # overflow of wider types is detected below
             array = array.astype(np.float64)
-    # One pass: NaN compares with nothing.
+    # one pass, since comparisons with NaN are False
     if np.count_nonzero(np.abs(array) <= largest) != array.size:
         if not is_all_finite(array):
             raise InputError(f"{name} has a value that is not finite: every number must be finite.")
@@ -57,16 +59,16 @@ def check_numbers_array(name: str, values: object, largest: float = LARGEST) -> 
 
 
 def check_whole_numbers(name: str, values: object) -> np.ndarray:
-    """Numbers (n,) of vertices, as integers.
+    """Return vertex numbers (n,) as integers.
 
     Raises
     ------
     InputError
-        Fractions, truth values, anything but whole numbers in one dimension.
+        Fractions, booleans, or values that are not one-dimensional.
     """
     array = as_array(name, values)
     if array.dtype.kind == "b":
-        raise InputError(f"{name} is a mask of truth values: give vertex numbers, as np.flatnonzero(mask) finds them.")
+        raise InputError(f"{name} is a boolean mask: give vertex numbers, as np.flatnonzero(mask) finds them.")
     if array.ndim != 1 or (array.dtype.kind not in "iu" and array.size):
         raise InputError(
             f"{name} has shape {array.shape} and type {array.dtype}: give the numbers of vertices, (n,) integers."
@@ -75,7 +77,7 @@ def check_whole_numbers(name: str, values: object) -> np.ndarray:
 
 
 def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
-    """Numbers (n,) of vertices of a mesh that has `count`.
+    """Return vertex numbers (n,) of a mesh with `count` vertices.
 
     Raises
     ------
@@ -85,17 +87,17 @@ def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
     vertices = check_whole_numbers(name, values)
     beyond = vertices[(vertices < 0) | (vertices >= count)]
     if len(beyond):
-        raise InputError(f"the mesh has no vertex {beyond[0]}: ask for some of 0 to {count - 1}.")
+        raise InputError(f"the mesh has no vertex {beyond[0]}: choose from 0 to {count - 1}.")
     return vertices
 
 
 def check_at_least(name: str, value: object, least: int) -> int:
-    """Return a whole number, at least `least`.
+    """Return an integer that is at least `least`.
 
     Raises
     ------
     InputError
-        Anything else; truth values are no numbers.
+        Any other value, including booleans.
     """
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,6 @@
-"""Effects + anatomy + device -> Problem: the one `match` over effects. A term's module is imported in its own arm.
+"""Compilation of effects to a problem: one `match` over all effects, which imports a term's module when needed.
 
-Effects that this package does not know build their terms themselves.
+User-defined effects build their own terms.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ CAUSES = {
     ToolContact: Touching,
     Retraction: Retracted,
 }
-"""The cause that each effect answers; other effects act by themselves."""
+"""Cause required by each effect; other effects act without loads."""
 
 
 def compile_problem(
@@ -79,15 +79,15 @@ def compile_problem(
     space: Discretisation | None = None,
     skin: ContactSurface | None = None,
 ) -> Problem:
-    """Build the terms and constraints that `effects` ask for, and nothing else; on linear tetrahedra without `space`.
+    """Build the terms and constraints of `effects`; default `space`: linear tetrahedra.
 
-    `skin` is the surface of `space`, for who presses it too.
+    `skin` is the surface of `space`, if it is shared with other code.
 
     Raises
     ------
     InputError
-        Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not held. An
-        effect of the caller's own that makes no term, or one of a name that is taken.
+        Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not fixed. A
+        user-defined effect that does not return a term, or whose name is in use.
     """
     effects = _compatible(effects)
     space = space or discretise(anatomy.mesh, "p1")
@@ -134,7 +134,7 @@ def compile_problem(
 
                 barriers.append(build_skull(effect, anatomy, space, _shear(effects), device))
             case Pulsation() | ToolDisplacement():
-                pass  # elasticity swells; a constraint: `_impose` reads the loads
+                pass  # Elasticity includes the swelling; tool displacement is a constraint, see `_impose`.
             case Resection():
                 raise InputError("Resection changes the body: make its solver with `sim.finite_elements`.")
             case OwnEffect():
@@ -155,31 +155,31 @@ def compile_problem(
 
 
 def _compatible(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Return the effects, if they can act together."""
+    """Return the effects as a tuple, if they are compatible."""
     effects = tuple(effects)
     for effect in effects:
         if isinstance(effect, type):
-            raise InputError(f"{effect.__name__} is a class, and no effect yet: write {effect.__name__}(...).")
+            raise InputError(f"{effect.__name__} is a class, not an instance: write {effect.__name__}(...).")
     kinds = [type(effect) for effect in effects]
     for kind in kinds:
         if kinds.count(kind) > 1:
-            raise InputError(f"the effect {kind.__name__} is asked for {kinds.count(kind)} times: once is enough.")
+            raise InputError(f"the effect {kind.__name__} occurs {kinds.count(kind)} times: give it once.")
     if Elasticity not in kinds:
         raise InputError("no effect resists deformation: add Elasticity.")
     skulls = [kind.__name__ for kind in (Bonded, Slide, SkullContact) if kind in kinds]
     if len(skulls) > 1:
-        raise InputError(f"{' and '.join(skulls)} contradict each other: each says what the skull does. Choose one.")
+        raise InputError(f"{' and '.join(skulls)} are alternative contact models of the skull: choose one.")
     return effects
 
 
 def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:
-    """Refuse terms that are none, and names that two terms have."""
+    """Reject user-defined terms that are not terms or whose names are in use."""
     taken = {term.name for term in terms}
     for term in own:
         if not isinstance(term, Term):
-            raise InputError(f"an effect of your own made a {type(term).__name__}: let it make a sim.Term.")
+            raise InputError(f"a user-defined effect returned a {type(term).__name__}: must be a sim.Term.")
         if term.name in taken:
-            raise InputError(f"two terms are called {term.name!r}: give yours another name.")
+            raise InputError(f"two terms are called {term.name!r}: rename the user-defined one.")
         taken.add(term.name)
 
 
@@ -190,12 +190,12 @@ def _shear(effects: Iterable[Effect]) -> float:
 
 
 def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
-    """Refuse loads that no effect of the scene answers.
+    """Reject loads whose cause no effect of the scene uses.
 
     Raises
     ------
     InputError
-        Naming the cause and the effect that it needs; or what is given instead of loads.
+        With the cause and the required effect; or with the argument given instead of loads.
     """
     check_loads(loads)
     effects = tuple(effects)
@@ -204,7 +204,7 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
     for cause in loads.causes:
         if type(cause) not in answered:
             needed = next((effect.__name__ for effect, kind in CAUSES.items() if kind is type(cause)), "that it is for")
-            raise InputError(f"loads hold {type(cause).__name__}, which nothing answers: add the effect {needed}.")
+            raise InputError(f"loads hold {type(cause).__name__}, which no effect uses: add the effect {needed}.")
 
 
 def _impose(space: Discretisation, skin: ContactSurface, loads: Loads) -> Imposed:
@@ -221,7 +221,7 @@ def _impose(space: Discretisation, skin: ContactSurface, loads: Loads) -> Impose
 
 @dataclass(frozen=True, eq=False)
 class LocalProblem:
-    """A problem on some of a body's nodes, and what puts a force (3n, b) [N] on it, or none."""
+    """Problem on a subset of a body's nodes, and a function that sets or clears a force (3n, b) [N] on it."""
 
     problem: Problem
     put: Callable[[wp.array | None], None]
@@ -230,14 +230,14 @@ class LocalProblem:
 def compile_part(
     effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, nodes: np.ndarray
 ) -> Problem:
-    """What resists deformation in the `chosen` (T,) bool tetrahedra alone, posed on their `nodes` (n,), ascending."""
+    """Compile the elasticity of the `chosen` tetrahedra (T,) bool alone, on their `nodes` (n,), ascending."""
     effect = next(effect for effect in effects if isinstance(effect, Elasticity))
     constraint = Constraint(whole.constraint.held[nodes], whole.constraint.normal[nodes], whole.device)
     return Problem(tuple(_elasticity(effect, space, whole.device, chosen, nodes)), constraint, whole.device)
 
 
 def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
-    """Return a part and a stiffness (m, m) [N/m] around it, which its rows (m,) of 3n touch."""
+    """Return a part with a surrounding stiffness (m, m) [N/m] on its rows (m,) of 3n."""
     from .terms.schur_stiffness import Exterior
 
     return _loaded(replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, part.device))))
@@ -246,9 +246,9 @@ def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.nda
 def compile_clamped_part(
     effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, nodes: np.ndarray
 ) -> tuple[LocalProblem, Callable[[], sp.csc_array]]:
-    """As `compile_part`, whose nodes that other tetrahedra touch are held.
+    """Compile as `compile_part`, with nodes fixed that other tetrahedra share.
 
-    And its curvature (3n, 3n) [N/m], assembled, where the problem of one column was last linearised.
+    Also return a function for its tangent stiffness (3n, 3n) [N/m] at the last linearisation of a single load case.
     """
     effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), whole.device
     terms = _elasticity(effect, space, device, chosen, nodes)
@@ -275,16 +275,16 @@ def _elasticity(
     nodes: np.ndarray | None = None,
     pulsation: Pulsation | None = None,
 ) -> list[Curved]:
-    """One term for each law and kind of element, over the elements of all regions that obey it.
+    """Build one term per law and element part, over the elements of all regions with that law.
 
-    `within` (T,) bool: of these tetrahedra alone, posed on their own nodes (n,).
+    `within` (T,) bool restricts it to these tetrahedra, on their own nodes (n,).
     """
     mesh = space.mesh
     labels = [int(label) for label in np.unique(mesh.region)]
     swell = np.isin(mesh.region, labels if pulsation is None or pulsation.regions is None else pulsation.regions)
     absent = set() if pulsation is None else set(pulsation.regions or ()) - set(labels)
     if absent:
-        raise InputError(f"Pulsation is asked of region {min(absent)}, but the mesh has the regions {labels}.")
+        raise InputError(f"Pulsation is given for region {min(absent)}, but the mesh has the regions {labels}.")
     unknown = sorted(set(effect.regions) - set(effect.on(labels).regions))
     if unknown:
         raise InputError(f"a law is given for {describe_region(unknown[0])}, but the mesh has the regions {labels}.")
@@ -322,9 +322,9 @@ def _obeying(
     device: Device,
     swelling: tuple[Pulsation, np.ndarray] | None,
 ) -> Curved:
-    """Return the term of elements of tissues that obey one law, `which` (T,) of them each; all of them relax, or none.
+    """Return the term of elements whose tissues, indexed by `which` (T,), have one law; all of them relax, or none.
 
-    `swelling`: the effect, and which elements (T,) bool it swells.
+    `swelling`: the effect, and a mask (T,) of elements that swell.
     """
     from .terms.elasticity import ElasticTerm as ElasticityTerm
 
@@ -333,7 +333,7 @@ def _obeying(
     coefficients = collect_coefficients(tissues, carries)[which]
     name = f"elasticity {law.name}" if carries == "whole" else f"elasticity {law.name} of {carries}"
     sources = []
-    if tissues[0].prony and carries != "volume":  # what resists a change of volume does not relax
+    if tissues[0].prony and carries != "volume":  # the volumetric part does not relax
         from .terms.viscoelastic import Prony
 
         name, points = f"visco{name}", elements.weight.shape[1]

@@ -1,4 +1,4 @@
-"""How hard what touches a body presses on it, from place to place."""
+"""Contact pressure on the surface of a body."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .loads import Loads
 
 
 def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
-    """Mean pressure (B, V) [Pa] of tools, and of a skull that lets go, round each vertex: its force by its area.
+    """Return the mean contact pressure (B, V) [Pa] of tools and separable skull at each vertex: nodal force / area.
 
-    A vertex has a third of the area of each surface triangle at it, as it is deformed; inside the body it has neither.
-    Tools are where the answer has them.
+    The area is a third of each adjacent deformed surface triangle; interior vertices have neither force nor area.
+    Tools are at the poses in `answer`.
 
     Raises
     ------
     InputError
-        Nothing that touches; quadratic elements, whose nodal forces are no pressures; an answer to other loads, or not
-        of all vertices.
+        No contact effect; quadratic elements, whose nodal forces do not give pressures; a solution of other loads, or
+        not at all vertices.
     """
     if not fem.problem.barriers:
         raise InputError("nothing touches this body: add ToolContact, Retraction or SkullContact to read a pressure.")
@@ -31,8 +31,8 @@ def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
     count = fem.space.count
     if answer.displacement.shape != (len(loads), count, 3):
         raise InputError(
-            f"the answer has {len(answer)} load cases at {len(answer.nodes)} vertices, the loads have {len(loads)} and "
-            f"the body {count}: give the whole answer to these loads."
+            f"the solution has {len(answer)} load cases at {len(answer.nodes)} vertices, the loads have {len(loads)}, "
+            f"and the body {count}: give the solution of these loads at all vertices."
         )
     device, surface = fem.problem.device, fem.space.surface
     with fem.lock:

@@ -1,4 +1,4 @@
-"""What comes out of every deformer: displacements, how they came about, and what they cost."""
+"""Result of a deformation model: displacements, outcomes and cost."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from .errors import InputError
 from .loads import Loads
 
 ROWS = ("reached", "inverted", "leaked", "bond", "strained")
-"""Fields (B,) of a `Deformation` that not every deformer knows."""
+"""Names of fields (B,) of a `Deformation` that some models do not compute."""
 COLUMNS = ("bound", "reaction_bound", "stretch")
-"""Fields (2, B) of a `Deformation` that not every deformer knows."""
+"""Names of fields (2, B) of a `Deformation` that some models do not compute."""
 
 
 class Outcome(Enum):
-    """How an answer came about; the value is the sentence that a user reads."""
+    """Outcome of a load case; the value is the description for users."""
 
     CONVERGED = "converged to the tolerance asked for"
-    CONVERGED_ANEW = "converged to the tolerance asked for, from rest: the start lay inside out, led there, or nowhere"
+    CONVERGED_ANEW = "converged to the tolerance asked for, from the undeformed state, as the start failed"
     CONVERGED_IN_STEPS = "converged to the tolerance asked for, the load applied in steps"
     BUDGET = "stopped when the budget of steps was spent"
     STALLED = "stopped because no step lowered the energy"
     ROUND_OFF = (
-        "stopped because the residual is at the round-off of its number type; float64 or a coarser tolerance goes on"
+        "stopped because the residual is at the round-off of its number type: use float64 or a coarser tolerance"
     )
     PIERCED = "stopped because a tool came to be inside the tissue, where it has no surface to press on"
     ON_BONE = "a tool overlaps surface that is fixed or covered by the skull: it stands on bone"
@@ -42,7 +42,7 @@ class Outcome(Enum):
 
     @property
     def good(self) -> bool:
-        """Whether the answer may be relied on."""
+        """Return True if the result is reliable."""
         return self in (
             Outcome.CONVERGED,
             Outcome.CONVERGED_ANEW,
@@ -53,7 +53,7 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class Cost:
-    """Wall seconds by stage, for the whole batch; set-up (factorisation, compilation) is not among them."""
+    """Wall-clock time by stage for the whole batch [s], without set-up (factorisation, compilation)."""
 
     seconds: Mapping[str, float] = field(default_factory=dict)
 
@@ -65,50 +65,50 @@ class Cost:
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """B answers of one deformer.
+    """Results of one deformation model for B load cases.
 
     Parameters
     ----------
     displacement
-        (B, n, 3) [m], always finite.
+        Displacements (B, n, 3) [m], always finite.
     nodes
-        (n,) the mesh vertices that the rows belong to (a surrogate may know only the tumour's).
+        Mesh vertices (n,) of the rows (a surrogate may be limited to the tumour's).
     outcome
-        B outcomes.
+        Outcomes of the B load cases.
     iterations, residual, time
-        (B,): outer steps of all descents, relative residual as in `Accuracy`, time [s]. A surrogate has zero
-        iterations, and NaN for the residual that it did not compute.
+        Outer iterations of all descents, relative residual as in `Accuracy`, time [s], each (B,). A surrogate has 0
+        iterations and NaN residual.
     reaction
-        (B, tools, 6): force [N] and moment about the tool's point [N m] that each tool exerts.
+        Force [N] and moment about the tool's point [N m] that each tool exerts: (B, tools, 6).
     memory
-        What the tissue and the tools remember: by the name of a term, rows (B, ...). The next answer needs it.
+        History of tissue and tools, by term name, rows (B, ...); required by the next solution.
     warm
-        What makes the next answer faster, rows (B, ...): it may be dropped, and is neither stored nor compared.
+        Data that accelerate the next solution, rows (B, ...): optional, and neither stored nor compared.
     cost
-        Seconds by stage.
+        Computing time by stage.
     reached
-        (B,): the share of the load, or of the prescribed motion, under which the displacement is in equilibrium to the
-        tolerance. 1 when converged; of a case that failed, the largest share found, and 0 where the displacement is
-        merely the last accepted state. NaN from a deformer that does not know.
+        Fraction (B,) of the load or prescribed motion for which the displacement is in equilibrium to the
+        tolerance: 1 if converged, otherwise the largest such fraction, 0 if the displacement is only the
+        last accepted iterate, NaN if the model does not compute it.
     inverted
-        (B,) whole numbers: tetrahedra that lie inside out, or collapsed; -1 from a deformer that does not know.
+        Number (B,) of inverted or collapsed tetrahedra; -1 if the model does not compute it.
     leaked
-        (B,): the volume that passes out through the closed skull, as a share of what the opening takes in and gives
-        out. NaN from a deformer that does not know, as a live frame on a card or a trained model.
+        Volume (B,) that passes outwards through the closed skull, as a fraction of the volume exchanged through the
+        craniotomy. NaN if the model does not compute it, such as live frames on a GPU or surrogates.
     bond
-        (B,): the largest traction of a `Bonded` skull, as a share of what the bond bears. Above 1 the bond would tear,
-        and the answer is no longer one of its law. NaN where nothing is bonded, or from a deformer as above.
+        Largest traction (B,) of a `Bonded` skull, as a fraction of the bond's strength. Above 1 the bond would fail,
+        and the result is no longer valid. NaN without bond, or if the model does not compute it.
     bound
-        (2, B) [m]: with probability 0.95, and 0.99, no tumour vertex is farther off what the deformer was trained on;
-        NaN from one that promises nothing.
+        Bounds (2, B) [m] on the error of all tumour vertices relative to the training reference, with probability 0.95
+        and 0.99; NaN from a model without bounds.
     reaction_bound
-        (2, B) [N]: the same of the force of each tool in `reaction`.
+        Bounds (2, B) [N] on the error of each tool force in `reaction`, with the same probabilities.
     stretch
-        (2, B): the smallest and the largest principal stretch of the tissue. NaN from a deformer that does not know.
+        Smallest and largest principal stretch (2, B) of the tissue. NaN if the model does not compute it.
     strained
-        (B,) [m^3]: the volume whose stretch leaves the range measured on brain, 0.5 to 1.5. NaN as `stretch`.
+        Volume (B,) [m^3] with stretch outside the range measured on brain, 0.5 to 1.5. NaN as `stretch`.
     source
-        Who answered, in words: finite elements of which kind and tissue, or what learned from them.
+        Description of the model: elements and tissue of the FEM, or the estimator.
     """
 
     displacement: np.ndarray
@@ -138,13 +138,13 @@ class Deformation:
             if given.shape != shape:
                 object.__setattr__(self, name, np.broadcast_to(given, shape))
         if not is_all_finite(self.displacement):
-            raise AssertionError("a deformer let a displacement pass that is not finite: a defect of the deformer")
+            raise AssertionError("a deformation model returned non-finite displacements: this is a defect of the model")
 
     def __len__(self) -> int:
         return len(self.displacement)
 
     def rows(self, index: np.ndarray) -> Deformation:
-        """Return some of the answers (k,), as a deformation; the cost stays that of all."""
+        """Return a subset (k,) of the load cases; the cost stays that of all."""
         return replace(
             self,
             displacement=self.displacement[index],
@@ -160,12 +160,12 @@ class Deformation:
         )
 
     def at(self, nodes: np.ndarray) -> Deformation:
-        """Return the rows of some mesh vertices `nodes` (n,).
+        """Return the result at some mesh vertices `nodes` (n,).
 
         Raises
         ------
         InputError
-            A vertex that is not among `self.nodes`; what are no whole numbers.
+            A vertex that is not in `self.nodes`; values that are not integers.
         """
         nodes = check_whole_numbers("the vertices", nodes)
         if np.array_equal(nodes, self.nodes):
@@ -173,8 +173,7 @@ class Deformation:
         missing = ~np.isin(nodes, self.nodes)
         if missing.any():
             raise InputError(
-                f"this deformation does not know vertex {nodes[missing][0]}: ask for one of its {len(self.nodes)} "
-                "vertices."
+                f"this deformation lacks vertex {nodes[missing][0]}: choose from its {len(self.nodes)} vertices."
             )
         order = np.argsort(self.nodes)
         position = order[np.searchsorted(self.nodes, nodes, sorter=order)]
@@ -182,7 +181,7 @@ class Deformation:
 
 
 def join_deformations(parts: Sequence[Deformation]) -> Deformation:
-    """Answers of the same vertices, one part after the other; seconds add up, and of memories stays what all have."""
+    """Concatenate results for the same vertices; times are added, and only memories common to all are kept."""
 
     def stacked(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts])
@@ -210,12 +209,12 @@ def join_deformations(parts: Sequence[Deformation]) -> Deformation:
 
 
 def check_start(start: Deformation, count: int, vertices: int) -> None:
-    """Refuse a start that is not one of `count` load cases at all vertices of the mesh.
+    """Reject a start that does not have `count` load cases at all vertices of the mesh.
 
     Raises
     ------
     InputError
-        What is no deformation; displacements of another shape; times or a memory of other rows, or not finite.
+        Another type; displacements of another shape; times or a memory with other rows, or not finite.
     """
     if not isinstance(start, Deformation):
         raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")
@@ -224,20 +223,20 @@ def check_start(start: Deformation, count: int, vertices: int) -> None:
             f"the start has displacements of shape {np.shape(start.displacement)}: give every vertex of {count} load "
             f"cases, ({count}, {vertices}, 3)."
         )
-    # A term may be called as something warm is: each is checked as what it is.
+    # A term and a warm-start entry may share a name: each is checked by its own rule.
     needed = [(name, values, True) for name, values in {"time": start.time, **start.memory}.items()]
     for name, values, finite in [*needed, *((name, values, False) for name, values in start.warm.items())]:
         array = as_array(f"the start's {name!r}", values)
         good = array.dtype.kind in "fiu" and array.shape[:1] == (count,)
         if not good or (finite and not is_all_finite(array)):
             raise InputError(
-                f"the start's {name!r} are no {count} rows of finite numbers: start from an answer to {count} loads as "
-                "it came, or from rest."
+                f"the start's {name!r} are no {count} rows of finite numbers: use a solution of {count} loads "
+                "unmodified, or no start."
             )
 
 
 def guess(displacement: np.ndarray) -> Deformation:
-    """Return a start for a deformer: displacements (B, V, 3) [m] of every vertex that somebody has thought of.
+    """Return a start for a deformation model from user-defined displacements (B, V, 3) [m] of all vertices.
 
     Raises
     ------
@@ -255,13 +254,13 @@ def guess(displacement: np.ndarray) -> Deformation:
 
 @runtime_checkable
 class Deformer(Protocol):
-    """Whatever answers loads with a deformation: the finite elements, or a model that learnt from them."""
+    """Interface of deformation models: FEM solvers and surrogates trained on them."""
 
     @property
     def anatomy(self) -> Anatomy:
-        """The body that is deformed."""
+        """Anatomy that is deformed."""
         ...
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Answer `loads`, from `start`, at mesh vertices `at` (n,). Pure: same loads and start, same answer."""
+        """Compute the deformation under `loads`, from `start`, at mesh vertices `at` (n,); a pure function."""
         ...

@@ -1,4 +1,4 @@
-"""What a scene may ask for: descriptions only. `compile` turns each into a term or a constraint."""
+"""Effects of a scene, as descriptions; `compile` converts each to a term or a constraint."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ if TYPE_CHECKING:
     from .discretisation.body import Body
     from .discretisation.term import Term
 
-# Of `Pulsation`: shares of the volume, by which the opened template moves as much as opened brains do.
-CARDIAC, RESPIRATORY = 4.5e-4, 4.5e-4
-LARGEST_WAVE = 0.3
+# With these amplitudes of `Pulsation`, the exposed cortex of the template moves as observed in patients.
+CARDIAC = 4.5e-4  # amplitude of the heartbeat [volume fraction]
+RESPIRATORY = 4.5e-4  # amplitude of respiration [volume fraction]
+LARGEST_WAVE = 0.3  # maximum amplitude [volume fraction]
 
 
 @dataclass(frozen=True)
 class Elasticity:
-    """Tissue resists deformation. `regions` names the law of each region label; the rest obeys `default`.
+    """Elastic resistance of tissue. `regions` gives the law of each region label; other regions have `default`.
 
-    Necrosis without a law of its own obeys the tumour's. `default=None` makes a region without a law an error.
+    Necrosis without its own law has the tumour's. With `default=None` a region without a law is an error.
 
     Raises
     ------
     InputError
-        What is no tissue.
+        A value that is not a tissue.
     """
 
     default: Tissue | None = BRAIN
@@ -46,72 +47,72 @@ class Elasticity:
                 check_described(tissue)
 
     def of(self, label: int) -> Tissue | None:
-        """Return the law of a region, if it has any."""
+        """Return the law of a region, or None."""
         return self.regions.get(label, self.regions.get(_around(label), self.default))
 
     def on(self, labels: Iterable[int]) -> Elasticity:
-        """Return the same for a body of these regions: without laws that none of them obeys."""
+        """Return the effect for a body with these regions, without laws of others."""
         obeyed = {each for label in labels for each in (label, _around(label))}
         return replace(self, regions={label: law for label, law in self.regions.items() if label in obeyed})
 
     def __str__(self) -> str:
-        """Return the tissues as they are named beside every answer."""
+        """Return the description of the tissues for results."""
         named = [] if self.default is None else [str(self.default)]
         return "; ".join([*named, *(f"{describe_region(label)}: {tissue}" for label, tissue in self.regions.items())])
 
 
 def _around(label: int) -> int:
-    """Return the region that a region lies in, or itself."""
+    """Return the region that contains a region, or itself."""
     return TUMOUR_LABEL if label == NECROSIS_LABEL else label
 
 
 @dataclass(frozen=True)
 class Held:
-    """Components marked in `Anatomy.held` do not move, or move as `Prescribed` loads say."""
+    """Fixed nodes: components marked in `Anatomy.held` do not move, or as `Prescribed` loads define."""
 
 
 @dataclass(frozen=True)
 class ToolForce:
-    """A tool pushes with a known force: `Pushed` loads become dead tractions on its footprint."""
+    """Tool that pushes with a known force: `Pushed` loads become dead tractions on its footprint."""
 
 
 @dataclass(frozen=True)
 class ToolDisplacement:
-    """A tool moves the tissue under its footprint by a known vector: `Displaced` loads are constraints."""
+    """Tool that moves the tissue under its footprint by a known vector: `Displaced` loads become constraints."""
 
 
 @dataclass(frozen=True)
 class NodalForce:
-    """Dead forces at the mesh's own nodes: `Nodal` loads."""
+    """Dead loads at mesh vertices: `Nodal` loads."""
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """Tissue weighs less under the cerebrospinal fluid than above it; `Posture` loads say how the head lies now.
+    """Change of weight due to the head posture and the cerebrospinal fluid level, given by `Posture` loads.
 
-    The scan shows a body in equilibrium with its weight then, so that only the change since acts. What acts is the
-    weight as a `Posture` has it less the weight in the scan, as dead forces in the rest configuration. Tissue above the
-    level weighs density x g, under it (density - csf_density) x g. The latter is Archimedes' body force, which is the
-    fluid's pressure on the tissue but for how much that squeezes it.
+    The scan shows the body in equilibrium under its weight, so only the change of weight since then acts:
+    the weight in the `Posture` minus that in the scan, as dead loads in the undeformed configuration. Tissue above the
+    level weighs density x g, below it (density - csf_density) x g. The latter includes Archimedes' buoyancy, the
+    fluid pressure on the tissue except for the compression it causes.
 
-    Left out are tissue that moves through the level, densities of tumour and oedema, and fluid that does not surround
-    the tissue (ventricles, cysts). So is tissue that loses water or is cut out. So is the gap that opens where the
-    brain sinks away from the skull: with `Bonded` and `Slide` it stays on it.
+    Not modelled: tissue that crosses the level, densities of tumour and oedema, and fluid that does not surround
+    the tissue (ventricles, cysts); tissue that loses water or is resected; and the gap that opens where the
+    brain sinks away from the skull, as `Bonded` and `Slide` keep it closed.
 
     Parameters
     ----------
     direction
-        Which way gravity pulled in the scan (3,), of any length but none, in the mesh's frame; supine in RAS.
+        Direction of gravity in the scan (3,), nonzero, in mesh coordinates; default: supine in RAS.
     csf_level
-        How high the fluid stood in the scan [m] above the origin, against `direction`: what has
-        -direction . x < csf_level is under it. Infinite: the skull was closed and full.
+        Height of the fluid in the scan [m] above the origin, against `direction`: points with
+        -direction . x < csf_level are submerged. Infinite: the skull was closed and full.
     density, csf_density
-        Of tissue and fluid [kg/m^3]; customary values.
+        Densities of tissue and fluid [kg/m^3]; customary values.
 
     Raises
     ------
     InputError
-        A direction of no length, a level that is no number, a density that is not positive.
+        A zero direction, a level that is NaN, a density that is not positive.
     """
 
     direction: tuple[float, float, float] = (0.0, -1.0, 0.0)
@@ -124,7 +125,7 @@ class Gravity:
         if len(self.direction) != 3 or not given:
             raise InputError(f"Gravity.direction is {self.direction}: give three finite numbers, not all zero.")
         if math.isnan(self.csf_level):
-            raise InputError("Gravity.csf_level is no number: give a height [m], or infinity for a full skull.")
+            raise InputError("Gravity.csf_level is NaN: give a height [m], or infinity for a full skull.")
         for name, value in (("density", self.density), ("csf_density", self.csf_density)):
             if not 0.0 < value < math.inf:
                 raise InputError(f"Gravity.{name} is {value} kg/m^3: give a positive number.")
@@ -132,24 +133,24 @@ class Gravity:
 
 @dataclass(frozen=True)
 class Inertia:
-    """Tissue keeps its velocity: answers follow one another in time, one step of backward Euler each.
+    """Inertia of tissue: solutions form a time series, with one backward Euler step each.
 
-    The step is the time of the loads less the time of the start. At that time the nodes stood where the start has them,
-    with the velocities of its memory; at rest without one. Where no time passes the body and the tools that touch it
-    stay as they are, whatever acts. Backward Euler is of first order in the step and damps what swings faster than
-    that: energy does not grow, and one long step is statics.
+    The time step is the time of the loads minus that of the start, which also gives the initial displacements and, in
+    its memory, the velocities; undeformed and at rest without a start. In a zero time step body and tools do not
+    move, whatever the loads. Backward Euler is first-order accurate and damps motion faster than the time
+    step: energy does not grow, and a long step gives the static solution.
 
     Parameters
     ----------
     density
-        Of the tissue [kg/m^3].
+        Density of the tissue [kg/m^3].
     damping
-        Force per mass and velocity [1/s], as of a body in a medium at rest: free motion decays with exp(-damping t).
+        Force per mass and velocity [1/s], as in a viscous medium at rest: free motion decays with exp(-damping t).
 
     Raises
     ------
     InputError
-        A density that is not positive, damping that is negative.
+        A density that is not positive, or negative damping.
     """
 
     density: float = 1040.0
@@ -159,28 +160,28 @@ class Inertia:
         if not 0.0 < self.density < math.inf:
             raise InputError(f"Inertia.density is {self.density} kg/m^3: give a positive number.")
         if not 0.0 <= self.damping < math.inf:
-            raise InputError(f"Inertia.damping is {self.damping} 1/s: give a number that is not negative.")
+            raise InputError(f"Inertia.damping is {self.damping} 1/s: must be >= 0.")
 
 
 @dataclass(frozen=True)
 class Resection:
-    """Tissue is taken away, step after step; `Resected` loads say how many steps are done, without them all are.
+    """Removal of tissue in steps; `Resected` loads give the number of steps done, by default all.
 
-    The wall of the cavity is free surface. What a step loosens (a piece joined by no face to anything held) goes with
-    it. `sim.finite_elements` makes what solves it.
+    The cavity wall is free surface. Pieces without a face in common with fixed tissue are removed as
+    well. `sim.finite_elements` builds the solver.
 
-    What is left remembers what it went through. Left out: the stress that the scan's own equilibrium holds, so that
-    without another load nothing moves.
+    The remaining tissue keeps its history. Not modelled: residual stress in the scan, so without
+    other loads nothing moves.
 
     Parameters
     ----------
     steps
-        Of each step the numbers of the tetrahedra that it takes.
+        Tetrahedron numbers that each step removes.
 
     Raises
     ------
     InputError
-        No steps, steps that are no whole numbers, a step that takes nothing, a tetrahedron that is taken twice.
+        No steps, numbers that are not integers, an empty step, a tetrahedron that is removed twice.
     """
 
     steps: tuple[tuple[int, ...], ...]
@@ -196,7 +197,7 @@ class Resection:
         taken: dict[int, int] = {}
         for number, step in enumerate(self.steps, start=1):
             if not step:
-                raise InputError(f"step {number} of Resection takes nothing: leave it out.")
+                raise InputError(f"step {number} of Resection is empty: remove it.")
             for element in step:
                 if element in taken:
                     raise InputError(
@@ -208,14 +209,14 @@ class Resection:
 
 @dataclass(frozen=True)
 class Wave:
-    """A periodic change of volume, amplitude sin(2 pi frequency t): none at t = 0.
+    """Periodic volume change, amplitude x sin(2 pi frequency t); zero at t = 0.
 
     Parameters
     ----------
     frequency
-        [Hz].
+        Frequency [Hz].
     amplitude
-        The largest change as a share of the volume; half of what lies between the largest and the smallest.
+        Maximum change as a fraction of the volume; half of the peak-to-peak change.
 
     Raises
     ------
@@ -231,31 +232,31 @@ class Wave:
             raise InputError(f"Wave.frequency is {self.frequency} Hz: give a positive number.")
         if not 0.0 <= self.amplitude <= LARGEST_WAVE:
             raise InputError(
-                f"Wave.amplitude is {self.amplitude} of the volume: give a share from 0 to {LARGEST_WAVE}; "
-                "of brain, some thousandths."
+                f"Wave.amplitude is {self.amplitude}: must be a volume fraction from 0 to {LARGEST_WAVE}; "
+                "typical for brain: 0.0005."
             )
 
 
 @dataclass(frozen=True)
 class Pulsation:
-    """Tissue swells and shrinks with heartbeat and breath, by its blood: `Loads.time` alone says how much.
+    """Volume change of tissue with heartbeat and respiration due to its blood, as a function of `Loads.time`.
 
-    By the same share at every point, without delay; where the skull is open it bulges. As it was in the scan at t = 0.
-    With the default amplitudes and tissue the template's cortex in an opening of 50 mm moves by up to half a millimetre
-    from peak to peak, as is observed. That is half a millilitre of blood each. The more tissue gives in volume the less
+    The volume fraction is uniform and without delay; tissue bulges through the craniotomy. It is 0 at t = 0, the scan.
+    With the default amplitudes and tissue, the template's cortex in a craniotomy of 50 mm moves by up to 0.5 mm
+    peak to peak, as observed. This is half a millilitre of blood each. The more compressible the tissue, the less
     it bulges.
 
     Parameters
     ----------
     cardiac, respiratory
-        What heart and breath do; they add up.
+        Waves of heartbeat and respiration, which are added.
     regions
-        Labels of the regions that swell; None: all.
+        Region labels that swell; None: all.
 
     Raises
     ------
     InputError
-        No region.
+        An empty tuple of regions.
     """
 
     cardiac: Wave = Wave(1.0, CARDIAC)
@@ -264,25 +265,25 @@ class Pulsation:
 
     def __post_init__(self) -> None:
         if self.regions is not None and not self.regions:
-            raise InputError("Pulsation swells no region: name some, give None for all, or leave the effect out.")
+            raise InputError("Pulsation has no regions: name some, give None for all, or remove the effect.")
 
     def swelling(self, times: np.ndarray) -> np.ndarray:
-        """Change of volume (B,) as a share of it, at times (B,) [s]."""
+        """Return the relative volume change (B,) at times (B,) [s]."""
         waves = (self.cardiac, self.respiratory)
         return sum((wave.amplitude * np.sin(2.0 * np.pi * wave.frequency * times) for wave in waves), np.zeros(()))
 
 
 @dataclass(frozen=True)
 class ToolContact:
-    """Rigid tools, moved by pose, press and slide without friction on the tissue that they touch: `Touching` loads.
+    """Frictionless contact of tissue with rigid tools of prescribed pose: `Touching` loads.
 
-    Tissue begins to feel a tool at a distance of `gap` [m], and is never nearer than a few hundredths of that. Only
-    what no bone covers is touched: surface that is neither held nor under the skull.
+    Contact forces start at a distance of `gap` [m]; the distance stays above a few hundredths of it. Only
+    surface that is neither fixed nor under the skull can be touched.
 
     Raises
     ------
     InputError
-        No tool, what is no tool, or a gap that is not positive.
+        No tool, a value that is not a tool, or a gap that is not positive.
     """
 
     tools: tuple[Tool, ...]
@@ -299,14 +300,14 @@ class ToolContact:
 
 @dataclass(frozen=True)
 class Retraction:
-    """A blade is laid on the tissue and held at a displacement: `Retracted` loads.
+    """Retractor blade that is placed on the tissue and moved by a displacement: `Retracted` loads.
 
-    As `ToolContact`, whose `gap` [m] it has; what it takes to hold the blade comes out as its reaction.
+    Contact is as in `ToolContact`, with the same `gap` [m]; the holding force is the reaction.
 
     Raises
     ------
     InputError
-        A blade that is none, or a gap that is not positive.
+        A blade that is not a `Spatula`, or a gap that is not positive.
     """
 
     blade: Spatula
@@ -334,45 +335,45 @@ BuiltIn = (
     | Retraction
     | SkullContact
 )
-"""The effects that this package knows."""
+"""Effects of this package."""
 
 
 @runtime_checkable
 class OwnEffect(Protocol):
-    """An effect of your own, as a frozen dataclass: it builds its `Term` itself. `docs/extend.md` works one out."""
+    """Interface of user-defined effects, frozen dataclasses that build their own `Term`; see `docs/extend.md`."""
 
     @property
     def cause(self) -> type | None:
-        """The kind of cause that it answers; None: it acts by itself."""
+        """Type of cause that it requires; None: it acts without loads."""
         ...
 
     @property
     def remembers(self) -> bool:
-        """Whether an answer depends on the one before, so that a scene cannot be entered in its middle."""
+        """True if a solution depends on the previous one, so that a scene must be solved from its start."""
         ...
 
     def term(self, body: Body) -> Term:
-        """Its summand of the potential on a body. Import here what only the term needs."""
+        """Build its energy term on a body. Import here modules that only the term needs."""
         ...
 
 
 Effect = BuiltIn | OwnEffect
-"""Everything that a scene may ask for."""
+"""Any effect of a scene."""
 
 
 SKULLS = {"bonded": Bonded(), "slide": Slide(), "contact": SkullContact()}
-"""What the skull may do, by name; the first is recommended, the others are its brackets."""
+"""Skull models by name; the first is recommended, the others are its frictionless limits."""
 
 
 def pushed_effects(anatomy: Anatomy, tissue: Tissue | Elasticity, skull: str = "bonded") -> tuple[Effect, ...]:
-    """What a tool that pushes on a body of this tissue calls for; one of `SKULLS` where the anatomy has a skull."""
+    """Return the effects for a pushing tool on a body of this tissue, with one of `SKULLS` if there is a skull."""
     made = tissue if isinstance(tissue, Elasticity) else Elasticity(tissue)
     covered = (SKULLS[skull],) if anatomy.slide_normal.any() else ()
     return (made, Held(), *covered, ToolForce())
 
 
 def remember(effects: Iterable[Effect]) -> bool:
-    """Whether an answer depends on the one before: where tools were, velocities, stress that fades, what was cut."""
+    """Return True if a solution depends on the previous one: tool path, velocities, relaxation or resection."""
     return any(map(_remembers, effects))
 
 

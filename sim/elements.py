@@ -1,9 +1,9 @@
-"""Which finite elements there are, by name."""
+"""Available finite elements, by name."""
 
-ELEMENTS = {
+ELEMENTS = {  # descriptions by name
     "p1": "linear tetrahedra: the fastest, and too stiff, the more so the less tissue can be compressed",
     "p2": "quadratic tetrahedra: the most accurate, seven times as many nodes",
     "smoothed": "linear tetrahedra with strains averaged over edges and nodes: nearly as accurate as p2 on p1's nodes",
 }
 RECOMMENDED = "smoothed"
-"""The element of every scene and command that names none, on meshes of linear tetrahedra."""
+"""Default element of scenes and commands, on meshes of linear tetrahedra."""

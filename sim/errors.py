@@ -1,5 +1,5 @@
-"""What a user can put right: one exception whose text is a sentence."""
+"""Exception for errors that a user can correct."""
 
 
 class InputError(ValueError):
-    """Input that cannot be used. The text names the thing, the reason and the remedy."""
+    """Invalid input; the text gives the value, the reason and the remedy."""

@@ -1,4 +1,4 @@
-"""The finite-element deformer: warm start, batches, and load stepping when Newton fails."""
+"""FEM solver for deformations: warm starts, batches, and load stepping if Newton's method fails."""
 
 from __future__ import annotations
 
@@ -43,42 +43,42 @@ from .strategy.plan import SolverPlan, SolverStep, build_local_solvers, plan_for
 from .strategy.strategy import SolverResult, Strategy
 from .strategy.time_steps import KEPT, NoMotionStep, group_alike
 
-# The memory's key for mid-edge nodes: how far (B, E, 3) [m] each stands off the line between its edge's ends.
+# Key in the memory: displacements (B, E, 3) [m] of mid-edge nodes relative to the centres of their edges.
 MIDDLES = "mid-edge nodes"
 
 
 class Fem:
-    """A Deformer: static equilibrium by finite elements; a step in time where effects need it.
+    """FEM deformation model: static equilibrium, or a time step if effects require it.
 
-    Threads may share it: they take turns under its `lock`, and each gets the answer that it would get alone. To use
-    several cores at once, give each thread a `Fem` of its own.
+    Instances are thread-safe: calls are serialised by `lock`, and results do not depend on other threads. To use
+    several CPU cores at once, create one `Fem` per thread.
 
     Parameters
     ----------
     anatomy
-        The body.
+        Anatomy to be deformed.
     effects
-        What the scene calls for; nothing else is compiled.
+        Effects of the scene; nothing else is compiled.
     accuracy
-        Tolerance, budgets and precision.
+        Tolerance, iteration limits and precision.
     device
-        "auto", "cpu", "cuda" or "cuda:1".
+        Device name: "auto", "cpu", "cuda" or "cuda:1".
     batch
-        Most load cases that are solved together; None: as many as are worth it on this device. Quadratic elements with
-        levels go one by one on the CPU.
+        Maximum load cases solved together; None: a device-dependent default. Quadratic elements with
+        multigrid levels are solved one by one on the CPU.
     element
-        One of `elements.ELEMENTS`; None: the recommended one, or p2 on a mesh that brings mid-edge nodes.
+        Element in `elements.ELEMENTS`; None: the recommended one, or p2 for a mesh with mid-edge nodes.
     live
-        Loads come one at a time. On the CPU the first takes a second more, the others a third to two thirds as long.
+        True if loads come one at a time. On the CPU the first takes one second more, others 1/3 to 2/3 of the time.
     avoid
-        Solvers that are not tried, as where one is measured or doubted. Newton-CG always is.
+        Solvers to skip, for measurements and checks; Newton-CG cannot be skipped.
     stiff_as
-        Another `Fem` of the same rest stiffness, as where only a change of volume differs: its factor is shared.
+        Another `Fem` with the same undeformed stiffness, for example with other swelling: its factorisation is shared.
 
     Raises
     ------
     InputError
-        Effects or elements that cannot be had, a body that is not held, a device that is not there, a batch of none.
+        Unsupported effects or elements, a body that is not fixed, a device that is not available, a batch below 1.
     """
 
     def __init__(
@@ -113,51 +113,51 @@ class Fem:
         plan = plan_for(problem, preconditioner, self.space, accuracy, check_at_least("batch", batch, 1), live, avoid)
         parts = build_local_solvers(plan, problem, preconditioner, self.effects, self.space)
         if problem.device.on_cuda:
-            parts[0]()  # a card is there for batches; a frame on the CPU need not wait for what it does not use
+            parts[0]()  # prepare for batches on a GPU; on the CPU, parts are built when first used
         self._diagnostics = Diagnostics(anatomy, self.space, self.effects, problem.device, accuracy.limit_strain)
         inversion = Inversion(self.space, problem.device, problem.bounded)
         self.strategy = Strategy(problem, preconditioner, inversion, accuracy, plan, *parts)
-        """What solves a load: the plan's solvers, one after the other."""
+        """Solvers of the plan, applied in order."""
         self._paced = lru_cache(KEPT)(self._strategy_over)
         self._resting = RestStiffnessSolver(problem, preconditioner, accuracy.inner)
 
     @property
     def plan(self) -> SolverPlan:
-        """Which solvers are tried, and in which order."""
+        """Solvers that are tried, in order."""
         return self.strategy.plan
 
     @property
     def batch(self) -> int:
-        """Most load cases that are solved together."""
+        """Maximum number of load cases solved together."""
         return self.plan.batch
 
     @cached_property
     def description(self) -> str:
-        """Element and tissue in words: every answer carries them."""
+        """Description of element and tissue, included in every result."""
         return describe_solver(self.space.element, self.effects)
 
     @property
     def problem(self) -> Problem:
-        """What is minimised."""
+        """Boundary value problem that is solved."""
         return self.strategy.problem
 
     @property
     def anatomy(self) -> Anatomy:
-        """The body that is deformed."""
+        """Anatomy that is deformed."""
         return self._anatomy
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Return static equilibrium under every load case.
+        """Return the static equilibrium under every load case.
 
-        `start` (B rows, every vertex) is the first guess and brings its memory; at rest without one. `at` (n,) picks
-        vertices of the answer.
+        `start` (B rows, all vertices) gives the initial guess and the memory; without it the body starts undeformed.
+        `at` (n,) selects vertices of the result.
 
         Raises
         ------
         InputError
-            Loads that no effect answers, or that do not touch the body; a start that does not fit. Memory that does not
-            fit; a vertex that the mesh does not have.
+            Loads that no effect uses, or that do not touch the body; a start that does not match. A problem that
+            exceeds the memory; a vertex that the mesh does not have.
         """
         check_causes(self.effects, loads)
         at = None if at is None else self._vertices(at)
@@ -181,7 +181,7 @@ class Fem:
         return answer.rows(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
     def _strategy_at(self, step: float) -> Strategy | NoMotionStep:
-        """Whose preconditioner knows the step in time [s]; of an infinite one, that of statics."""
+        """Return the strategy with a preconditioner for a time step [s]; an infinite step is static."""
         if step == 0.0 or step == math.inf:
             return self.strategy if step else NoMotionStep(self.problem, self.strategy.inversion)
         return self._paced(step)
@@ -191,12 +191,12 @@ class Fem:
         return Strategy(self.problem, preconditioner, self.strategy.inversion, self.accuracy, self.plan)
 
     def _batches(self, count: int) -> Iterator[slice]:
-        """Return the rows of each batch, at least one."""
+        """Iterate over the row slices of the batches, at least one."""
         return (slice(first, first + self.batch) for first in range(0, max(count, 1), self.batch))
 
     @cached_property
     def following(self) -> FrameSequence | None:
-        """Who answers frame after frame on CUDA. The CPU waits for nothing that this would spare it."""
+        """Solver for frame sequences on CUDA; None if the plan has none, as on the CPU, where it saves no time."""
         if not self.plan.frames:
             return None
         return build_frame_sequence(
@@ -209,21 +209,21 @@ class Fem:
     def _check_static(self, loads: Loads) -> None:
         check_causes(self.effects, loads)
         if self.problem.paced:
-            raise InputError("answers under Inertia are steps in time, which no equilibrium is behind: leave it out.")
+            raise InputError("solutions under Inertia are time steps without static equilibrium: remove Inertia.")
 
     def _unsmoothed(self, step: float) -> sp.csc_array:
-        """Rest stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, over a step in time [s]."""
+        """Return the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, for a time step [s]."""
         linear = discretise(self._anatomy.mesh, "p1")
         return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature(step)
 
     @lock_method
     def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
-        """Return the relative residual (B,), in this solver's precision, of somebody's answers at every vertex.
+        """Return the relative residual (B,), in this solver's precision, of given solutions at all vertices.
 
         Raises
         ------
         InputError
-            As `deform`; tissue that keeps its velocity, whose answers are steps in time.
+            As `deform`; effects with inertia, whose solutions are time steps.
         """
         self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.memory))
@@ -231,12 +231,12 @@ class Fem:
 
     @lock_method
     def reading(self, nodes: np.ndarray, modes: np.ndarray) -> SeriesReading:
-        """What `series` is asked for: the shares that modes (r, n, 3) have in the motion of vertices `nodes` (n,).
+        """Return the projection of the motion of vertices `nodes` (n,) on modes (r, n, 3), an argument of `series`.
 
         Raises
         ------
         InputError
-            A vertex that the mesh does not have; memory that would not fit.
+            A vertex that the mesh does not have; a problem that exceeds the memory.
         """
         nodes = self._vertices(nodes)
         device, rows = self.problem.device, (3 * nodes[:, None] + np.arange(3)).ravel()
@@ -252,35 +252,35 @@ class Fem:
 
     @lock_method
     def series(self, loads: Loads, orders: int, reading: SeriesReading, sizes: int = 1) -> np.ndarray:
-        """Power series (G, terms, r) of what is read of the answers, in the sizes of the loads, as far as it converges.
+        """Return the power series (G, terms, r) of a projection of the solution in the magnitudes of the loads.
 
-        Each `sizes` successive loads are one group of G. Under s_1 times the first, ... s_m times the last of a group,
-        all at once, the answer is the sum of its terms times the `products` of s_1 ... s_m, order after order: of one
-        load s u_1 + s^2 u_2 + ..., of three 3 + 6 + 10 terms to the third order.
+        Each `sizes` successive loads form one group of G. For a group whose loads, scaled by s_1 ... s_m, act
+        simultaneously, the solution is the sum of the terms times the `products` of s_1 ... s_m, order by order: one
+        load gives s u_1 + s^2 u_2 + ..., three loads 3 + 6 + 10 terms up to third order. Convergence is not checked.
 
         Raises
         ------
         InputError
-            As `deform`; loads that prescribe motion, which no force is in proportion to, or do not come in such groups.
-            A solver in float32, whose round-off would be taken for the higher orders.
+            As `deform`; loads with prescribed motion, which are not proportional to a force, or an incomplete group.
+            A solver in float32, whose round-off would dominate the higher orders.
         """
         check_causes(self.effects, loads)
         if not self.problem.plain:
-            raise InputError("a series is had of elastic bodies under forces alone: leave the other effects out.")
+            raise InputError("a power series requires elastic bodies under forces only: remove the other effects.")
         if self.problem.device.precision != "float64":
-            raise InputError("a series of differences needs float64: ask for an Accuracy of that precision.")
+            raise InputError("a power series requires float64: use an Accuracy of that precision.")
         for cause in loads.causes:
             if not isinstance(cause, Pushed | Nodal):
-                raise InputError(f"a series is had of `Pushed` and `Nodal` loads, not of `{type(cause).__name__}`.")
+                raise InputError(f"a power series requires `Pushed` or `Nodal` loads, not `{type(cause).__name__}`.")
         if len(loads) % sizes:
-            raise InputError(f"{len(loads)} loads are no groups of {sizes}: give a multiple of that.")
+            raise InputError(f"{len(loads)} loads cannot be grouped by {sizes}: give a multiple of {sizes}.")
         widest = len(list_factors(sizes, orders))
         groups = min(len(loads) // sizes, max(1, self.batch // widest))
         columns = groups * widest
         check_fits(self.problem.rows, columns, columns, self.problem.device, self.strategy.held)
         edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
         found = np.empty((len(loads) // sizes, count_terms(sizes, orders), reading.count))
-        # Threads of BLAS wait for one another, ages where something else runs on their cores.
+        # BLAS threads wait for each other, very long if other processes use their cores.
         with limit_to_one_thread():
             for first in range(0, len(found), max(groups, 1)):
                 some = loads.rows(slice(first * sizes, (first + groups) * sizes))
@@ -291,7 +291,7 @@ class Fem:
         return found
 
     def guess(self, loads: Loads, start: Deformation) -> np.ndarray:
-        """Somebody's answers as columns (3N, B) [m] over the nodes of the element."""
+        """Return a given solution as columns (3N, B) [m] over the nodes of the element."""
         vertices = len(self._anatomy.mesh.nodes)
         check_start(start, len(loads), vertices)
         full = self.space.interpolate_field(start.at(np.arange(vertices)).displacement)
@@ -317,7 +317,7 @@ class Fem:
         at: np.ndarray | None,
         seconds: Mapping[str, float],
     ) -> Deformation:
-        """What was found, as a deformation: reactions, and `more` that is warm; it took `seconds` by stage."""
+        """Build the deformation from a solver result, with reactions, warm-start data `more` and `seconds` by stage."""
         solved = time.perf_counter()
         self.problem.begin(replace(cases, share=found.gone, anew=found.anew))
         memory = dict(self.problem.end(found.u))
@@ -352,7 +352,7 @@ class Fem:
         )
 
     def _reaction(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:
-        """(B, tools, 6): force and moment about its point that each tool exerts [N, N m]."""
+        """Return force and moment about its point that each tool exerts [N, N m]: (B, tools, 6)."""
         rows = []
         for cause in loads.causes:
             if isinstance(cause, Pushed | Displaced):
@@ -365,11 +365,11 @@ class Fem:
 
 
 def _joined(parts: list[Deformation]) -> Deformation:
-    """Batches, one after the other, as one deformation. What is warm in one is not for all of them."""
+    """Concatenate batches to one deformation; their warm-start data are dropped, as they may differ."""
     return parts[0] if len(parts) == 1 else join_deformations([replace(part, warm={}) for part in parts])
 
 
 def describe_solver(element: str, effects: Iterable[Effect]) -> str:
-    """Finite elements in words: their element and tissue, as every answer, picture and file names them."""
+    """Return the description of the element and the tissue, for results, images and files."""
     tissue = next((str(effect) for effect in effects if isinstance(effect, Elasticity)), "no elasticity")
     return f"finite elements ({element}; {tissue})"

@@ -1,4 +1,4 @@
-"""A batch of causes: what the world does to the tissue, one row per load case."""
+"""Loads: a batch of causes that act on tissue, one row per load case."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from .errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Pushed:
-    """A dead traction on a round footprint: t(x) = F w(|x - c| / r) / integral of w, w(s) = sqrt(1 - s^2).
+    """Dead traction on a round footprint: t(x) = F w(|x - c| / r) / integral of w, w(s) = sqrt(1 - s^2).
 
-    point (B, 3) [m] in the rest configuration, force (B, 3) [N], footprint (B,) radius [m].
+    point (B, 3) [m] in the undeformed configuration, force (B, 3) [N], footprint radius (B,) [m].
     """
 
     point: np.ndarray
@@ -26,10 +26,10 @@ class Pushed:
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """A tool that moves the tissue under it: the w-weighted mean motion of the footprint is prescribed.
+    """Prescribed mean motion of a tool's footprint, weighted by w as in `Pushed`.
 
-    The dual of `Pushed`: the force that it takes comes out as reaction, and `Pushed` with that force gives the
-    same deformation. point (B, 3) [m], displacement (B, 3) [m], footprint (B,) radius [m].
+    The dual of `Pushed`: the required force is the reaction, and `Pushed` with that force gives the
+    same deformation. point (B, 3) [m], displacement (B, 3) [m], footprint radius (B,) [m].
     """
 
     point: np.ndarray
@@ -39,25 +39,25 @@ class Displaced:
 
 @dataclass(frozen=True, eq=False)
 class Nodal:
-    """Dead forces at the mesh's own nodes: force (B, V, 3) [N]."""
+    """Dead loads at mesh vertices: force (B, V, 3) [N]."""
 
     force: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Prescribed:
-    """Values of the held components: displacement (B, V, 3) [m]; entries that are not held are ignored."""
+    """Displacement (B, V, 3) [m] of fixed components; entries of other components are ignored."""
 
     displacement: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """How the head lies and how high its fluid stands now; the effect `Gravity` knows how they were in the scan.
+    """Current direction of gravity and fluid level of the head; the effect `Gravity` has those of the scan.
 
-    direction (B, 3) is which way gravity pulls in the mesh's frame, of any length but none. csf_level (B,) [m] is above
-    the origin, against the direction. share (B,) is that of the change of weight since the scan that acts. In the
-    scan's own posture no force acts, and half a load is half of the change, which no posture between the two would be.
+    direction (B, 3) of gravity in mesh coordinates, nonzero. csf_level (B,) [m] above the origin,
+    against the direction. share (B,): fraction of the change of weight since the scan that acts. In the scan's posture
+    there is no force. Half of the load is half of the change, which does not correspond to a posture.
     """
 
     direction: np.ndarray
@@ -67,16 +67,16 @@ class Posture:
 
 @dataclass(frozen=True, eq=False)
 class Resected:
-    """How many steps of the effect `Resection` are done: done (B,) whole numbers. Of a share of a load, as many."""
+    """Number of completed steps of the effect `Resection`: done (B,) integers; not affected by load scaling."""
 
     done: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Touching:
-    """Where the tools of `ToolContact` are: T_world_tool pose (B, tools, 4, 4), in its order.
+    """Poses of the tools of `ToolContact`, in its order: T_world_tool pose (B, tools, 4, 4).
 
-    They come straight from where they were in the start; without one, along their shafts from clear of the body.
+    Tools move straight from their poses in the start; without one, along their shafts from a pose clear of the body.
     """
 
     pose: np.ndarray
@@ -84,27 +84,27 @@ class Touching:
 
 @dataclass(frozen=True, eq=False)
 class Retracted:
-    """A blade laid on at T_world_tool pose (B, 4, 4), clear of the tissue, and moved by displacement (B, 3) [m]."""
+    """Retractor placed at T_world_tool pose (B, 4, 4), clear of the tissue, and moved by displacement (B, 3) [m]."""
 
     pose: np.ndarray
     displacement: np.ndarray
 
 
 class OwnCause(Protocol):
-    """What an effect of your own answers: a frozen dataclass (eq=False) of arrays (B, ...), a row per load case."""
+    """Interface of causes for user-defined effects: frozen dataclasses (eq=False) of arrays (B, ...) by load case."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def magnitude(self) -> str | None:
-        """The name of the array that grows with the load, so that half a load can be had; None: there is none."""
+        """Name of the array that scales with the load, for load stepping; None: there is none."""
         ...
 
 
-BuiltIn = Pushed | Displaced | Nodal | Prescribed | Posture | Resected | Touching | Retracted
-Cause = BuiltIn | OwnCause
+BuiltIn = Pushed | Displaced | Nodal | Prescribed | Posture | Resected | Touching | Retracted  # causes of this package
+Cause = BuiltIn | OwnCause  # all causes
 C = TypeVar("C", bound=Cause)
-# The array of each cause that grows with the load; the others say where it acts. Tools move on `Cases.share`.
+# Array of each cause that scales with the load; the others give its location. Tools move with `Cases.share`.
 MAGNITUDE = {
     Pushed: "force",
     Displaced: "displacement",
@@ -112,34 +112,34 @@ MAGNITUDE = {
     Prescribed: "displacement",
     Posture: "share",
 }
-# Arrays of one number a load case.
+# arrays with one number per load case
 SCALARS = ("footprint", "csf_level", "share", "done")
-# Radii of footprints [m]: a needle's point is blunter than the least, and the widest covers a brain.
-SMALLEST_FOOTPRINT, LARGEST_FOOTPRINT = 1e-4, 0.1
-# A shorter vector has squares that are no numbers any more.
+SMALLEST_FOOTPRINT = 1e-4  # minimum footprint radius [m], below a needle's tip
+LARGEST_FOOTPRINT = 0.1  # maximum footprint radius [m], covers a brain
+# Minimum length of a vector, so that its square does not underflow.
 SHORTEST = 1e-100
-# How far from a rotation the upper left of a pose may be.
+# Maximum deviation of a pose's 3 x 3 block from a rotation.
 RIGID = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """B load cases, each the sum of all causes. Without any, time alone goes on.
+    """B load cases, each the sum of all causes; without causes only the time changes.
 
-    `Pushed` may come several times, once for each tool that pushes; every other kind once.
+    `Pushed` may occur several times, once per pushing tool; every other type once.
 
     Parameters
     ----------
     causes
         `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`, `Resected`, `Touching`, `Retracted`, or an `OwnCause`.
     time
-        (B,) [s]; the time at which the answer is wanted. Zero where nothing depends on time.
+        Time (B,) [s] of the solution; zero if nothing depends on time.
 
     Raises
     ------
     InputError
-        Neither cause nor time, a kind but `Pushed` twice, what is no cause, rows that do not agree. What are no real,
-        finite numbers of the shapes that the causes name; radii of footprints outside 0.1 to 100 mm.
+        Neither cause nor time, a type other than `Pushed` twice, a value that is not a cause, unequal numbers of rows.
+        Arrays that are not real, finite and of the required shapes; footprint radii outside 0.1 to 100 mm.
     """
 
     causes: tuple[Cause, ...]
@@ -170,41 +170,41 @@ class Loads:
 
     @property
     def times(self) -> np.ndarray:
-        """(B,) [s]."""
+        """Time (B,) [s] of each load case."""
         assert self.time is not None
         return self.time
 
     def of(self, kind: type[C]) -> C | None:
-        """Return the cause of one kind, or None.
+        """Return the cause of a type, or None.
 
         Raises
         ------
         InputError
-            Several of that kind: who asks for one cannot answer them.
+            Several causes of that type.
         """
         found = self.every(kind)
         if len(found) > 1:
-            raise InputError(f"the loads have {len(found)} causes {kind.__name__}, but one is taken here: give one.")
+            raise InputError(f"the loads have {len(found)} causes {kind.__name__}, but one is supported: give one.")
         return found[0] if found else None
 
     def every(self, kind: type[C]) -> tuple[C, ...]:
-        """All causes of one kind."""
+        """Return all causes of a type."""
         return tuple(cause for cause in self.causes if isinstance(cause, kind))
 
     def without_kind(self, kind: type[Cause]) -> Loads:
-        """Return the same loads without the cause of one kind."""
+        """Return the loads without causes of a type."""
         return Loads(tuple(cause for cause in self.causes if not isinstance(cause, kind)), self.times)
 
     def only(self, kind: type[C]) -> C | None:
-        """Return the cause of one kind, or None where there is none, or another beside it."""
+        """Return the only cause if it is of a type, else None."""
         return self.of(kind) if len(self.causes) == 1 else None
 
     def rows(self, index: slice | np.ndarray) -> Loads:
-        """Return some of the load cases, as loads."""
+        """Return a subset of the load cases."""
         return Loads(tuple(select_rows(cause, index) for cause in self.causes), self.times[index])
 
     def scaled(self, fraction: float | np.ndarray) -> Loads:
-        """Return the same causes with every magnitude that they have times `fraction` (scalar or (B,))."""
+        """Return the loads with all magnitudes multiplied by `fraction`, a scalar or (B,)."""
 
         def grown(cause: Cause) -> Any:
             name = MAGNITUDE.get(type(cause)) if isinstance(cause, BuiltIn) else cause.magnitude
@@ -218,17 +218,17 @@ class Loads:
 
 
 def select_rows(cause: C, index: slice | np.ndarray) -> C:
-    """Return a cause of some of the load cases, by number, a slice, or (B,) bool."""
+    """Return a cause for a subset of the load cases, by number, slice, or mask (B,)."""
     return replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
 
 
 def stacked(parts: Sequence[Loads]) -> Loads:
-    """Return the load cases of several loads, one after the other.
+    """Concatenate the load cases of several loads.
 
     Raises
     ------
     InputError
-        No loads, or loads of different kinds of causes.
+        No loads, or loads with different types of causes.
     """
     kinds = {tuple(type(cause) for cause in part.causes) for part in parts}
     if len(kinds) != 1:
@@ -245,12 +245,12 @@ def stacked(parts: Sequence[Loads]) -> Loads:
 
 
 def check_loads(loads: object) -> None:
-    """Refuse what is no `Loads`.
+    """Reject a value that is not `Loads`.
 
     Raises
     ------
     InputError
-        Naming what is given.
+        With the value.
     """
     if not isinstance(loads, Loads):
         raise InputError(f"loads is {loads!r:.80}: give Loads, such as push(...) makes.")
@@ -269,7 +269,7 @@ def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) ->
 
 
 def posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads:
-    """Loads of the whole change of weight since the scan: direction (3,) or (B, 3), csf_level scalar or (B,) [m].
+    """Return loads for the full change of weight since the scan: direction (3,) or (B, 3), csf_level () or (B,) [m].
 
     Raises
     ------
@@ -281,19 +281,19 @@ def posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads:
 
 
 def check_field(name: str, field: np.ndarray, vertices: int) -> None:
-    """Refuse a whole field (B, V, 3) of another mesh.
+    """Reject a field (B, V, 3) of another mesh.
 
     Raises
     ------
     InputError
-        Naming the field, its vertices and the mesh's.
+        With the field, its number of vertices and that of the mesh.
     """
     if field.shape[1] != vertices:
         raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {vertices}.")
 
 
 def _repeated(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Arrays of a cause, each with its shape in one load case: what is given once is for all cases."""
+    """Return the arrays of a cause, each given with its shape per load case; single values apply to all cases."""
     arrays = {}
     for key, (values, shape) in given.items():
         array = as_array(f"{name}.{key}", values)
@@ -308,7 +308,7 @@ def _repeated(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, n
         stated = ", ".join(f"{key} {len(array)}" for key, array in arrays.items())
         raise InputError(f"{name} has rows of {stated}: give each one row, or one for each load case.")
     rows = counts.pop() if counts else 1
-    # To broadcast takes longer than all the rest of a push.
+    # Broadcasting takes longer than the remainder of `push`.
     return {
         key: array if len(array) == rows else np.broadcast_to(array, (rows, *array.shape[1:]))
         for key, array in arrays.items()
@@ -344,14 +344,14 @@ def _checked(cause: Cause) -> Cause:
                         f"{SMALLEST_FOOTPRINT:g} to {LARGEST_FOOTPRINT:g} (7 mm are 0.007)."
                     )
         if key == "done" and ((array < 0.0) | (array % 1.0 != 0.0)).any():
-            raise InputError(f"{name}.{key} is {array}: give how many steps are done, as whole numbers from 0 up.")
+            raise InputError(f"{name}.{key} is {array}: must be numbers of completed steps, integers >= 0.")
         if key == "direction" and not (np.abs(array).max(axis=1) >= SHORTEST).all():
-            raise InputError(f"{name}.{key} has a row of zeros: give every load case the way that gravity pulls.")
+            raise InputError(f"{name}.{key} has a row of zeros: give the direction of gravity for every load case.")
     return type(cause)(**arrays)
 
 
 def _check_poses(name: str, pose: np.ndarray, axes: int) -> None:
-    """Refuse what does not move bodies rigidly."""
+    """Reject poses that are not rigid transformations."""
     if pose.ndim != axes or pose.shape[-2:] != (4, 4):
         raise InputError(
             f"{name}.pose has shape {pose.shape}: give {'(B, tools, 4, 4)' if axes == 4 else '(B, 4, 4)'}."

@@ -1,4 +1,4 @@
-"""Tissue laws as descriptions, and the only conversion of (E, nu) to coefficients in the house."""
+"""Descriptions of tissue laws, and the conversion of (E, nu) to their coefficients."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ if TYPE_CHECKING:
     from .terms.laws.law import Law
 
 LAWS = ("linear", "corotational", "neo-hookean", "stable-neo-hookean")
-"""The laws that E and nu determine; `Ogden` has constants of its own."""
+"""Laws determined by E and nu; `Ogden` has other constants."""
 
 
 HYPERELASTIC = ("neo-hookean", "stable-neo-hookean", "ogden")
-"""The laws that a Prony series may relax: their energy knows shape from volume at finite strain."""
+"""Laws that support a Prony series: their energy separates shape from volume at finite strain."""
 Pairs = tuple[tuple[float, float], ...]
-"""A Prony series: pairs (g, tau [s]). Of a stress that is held in shape, sum g (1 - exp(-t / tau)) has gone after t."""
+"""Prony series of pairs (g, tau [s]): deviatoric stress relaxes by a fraction sum g (1 - exp(-t / tau)) in time t."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """A tissue law by name with its engineering constants.
+    """Tissue law by name, with engineering constants.
 
     Parameters
     ----------
     law
-        One of `LAWS`.
+        Name in `LAWS`.
     young
         Young's modulus at small strain [Pa].
     poisson
         Poisson's ratio at small strain, -1 < nu < 0.5.
     prony
-        How the resistance to a change of shape relaxes, if it does: E and nu are then instantaneous.
+        Prony series of the deviatoric stress, or (); E and nu are then instantaneous.
 
     Raises
     ------
     InputError
-        Unknown law, E <= 0, nu outside (-1, 0.5), a series that no tissue has or the law cannot have.
+        Unknown law, E <= 0, nu outside (-1, 0.5), a series that is not physical or not supported by the law.
     """
 
     law: str
@@ -67,7 +67,7 @@ class Material:
         check_prony(self.prony, self.law)
 
     def __str__(self) -> str:
-        """Return the tissue as it is named beside every answer."""
+        """Return the description for results."""
         return f"{self.law}, E {1e-3 * self.young:g} kPa, nu {self.poisson:g}{', relaxing' if self.prony else ''}"
 
     @property
@@ -78,16 +78,16 @@ class Material:
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """What the law's kernels take: Lamé's (mu, lambda) [Pa]."""
+        """Coefficients of the law's kernels: Lamé's (mu, lambda) [Pa]."""
         return self.lame
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
-        """Return the same with other Lamé constants (mu, lambda) [Pa]."""
+        """Return the coefficients for other Lamé parameters (mu, lambda) [Pa]."""
         return mu, lam
 
     @property
     def functions(self) -> Law:
-        """The law's Warp functions, imported with the first use."""
+        """Warp functions of the law, imported on first use."""
         return _built_in(self.law)
 
 
@@ -101,17 +101,17 @@ class Ogden:
     Parameters
     ----------
     terms
-        Pairs (c_i [Pa], m_i), as many as you like.
+        Pairs (c_i [Pa], m_i), in any number.
     bulk
         Bulk modulus K [Pa].
     prony
-        How the resistance to a change of shape relaxes, if it does: the terms are then instantaneous.
+        Prony series of the deviatoric stress, or (); the terms are then instantaneous.
 
     Raises
     ------
     InputError
-        No terms, numbers that are not finite, an exponent of zero, no stiffness in shear or in volume, a series that no
-        tissue has.
+        No terms, numbers that are not finite, a zero exponent, no stiffness in shear or volume, a series that is not
+        physical.
     """
 
     law = "ogden"
@@ -124,16 +124,16 @@ class Ogden:
             raise InputError("Ogden's law has no terms: give at least one pair (c, m).")
         for c, m in self.terms:
             if not (np.isfinite(c) and np.isfinite(m) and m != 0.0):
-                raise InputError(f"Ogden's term ({c}, {m}) is none: give a finite c [Pa] and a finite m that is not 0.")
+                raise InputError(f"Ogden's term ({c}, {m}) is invalid: give a finite c [Pa] and a finite, nonzero m.")
         total = sum(c for c, _ in self.terms)
         if total <= 0.0:
-            raise InputError(f"Ogden's c sum to {total} Pa, twice the shear modulus: let the sum be positive.")
+            raise InputError(f"Ogden's c sum to {total} Pa, twice the shear modulus: must be positive.")
         if not (np.isfinite(self.bulk) and self.bulk > 0.0):
             raise InputError(f"the bulk modulus is {self.bulk} Pa: give a positive number.")
         check_prony(self.prony, self.law)
 
     def __str__(self) -> str:
-        """Return the tissue as it is named beside every answer."""
+        """Return the description for results."""
         terms = "; ".join(f"{c:g},{m:g}" for c, m in self.terms)
         return f"{self.law} {terms} Pa, K {1e-3 * self.bulk:g} kPa{', relaxing' if self.prony else ''}"
 
@@ -145,17 +145,17 @@ class Ogden:
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """What the law's kernels take: (K, c_1, m_1, c_2, m_2, ...)."""
+        """Coefficients of the law's kernels: (K, c_1, m_1, c_2, m_2, ...)."""
         return self.coefficients_at(*self.lame)
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
-        """Return the same with other Lamé constants (mu, lambda) [Pa] at small strain."""
+        """Return the coefficients for other Lamé parameters (mu, lambda) [Pa] at small strain."""
         share = mu / self.lame[0]
         return (lam + 2.0 * mu / 3.0, *(number for c, m in self.terms for number in (share * c, m)))
 
     @property
     def functions(self) -> Law:
-        """The law's Warp functions, imported with the first use."""
+        """Warp functions of the law, imported on first use."""
         return _built_in(self.law)
 
 
@@ -164,19 +164,19 @@ def _built_in(law: str) -> Law:
 
 
 class Tissue(Protocol):
-    """What a region may be made of: `Material`, `Ogden`, or a law of your own as a frozen dataclass.
+    """Interface of tissues: `Material`, `Ogden`, or a user-defined law as a frozen dataclass.
 
-    `sim.check_tissue` holds one to what the solver asks of it.
+    `sim.check_tissue` tests the requirements of the solver.
     """
 
     @property
     def law(self) -> str:
-        """The law's name; tissues of one name have the same `functions`."""
+        """Name of the law; tissues with the same name have the same `functions`."""
         ...
 
     @property
     def functions(self) -> Law:
-        """The energy, the stress and its change, as Warp functions."""
+        """Warp functions for energy, stress and stress increment."""
         ...
 
     @property
@@ -186,29 +186,29 @@ class Tissue(Protocol):
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """What the functions take, as many of every tissue of the law."""
+        """Arguments of the functions, the same number for every tissue of the law."""
         ...
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
-        """Return the same with other Lamé constants (mu, lambda) [Pa] at small strain, mu = 0 among them.
+        """Return the coefficients for other Lamé parameters (mu, lambda) [Pa] at small strain, including mu = 0.
 
-        The energy is linear in the two: smoothed elements carry shape and volume apart.
+        The energy is linear in both: smoothed elements separate shape and volume.
         """
         ...
 
     @property
     def prony(self) -> Pairs:
-        """How the resistance to a change of shape relaxes; () if it does not."""
+        """Prony series of the deviatoric stress; () without relaxation."""
         ...
 
 
 def check_described(tissue: object) -> None:
-    """Refuse what does not say all that a `Tissue` says.
+    """Reject a value that lacks attributes of a `Tissue`.
 
     Raises
     ------
     InputError
-        Naming what is missing.
+        With the missing attributes.
     """
     asked = ("law", "functions", "lame", "coefficients", "coefficients_at", "prony")
     missing = [name for name in asked if getattr_static(tissue, name, None) is None]
@@ -220,12 +220,12 @@ def check_described(tissue: object) -> None:
 
 
 def build_functions(tissues: Iterable[Tissue]) -> Law:
-    """Return the Warp functions that tissues of one name share.
+    """Return the Warp functions of tissues with the same law name.
 
     Raises
     ------
     InputError
-        Two laws of one name.
+        Two laws with one name.
     """
     found = {tissue.functions: tissue.law for tissue in tissues}
     if len(found) > 1:
@@ -234,7 +234,7 @@ def build_functions(tissues: Iterable[Tissue]) -> Law:
 
 
 def check_prony(prony: Pairs, law: str) -> None:
-    """Refuse a Prony series that no tissue has, or that a law cannot have.
+    """Reject a Prony series that is not physical, or not supported by a law.
 
     Raises
     ------
@@ -243,22 +243,24 @@ def check_prony(prony: Pairs, law: str) -> None:
     """
     if prony and law not in HYPERELASTIC:
         raise InputError(
-            f"the law {law} cannot relax: its energy does not part shape from volume; "
+            f"the law {law} does not support relaxation, as its energy does not separate shape and volume: "
             f"choose one of {', '.join(HYPERELASTIC)}."
         )
     for g, tau in prony:
         if not (0.0 < g < 1.0 and 0.0 < tau < np.inf):
-            raise InputError(f"the Prony pair ({g}, {tau}) is none: give 0 < g < 1 and a positive tau [s].")
+            raise InputError(f"the Prony pair ({g}, {tau}) is invalid: give 0 < g < 1 and a positive tau [s].")
     total = sum(g for g, _ in prony)
     if total >= 1.0:
-        raise InputError(f"the Prony series' g sum to {total:g}: below 1, so that some stiffness is left in the end.")
+        raise InputError(
+            f"the Prony series' g sum to {total:g}: must be below 1, so that the long-term stiffness is positive."
+        )
 
 
 def to_tissue_json(tissue: Tissue) -> str:
-    """One line that `read_tissue_json` reads."""
+    """Return a line of JSON for `read_tissue_json`."""
     constants = asdict(tissue)  # pyright: ignore[reportArgumentType]
     if not tissue.prony:
-        constants.pop("prony", None)  # as it was written before there were any
+        constants.pop("prony", None)  # omitted for backward compatibility
     return json.dumps({"law": tissue.law, **constants})
 
 
@@ -268,7 +270,7 @@ def read_tissue_json(text: str) -> Tissue:
     Raises
     ------
     InputError
-        Text that it did not write, or constants that no tissue has.
+        Text in another format, or invalid constants.
     """
     try:
         constants = json.loads(text)
@@ -280,17 +282,17 @@ def read_tissue_json(text: str) -> Tissue:
     except InputError as error:
         raise InputError(f"{text[:200]!r} is no tissue: {error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"{text[:200]!r} is no tissue that this version knows: simulate anew.") from error
+        raise InputError(f"{text[:200]!r} is not a tissue supported by this version: simulate again.") from error
 
 
-# Where shape and volume are carried by different elements, those that carry shape keep a Poisson's ratio of 0.3.
+# Ratio lambda / mu of elements that carry shape only, a Poisson's ratio of 0.3.
 SOFT = 1.5
 
 
 def get_portion(tissue: Tissue, carries: str) -> tuple[float, float]:
-    """Lamé's (mu, lambda) [Pa] of the "whole" tissue, of its resistance to a change of "shape", or of "volume".
+    """Return Lamé's (mu, lambda) [Pa] of the "whole" tissue, or of its "shape" or "volume" portion.
 
-    The last two sum to the first; in every law lambda weighs the square of one measure of volume.
+    The two portions add up to the whole; in every law lambda multiplies the square of a volume measure.
     """
     mu, lam = tissue.lame
     soft = min(lam, SOFT * mu)
@@ -298,32 +300,32 @@ def get_portion(tissue: Tissue, carries: str) -> tuple[float, float]:
 
 
 def collect_coefficients(tissues: Sequence[Tissue], carries: str = "whole") -> np.ndarray:
-    """Coefficients (n, k) of one portion (`get_portion`) of n tissues of one law.
+    """Return the coefficients (n, k) of one portion (see `get_portion`) of n tissues with one law.
 
-    Shorter Ogden sums are filled up with terms (0, 1), which add 0.
+    Shorter Ogden sums are padded with terms (0, 1), which are zero.
 
     Raises
     ------
     InputError
-        Tissues of another law that have different numbers of them.
+        Tissues of another law with different numbers of coefficients.
     """
     rows = [tuple(tissue.coefficients_at(*get_portion(tissue, carries))) for tissue in tissues]
     lengths = sorted({len(row) for row in rows})
     if len(lengths) > 1 and tissues[0].law != Ogden.law:
         raise InputError(
-            f"regions of the law {tissues[0].law} have {lengths[0]} and {lengths[-1]} coefficients: give all as many."
+            f"regions of the law {tissues[0].law} have {lengths[0]} and {lengths[-1]} coefficients: must be equal."
         )
     longest = lengths[-1]
     return np.array([row + (0.0, 1.0) * ((longest - len(row)) // 2) for row in rows])
 
 
 BRAIN = Material("neo-hookean", 3000.0, 0.49)
-"""The recommended tissue, of every scene and command; the recommended element is `elements.RECOMMENDED`."""
+"""Recommended tissue, the default of every scene and command; the recommended element is `elements.RECOMMENDED`."""
 
 
 @dataclass(frozen=True)
 class MaterialSet:
-    """A tissue, the time scale on which it behaves so, and where its constants come from."""
+    """Tissue, the time scale for which it is valid, and the source of its constants."""
 
     tissue: Material | Ogden
     time_scale: str
@@ -352,22 +354,22 @@ MATERIALS = {
         "minutes to hours: the limit in which fluid has left the tissue; how fast it leaves is not modelled",
         "E 2.1 kPa, nu 0.45 in brain that consolidates: Miga, Paulsen et al. 1999, IEEE Trans. Med. Imaging 18:866-874",
     ),
-    # mu is read as the shear modulus, 2 mu / alpha^2 before the bracket, as in the measurements that the paper compares
-    # itself with; if it were FEBio's c_1, the tissue would be half as stiff.
+    # mu is the shear modulus, with 2 mu / alpha^2 before the bracket, as in the measurements with which the paper
+    # compares; if it were FEBio's c_1, the tissue would be half as stiff.
     "minutes": MaterialSet(
         Ogden(((1340.0, -19.0),), 148e3),
         "minutes",
         "mu 670 Pa, alpha -19, K 148 kPa from brain shift between prone and supine in vivo, PMC9748497",
     ),
-    # Incompressible in the paper; the bulk modulus is that of a Poisson's ratio of 0.49 at once.
+    # Incompressible in the paper; the bulk modulus is that of an instantaneous Poisson's ratio of 0.49.
     "viscoelastic": MaterialSet(
         Ogden(((2.0 * 842.0, -4.7),), 842.0 * 2.98 / 0.06, ((0.45, 0.5), (0.365, 50.0))),
         "half a second to minutes, as loads say how much time goes by; else at once",
         "mu 842 Pa, alpha -4.7, g 0.45 and 0.365, tau 0.5 and 50 s: Miller, Chinzei 2002, J. Biomech. 35:483-490",
     ),
 }
-"""Tissues by the names that commands take, each with the time scale on which it behaves so and its source.
+"""Tissues by the names used in commands, each with the time scale for which it is valid and its source.
 
-Brain has no single stiffness: choose by how long a load lasts. `default` is what scenes and the shipped models have;
-`viscoelastic` depends on the time that its loads tell; `seed` is that of the published protocol.
+Brain has no single stiffness: choose by the duration of a load. `default` is used in scenes and the shipped models;
+`viscoelastic` depends on the time of its loads; `seed` is that of the published protocol.
 """

@@ -1,4 +1,4 @@
-"""Finite elements of a body from which tissue is taken: one solver for each state that it passes through."""
+"""FEM solver for a body under resection: one solver per resection step."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from .fem import MIDDLES, Fem
 from .loads import Loads, Resected, check_loads
 from .runtime.exclusive import lock_method
 
-# The memory's key for how many steps (B,) were done.
+# Key in the memory: number of completed steps (B,).
 DONE = "resection"
-# Shape of a tool's pose.
+# shape of a tool pose
 POSE = (4, 4)
 
 
 class OperatedFem:
-    """A Deformer: each load case is answered by the finite elements of what is left of the body.
+    """FEM deformation model that solves each load case on the body that remains after its resection steps.
 
-    Vertices of which nothing is left stay where they were in the scan. Memories are those of the whole body, whose
-    elements and nodes that are gone remember nothing. Threads may share it, and take turns, as in `Fem`.
+    Vertices without remaining tissue keep their undeformed position. Memories have the rows of the whole body; removed
+    elements and nodes have zero memory. Instances are thread-safe, as `Fem`.
 
     Parameters
     ----------
     bodies
-        After 0, 1, ... all steps.
+        Bodies after 0, 1, ... all steps.
     make
-        Makes the solver of one of them.
+        Function that builds the solver of an anatomy.
     ahead
-        All are made at once, and kept: no load waits for one. Else each when it is first asked for.
+        Build all solvers at once and keep them, so that no load waits; else each on first use.
     kept
-        Of the latter, how many stay in memory.
+        Number of the latter that stay in memory.
     """
 
     def __init__(
@@ -57,21 +57,21 @@ class OperatedFem:
 
     @property
     def anatomy(self) -> Anatomy:
-        """The whole body."""
+        """Anatomy of the whole body."""
         return self._bodies[0].anatomy
 
     def remains(self, done: int) -> RemainingBody:
-        """What is left after so many steps."""
+        """Return the body that remains after `done` steps."""
         return self._bodies[done]
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """As `Fem.deform`; `start` may be an answer after other steps, and what is left goes on from it.
+        """Compute as `Fem.deform`; `start` may be a solution after another number of steps.
 
         Raises
         ------
         InputError
-            As `Fem.deform`; more steps done than there are.
+            As `Fem.deform`; more steps than there are.
         """
         check_loads(loads)
         if start is not None:
@@ -95,16 +95,16 @@ class OperatedFem:
         return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
 
     def _begun(self, start: Deformation, stage: int, stays: bool) -> Deformation:
-        """Return an answer as one of the body at a stage, which `stays` what it was or was another."""
+        """Return a solution of the whole body as one of a stage; `stays` if it had the same number of steps."""
         memory = dict(start.memory) if stays else self._lasting(start.memory, stage)
         memory.pop(DONE, None)
         for name, place in self._places(memory, stage).items():
-            if memory[name].shape[1:] == self._shape(name):  # another body's is refused by who reads it
+            if memory[name].shape[1:] == self._shape(name):  # a mismatch is rejected where the memory is read
                 memory[name] = memory[name][place]
         return replace(start, displacement=self._masked(start, stage), memory=memory, warm=start.warm if stays else {})
 
     def _ended(self, answer: Deformation, stage: int) -> Deformation:
-        """Return the answer of the body at a stage as one of the whole body, marked with the steps that it is of."""
+        """Return a solution of a stage as one of the whole body, marked with its number of steps."""
         memory = {**answer.memory, DONE: np.full(len(answer), float(stage))}
         for name, place in self._places(memory, stage).items():
             own = memory[name]
@@ -113,12 +113,12 @@ class OperatedFem:
         return replace(answer, displacement=self._masked(answer, stage), memory=memory)
 
     def _masked(self, answer: Deformation, stage: int) -> np.ndarray:
-        """Displacements of an answer with orphaned vertices at rest."""
+        """Return the displacements of a solution, with zero at orphaned vertices."""
         orphaned = self._bodies[stage].anatomy.orphaned[answer.nodes]
         return np.where(orphaned[:, None], 0.0, answer.displacement)
 
     def _together(self, parts: list[Deformation], stages: list[int]) -> Deformation:
-        """Answers of the bodies at some stages; where one has no such elements at all, they remember nothing."""
+        """Join solutions of several stages; memories that a stage lacks are zero."""
         memories = [self._lasting(part.memory, stage) for part, stage in zip(parts, stages, strict=True)]
         shapes = {name: value.shape[1:] for memory in memories for name, value in memory.items()}
         whole = [
@@ -130,34 +130,34 @@ class OperatedFem:
         )
 
     def _lasting(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
-        """What means the same in another body: memories of elements and nodes, poses of tools, steps done."""
+        """Return the memories that are valid for another body: of elements and nodes, tool poses, steps done."""
         rows = self._rows(stage)
         return {
             name: value for name, value in memory.items() if name in rows or name == DONE or value.shape[2:] == POSE
         }
 
     def _places(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, tuple[slice, np.ndarray, slice]]:
-        """Of memories of elements and nodes, by name: where in the whole body's those of a stage's are.
+        """Return the index of a stage's rows in the whole body's memories of elements and nodes, by name.
 
-        A row is shorter where what is gone relaxed in a longer series.
+        Rows are shorter if the removed tissue had a longer Prony series.
         """
         rows = self._rows(stage) if stage else {}
         return {name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in memory if name in rows}
 
     def _shape(self, name: str) -> tuple[int, int]:
-        """Of a memory of the whole body's elements or nodes: how many they are, and numbers of each."""
+        """Return rows and row length of a memory of the whole body's elements or nodes."""
         marks, width = self._rows(0)[name]
         return len(marks), width
 
 
 def _rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
-    """Of each memory whose rows are elements or nodes: what tells them (n, k) from all others, and their length."""
+    """Return unique keys (n, k) and row length of each memory of elements or nodes, by name."""
     terms = [term for term in fem.problem.terms if isinstance(term, Remembering)]
     return {MIDDLES: (fem.space.edges, 3)} | {term.name: (term.marks, term.width) for term in terms}
 
 
 def _found(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Where (n,) each of some rows (n, k) is in the whole (m, k)."""
+    """Return the index (n,) of some rows (n, k) in the whole (m, k)."""
     _, number = np.unique(np.concatenate([whole, some]), axis=0, return_inverse=True)
     known, asked = np.split(number.ravel(), [len(whole)])
     order = np.argsort(known)
@@ -173,7 +173,7 @@ def finite_elements(
     element: str | None = None,
     live: bool = False,
 ) -> Fem | OperatedFem:
-    """Return the finite elements that effects ask for, `Resection` among them; else as `Fem`.
+    """Return the FEM solver for effects, which may include `Resection`; arguments as `Fem`.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def finite_elements(
     cuts = [effect for effect in effects if isinstance(effect, Resection)]
     if len(cuts) != 1:
         return Fem(anatomy, effects, accuracy, device, batch, element, live)
-    # Vertices of which nothing is left are held, whoever asks for it.
+    # vertices without remaining tissue are fixed, even if the user has no `Held`
     others = [effect for effect in effects if not isinstance(effect, Resection | Held)]
 
     def make(body: Anatomy) -> Fem:
@@ -194,7 +194,7 @@ def finite_elements(
 
 
 def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
-    """Effects without what they say of regions that are gone altogether."""
+    """Return the effects without references to regions that are completely removed."""
     present = set(body.mesh.region.tolist())
     gone = set(whole.mesh.region.tolist()) - present
 

@@ -1,4 +1,4 @@
-"""What a skull may do to the brain under it: descriptions only."""
+"""Contact models of brain and skull, as descriptions."""
 
 import math
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ from .errors import InputError
 
 @dataclass(frozen=True)
 class Bonded:
-    """The meninges bind the brain to the skull: nodes with a normal in `Anatomy.slide_normal` do not move.
+    """Brain bonded to the skull by the meninges: nodes with a normal in `Anatomy.slide_normal` do not move.
 
-    The limit of an elastic layer. In the default brain one with 0.1 kPa of shear per mm moves the tumour 2 % more. What
-    was measured is stiffer (11 MPa per mm under compression: Mazumder et al. 2013, Acta Bioeng. Biomech. 15(2):3-11).
-    It holds as long as the traction stays below the bond's strength: `Deformation.bond` tells how near it comes.
-    `Slide` and `SkullContact`, without friction, are its brackets.
+    Stiff limit of an elastic layer. In the default brain, a layer of 0.1 kPa shear per mm moves the tumour 2 % more.
+    The measured one is stiffer (11 MPa per mm in compression: Mazumder et al. 2013, Acta Bioeng. Biomech. 15(2):3-11).
+    Valid while the traction is below the bond's strength; `Deformation.bond` gives the largest ratio.
+    `Slide` and `SkullContact` are the frictionless limits.
 
     Parameters
     ----------
     tension, shear
-        Strengths [Pa]; of sheep, the least of 2.8 to 3.4 and of 1.8 to 2.1 kPa (Arzemanzadeh, Miller, Rosenow, Vos,
-        Wittek 2025, arXiv 2512.08425).
+        Tensile and shear strength [Pa]; of sheep, the minima of 2.8 to 3.4 and of 1.8 to 2.1 kPa (Arzemanzadeh, Miller,
+        Rosenow, Vos, Wittek 2025, arXiv 2512.08425).
 
     Raises
     ------
@@ -38,28 +38,28 @@ class Bonded:
 
 @dataclass(frozen=True)
 class Slide:
-    """Nodes with a normal in `Anatomy.slide_normal` do not move along it; tangentially they are free.
+    """Frictionless sliding: nodes with a normal in `Anatomy.slide_normal` move only perpendicular to it.
 
-    A wall that neither lets go nor resists shear. Every undulation of the wall holds the tissue that slides in it, so
-    that the motion of a deep tumour depends on how smooth the surface is.
+    The wall does not separate and has no shear resistance. Undulations of the wall obstruct sliding tissue, so
+    the motion of a deep tumour depends on the smoothness of the surface.
     """
 
 
 @dataclass(frozen=True)
 class SkullContact:
-    """The skull holds the brain on its side without friction, and lets go of it: where `Slide` would keep it on.
+    """Frictionless unilateral contact with the skull: unlike in `Slide`, the brain can separate.
 
-    Nodes with a normal in `Anatomy.slide_normal` stay on their side of a wall across it, `gap` [m] above where they are
-    at rest. The wall bends as the normals round them do; they feel it in the last tenth of a millimetre. Nodes of the
-    craniotomy rise in it freely, but meet bone beyond its edge, which is as round as the mesh is coarse there. The body
-    needs what `Held` holds: bone alone only bars its way.
+    Nodes with a normal in `Anatomy.slide_normal` stay on their side of a wall perpendicular to it, at an undeformed
+    distance of `gap` [m]. The wall is curved as the normals around them; contact starts in the last 0.1 mm. Nodes in
+    the craniotomy can rise through it, but touch bone beyond its edge, whose radius is set by the mesh size. The body
+    needs fixed nodes of `Held`, since bone only limits its motion.
 
-    What the gap holds may pass the closed skull, and `Deformation.leaked` counts it: 0.1 mm round a brain are 6 ml.
+    The volume of the gap may pass the closed skull, see `Deformation.leaked`: 0.1 mm around a brain are 6 ml.
 
     Parameters
     ----------
     gap
-        [m] between brain and bone at rest.
+        Undeformed distance between brain and bone [m].
 
     Raises
     ------
@@ -74,6 +74,6 @@ class SkullContact:
 
 
 def check_gap(effect: str, gap: float) -> None:
-    """Refuse a gap [m] between bodies that is not positive."""
+    """Reject a gap [m] that is not positive."""
     if not 0.0 < gap < math.inf:
         raise InputError(f"{effect}.gap is {gap} m: give a positive number.")

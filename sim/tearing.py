@@ -1,4 +1,4 @@
-"""A bond that tears: what passes its strength lets go of the skull, slides on it or leaves it, and never passes it."""
+"""Debonding of brain from skull: overloaded bonds fail, and the tissue then slides on the skull or separates."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from .loads import Loads
 
 @dataclass(frozen=True)
 class Tearing:
-    """By which patches a bond tears, and when it has come to rest.
+    """Patch size and convergence of debonding.
 
     Parameters
     ----------
     rounds
-        Solves after which a tear is given up that has not come to rest.
+        Maximum number of solves.
     through
-        [m] How far what let go may pass the skull.
+        Tolerance of penetration into the skull by debonded vertices [m].
     pull
-        How strongly a vertex may be pulled that slides, as a share of what the hardest pressed one bears.
+        Tolerance of tension on a sliding vertex, as a fraction of the largest compression.
     around
-        [m] Tractions are means over so far: a tear grows by patches of that size whatever the mesh.
+        Averaging radius of tractions [m]: bonds fail in patches of that size on any mesh.
     """
 
     rounds: int = 60
@@ -42,23 +42,23 @@ class Tearing:
 
 
 TEARING = Tearing()
-"""Tears as they are followed unless others are asked for."""
+"""Default debonding options."""
 
 
 @dataclass(frozen=True, eq=False)
 class Torn:
-    """One load's answer when nothing of the bond bears more than its strength.
+    """Solution of one load with no bond above its strength.
 
     Parameters
     ----------
     answer
-        The equilibrium; its `bond` is the largest share that what still holds bears.
+        Equilibrium; its `bond` is the largest traction ratio of intact bonds.
     sliding, free
-        (n,) mesh vertices that let go: pressed on the skull and sliding without friction, or off it.
+        Debonded mesh vertices (n,): pressed on the skull and sliding without friction, or separated from it.
     rounds
-        Solves that it took.
+        Number of solves.
     rested
-        Whether nothing changes any more.
+        True if the active set has converged.
     """
 
     answer: Deformation
@@ -77,25 +77,25 @@ def torn(
     element: str | None = None,
     tearing: Tearing = TEARING,
 ) -> Torn:
-    """Solve one load; let go what bears too much, as well as what slides and is pulled; hold what would pass the skull.
+    """Solve one load with debonding: an active set iteration over bonded, sliding and separated vertices.
 
-    Brittle: no energy is left in what is torn, and it does not heal. What let go
-    meets the plane across its normal at rest, without a gap: these constraints are an active set. With a strength near
-    zero the skull only presses.
+    Bonds above their strength fail, sliding vertices under tension separate, and vertices that would penetrate slide.
+    Failure is brittle and irreversible. Contact is with the tangent plane of the undeformed position,
+    without a gap. With a strength near zero the skull only presses.
 
     Parameters
     ----------
     effects
-        With `Bonded`, whose strengths count.
+        Effects with `Bonded`, whose strengths apply.
     loads
-        One load.
+        Loads with one load case.
     tearing
-        Size of the patches that tear, and when a tear has come to rest.
+        Patch size and convergence criteria.
 
     Returns
     -------
     Torn
-        The answer after the tear, which vertices let go, and whether nothing changes any more.
+        Solution after debonding, debonded vertices, and convergence.
 
     Examples
     --------
@@ -105,13 +105,13 @@ def torn(
     Raises
     ------
     InputError
-        More loads than one, no `Bonded`, a body that tears off wholly, and as `Fem.deform`.
+        More than one load, no `Bonded`, a body that separates completely, and as `Fem.deform`.
     """
     if len(loads) != 1:
-        raise InputError(f"{len(loads)} loads tear apart from each other: give one at a time.")
+        raise InputError(f"{len(loads)} loads debond separately: give one at a time.")
     skull = next((effect for effect in effects if isinstance(effect, Bonded)), None)
     if skull is None:
-        raise InputError("nothing is bonded here: add Bonded, whose strengths count.")
+        raise InputError("there is no bond: add Bonded with its strengths.")
     others = tuple(effect for effect in effects if effect is not skull)
     covered = (anatomy.slide_normal != 0.0).any(axis=1)
     bonded, sliding = covered, np.zeros_like(covered)
@@ -139,7 +139,7 @@ def torn(
 
 
 def _reaction(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
-    """What holds the body (3N, 1) [N]."""
+    """Return the gradient of the energy, the reaction forces (3N, 1) [N]."""
     problem = fem.problem
     problem.begin(Cases(loads, answer.time, answer.memory))
     return problem.gradient(problem.device.array(fem.guess(loads, answer)))
@@ -148,9 +148,9 @@ def _reaction(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
 def _shares(
     skull: Bonded, anatomy: Anatomy, fem: Fem, bonded: np.ndarray, force: wp.array, around: float
 ) -> np.ndarray:
-    """Round each mesh vertex that is bonded, of what the bond bears, as a share of its strength: (V,).
+    """Return the traction ratio (V,) of each bonded vertex: mean traction around it / strength.
 
-    Means over what holds alone: what has let go bears nothing.
+    Means include intact bonds only.
     """
     body = replace(anatomy, slide_normal=np.where(bonded[:, None], anatomy.slide_normal, 0.0))
     bond = Bond(skull, body, fem.space, fem.problem.device, around)
@@ -161,7 +161,7 @@ def _shares(
 
 
 def _at_vertices(fem: Fem, force: wp.array) -> np.ndarray:
-    """Nodal forces (V, 3) [N], those at the middle of an edge shared by its ends."""
+    """Return nodal forces (V, 3) [N], those of mid-edge nodes divided between the ends."""
     whole = force.numpy().reshape(-1, 3).astype(np.float64)
     count = len(fem.anatomy.mesh.nodes)
     out = whole[:count].copy()

@@ -1,8 +1,8 @@
-"""Rigid tools that touch tissue: each is all that lies within a radius of a point, a line, a rectangle or a box.
+"""Rigid tools: each is the set of points within a radius of a point, a line, a rectangle or a box (its core).
 
-A tool of your own is the union of several such.
+User-defined tools are unions of several such sets.
 
-In a tool's own frame its lowest point is the origin and its shaft goes along +z.
+In tool coordinates the lowest point is the origin and the shaft points along +z.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from .errors import InputError
 
-# Sine of the angle at which an edge counts as square to a direction.
+# Sine of the angle below which an edge counts as perpendicular to a direction.
 SQUARE = 1e-6
 
 
@@ -30,7 +30,7 @@ def _check(tool: object) -> None:
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball of `radius` [m], its centre that far up the shaft.
+    """Ball of `radius` [m], with its centre at this height on the shaft.
 
     Raises
     ------
@@ -46,7 +46,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class Capsule:
-    """A round rod along the shaft with round ends: `radius` [m] about a line of `length` [m].
+    """Round rod with hemispherical ends along the shaft: `radius` [m] about a line of `length` [m].
 
     Raises
     ------
@@ -63,9 +63,9 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Spatula:
-    """A flat blade across the shaft, `width` [m] along x and `length` [m] along y, twice its `edge` radius [m] thick.
+    """Flat blade perpendicular to the shaft, `width` [m] along x, `length` [m] along y, thickness 2 `edge` [m].
 
-    The sizes include the round edge.
+    The sizes include the rounded edge.
 
     Raises
     ------
@@ -82,16 +82,16 @@ class Spatula:
         if 2.0 * self.edge > min(self.width, self.length):
             raise InputError(
                 f"a Spatula of {1e3 * self.width:g} x {1e3 * self.length:g} mm has no room for round edges of "
-                f"{1e3 * self.edge:g} mm: make it wider, or them smaller."
+                f"{1e3 * self.edge:g} mm: increase its size, or reduce the radius."
             )
 
 
-BuiltIn = Ball | Capsule | Spatula
+BuiltIn = Ball | Capsule | Spatula  # tools of this package
 
 
 @dataclass(frozen=True, eq=False)
 class Core:
-    """What a tool lies within `radius` [m] of: a box in its frame, centre (3,) and half sizes (3,) [m], some 0."""
+    """Core of a tool, the set of points within `radius` [m] of a box: centre (3,), half sizes (3,) [m], possibly 0."""
 
     centre: np.ndarray
     half: np.ndarray
@@ -99,36 +99,36 @@ class Core:
 
     @property
     def corners(self) -> np.ndarray:
-        """Of the box (n, 3) [m], each once."""
+        """Distinct corners (n, 3) [m] of the box."""
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
         return np.unique(self.centre + signs * self.half, axis=0)
 
     @property
     def extent(self) -> float:
-        """How far the tool's farthest point is from its origin [m], at most."""
+        """Upper bound of the distance from the tool's origin to its farthest point [m]."""
         return float(np.linalg.norm(np.abs(self.centre) + self.half)) + self.radius
 
 
 @runtime_checkable
 class OwnTool(Protocol):
-    """A shape of your own, as a frozen dataclass: the union of several cores, one rigid body."""
+    """Interface of user-defined tools, frozen dataclasses: one rigid body as the union of several cores."""
 
     @property
     def cores(self) -> tuple[Core, ...]:
-        """What it is made of. Its lowest point is the origin, its shaft goes along +z; cores may overlap."""
+        """Cores, which may overlap. The lowest point is the origin, the shaft points along +z."""
         ...
 
 
-Tool = BuiltIn | OwnTool
+Tool = BuiltIn | OwnTool  # all tools
 
 
 def parse_tool(text: str) -> BuiltIn:
-    """Return the tool whose `repr` is this text, of a file from outside: nothing of it is carried out.
+    """Return the tool whose `repr` is this text; it may come from an untrusted file, since it is not evaluated.
 
     Raises
     ------
     InputError
-        A text that is no tool of `BuiltIn`, or one of impossible sizes.
+        A text that is not a tool of `BuiltIn`, or one with invalid sizes.
     """
     kinds = {kind.__name__: kind for kind in BuiltIn.__args__}
     with suppress(SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
@@ -139,7 +139,7 @@ def parse_tool(text: str) -> BuiltIn:
 
 
 def read_tool_statement(text: str | None, ball: object) -> BuiltIn | None:
-    """The tool that a file states by its `repr`, or one of an earlier version by a `ball`'s radius [m]; None: neither.
+    """Return the tool that a file gives by its `repr`, or older files by the radius [m] of a `ball`; None without both.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def read_tool_statement(text: str | None, ball: object) -> BuiltIn | None:
 
 
 def name_tool(tool: Tool) -> str:
-    """What a person calls a tool, with its sizes in millimetres; one of your own by its `repr`."""
+    """Return the name of a tool with its sizes in millimetres; for a user-defined tool its `repr`."""
     match tool:
         case Ball(radius):
             return f"a ball of {1e3 * radius:g} mm"
@@ -165,12 +165,12 @@ def name_tool(tool: Tool) -> str:
 
 
 def check_tool(effect: str, tool: object) -> None:
-    """Refuse what tissue cannot touch.
+    """Reject a value that is not a valid tool.
 
     Raises
     ------
     InputError
-        What is no tool, or one of no cores, or of cores that are not finite or have no radius.
+        Another type, no cores, or cores that are not finite or have no radius.
     """
     if not isinstance(tool, Tool):
         allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
@@ -180,16 +180,16 @@ def check_tool(effect: str, tool: object) -> None:
         if not (np.isfinite([*core.centre, *core.half, core.radius]).all() and core.radius > 0.0):
             raise InputError(f"{tool!r} has a core that is not finite or has no radius: give a positive one in metres.")
     if not cores:
-        raise InputError(f"{tool!r} has no cores: give at least one, of which tissue touches the surface.")
+        raise InputError(f"{tool!r} has no cores: give at least one.")
 
 
 def list_cores(tool: Tool) -> tuple[Core, ...]:
-    """What a tool is made of: all that lies within any of these."""
+    """Return the cores of a tool."""
     return (get_core(tool),) if isinstance(tool, BuiltIn) else tuple(tool.cores)
 
 
 def get_core(tool: BuiltIn) -> Core:
-    """What a tool of one core is made of."""
+    """Return the core of a built-in tool."""
     match tool:
         case Ball(radius):
             return Core(np.array([0.0, 0.0, radius]), np.zeros(3), radius)
@@ -200,14 +200,14 @@ def get_core(tool: BuiltIn) -> Core:
 
 
 def compute_extent(tool: Tool) -> float:
-    """How far the tool's farthest point is from its origin [m], at most."""
+    """Return an upper bound of the distance from the tool's origin to its farthest point [m]."""
     return max(core.extent for core in list_cores(tool))
 
 
 def find_foremost_points(tool: BuiltIn, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """The points (B, 3) [m] of a tool at T_world_tool `pose` (B, 4, 4) that are farthest in a unit `direction` (3,).
+    """Return points (B, 3) [m] of a tool at T_world_tool `pose` (B, 4, 4) that are farthest in a unit `direction` (3,).
 
-    Of an edge or a face that stands square to it the middle.
+    If an edge or a face is perpendicular to the direction, it is its centre.
     """
     core, local = get_core(tool), np.einsum("bji,j->bi", pose[:, :3, :3], direction)
     corner = core.centre + np.where(np.abs(local) < SQUARE, 0.0, np.sign(local)) * core.half
@@ -215,7 +215,7 @@ def find_foremost_points(tool: BuiltIn, pose: np.ndarray, direction: np.ndarray)
 
 
 def compute_distances(tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Signed distances (n,) [m] of points (n, 3) [m] from a tool at T_world_tool `pose` (4, 4); negative inside."""
+    """Return signed distances (n,) [m] of points (n, 3) [m] from a tool at T_world_tool `pose` (4, 4): < 0 inside."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     return np.min([_distances(core, local - core.centre) for core in list_cores(tool)], axis=0)
 

@@ -217,7 +217,7 @@ def test_no_force_is_answered_and_too_much_is_said(model, loads):
 def test_what_it_does_not_know_is_refused(model, box, loads, truth):
     with pytest.raises(InputError, match=r"causes Displaced"):
         model.deform(Loads((Displaced(np.zeros((1, 3)), np.full((1, 3), 1e-3), np.array([6e-3])),)))
-    with pytest.raises(InputError, match=r"does not know vertex"):
+    with pytest.raises(InputError, match=r"lacks vertex"):
         model.deform(loads, at=np.array([box.tumour_nodes[1]]))
     with pytest.raises(InputError, match=r"no published learner is called 'forest'"):
         published_model("forest", box, loads, truth)

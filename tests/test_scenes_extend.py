@@ -57,7 +57,7 @@ def test_the_code_of_each_section_runs_by_itself(folder):
     done = subprocess.run([sys.executable, "page.py"], cwd=folder, capture_output=True, text=True, env=paths)
     assert done.returncode == 0, done.stderr
     *_, law, veins, first, second = done.stdout.splitlines()
-    assert "Hooke's law at small strain: off by" in done.stdout and "single precision" in law
+    assert "Hooke's law at small strain: relative error" in done.stdout and "single precision" in law
     free, held = map(float, veins.split())
     assert 5e-4 < held < 0.9 * free
     forces = [[float(figure) for figure in row.strip("[] ").split()] for row in (first, second)]

@@ -92,7 +92,7 @@ class TestOpenings:
             ("--opening-at", curve(), "Curve", "holds an open curve; --opening-at takes one point or"),
             ("--opening-at", [[0.0, 0.0, 55.0]], "Plane", "holds a plane; --opening-at takes"),
             ("--opening-over", curve(), "ClosedCurve", "--opening-over takes one point or a line of two points"),
-            ("--opening-at", curve()[:2], "ClosedCurve", "needs three points or more"),
+            ("--opening-at", curve()[:2], "ClosedCurve", "needs at least three distinct points"),
             ("--opening-at", curve() + [0.0, 0.0, 30.0], "ClosedCurve", "opening's outline lies up to 2"),
         ):
             assert reason in self.found(folder, capsys, option, points, kind)

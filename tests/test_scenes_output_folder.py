@@ -133,7 +133,7 @@ REFUSED = {
     "series.nii.gz": (lambda path: save(path, np.ones((40, 40, 32, 3), np.uint8)), "not one volume"),
     "slice.nii.gz": (lambda path: save(path, np.ones((40, 40), np.uint8)), "not one volume"),
     "nowhere.nii": (nan_place, "singular"),
-    "scan.png": (lambda path: path.write_bytes(b"no image"), "is not called .nii"),
+    "scan.png": (lambda path: path.write_bytes(b"no image"), "unsupported file type; expected .nii"),
     "none.nii.gz": (lambda path: None, "no such file"),
 }
 

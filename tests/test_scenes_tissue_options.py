@@ -65,7 +65,7 @@ def test_what_is_asked_for(words: tuple[str, ...], expected: Tissue) -> None:
         (("--material", "ogden", "--ogden", "1340,-19;", "--bulk", "1e4"), "write pairs C,M"),
         (("--material", "ogden", "--ogden", "1340,-19,3", "--bulk", "1e4"), "write pairs C,M"),
         (("--material", "ogden", "--ogden", "soft,-19", "--bulk", "1e4"), "write pairs C,M"),
-        (("--material", "ogden", "--ogden", "1340,0", "--bulk", "1e4"), "finite m that is not 0"),
+        (("--material", "ogden", "--ogden", "1340,0", "--bulk", "1e4"), "finite, nonzero m"),
         (("--material", "ogden", "--ogden", "nan,2", "--bulk", "1e4"), "finite c"),
         (("--material", "ogden", "--ogden", "1340,2", "--bulk", "-1"), "bulk modulus is -1.0 Pa"),
         (("--poisson", "0.5"), "Poisson's ratio is 0.5"),

@@ -213,7 +213,7 @@ def skewed() -> np.ndarray:
         (lambda: solver(Hard((), (BALL, BALL))).deform(touching(DOWN)), "poses of 1 tools, but ToolContact has 2"),
         (
             lambda: Fem(BLOCK, [Elasticity(SOFT), Held()], TRAIN, "cpu", element="p1").deform(touching(DOWN)),
-            "loads hold Touching, which nothing answers: add the effect ToolContact",
+            "loads hold Touching, which no effect uses: add the effect ToolContact",
         ),
         (
             lambda: Fem(
@@ -223,7 +223,7 @@ def skewed() -> np.ndarray:
                 "cpu",
                 element="p1",
             ),
-            "finds no surface to touch: all of it is held or slides",
+            "finds no surface to touch: all of it is fixed or under the skull",
         ),
         (lambda: ToolContact(()), "ToolContact has no tool"),
         (lambda: ToolContact((7e-3,)), r"ToolContact has 0\.007 for a tool: choose from Ball, Capsule, Spatula"),  # type: ignore

@@ -67,7 +67,7 @@ def test_it_is_of_the_whole_answer_to_its_loads() -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu", element="p1")
     loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
     answer, none = fem.deform(loads), np.zeros(0, int)
-    with pytest.raises(InputError, match="1 load cases at 2 vertices, the loads have 1 and the body 196"):
+    with pytest.raises(InputError, match="1 load cases at 2 vertices, the loads have 1, and the body 196"):
         pressure(fem, loads, answer.at(np.arange(2)))
     with pytest.raises(InputError, match="1 load cases at 196 vertices, the loads have 0"):
         pressure(fem, loads.rows(none), answer)

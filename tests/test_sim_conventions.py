@@ -129,11 +129,11 @@ class TestConventions:
         for sources, reason in (
             (
                 Sources(aseg, convention="brats", mask=tmp_path / "t1.nii"),
-                "it has 24, 41, 42 beside. It looks like free",
+                "it has 24, 41, 42 in addition. It looks like free",
             ),
             (
                 Sources(aseg, convention="fsl", tumour_in=tumour),
-                "it has 4, 24, 41, 42 beside. It looks like freesurfer or",
+                "it has 4, 24, 41, 42 in addition. It looks like freesurfer or",
             ),
             (Sources(brats, convention="freesurfer", tumour_in=tumour), "it lacks 41. It looks like brats"),
             (Sources(brats, convention="fsl", tumour_in=tumour), "it lacks 3. It looks like brats"),

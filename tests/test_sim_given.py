@@ -106,8 +106,8 @@ def cut() -> Any:
 
 
 VERTICES = [
-    (np.ones(64, bool), "at is a mask of truth values: give vertex numbers, as np.flatnonzero"),
-    ([True, False], "at is a mask"),
+    (np.ones(64, bool), "at is a boolean mask: give vertex numbers, as np.flatnonzero"),
+    ([True, False], "at is a boolean mask"),
     ([1.5], r"at has shape \(1,\) and type float64: give the numbers of vertices"),
     (np.array([1.0, 2.0]), "type float64"),
     (np.array([[1, 2]]), r"shape \(1, 2\)"),
@@ -115,7 +115,7 @@ VERTICES = [
     (["one"], "type <U3"),
     ([[1], [1, 2]], "at makes no array"),
     ([-1], "no vertex -1"),
-    ([10**6], "no vertex 1000000: ask for some of 0 to 63"),
+    ([10**6], "no vertex 1000000: choose from 0 to 63"),
     (np.array([2**63 + 5], np.uint64), "no vertex"),
 ]
 
@@ -150,9 +150,9 @@ def test_lists_of_vertices_will_do(fem: Fem, cut: Any) -> None:
             assert some.displacement.shape == (1, len(at), 3)
         none: Any = []
         assert body.deform(PUSH, at=none).displacement.shape == whole.at(none).displacement.shape == (1, 0, 3)
-    with pytest.raises(InputError, match="does not know vertex 3"):
+    with pytest.raises(InputError, match="lacks vertex 3"):
         fem.deform(PUSH, at=np.array([1])).at(np.array([3]))
-    with pytest.raises(InputError, match="does not know vertex 3"):
+    with pytest.raises(InputError, match="lacks vertex 3"):
         fem.deform(PUSH, at=np.zeros(0, int)).at(np.array([3]))
 
 
@@ -167,7 +167,7 @@ def test_batches_of_none(batch: Any) -> None:
     [
         ({"accuracy": "live"}, "accuracy is 'live': give an Accuracy"),
         ({"anatomy": "patient.vtu"}, r"anatomy is 'patient.vtu': give an Anatomy, such as read_anatomy\(FILE.vtu\)"),
-        ({"effects": (Elasticity, Held)}, r"Elasticity is a class, and no effect yet: write Elasticity\(...\)"),
+        ({"effects": (Elasticity, Held)}, r"Elasticity is a class, not an instance: write Elasticity\(...\)"),
         ({"element": "p7"}, "no element is called 'p7'"),
         ({"element": ["p1"]}, r"no element is called \['p1'\]"),
         ({"effects": Elasticity()}, "effects is Elasticity.*: give a tuple of effects"),

@@ -211,5 +211,5 @@ def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: s
 
 def test_a_posture_without_gravity_is_refused() -> None:
     fem = Fem(base_held(box((1, 1, 1))), [Elasticity(), Held()], TIGHT, "cpu", element="p1")
-    with pytest.raises(InputError, match="loads hold Posture, which nothing answers: add the effect Gravity"):
+    with pytest.raises(InputError, match="loads hold Posture, which no effect uses: add the effect Gravity"):
         fem.deform(posture(DOWN, 0.0))

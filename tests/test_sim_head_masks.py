@@ -117,20 +117,20 @@ def test_a_head_is_the_same_in_every_format(tmp_path, name, axes):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"leave_out": ("space",)}, "does not state its space, so nobody knows where left is"),
-        ({"space": "scanner-xyz"}, "its space is stated as 'scanner-xyz'"),
+        ({"leave_out": ("space",)}, "does not state its space, so its left side is unknown"),
+        ({"space": "scanner-xyz"}, "its space is 'scanner-xyz'"),
         ({"leave_out": ("space origin",)}, "does not state its space origin"),
         ({"leave_out": ("space directions",)}, "does not state its space directions"),
         ({"leave_out": ("endian",)}, "does not state its endian"),
         ({"more": 'space units: "inch" "inch" "inch"\n'}, "its space units are"),
-        ({"coding": "hex"}, "coded as 'hex': raw, gzip and bzip2 are read"),
-        ({"more": "data file: voxels.raw\n"}, "has its voxels in 'voxels.raw', and no such file is beside it"),
-        ({"more": "data file: LIST\n"}, "no such file is beside it"),
-        ({"more": "datafile: ../voxels.raw\n"}, r"in '\.\./voxels.raw', and only a file beside it is read"),
-        ({"more": "data file: /etc/passwd\n"}, "only a file beside it is read"),
-        ({"more": "data file: sub\\\\voxels.raw\n"}, "only a file beside it is read"),
-        ({"more": "data file: ..\n"}, "only a file beside it is read"),
-        ({"more": "byte skip: 16\n"}, "skips a part of itself"),
+        ({"coding": "hex"}, "coded as 'hex': must be raw, gzip or bzip2"),
+        ({"more": "data file: voxels.raw\n"}, "has its voxels in 'voxels.raw', and no such file is in the same folder"),
+        ({"more": "data file: LIST\n"}, "no such file is in the same folder"),
+        ({"more": "datafile: ../voxels.raw\n"}, r"in '\.\./voxels.raw', and only a file in the same folder is read"),
+        ({"more": "data file: /etc/passwd\n"}, "only a file in the same folder is read"),
+        ({"more": "data file: sub\\\\voxels.raw\n"}, "only a file in the same folder is read"),
+        ({"more": "data file: ..\n"}, "only a file in the same folder is read"),
+        ({"more": "byte skip: 16\n"}, "skips bytes"),
     ],
 )
 def test_an_nrrd_file_that_does_not_say_all_is_refused(tmp_path, change, reason):
@@ -157,7 +157,7 @@ def test_a_damaged_nrrd_file_is_a_sentence(tmp_path, coding):
     ):
         read_volume(path)
     path.write_bytes(whole.replace(b"sizes: 12 12 12", b"sizes: 9999 999 999"))
-    with pytest.raises(InputError, match=r"9\.98e\+09 voxels, and 5\.37e\+08 are the most"):
+    with pytest.raises(InputError, match=r"9\.98e\+09 voxels; the maximum is 5\.37e\+08"):
         read_volume(path)
 
 
@@ -279,7 +279,7 @@ class TestSeveralFiles:
         tumour, brain = files / "tumour.nii.gz", files / "brain.nii.gz"
         nifti(files / "none.nii", np.zeros((5, 5, 5), np.uint8), np.eye(4))
         for sources, reason in (
-            (Sources(tumour, brain=(1,), mask=brain), "leave one of them out"),
+            (Sources(tumour, brain=(1,), mask=brain), "give only one of them"),
             (Sources(tumour, mask=brain, tumour_in=tumour), "nothing is left"),
             (Sources(tumour, tumour=(1,), mask=files / "none.nii"), "none.nii: is empty"),
             (Sources(tumour, tumour=(1,)), "at least one label of the brain"),

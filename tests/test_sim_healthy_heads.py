@@ -167,7 +167,7 @@ def test_tumour_is_drawn_in_mask_with_t1(masked, capsys):
     ("words", "reason"),
     [
         (("--mask", "none.nii.gz"), "none.nii.gz: no such file"),
-        (("--mask", "zero.nii.gz"), "zero.nii.gz: has no voxel other than 0"),
+        (("--mask", "zero.nii.gz"), "zero.nii.gz: all voxels are 0"),
         (("--mask", "tiny.nii.gz"), "make a brain of 0.064 ml"),
         (("--mask", "brain.nii.gz", "--head", "fsaverage"), "leave one of them out"),
         (("--mask", "brain.nii.gz", "--brain-volume", "nan"), "--brain-volume nan is outside 20 to 5000"),

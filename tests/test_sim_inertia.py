@@ -281,5 +281,5 @@ def test_where_no_time_passes_tools_stay_where_they_are() -> None:
 def test_a_step_in_time_is_not_held_against_an_equilibrium() -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu", element="p1")
     answer = fem.deform(at(0.1))
-    with pytest.raises(InputError, match="answers under Inertia are steps in time"):
+    with pytest.raises(InputError, match="solutions under Inertia are time steps"):
         fem.residual(at(0.1), answer)

@@ -92,7 +92,7 @@ def test_voxels_that_are_no_tissue_leave_the_others_as_they_are():
 def test_a_volume_elsewhere_or_without_numbers_is_refused(tmp_path):
     with pytest.raises(InputError, match="does not cover"):
         ramp().around(places([[400.0, 0.0, 0.0]]), brain())
-    with pytest.raises(InputError, match="no numbers in the brain"):
+    with pytest.raises(InputError, match="no finite values in the brain"):
         Intensity(np.full((40, 50, 30), np.nan), AFFINE).around(places([[20.0, 20.0, 10.0]]), brain())
     with pytest.raises(InputError, match="no such file"):
         read_intensity(tmp_path / "none.nii.gz")

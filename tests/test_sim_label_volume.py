@@ -182,7 +182,7 @@ def test_files_that_are_no_volumes(tmp_path):
         ("text.nii.gz", "cannot be read as NIfTI"),
         ("half.nii.gz", "cannot be read as NIfTI"),
         ("text.mgz", "cannot be read as a FreeSurfer volume"),
-        ("text.img", "is not called .nii"),
+        ("text.img", "unsupported file type; expected .nii"),
     ):
         with pytest.raises(InputError, match=reason) as caught:
             volume_subject(tmp_path / name, (1,), (3,))

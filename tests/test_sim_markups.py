@@ -43,7 +43,7 @@ def test_points_of_older_files_are_of_the_system_that_is_stated(tmp_path, system
     [
         (None, OLD.format(1, 2), "does not state its coordinate system"),
         ("2", OLD.format(1, 2), "its coordinate system is '2'"),
-        ("LPS", OLD.format(1, "nan"), "coordinates are no numbers"),
+        ("LPS", OLD.format(1, "nan"), "non-finite coordinates"),
         ("LPS", "1,2", "cannot be read as markups"),
         ("LPS", OLD.format(1, 2).replace('1",', "1,"), "cannot be read as markups"),
         ("LPS", "", "has 0 points that are placed"),
@@ -63,9 +63,9 @@ def test_a_curve_is_smooth_through_its_points(tmp_path):
 @pytest.mark.parametrize(
     ("more", "reason"),
     [
-        ({"system": "IJK"}, "its coordinate system is 'IJK': LPS and RAS are known"),
-        ({"coordinateUnits": ["m", "m", "m"]}, "and mm are read"),
-        ({"points": [[0.0, np.nan, 0.0]]}, "coordinates are no numbers"),
+        ({"system": "IJK"}, "its coordinate system is 'IJK': it must be LPS or RAS"),
+        ({"coordinateUnits": ["m", "m", "m"]}, "must be mm"),
+        ({"points": [[0.0, np.nan, 0.0]]}, "non-finite coordinates"),
         ({"points": [[0.0, 1e308, 0.0]]}, "more than 10 m away: coordinates are in mm"),
         ({"points": []}, "has 0 points that are placed"),
         ({"controlPoints": 3}, "cannot be read as markups"),

@@ -28,7 +28,7 @@ def test_formats_that_may_be_read_for_ever_are_refused(tmp_path: Path, name: str
 def test_a_mesh_includes_no_other_file(tmp_path: Path, word: str) -> None:
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(tmp_path / "b.inp")
     (tmp_path / "a.inp").write_text(f"*HEADING\n{word}, INPUT={tmp_path}/b.inp\n")
-    with pytest.raises(InputError, match=r"it includes another file\. Join the two to one"):
+    with pytest.raises(InputError, match=r"it includes another file\. Merge both into one file"):
         read_mesh(tmp_path / "a.inp")
 
 

@@ -24,7 +24,7 @@ def test_volume_without_orientation_needs_axes(tmp_path):
     labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
     path = tmp_path / "l.nii"
     nibabel.save(nibabel.Nifti1Image(labels, None), path)
-    with pytest.raises(InputError, match=r"neither sform nor qform, so nobody knows where left is.* --axes RAS"):
+    with pytest.raises(InputError, match=r"neither sform nor qform, so its left side is unknown.* --axes RAS"):
         volume_subject(path, (1,), (3,))
     with pytest.raises(InputError, match="axes 'RAR' are no directions"):
         read_labels(path, Voxels(axes="RAR"))

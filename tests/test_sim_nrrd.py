@@ -28,7 +28,7 @@ def test_voxels_beside_a_header(tmp_path, coding):
         (text, voxels[: len(voxels) // 2], "ends|too short"),
         (text.replace(b"sizes: 12 12 12", b"sizes: 12 12 13"), voxels, "ends after|too short"),
         (text.replace(b"sizes: 12 12 12", b"sizes: 800 800 800"), voxels, "is too short for its"),
-        (text, None, "no such file is beside it"),
+        (text, None, "no such file is in the same folder"),
     ):
         path.write_bytes(header_now)
         beside.unlink() if voxels_now is None else beside.write_bytes(voxels_now)

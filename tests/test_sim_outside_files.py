@@ -155,7 +155,7 @@ class TestMeshes:
         """Blocks of -8 bytes would make meshio read one place for ever."""
         path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<q", -8) * 4)
         path.write_bytes(path.read_bytes().replace(b"UInt64", kind.encode()).replace(b' compressor="vtkZLib', b' a="'))
-        with pytest.raises(InputError, match=f"header_type is '{kind}'. Write it anew with UInt32 or UInt64"):
+        with pytest.raises(InputError, match=f"header_type is '{kind}'. Write it again with UInt32 or UInt64"):
             read_mesh(path)
 
     @pytest.mark.parametrize("name", ["a.vtu", "a.xdmf"])

@@ -98,7 +98,7 @@ class TestEffect:
                 made.name = "tool force"
                 return made
 
-        with pytest.raises(InputError, match=r"made a int: let it make a sim\.Term"):
+        with pytest.raises(InputError, match=r"returned a int: must be a sim\.Term"):
             answer(Elasticity(), Nothing((5,)))
         with pytest.raises(InputError, match=r"two terms are called 'tool force'"):
             answer(Elasticity(), Named((5,)))
@@ -121,7 +121,7 @@ class TestEffect:
         answer(Elasticity(), Pulled((5,)), loads=loads)
         assert seen[0].tolist() == [1.0, 2.0] and remember((Pulled((5,)),)) and not remember((VEINS.Veins((5,)),))
         assert loads.scaled(0.5).of(Pull).share.tolist() == [0.5, 1.0]
-        with pytest.raises(InputError, match=r"loads hold Pull, which nothing answers: add the effect that it is for"):
+        with pytest.raises(InputError, match=r"loads hold Pull, which no effect uses: add the effect that it is for"):
             answer(Elasticity(), loads=loads)
 
     def test_what_is_no_cause_is_a_sentence(self):
@@ -179,7 +179,7 @@ class TestTwoTools:
     def test_who_takes_one_says_so(self):
         loads = Loads(TOOLS)
         assert loads.every(Pushed) == loads.causes and loads.only(Pushed) is None
-        with pytest.raises(InputError, match=r"2 causes Pushed, but one is taken here"):
+        with pytest.raises(InputError, match=r"2 causes Pushed, but one is supported"):
             loads.of(Pushed)
         with pytest.raises(InputError, match=r"each kind but Pushed once"):
             Loads((Nodal(np.zeros((1, 3, 3))), Nodal(np.zeros((1, 3, 3)))))

@@ -158,11 +158,11 @@ def test_what_has_no_series_is_refused(box):
     with pytest.raises(InputError, match="float64"):
         series(Fem(box, (Elasticity(), *EFFECTS), TRAIN, "cpu", element="p1"), pushes(1.0), 3, box.tumour_nodes)
     fem = Fem(box, (Elasticity(), *EFFECTS, ToolDisplacement()), REFERENCE, "cpu", element="p1")
-    with pytest.raises(InputError, match="not of `Displaced`"):
+    with pytest.raises(InputError, match="not `Displaced`"):
         series(fem, Loads((Displaced(POINT, 0.01 * FORCE, RADIUS),)), 3, box.tumour_nodes)
     with pytest.raises(InputError, match="no vertex 99999"):
         fem.reading(np.array([99999]), np.ones((1, 1, 3)))
-    with pytest.raises(InputError, match="2 loads are no groups of 3"):
+    with pytest.raises(InputError, match="2 loads cannot be grouped by 3"):
         series(fem, pushes(1.0), 3, box.tumour_nodes, 3)
 
 

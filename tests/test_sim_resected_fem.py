@@ -129,5 +129,5 @@ class TestMemory:
         strange = replace(
             guess(np.zeros((1, len(MESH.nodes), 3))), memory={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}
         )
-        with pytest.raises(InputError, match="start from an answer of the same mesh"):
+        with pytest.raises(InputError, match="start from a solution of the same mesh"):
             made.deform(Loads((Resected(np.array([1])),)), strange)

@@ -202,7 +202,7 @@ def test_middles_that_make_no_mesh_are_refused(mesh: TetMesh, middles: np.ndarra
 
 def test_elements_that_a_mesh_cannot_have_are_refused() -> None:
     for element in ("p1", "smoothed"):
-        with pytest.raises(InputError, match=f"quadratic tetrahedra, which are no {element}: take p2"):
+        with pytest.raises(InputError, match=f"quadratic tetrahedra, not {element}: use p2"):
             discretise(quadratic(ONE), element)
     with pytest.raises(InputError, match="no element is called 'q1': choose one of p1, p2, smoothed"):
         discretise(ONE, "q1")

@@ -166,10 +166,10 @@ def absent() -> object:
     ("build", "sentence"),
     [
         (lambda: Wave(0.0, 1e-3), r"Wave\.frequency is 0\.0 Hz: give a positive"),
-        (lambda: Wave(1.0, -1e-3), r"Wave\.amplitude is -0\.001 of the volume: give a share from 0 to 0\.3"),
+        (lambda: Wave(1.0, -1e-3), r"Wave\.amplitude is -0\.001: must be a volume fraction from 0 to 0\.3"),
         (lambda: Wave(1.0, 0.5), r"amplitude is 0\.5"),
-        (lambda: Pulsation(regions=()), "Pulsation swells no region"),
-        (absent, r"Pulsation is asked of region 7, but the mesh has the regions \[0\]"),
+        (lambda: Pulsation(regions=()), "Pulsation has no regions"),
+        (absent, r"Pulsation is given for region 7, but the mesh has the regions \[0\]"),
     ],
 )
 def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: str) -> None:

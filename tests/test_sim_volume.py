@@ -45,7 +45,7 @@ class TestVolumes:
 
     def test_no_volume_is_larger_than_the_limit(self, tmp_path: Path) -> None:
         path = header_with(volume(tmp_path / "a.nii.gz"), 40, "<4h", 3, 1600, 1600, 1600)
-        with pytest.raises(InputError, match=r"4\.1e\+09 voxels, and 5\.37e\+08 are the most"):
+        with pytest.raises(InputError, match=r"4\.1e\+09 voxels; the maximum is 5\.37e\+08"):
             read_volume(path)
 
     @pytest.mark.parametrize("numbers", [(np.nan, 0.0), (-np.inf, 0.0)])

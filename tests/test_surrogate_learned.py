@@ -331,7 +331,7 @@ def test_other_loads_and_other_vertices_are_refused(model, box):
         with pytest.raises(InputError, match=f"{type(cause).__name__}.*trained on pushing forces only"):
             model.deform(Loads((cause,)))
     tumour = np.isin(np.arange(len(box.mesh.nodes)), box.tumour_nodes)
-    wrong = ((tumour, "at is a mask"), ([1.5], "type float64"), ([[1]], "shape"), ([-1], "not vertex -1"), ("x", "<U1"))
+    wrong = ((tumour, "boolean mask"), ([1.5], "type float64"), ([[1]], "shape"), ([-1], "not vertex -1"), ("x", "<U1"))
     for at, sentence in wrong:
         with pytest.raises(InputError, match=sentence):
             model.deform(push([0, 0, 0], [0, 0, -0.1], 6e-3), at=at)

@@ -106,14 +106,14 @@ def test_of_a_pose_the_tip_is_where_the_pose_has_it(box, gauge):
     tip = pose[:, :3, 3] + 6e-3 * pose[:, :3, 2] + 6e-3 * open_cortex(box).axis
     away = trimesh.proximity.closest_point_naive(surface(box.mesh.nodes, box.tumour_surface), tip)[1]
     assert gauge.distances(loads, still, gauge.nodes, Ball(6e-3)) == pytest.approx(away, abs=1e-12)
-    with pytest.raises(InputError, match="no known tool"):
+    with pytest.raises(InputError, match="no tip"):
         gauge.distances(loads, still, gauge.nodes)
 
 
 def test_what_it_needs_it_asks_for(box, gauge, fresh):
     loads = fresh[0].rows(slice(0, 1))
     nodes = box.tumour_nodes
-    with pytest.raises(InputError, match="ask for the open cortex and the tumour"):
+    with pytest.raises(InputError, match="request the open cortex and the tumour"):
         gauge.distances(loads, np.zeros((1, len(nodes), 3)), nodes)
     whole = replace(box, mesh=replace(box.mesh, region=np.ones(len(box.mesh.tets), int)))
     with pytest.raises(InputError, match="has no tumour"):

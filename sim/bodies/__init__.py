@@ -1,1 +1,1 @@
-"""From an image, a label volume, the template or a file to an anatomy."""
+"""Build an anatomy from an image, a label volume, the template or a mesh file."""

@@ -1,4 +1,4 @@
-"""Abaqus input files: nodes, elements and sets of elements, in as many blocks as the program wrote."""
+"""Reader for Abaqus input files: nodes, elements and element sets of all blocks."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy as np
 
 from ..errors import InputError
 
-SOLID = re.compile(r"[AD]?C3D(4|5|6|8|10|13|15|20|27)(?!\d)")
+SOLID = re.compile(r"[AD]?C3D(4|5|6|8|10|13|15|20|27)(?!\d)")  # types of solid elements, by number of nodes
 # meshio's names of solid elements by their number of nodes.
 SOLIDS = {4: "tetra", 5: "pyramid", 6: "wedge", 8: "hexahedron", 10: "tetra10", 13: "pyramid13", 15: "wedge15",
           20: "hexahedron20", 27: "hexahedron27"}  # fmt: skip
-# Numbers of one element: its own, and those of its nodes.
+# Integers per element: its own number, and those of its nodes.
 WIDTHS = {"tetra": 5, "tetra10": 11}
 # Keywords that make or move nodes and elements.
 GENERATORS = "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"
@@ -25,7 +25,7 @@ GENERATORS = "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Elements of one type: nodes (n, k) of tetrahedra, and (n, 0) of others."""
+    """Elements of one type: node indices (n, k) of tetrahedra, (n, 0) of other elements."""
 
     type: str
     data: np.ndarray
@@ -33,7 +33,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class AbaqusMesh:
-    """Contents of a file under the names of meshio's meshes; a set has its rows of each block."""
+    """File contents with the field names of a meshio mesh; each set lists its row indices per block."""
 
     points: np.ndarray
     cells: list[Block]
@@ -44,13 +44,13 @@ class AbaqusMesh:
 
 
 def read_abaqus(path: Path) -> AbaqusMesh:
-    """Read nodes, elements and sets of elements of all blocks of a file; names are in capitals.
+    """Read nodes, elements and element sets of all blocks of a file; names are in capitals.
 
     Raises
     ------
     InputError
-        A file that refers to another, computes nodes by a rule, or uses a number for two nodes or for none. Instances
-        that are rotated, moved apart, or of one part.
+        A file that includes another file, generates nodes by a rule, defines a node twice or uses an undefined one.
+        Instances that are rotated, that have different translations, or several of one part.
     """
     index, points = dict[int, int](), list[list[float]]()
     blocks, sets = list[tuple[str, np.ndarray]](), dict[str, list[np.ndarray]]()
@@ -59,7 +59,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
     with path.open(encoding="utf-8-sig", errors="replace") as lines:
         for keyword, options, rows in _sections(lines):
             if keyword == "INCLUDE" or (keyword in ("NODE", "ELEMENT", "ELSET") and "INPUT" in options):
-                raise InputError("it includes another file. Join the two to one.")
+                raise InputError("it includes another file. Merge both into one file.")
             if keyword in GENERATORS or (keyword == "NODE" and options.get("SYSTEM", "R") != "R"):
                 raise InputError(f"its *{keyword} computes coordinates or elements: save it with all of them listed.")
             if keyword in ("ASSEMBLY", "INSTANCE", "END INSTANCE", "END ASSEMBLY"):
@@ -85,7 +85,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
 
 
 def _sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[str]]]:
-    """Split lines into keywords, each with its parameters and data lines; comments and blank lines are dropped."""
+    """Yield each keyword with its options and data lines; comments and blank lines are dropped."""
     head, rows = "", list[str]()
     for line in chain(map(str.strip, lines), "*"):
         if line.startswith("*") and not line.startswith("**"):
@@ -100,7 +100,7 @@ def _sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[
 
 
 def _translation(instances: list[tuple[str, list[str]]]) -> np.ndarray:
-    """Return translation (3,) that all instances (name of the part, data lines) share; 0 without instances."""
+    """Return the translation (3,) that all instances (part name, data lines) share; 0 without instances."""
     parts = [part for part, _ in instances if part]
     if any(len(rows) > 1 for _, rows in instances):
         raise InputError("an *INSTANCE is rotated: its nodes must be listed where they lie. Save it as one mesh.")
@@ -115,7 +115,7 @@ def _translation(instances: list[tuple[str, list[str]]]) -> np.ndarray:
 
 
 def _add_nodes(rows: list[str], index: dict[int, int], points: list[list[float]]) -> None:
-    """Append the nodes of a block: number, and up to three coordinates, 0 where they are blank."""
+    """Append the nodes of a block: number and up to three coordinates, 0 where blank."""
     for row in rows:
         number, *cells = (cell.strip() for cell in f"{row},,,".split(","))
         place = [float(cell or 0.0) for cell in cells[:3]]
@@ -130,7 +130,7 @@ def _add_nodes(rows: list[str], index: dict[int, int], points: list[list[float]]
 
 
 def _elements(name: str, rows: list[str]) -> tuple[str, np.ndarray]:
-    """Type and table (n, 1 + k) of a block's elements: number and nodes of tetrahedra, of others the number alone."""
+    """Return the type and table (n, 1 + k) of a block: element number and node numbers (k = 0 unless tetrahedra)."""
     if not name:
         raise InputError("an *ELEMENT has no TYPE: state it, such as TYPE=C3D4.")
     solid = SOLID.match(name)
@@ -142,7 +142,7 @@ def _elements(name: str, rows: list[str]) -> tuple[str, np.ndarray]:
 
 
 def _members(rows: list[str], generate: bool, sets: Mapping[str, list[np.ndarray]]) -> list[np.ndarray]:
-    """Numbers of elements, listed or by first, last and step (`generate`), and those of sets that are named."""
+    """Return element numbers: listed, or first, last and step (`generate`), plus those of the named sets."""
     if generate:
         return [np.arange(first, last + 1, *step) for first, last, *step in (_whole([row]) for row in rows)]
     cells = [cell.strip(' "') for row in rows for cell in row.split(",")]
@@ -151,5 +151,5 @@ def _members(rows: list[str], generate: bool, sets: Mapping[str, list[np.ndarray
 
 
 def _whole(rows: list[str]) -> list[int]:
-    """Whole numbers in cells between commas, blank ones left out."""
+    """Parse the integers between commas; blank cells are skipped."""
     return [int(cell) for row in rows for cell in row.split(",") if cell.strip()]

@@ -1,8 +1,8 @@
-"""A graded body-centred cubic lattice of tetrahedra: what `isosurface_stuffing` carves bodies from.
+"""Graded body-centred cubic lattice of tetrahedra, the background mesh of `isosurface_stuffing`.
 
 A 2:1 balanced octree, filled with tetrahedra as in Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral
 Meshes with Good Dihedral Angles", section 3. Between cells of one size lie the BCC tetrahedra (dihedral angles 60 and
-90 degrees). Between cells of two sizes lie pyramids, split along the diagonal through the larger face's middle (at
+90 degrees). Between cells of two sizes lie pyramids, split along the diagonal through the larger face's centre (at
 least 45).
 """
 
@@ -14,20 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-NEIGHBOURS = np.ones((3, 3, 3), bool)
-# Corners of a square face in the two tangential axes, in turn; each edge k joins corners k and k + 1.
+NEIGHBOURS = np.ones((3, 3, 3), bool)  # all 26 neighbours of a cell, for the 2:1 balance
+# Corners of a square face in the two tangential axes, in cyclic order; edge k joins corners k and k + 1.
 SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 Sizing = Callable[[np.ndarray], np.ndarray]
-"""Wanted cell size (n,) [m] at points (n, 3) [m]."""
+"""Function that returns the requested cell size (n,) [m] at points (n, 3) [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Tetrahedra that fill a box.
+    """Tetrahedral lattice that fills a box.
 
-    nodes (V, 3) [m]; tets (T, 4), positively oriented; centre (V,) bool: the node is the middle of a cell, not a
-    corner. An edge that joins the two kinds is a short one, any other a long one.
+    nodes (V, 3) [m]; tets (T, 4), positively oriented; centre (V,) bool: True at the centre of a cell, False at a cell
+    corner. Edges between a centre and a corner are short, all others long.
     """
 
     nodes: np.ndarray
@@ -38,8 +38,8 @@ class Lattice:
 def build_graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, levels: int, size: Sizing) -> Lattice:
     """Return the lattice over the box from `low` (3,) to `high` (3,) [m].
 
-    Cells of edge `coarsest` [m] are halved up to `levels` times where they are larger than `size` asks for.
-    Neighbours, diagonal ones too, differ by one halving at most.
+    Cells of edge `coarsest` [m] are halved up to `levels` times until they are no larger than `size`. Neighbouring
+    cells, including diagonal ones, differ by at most one halving.
     """
     count = np.ceil((high - low) / coarsest).astype(int)
     origin = 0.5 * (low + high) - 0.5 * coarsest * count
@@ -72,7 +72,7 @@ def build_graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, lev
 def _octree(
     origin: np.ndarray, count: np.ndarray, coarsest: float, levels: int, size: Sizing
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Per level, which cells exist and which of them are halved (dense boolean arrays)."""
+    """Return two boolean grids per level: existing cells, and those of them that are halved."""
     split = []
     there = np.ones(count, bool)
     for level in range(levels):
@@ -94,12 +94,12 @@ def _children(halved: np.ndarray) -> np.ndarray:
 
 
 def _key(whole: np.ndarray, span: np.ndarray) -> np.ndarray:
-    """One number for whole coordinates (..., 3)."""
+    """Return a unique integer for each integer coordinate triple (..., 3)."""
     return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(whole, -1, 0)), tuple(span)))
 
 
 def _face(corner: np.ndarray, axis: int, edge: int, upper: bool) -> np.ndarray:
-    """Corners (n, 4, 3), in turn, of the lower or upper face across `axis` of cells at `corner` (n, 3)."""
+    """Return corners (n, 4, 3), cyclic, of the lower or upper face across `axis` of cells at `corner` (n, 3)."""
     offset = np.zeros((4, 3), int)
     offset[:, [(axis + 1) % 3, (axis + 2) % 3]] = SQUARE * edge
     offset[:, axis] = edge * upper
@@ -107,7 +107,7 @@ def _face(corner: np.ndarray, axis: int, edge: int, upper: bool) -> np.ndarray:
 
 
 def _between_equals(leaf: np.ndarray, axis: int, edge: int, known: np.ndarray, span: np.ndarray) -> list[np.ndarray]:
-    """BCC tetrahedra round each face between two leaves of one size, halved where an edge has a middle node."""
+    """Return BCC tetrahedra around each face between two leaves of equal size, halved at edges with a midpoint node."""
     ahead = np.delete(leaf, 0, axis)
     corner = np.argwhere(np.delete(leaf, -1, axis) & ahead) * edge
     below = corner + edge // 2
@@ -125,18 +125,18 @@ def _between_equals(leaf: np.ndarray, axis: int, edge: int, known: np.ndarray, s
 
 
 def _between_unequals(leaf: np.ndarray, exists: np.ndarray, axis: int, edge: int) -> list[np.ndarray]:
-    """Split pyramids on both sides of each face between a leaf and a leaf of twice its size."""
+    """Return the split pyramids on both sides of each face between a leaf and a leaf of twice its size."""
     tets = []
     for step in (-1, 1):
         neighbour = np.roll(exists, -step, axis)
         rim = [slice(None)] * 3
         rim[axis] = slice(-1, None) if step > 0 else slice(0, 1)
-        neighbour[tuple(rim)] = True  # nothing lies beyond the box
+        neighbour[tuple(rim)] = True  # no cell exists beyond the box
         index = np.argwhere(leaf & ~neighbour)
         small = index * edge + edge // 2
         large = (index + step * np.eye(3, dtype=int)[axis]) // 2 * 2 * edge + edge
         square = _face(index * edge, axis, edge, upper=step > 0)
-        # The larger face's middle is the corner at which both tangential indices turn from even to odd.
+        # The larger face's centre is the corner at which both tangential indices change from even to odd.
         tangential = np.stack([index[:, (axis + 1) % 3], index[:, (axis + 2) % 3]], 1)
         first = np.argmax((SQUARE[None] == 1 - tangential[:, None] % 2).all(2), axis=1)
         a, b, c, d = (square[np.arange(len(square)), (first + k) % 4] for k in range(4))

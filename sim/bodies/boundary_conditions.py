@@ -1,4 +1,4 @@
-"""Where a brain is held: at the brainstem and at sheets of dura; where a skull stands over it; and where it is open."""
+"""Boundary conditions of a brain: nodes fixed at brainstem and dura, skull contact nodes, and the craniotomy."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ def add_boundary_conditions(
     outline: np.ndarray | None = None,
     septa: Sequence[Septum] = (),
 ) -> Anatomy:
-    """Return the anatomy of `mesh` opened round `site` (3,) [m], a point at the cortex.
+    """Return the anatomy of `mesh` with a craniotomy around `site` (3,) [m], a point on the cortex.
 
-    The stem is held: surface nodes within a share of the brain's height from the lowest one (least superior). The
-    craniotomy is free: surface nodes within half of the diameter `craniotomy` [m] along the surface from the point
-    nearest to `site`. An `outline` (n, 3) [m] frees those within it instead. Sheets of dura, `septa`, hold what is at
-    them, but for the craniotomy.
+    The brainstem is fixed: surface nodes within a fraction of the brain's height from the lowest (least superior) node.
+    The craniotomy is free: surface nodes within a geodesic distance of half its diameter `craniotomy` [m] of the point
+    nearest to `site`. With an `outline` (n, 3) [m], the nodes within it are free instead. Dural sheets, `septa`, fix
+    the nodes at them, except in the craniotomy.
 
-    The skull covers the rest of the surface, and effects say what it does. Each of its nodes has its
-    unit normal n_i, along the integral of grad N_i. A body of linear tetrahedra whose nodes do not move along theirs
-    passes no volume through the skull (Engelman, Sani, Gresho 1982, Int. J. Numer. Methods Fluids 2:225-238).
+    The skull covers the remaining surface; effects define its contact model. Each covered node has a
+    unit normal n_i along the integral of grad N_i. If no node of linear tetrahedra moves along its normal, no volume
+    passes through the skull (Engelman, Sani, Gresho 1982, Int. J. Numer. Methods Fluids 2:225-238).
 
     Raises
     ------
     InputError
-        An opening with too few nodes, or one that leaves no skull.
+        A craniotomy with too few nodes, or one that leaves no skull.
     """
     surface = mesh.surface
     outer = np.unique(surface)

@@ -1,4 +1,4 @@
-"""What the labels mean that widely used programs write: one table, by the names of these programs."""
+"""Table of label conventions of common segmentation programs, by convention name."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from ..errors import InputError
 
 @dataclass(frozen=True)
 class Convention:
-    """Label numbers of one program; those of a group that a file lacks are no loss.
+    """Label numbers of one program; a group may be absent from a file.
 
     Parameters
     ----------
     name
-        As it is given on the command line.
+        Name on the command line.
     source
-        Who writes such labels, in words.
+        Description of the programs that write such labels.
     brain
-        Everything between the meninges but free fluid: tissue, and the ventricles as its holes.
+        Labels of all tissue between the meninges and of the ventricles, without free fluid.
     needed
-        Of these, all must be there.
+        Labels of `brain` that a file must contain.
     tumour
-        Its core; () where another file or own numbers must tell.
+        Labels of the tumour core; () if another file or the user's own numbers must mark it.
     necrosis, oedema, ventricles
-        Parts of the core, of the brain, and of the brain.
+        Labels of parts of the core, of the brain, and of the brain, respectively.
     left, right
-        Of each hemisphere, where its labels are its own.
+        Labels that occur in one hemisphere only.
     only
-        Whether a file has no other labels than these.
+        True if a file has no other labels than these.
     mask
-        Whether the brain lies in another file.
+        True if the brain is marked in another file.
     apart
-        Labels that no file has together.
+        Labels of which a file lacks at least one.
     deepest
-        Labels that lie farthest inside.
+        Labels of the innermost tissue.
     """
 
     name: str
@@ -56,11 +56,11 @@ class Convention:
 
     @property
     def known(self) -> frozenset[int]:
-        """Every number that the convention names."""
+        """All label numbers of the convention except `necrosis`, which is part of `tumour`."""
         return frozenset(self.brain + self.tumour + self.oedema + self.ventricles + self.csf)
 
     def fits(self, present: Collection[int]) -> bool:
-        """Whether a file with these labels may be of the convention."""
+        """Return True if a file with these labels can follow the convention."""
         labels = set(present) - {0}
         if (self.tumour and not labels & set(self.tumour)) or (self.apart and labels >= set(self.apart)):
             return False
@@ -68,7 +68,7 @@ class Convention:
 
 
 def _both(*left: int) -> tuple[int, ...]:
-    """Labels of the left half, each with its fellow of the right one in FreeSurfer's table of colours."""
+    """Return left-hemisphere labels together with their right-hemisphere counterparts, by FreeSurfer's colour table."""
     return tuple(sorted((*left, *(RIGHT[label] for label in left))))
 
 
@@ -76,12 +76,12 @@ RIGHT = {
     2: 41, 3: 42, 4: 43, 5: 44, 7: 46, 8: 47, 9: 48, 10: 49, 11: 50, 12: 51, 13: 52, 17: 53, 18: 54, 26: 58, 28: 60,
     30: 62, 31: 63, 78: 79, 81: 82,
 }  # fmt: skip
-"""FreeSurfer's labels of the left half and their fellows on the right."""
-# Parcels of the cortex and of the white matter under it (aparc+aseg, wmparc): thousands by side.
+"""FreeSurfer labels of the left hemisphere, mapped to those of the right."""
+# Parcels of the cortex and of the white matter below it (aparc+aseg, wmparc), thousands per hemisphere.
 PARCELS = tuple(range(1000, 1036)), tuple(range(2000, 2036)), (*range(3000, 3036), 5001), (*range(4000, 4036), 5002)
-VENTRICLES = (*_both(4, 5), 14, 15, 72)
+VENTRICLES = (*_both(4, 5), 14, 15, 72)  # FreeSurfer labels; both hemispheres, and midline
 DEEP = (16, 77, 80, 85, *range(251, 256))
-"""Brainstem, lesions of the white matter, chiasm and corpus callosum: of no side."""
+"""Labels without a side: brainstem, white matter lesions, chiasm and corpus callosum."""
 
 FREESURFER = Convention(
     "freesurfer",
@@ -161,7 +161,7 @@ CONVENTIONS = {
         *TUMOURS,
     )
 }
-"""By their names. FSL FIRST, and SynthSeg, have the numbers of FreeSurfer."""
+"""Conventions by name. FSL FIRST and SynthSeg use the numbers of FreeSurfer."""
 
 
 def check_labels_fit(
@@ -171,14 +171,14 @@ def check_labels_fit(
     own: Collection[int] = (),
     against: Callable[[Convention], str] = lambda _: "",
 ) -> None:
-    """Reject a file whose labels `present` are not those of a convention, but for a user's `own` ones.
+    """Reject a file whose labels `present` do not follow a convention, apart from the user's `own` labels.
 
-    `against` says why a convention whose numbers fit is not that of the file; empty: it may be.
+    `against` returns the reason why a convention with matching numbers is not that of the file; empty if it may be.
 
     Raises
     ------
     InputError
-        Naming what is missing, not known or contradicted, and the conventions that would fit.
+        With the labels that are missing, unknown or contradictory, and the conventions that would fit.
     """
     labels = set(present) - {0} - set(own)
     missing = [label for label in convention.needed if label not in labels]
@@ -190,7 +190,7 @@ def check_labels_fit(
     elif missing:
         why = f"it lacks {_listed(missing)}"
     elif convention.only and not labels <= convention.known:
-        why = f"it has {_listed(sorted(labels - convention.known))} beside"
+        why = f"it has {_listed(sorted(labels - convention.known))} in addition"
     elif convention.apart and labels >= set(convention.apart):
         why = f"it has {' and '.join(map(str, convention.apart))} together"
     else:

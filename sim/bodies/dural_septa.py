@@ -1,4 +1,4 @@
-"""Falx and tentorium as walls: which nodes of a mesh do not move, so that none of its edges passes a sheet of dura.
+"""Falx and tentorium as rigid walls: mesh nodes are fixed so that no free edge crosses a dural sheet.
 
 Dural septa act as rigid membranes: Chen et al. 2011, IEEE Trans. Biomed. Eng. 58:499-508 (PMC3864010). Here tissue is
 bonded to them, and does not slide along them.
@@ -15,18 +15,20 @@ from ..errors import InputError
 from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
 
 SEPTA = ("falx", "tentorium")
-"""Their names."""
-# Places of an edge that are held against a sheet, at least and at most.
-FEWEST, MOST = 5, 200
-SHALLOWEST, DEEPEST = 10e-3, 60e-3
-"""[m] Of a falx that is drawn."""
+"""Names of the septa."""
+FEWEST = 5  # minimum sample points per mesh edge, in the test against a sheet
+MOST = 200  # maximum sample points per mesh edge
+SHALLOWEST = 10e-3
+"""Minimum depth of a synthetic falx [m]."""
+DEEPEST = 60e-3
+"""Maximum depth of a synthetic falx [m]."""
 SPACING = 1e-3
-"""[m] Of the points of a falx that is drawn."""
+"""Point spacing of a synthetic falx [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Septum:
-    """A sheet of dura: centres (n, 3) [m] of its voxels, and half of their diagonal [m]; balls of that hold them."""
+    """Sheet of dura as voxel centres (n, 3) [m]; balls with radius `reach` [m], half a voxel diagonal, cover it."""
 
     name: str
     points: np.ndarray
@@ -34,10 +36,10 @@ class Septum:
 
 
 def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
-    """Return a falx in the midline of a head that has none, from points (n, 3) [m, RAS] of its surface.
+    """Return a synthetic falx in the midline of a head, from surface points (n, 3) [m, RAS].
 
-    It hangs from the convexity by a `depth` [m], the same everywhere, and ends at half of the head's height. A real
-    one is narrow in front and wide behind. The outline of the head is convex, as the skull is, and sulci are ignored.
+    It extends inwards from the convexity by a constant `depth` [m] and ends at half of the head's height. A real
+    falx is narrow in front and wide behind. The head outline is convex, as the skull is; sulci are ignored.
 
     Raises
     ------
@@ -60,9 +62,9 @@ def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
 
 
 def find_held_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
-    """Which vertices (V,) bool a sheet holds: of each edge that meets it, the end that is nearer to where it does.
+    """Return a mask (V,) of vertices to fix: of each edge that meets the sheet, the end nearer to the intersection.
 
-    Of every tetrahedron through which the sheet goes, each edge that it cuts has then an end that does not move.
+    Every mesh edge that the sheet cuts therefore has at least one fixed end.
     """
     ends = np.sort(mesh.tets[:, EDGES].reshape(-1, 2))
     _, first = np.unique(compute_row_keys(ends), return_index=True)

@@ -1,4 +1,4 @@
-"""Which voxels a closed surface encloses."""
+"""Voxelisation of a closed surface."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import numpy as np
 from ..errors import InputError
 
 ASIDE = np.array([3.37e-5, 7.13e-5])
-"""Voxels by which rays miss the lattice, so that none meets an edge of triangles which lie on it."""
+"""Offset of the rays from the lattice [voxels], so that no ray hits an edge of triangles aligned with the lattice."""
 
 
 def fill_enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels (I, J, K) bool of an `edge` [m] whose middle lies inside a surface, and their affine (4, 4) to metres.
+    """Return voxels (I, J, K) bool of an `edge` [m] with centres inside a surface, and their affine (4, 4) to metres.
 
-    The surface has vertices (n, 3) [m] and triangles (m, 3), which may be turned either way. A middle is inside if
+    The surface has vertices (n, 3) [m] and triangles (m, 3) of either orientation. A centre is inside if
     a ray to it along z crosses the surface an odd number of times.
 
     Raises
     ------
     InputError
-        A surface that is not closed: some edge is not one of two triangles.
+        A surface that is not closed: some edge does not have exactly two triangles.
     """
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     if (np.unique(edges, axis=0, return_counts=True)[1] != 2).any():
@@ -38,7 +38,7 @@ def fill_enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tup
 
 
 def _crossings(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns (r, 2) of voxels whose ray along z meets a triangle of corners (m, 3, 3) [voxels], and the heights."""
+    """Return voxel columns (r, 2) whose ray along z meets a triangle (m, 3, 3) [voxels], and the heights (r,)."""
     low = np.ceil(corners[..., :2].min(axis=1)).astype(int)
     extent = np.maximum(np.floor(corners[..., :2].max(axis=1)).astype(int) - low + 1, 0)
     count = extent.prod(axis=1)

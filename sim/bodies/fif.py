@@ -1,4 +1,4 @@
-"""Surfaces of a head from FIF, the format of MNE's boundary elements: tags with headers of four whole numbers."""
+"""Reader for head surfaces in FIF, the format of MNE's boundary elements: tags with headers of four integers."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ import numpy as np
 from ..runtime.outside_files import read_as
 
 FRAME, POINTS, TRIANGLES = 3112, 3105, 3106
-"""Kinds of tags: a surface's frame of coordinates, its vertices and its triangles."""
-MRI = 5
-FLOATS, INTEGERS = (0x40000004, ">f4"), (0x40000003, ">i4")
-"""Types of dense matrices: row by row, and behind them columns, rows and the number of axes."""
+"""Tag kinds: coordinate system, vertices and triangles of a surface."""
+MRI = 5  # FIF code of the MRI coordinate system
+# Dense matrices: data row by row, then columns, rows and number of axes.
+FLOATS = 0x40000004, ">f4"  # type code and NumPy dtype of float matrices
+INTEGERS = 0x40000003, ">i4"  # type code and NumPy dtype of integer matrices
 
 
 def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the one surface in a FIF file: vertices (n, 3) [m, RAS of the MRI], triangles (m, 3).
+    """Return the surface in a FIF file: vertices (n, 3) [m, RAS of the MRI], triangles (m, 3).
 
     Raises
     ------
     InputError
-        A file that is not FIF, is cut off or damaged, or does not hold one surface in the MRI's frame.
+        A file that is not FIF, is truncated or damaged, or does not contain one surface in MRI coordinates.
     """
-    with read_as(path, "one surface in FIF, in the frame of the MRI", "Install the package that it belongs to anew."):
+    with read_as(path, "one surface in FIF, in the frame of the MRI", "Reinstall its package."):
         tags = _tags(path.read_bytes())
         ((_, frame),), (points,), (triangles,) = (tags[kind] for kind in (FRAME, POINTS, TRIANGLES))
         vertices = _matrix(*points, FLOATS).astype(np.float64)
@@ -37,7 +38,7 @@ def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tags(raw: bytes) -> dict[int, list[tuple[int, bytes]]]:
-    """Type and data of every tag, by kind. A header says where the next one is: 0 behind this one, -1 nowhere."""
+    """Return type and data of all tags by kind. A header gives the next position: 0 for adjacent, -1 for the end."""
     tags: dict[int, list[tuple[int, bytes]]] = {}
     at = 0
     while 0 <= at < len(raw):

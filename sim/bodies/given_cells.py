@@ -1,4 +1,4 @@
-"""Cells of a mesh file: one body of tetrahedra that meet at their nodes and do not overlap, and its regions."""
+"""Checks and regions of a given tetrahedral mesh: one conforming body without overlaps."""
 
 from __future__ import annotations
 
@@ -14,47 +14,49 @@ from ..anatomy import REGION_NAMES, describe_region
 from ..errors import InputError
 from ..geometry.tetmesh import FACES, TetMesh
 
-# Beginnings of meshio's names of volume cells.
+# Prefixes of meshio's names of volume cells.
 VOLUMES = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron", "VTK_LAGRANGE_TETRA", "VTK_LAGRANGE_HEXA",
            "VTK_LAGRANGE_WEDGE", "VTK_LAGRANGE_PYRAMID")  # fmt: skip
-# Cells of which each may be a region; of more cells, a number for each is an index.
+# Maximum number of cells for which one region per cell is accepted; for more cells, unique values are an index.
 FEW = 8
-# Nodes closer than this share of the body's size are one.
+# Merge distance of nodes, as a fraction of the body's size.
 COINCIDENT = 1e-9
-# Smallest barycentric coordinate of a point that lies inside a tetrahedron, not on its border.
+# Minimum barycentric coordinate of a point strictly inside a tetrahedron.
 INSIDE = 1e-3
-# Nodes and middles of tetrahedra that are looked for in other ones: an overlap of a thousandth of the volume shows.
+# Maximum number of nodes and centroids tested for overlap: enough to detect an overlap of 0.1 % of the volume.
 PROBES = 2**13
 SPELT = {"tumor": "tumour", "edema": "oedema", "ventricle": "ventricles", **{name: name for name in REGION_NAMES}}
-"""Names of regions in other spellings."""
+"""Region names by alternative spelling."""
 
 
 def check_cell_types(raw: Any, read: set[str]) -> None:
-    """Reject a mesh with volume cells of other types than those that are `read`.
+    """Reject a mesh that has volume cells of types other than `read`.
 
     Raises
     ------
     InputError
-        Naming the types.
+        With the names of these types.
     """
     others = {block.type for block in raw.cells if block.type.startswith(VOLUMES)} - read
     if others and read:
         counts = ", ".join(f"{sum(len(b.data) for b in raw.cells if b.type == one)} {one}" for one in sorted(others))
-        raise InputError(f"a part of its volume is {counts}: all of it must be tetrahedra. Split or mesh it so.")
+        raise InputError(
+            f"a part of its volume is {counts}: all of it must be tetrahedra. Split them, or mesh the volume again."
+        )
 
 
 def merge_nodes(
     points: np.ndarray, table: np.ndarray, data: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], int]:
-    """Points (V, 3), cells (T, n) and point data with one node in place of each group that coincides; how many went.
+    """Return points (V, 3), cells (T, n) and point data with coincident nodes merged, and the number of removed nodes.
 
     Raises
     ------
     InputError
-        Nodes that coincide and have different data.
+        Coincident nodes with different data.
     """
     used = np.unique(table)
-    whole = used[0] >= 0 and used[-1] < len(points)  # other numbers are rejected with the mesh
+    whole = used[0] >= 0 and used[-1] < len(points)  # invalid node numbers are rejected with the mesh
     size = np.ptp(points[used], axis=0).max() if whole else 0.0
     pairs = KDTree(points[used]).query_pairs(COINCIDENT * size, output_type="ndarray") if whole else used[:0]
     if not len(pairs):
@@ -71,17 +73,17 @@ def merge_nodes(
 
 
 def check_one_body(points: np.ndarray, tets: np.ndarray) -> None:
-    """Reject tetrahedra (T, 4) of positive orientation that are listed twice, or that overlap.
+    """Reject positively oriented tetrahedra (T, 4) that are listed twice or overlap.
 
     Raises
     ------
     InputError
-        Saying how many.
+        With the number of duplicates, faces or points.
     """
     faces = tets[:, FACES].reshape(-1, 3)
     turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
     sides = np.take_along_axis(faces, turn, axis=1).astype(np.int64) @ [len(points) ** 2, len(points), 1]
-    folded = len(faces) - len(np.unique(sides))  # two tetrahedra on one side of a face
+    folded = len(faces) - len(np.unique(sides))  # faces that two tetrahedra share on the same side
     twice = len(tets) - len(np.unique(np.sort(tets, axis=1), axis=0)) if folded else 0
     if twice:
         raise InputError(f"{twice} tetrahedra are listed twice: list each once.")
@@ -89,12 +91,12 @@ def check_one_body(points: np.ndarray, tets: np.ndarray) -> None:
     if inside:
         raise InputError(
             f"its tetrahedra overlap, at {inside} {'faces' if folded else 'nodes or middles'}: each place must lie in "
-            "one. Mesh it anew; of several bodies, cut them out of each other first, and mesh them together."
+            "one. Mesh it again; of several bodies, cut them out of each other first, and mesh them together."
         )
 
 
 def note_pieces(mesh: TetMesh) -> tuple[str, ...]:
-    """Return a note on a mesh in pieces that share no node; none where it is one."""
+    """Return a note if the mesh consists of several components without common nodes, else ()."""
     links = mesh.tets[:, [0, 0, 0]].ravel(), mesh.tets[:, 1:].ravel()
     graph = coo_array((np.ones(len(links[0])), links), shape=(len(mesh.nodes),) * 2)
     piece = connected_components(graph, directed=False)[1]
@@ -111,7 +113,7 @@ def note_pieces(mesh: TetMesh) -> tuple[str, ...]:
 
 
 def _inside_others(points: np.ndarray, tets: np.ndarray) -> int:
-    """Count nodes and middles of tetrahedra (T, 4), `PROBES` of them at most, that lie inside of another one."""
+    """Count nodes and centroids of tetrahedra (T, 4), at most `PROBES`, that lie inside another tetrahedron."""
     corners = points[tets]
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
@@ -127,14 +129,14 @@ def _inside_others(points: np.ndarray, tets: np.ndarray) -> int:
 
 
 def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Region (T,) of each tetrahedron in some blocks of cells, and a note where it is not cell data `region`.
+    """Return the region (T,) of each tetrahedron in the given cell blocks, and a note if it is not cell data `region`.
 
-    Without such data it is the one array of whole numbers that varies, or the sets of cells.
+    Without such data, regions are the only integer cell array that varies, or the cell sets.
 
     Raises
     ------
     InputError
-        `region` that is not one whole number for each, several arrays that differ, or sets that overlap.
+        `region` that is not one integer per tetrahedron, several arrays that differ, or sets that overlap.
     """
     if "region" in raw.cell_data:
         region = _whole(np.concatenate([raw.cell_data["region"][number] for number in blocks]))
@@ -144,7 +146,7 @@ def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str,
     stored = {name: _whole(np.concatenate([on[number] for number in blocks])) for name, on in raw.cell_data.items()}
     varied = {name: one for name, one in stored.items() if one is not None and _parts(one)}
     if "gmsh:physical" in varied:
-        varied.pop("gmsh:geometrical", None)  # the entities that the groups are made of
+        varied.pop("gmsh:geometrical", None)  # geometrical entities of the physical groups
     groups = {name: np.atleast_1d(value) for name, value in raw.field_data.items()}
     names = {int(v[0]): name for name, v in groups.items() if v.dtype.kind in "iu" and v.size == 2 and v[1] == 3}
     names |= {number: ", ".join(said) for number, said in getattr(raw, "cell_tags", {}).items()}
@@ -158,22 +160,22 @@ def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str,
 
 
 def _parts(values: np.ndarray) -> bool:
-    """Return True if whole numbers (T,) part the cells, and do not number them."""
+    """Return True if integers (T,) partition the cells rather than number them."""
     count = len(np.unique(values))
     return count > 1 and (count < len(values) or count <= FEW)
 
 
 def _whole(values: np.ndarray) -> np.ndarray | None:
-    """Values (T,) as whole numbers; None where they are none."""
+    """Return the values (T,) as integers; None if they are not integers."""
     if values.ndim != 1 or values.dtype.kind not in "biuf":
         return None
-    with np.errstate(invalid="ignore"):  # what is no number, or too large for one, does not come back
+    with np.errstate(invalid="ignore"):  # casts of NaN or overflow fail the comparison below
         whole = values.astype(np.int32)
     return whole if np.array_equal(values, whole) else None
 
 
 def _from_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Regions by the file's named sets of cells; one region 0 where no set parts the body."""
+    """Return regions from the named cell sets of a file; all 0 if no set divides the body."""
     marked, total = {}, sum(len(raw.cells[number].data) for number in blocks)
     for name, on in raw.cell_sets.items():
         masks = [np.zeros(len(raw.cells[number].data), bool) for number in blocks]
@@ -194,12 +196,9 @@ def _from_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]
 def _named(
     region: np.ndarray, names: Mapping[int, str], said: str, free: bool = False
 ) -> tuple[np.ndarray, tuple[str]]:
-    """Regions whose numbers are those of their groups' `names`, and a note; numbers that are not the file's are `free`.
+    """Return regions renumbered to match the group `names`, and a note; `free` numbers are not from the file.
 
-    Raises
-    ------
-    InputError
-        Names of which some are of regions, and others not, where the numbers contradict them.
+    Without contradiction between numbers and known names, numbers of the file are kept.
     """
     known = {number: SPELT.get(names.get(number, "").strip().lower()) for number in np.unique(region).tolist()}
     wrong = [number for number, name in known.items() if name and REGION_NAMES[name] != number]

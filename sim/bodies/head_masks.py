@@ -1,4 +1,4 @@
-"""Which voxels are brain and which tumour, from one label map or from several files on grids of their own."""
+"""Masks of brain and tumour from one label map or from several files on different grids."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from .placement import describe_side
 from .volume import read_volume
 from .voxels import OF_BRAINS, VoxelGrid, Voxels
 
-# Share of what is labelled that may lie outside of a mask without a word.
+# Fraction of labelled voxels that may lie outside the mask without a note.
 OUTSIDE = 0.01
 NECROSIS = "necrosis"
-"""The part that lies in the tumour; all others lie in the brain."""
-# Voxels that are kept round a brain: more than a tumour at the cortex goes on beyond it.
+"""Name of the part that belongs to the tumour; all other parts belong to the brain."""
+# Margin kept around brain and tumour [voxels]: larger than the tumour extension beyond the cortex.
 SURROUNDINGS = 10
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Files and labels that say what is brain and what tumour.
+    """Files and labels that define brain and tumour.
 
     Parameters
     ----------
     labels
-        The label map, whose grid is kept.
+        Label map, whose grid is used.
     brain, tumour
-        Labels by number or name; () for those of the convention, or for what other files mark.
+        Labels by number or name; () for those of the convention, or if other files mark them.
     convention
-        A name of `CONVENTIONS`, or None.
+        Name in `CONVENTIONS`, or None.
     mask
-        A volume whose voxels other than 0 are brain, in place of `brain`.
+        Volume whose nonzero voxels are brain; replaces `brain`.
     tumour_in
-        A label map that the labels `tumour` are of, all of them if there are none, and those of necrosis.
+        Label map that the labels `tumour` (all of its labels if empty) and those of necrosis refer to.
     parts
-        Labels of other tissues by name of `PART_LABELS` or `SEPTA`, in place of the convention's. Necrosis counts as
-        tumour, and all else as brain.
+        Labels of other tissues by name in `PART_LABELS` or `SEPTA`; they replace the convention's. Necrosis counts as
+        tumour, all other parts as brain.
     axes
-        Directions of the axes of NIfTI files that state none, such as RAS.
+        Axis directions of NIfTI files without orientation, such as RAS.
     """
 
     labels: Path
@@ -60,34 +60,34 @@ class Sources:
 
     @property
     def voxels(self) -> Voxels:
-        """Voxels that the files may have."""
+        """Reading options for the files."""
         return Voxels(axes=self.axes)
 
 
 @dataclass(frozen=True, eq=False)
 class HeadMasks:
-    """Marked voxels (I, J, K) bool on one grid.
+    """Masks (I, J, K) bool on a common grid.
 
     Parameters
     ----------
     name
-        Of the file, or of the files, as errors say it.
+        File name or names, for error messages.
     meant
-        What is taken for brain, in words.
+        Description of the brain's source.
     brain, tumour
-        What is labelled so; the brain need not hold the tumour.
+        Labelled voxels; the brain mask need not include the tumour.
     cut
-        Voxels of the brain on the border of a file that has a grid of its own.
+        Number of brain voxels on the border of their file's grid.
     grids
-        Of the files that were read.
+        Grids of the files.
     voxels
-        Voxels that a scan of the head may have.
+        Reading options for further scans of the head.
     parts
-        Other tissues by name, as `Sources.parts`, or as a convention tells them.
+        Masks of other tissues by name, as in `Sources.parts` or from the convention.
     affine
         (4, 4) from indices to metres (RAS).
     notes
-        Sentences about what had to be assumed.
+        Notes on assumptions.
     """
 
     name: str
@@ -103,14 +103,14 @@ class HeadMasks:
 
 
 def read_head_masks(sources: Sources) -> HeadMasks:
-    """Read what is brain and what tumour, on the label map's grid, widened so far that it holds the other files.
+    """Read brain and tumour masks on the label map's grid, extended to contain the other files.
 
     Raises
     ------
     InputError
-        What `read_labels` and `read_volume` refuse; a convention that is not known, or that the labels are not of.
-        Labels that are not there, or named twice; no labels, and nothing that stands for them. Left that lies on the
-        right. A tumour in another file that does not lie at the brain.
+        Input that `read_labels` or `read_volume` rejects; an unknown convention, or labels that do not follow it.
+        Labels that are missing or named twice; no labels and no replacement. Left labels on the right
+        side. A tumour in another file that does not lie at the brain.
     """
     convention = _convention(sources)
     _demand_named(sources, convention)
@@ -164,7 +164,7 @@ def read_head_masks(sources: Sources) -> HeadMasks:
 
 
 def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
-    """Return a note on labels of the file that were given no meaning."""
+    """Return a note on labels of the file that have no assigned meaning."""
     names = {(one.layer, one.value): one.name for one in whole.segments}
     found = {(layer, value) for layer, present in enumerate(whole.present) for value in present}
     left = [names.get(place, place[1]) for place in sorted(found - set(whole.places(named)))]
@@ -172,7 +172,7 @@ def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
 
 
 def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]) -> tuple[str, ...]:
-    """Return a note on labels of one's own that the anatomy contradicts."""
+    """Return a note on the user's own labels if the anatomy contradicts them."""
     if whole.layers.shape[-1] > 1 or not {NECROSIS, "oedema"}.intersection(parts):
         return ()
     own = {name: tuple(value for _, value in whole.places(labels)) for name, labels in parts.items()}
@@ -183,7 +183,7 @@ def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tupl
 
 
 def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
-    """Return a note on which side the tumour lies, as nothing else tells whether a file is of the right space."""
+    """Return a note on the side of the tumour, for a file that would also fit with x and y negated."""
     low, high = Mask(path, marked["brain"], affine).box
     centre = affine[:3, :3] @ np.argwhere(marked["tumour"]).mean(axis=0) + affine[:3, 3]
     return (
@@ -193,7 +193,7 @@ def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
 
 
 def _outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ...]:
-    """Return a note, if much of what is labelled lies outside of the brain's mask."""
+    """Return a note if many labelled voxels lie outside the brain mask."""
     labelled = np.logical_or.reduce([mask for name, mask in marked.items() if name != "brain"])
     out = int((labelled & ~marked["brain"]).sum())
     if out <= OUTSIDE * labelled.sum():
@@ -203,7 +203,7 @@ def _outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ..
 
 
 def _cavity(whole: LabelMap, convention: Convention | None, named: Mapping[str, Sequence[Label]]) -> tuple[str, ...]:
-    """Return a note on fluid that a convention of tumours marks, as a mask of the brain holds it."""
+    """Return a note on cavity fluid that a tumour convention marks, since a brain mask may include it."""
     fluid = _there(convention.csf, whole) if convention and convention.tumour else ()
     if not fluid or set(fluid) <= {label for labels in named.values() for label in labels}:
         return ()
@@ -216,7 +216,7 @@ def _cavity(whole: LabelMap, convention: Convention | None, named: Mapping[str, 
 
 
 def _cropped(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return the masks where brain or tumour are, and `SURROUNDINGS` voxels round them; and the affine (4, 4) there."""
+    """Return the masks cropped to brain and tumour with a margin of `SURROUNDINGS` voxels, and their affine (4, 4)."""
     anything = marked["brain"] | marked["tumour"]
     ends = [np.flatnonzero(anything.any(axis=tuple({0, 1, 2} - {axis})))[[0, -1]] for axis in range(3)]
     low = np.maximum(0, np.array(ends)[:, 0] - SURROUNDINGS)
@@ -229,7 +229,7 @@ def _cropped(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[st
 def _meant(
     whole: LabelMap, sources: Sources, convention: Convention | None
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
-    """Return the labels of brain and tumour: those given, or the convention's that are there."""
+    """Return the labels of brain and tumour: the user's, or those of the convention that occur."""
     brain, tumour = sources.brain, sources.tumour
     if convention is not None:
         necrosis = sources.parts.get(NECROSIS, ())
@@ -258,13 +258,13 @@ def _there(labels: Sequence[int], whole: LabelMap) -> tuple[int, ...]:
 
 
 def _parts(whole: LabelMap, convention: Convention) -> dict[str, np.ndarray]:
-    """Masks of the other tissues that the file marks."""
+    """Return masks of the convention's other tissues that occur in the file."""
     groups = {NECROSIS: convention.necrosis, "oedema": convention.oedema, "ventricles": convention.ventricles}
     return {name: whole.mask(found) for name, of in groups.items() if (found := _there(of, whole))}
 
 
 def _others(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
-    """What other files mark."""
+    """Read the masks that other files define, by name."""
     others = {}
     if sources.mask:
         volume = read_volume(sources.mask, sources.voxels)
@@ -291,9 +291,9 @@ def _convention(sources: Sources) -> Convention | None:
 
 
 def _demand_named(sources: Sources, convention: Convention | None) -> None:
-    """Refuse where nothing says what the brain is, or the tumour, or where two things do."""
+    """Reject sources that do not define the brain and the tumour exactly once."""
     if sources.mask and sources.brain:
-        raise InputError("--mask says what is brain, and --brain does: leave one of them out.")
+        raise InputError("--mask and --brain both define the brain: give only one of them.")
     if sources.mask and sources.tumour_in:
         raise InputError(
             "--mask says what is brain and --tumour-in what is tumour: of the labels nothing is left. Give the "
@@ -302,7 +302,7 @@ def _demand_named(sources: Sources, convention: Convention | None) -> None:
     if convention is not None and convention.mask and not (sources.mask or sources.brain):
         raise InputError(
             f"{sources.labels}: labels of {convention.name} do not mark the brain. Give --mask BRAIN.nii.gz; "
-            "an image without its skull will do."
+            "a skull-stripped image is accepted."
         )
     if not (sources.brain or sources.mask or (convention and convention.brain)):
         raise InputError("name at least one label of the brain: --brain 1,2, or give --mask BRAIN.nii.gz.")
@@ -313,9 +313,9 @@ def _demand_named(sources: Sources, convention: Convention | None) -> None:
 
 
 def _demand_one_meaning(whole: LabelMap, named: Mapping[str, tuple[str, Sequence[Label]]]) -> None:
-    """Refuse a label that two options name: by name of a tissue the option and its labels.
+    """Reject a label that two options name; `named` maps each tissue to its option and labels.
 
-    Brain may be named again as a part of brain, and tumour as necrosis.
+    A part of the brain may also be labelled brain, and necrosis also tumour.
     """
     for (one, (option, labels)), (two, (other, others)) in combinations(named.items(), 2):
         if one == _around(two):
@@ -330,12 +330,12 @@ def _demand_one_meaning(whole: LabelMap, named: Mapping[str, tuple[str, Sequence
 
 
 def _around(part: str) -> str:
-    """What a part of a head counts as; empty of brain and tumour themselves."""
+    """Return the mask that contains a part; empty for brain and tumour themselves."""
     return "" if part in ("brain", "tumour") else "tumour" if part == NECROSIS else "brain"
 
 
 def _demand_sides(whole: LabelMap, convention: Convention) -> None:
-    """Refuse labels whose left half lies on the right: the file's axes are not what it says."""
+    """Reject labels of the left hemisphere that lie on the right: the file's orientation is wrong."""
     right = []
     for side in (convention.left, convention.right):
         index = np.argwhere(np.isin(whole.layers[..., 0], side))
@@ -343,5 +343,5 @@ def _demand_sides(whole: LabelMap, convention: Convention) -> None:
     if right[0] > right[1]:
         raise InputError(
             f"{whole.path}: its labels of the left half lie {1e3 * (right[0] - right[1]):.0f} mm to the right of those "
-            "of the right half. Its affine is mirrored, or it is LPS that is stated as RAS: export it anew."
+            "of the right half. Its affine is mirrored, or it is LPS declared as RAS: export it again."
         )

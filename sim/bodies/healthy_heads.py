@@ -1,4 +1,4 @@
-"""Healthy heads beside the template: a mask of the brain, and what the inner skull of fsaverage encloses."""
+"""Healthy heads other than the template: from a brain mask, or from the inner skull of fsaverage."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from .label_volume import fill_brain
 from .template import MIDDLE, HealthyHead, measure_size, scale_affine
 from .volume import read_volume
 
-SEEN_FROM = (1e-3 * MIDDLE[0], 1e-3 * MIDDLE[1], 1e-3 * MIDDLE[2])
+SEEN_FROM = (1e-3 * MIDDLE[0], 1e-3 * MIDDLE[1], 1e-3 * MIDDLE[2])  # centre of the view [m]
 INNER_SKULL = Path("data", "fsaverage", "fsaverage-inner_skull-bem.fif")
-"""Where the wheel of mne has it."""
+"""Path of the inner skull surface in the package mne."""
 VOXEL = 1e-3
-"""[m] The skull is put onto voxels of this edge."""
-REMEDY = install_hint("heads")
+"""Voxel edge for the voxelised skull [m]."""
+REMEDY = install_hint("heads")  # remedy of messages about the package mne
 
 
 def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> HealthyHead:
-    """The head whose brain is what is not 0 in a volume, scaled about its centroid to a `volume` [m^3] if one is given.
+    """Return the head whose brain is the nonzero voxels of a mask, scaled about its centroid to `volume` [m^3].
 
-    `t1` is a volume of intensities in the same space, and is scaled with it.
+    `t1` is an intensity volume in the same space and is scaled with it.
 
     Raises
     ------
     InputError
-        What `read_volume`, `read_intensity` and `fill_brain` refuse, and a volume in which all is 0.
+        Input that `read_volume`, `read_intensity` or `fill_brain` rejects, and a volume that is 0 everywhere.
     """
     read = read_volume(mask)
     brain = read.values != 0
     if not brain.any():
-        raise InputError(f"{mask}: has no voxel other than 0: give a mask of the brain.")
+        raise InputError(f"{mask}: all voxels are 0: give a mask of the brain.")
     notes = list(read.notes)
     masks = HeadMasks(str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, cut=count_on_border(brain))
     solid = fill_brain(masks, notes)
@@ -51,12 +51,12 @@ def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None =
 def read_fsaverage_head(volume: float) -> HealthyHead:
     """Return the head of fsaverage, scaled to a `volume` [m^3]: all that its inner skull encloses counts as brain.
 
-    The surface of this body is the skull: no fluid lies between them, and no sulci are in it.
+    The brain surface coincides with the skull: there is no fluid between them, and there are no sulci.
 
     Raises
     ------
     InputError
-        A package mne that is not there, or that does not hold the skull as one closed surface.
+        The package mne is missing, or does not contain the skull as one closed surface.
     """
     path = _skull_path()
     points, triangles = read_surface(path)
@@ -70,7 +70,7 @@ def read_fsaverage_head(volume: float) -> HealthyHead:
 def _skull_path() -> Path:
     found = find_spec("mne")
     if found is None or not found.submodule_search_locations:
-        raise InputError(f"fsaverage's skull is in the package mne, which is not there. {REMEDY}")
+        raise InputError(f"fsaverage's skull is in the package mne, which is not installed. {REMEDY}")
     path = Path(found.submodule_search_locations[0]) / INNER_SKULL
     if not path.is_file():
         raise InputError(f"{path}: no such file, so this mne holds no skull of fsaverage. {REMEDY}")

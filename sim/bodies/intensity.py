@@ -1,4 +1,4 @@
-"""T1 intensities beside a mesh: a small NIfTI volume in the mesh's own frame, sampled at material points."""
+"""T1 intensities of a mesh: a small NIfTI volume in mesh coordinates, sampled at material points."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from ..runtime.atomic_files import write_atomically
 from .volume import read_volume
 from .voxels import OF_BRAINS, Voxels
 
-# Grey values that differ by less than this share of them are one.
+# Relative difference below which grey values count as equal.
 ALIKE = 1e-6
 
 
 @dataclass(frozen=True)
 class Window:
-    """Which grey values of a brain are dark and which are light, whatever a scanner's scale and zero are.
+    """Mapping of a scan's grey values to 0 .. 1, independent of the scanner's scale and offset.
 
     Parameters
     ----------
     low, high
-        Per cent of the brain, by volume, that is darker: few voxels, such as vessels, do not shift them.
+        Percentiles of the brain by volume, robust against a few voxels such as vessels.
     dark, light
-        In 0 .. 1: what these two become. What is beyond goes on in the same way, up to 0 and 1.
+        Grey values in 0 .. 1 of these percentiles; values outside are extrapolated linearly and clipped to 0 .. 1.
     beyond
-        What is brighter than `high` by so many times the difference of the two is no tissue: a vessel with contrast
-        agent, fat, or a voxel that is wrong.
+        Excess over `high`, in units of high - low, above which a voxel is not tissue: a vessel with contrast
+        agent, fat, or a wrong value.
     plain
-        What all becomes where the brain has one grey value.
+        Grey value if the brain is uniform.
     """
 
     low: float = 5.0
@@ -44,29 +44,29 @@ class Window:
 
 
 KEPT = Window(dark=0.25, light=0.75)
-"""That of the file beside a mesh: it keeps what is darker and lighter than nearly all of the brain."""
+"""Window of the file stored with a mesh: it preserves values darker and lighter than nearly all of the brain."""
 
 
 @dataclass(frozen=True, eq=False)
 class Intensity:
-    """Grey values (I, J, K), and the affine (4, 4) from voxel indices to metres in the mesh's RAS frame."""
+    """Grey values (I, J, K), and the affine (4, 4) from voxel indices to metres in mesh coordinates (RAS)."""
 
     values: np.ndarray
     affine: np.ndarray
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """Values (n,) in [0, 1] at points (n, 3) [m]: trilinear, 8-bit grey over 255, zero outside the volume."""
+        """Return values (n,) in [0, 1] at points (n, 3) [m]: trilinear, 8-bit grey / 255, zero outside the volume."""
         inverse = np.linalg.inv(self.affine)
         index = inverse[:3, :3] @ points.T + inverse[:3, 3:]
         return ndimage.map_coordinates(self.values, index, order=1, mode="constant", output=np.float64) / 255.0
 
     def around(self, points: np.ndarray, mesh: TetMesh, margin: float = 0.015) -> Intensity:
-        """Return the part round the box of points (n, 3) [m], with a margin [m], in the 8-bit grey of `KEPT`.
+        """Return the part around the box of points (n, 3) [m], with a margin [m], as 8-bit grey by `KEPT`.
 
         Raises
         ------
         InputError
-            A volume that does not reach there, or has no numbers in the brain.
+            A volume that does not cover the box, or has no finite values in the brain.
         """
         inverse = np.linalg.inv(self.affine)
         index = points @ inverse[:3, :3].T + inverse[:3, 3]
@@ -81,14 +81,14 @@ class Intensity:
         return Intensity(np.rint(255.0 * part.apply_window(mesh, KEPT)).astype(np.uint8), affine)
 
     def apply_window(self, mesh: TetMesh, window: Window = Window()) -> np.ndarray:
-        """Return the values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same frame.
+        """Return the values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same coordinates.
 
-        What is no number, or far too bright for tissue, becomes the brain's median.
+        Values that are not finite or far too bright for tissue are replaced by the brain's median.
 
         Raises
         ------
         InputError
-            A volume that has no finite numbers in the brain.
+            A volume without finite values in the brain.
         """
         corners = mesh.nodes[mesh.tets]
         inverse = np.linalg.inv(self.affine)
@@ -97,7 +97,7 @@ class Intensity:
         found = self.values[tuple(index[there].astype(int).T)].astype(np.float64)
         known = np.isfinite(found)
         if not known.any():
-            raise InputError("the T1 volume has no numbers in the brain: give one in the labels' own space.")
+            raise InputError("the T1 volume has no finite values in the brain: give one in the labels' own space.")
         found, size = found[known], mesh.volumes[there][known]
         order = np.argsort(found, kind="stable")
         share = (np.cumsum(size[order]) - 0.5 * size[order]) / size.sum()
@@ -111,17 +111,17 @@ class Intensity:
 
 
 def to_intensity_path(mesh: str | Path) -> Path:
-    """Where the intensities of a mesh file lie: MESH.t1.nii.gz beside MESH.vtu."""
+    """Return the path of a mesh file's intensities: MESH.t1.nii.gz next to MESH.vtu."""
     return Path(mesh).with_suffix(".t1.nii.gz")
 
 
 def write_intensity(path: str | Path, intensity: Intensity) -> None:
-    """Write 8-bit intensities as NIfTI in millimetres (RAS); the file appears whole or not at all.
+    """Write 8-bit intensities as NIfTI in millimetres (RAS), atomically.
 
     Raises
     ------
     InputError
-        A folder that cannot be written to.
+        A folder that is not writable.
     """
     import nibabel
 
@@ -134,12 +134,12 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
 
 
 def read_intensity(path: str | Path, voxels: Voxels = OF_BRAINS) -> Intensity:
-    """Read a volume of grey values: what `write_intensity` wrote, or a patient's scan.
+    """Read a grey value volume, from `write_intensity` or a patient's scan.
 
     Raises
     ------
     InputError
-        A file that is missing, unreadable, or not a volume. Voxels without a number are kept.
+        A file that is missing, unreadable, or not a volume. Non-finite voxels are kept.
     """
     volume = read_volume(path, voxels, finite=False)
     return Intensity(volume.values, volume.affine)

@@ -1,8 +1,8 @@
-"""Carve a body out of a lattice: snap nodes to a zero surface, then split the tetrahedra that it still crosses.
+"""Isosurface stuffing: snap lattice nodes to a zero level set, then split the tetrahedra that still cross it.
 
-Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral Meshes with Good Dihedral Angles". Carried out twice it
-gives two materials: once for the outer surface, of which one side is kept, and once for the interface, of which
-both are.
+Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral Meshes with Good Dihedral Angles". Applied twice, it
+gives two materials: first for the outer surface, of which the inside is kept, then for the interface, of which
+both sides are kept.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from ..geometry.tetmesh import EDGES
 from .bcc_lattice import Lattice
 from .signed_distance import Field
 
-CENTRE, CORNER, CUT = 0, 1, 2
+CENTRE, CORNER, CUT = 0, 1, 2  # node kinds: cell centre, cell corner, point on an earlier cut
 
+# Even permutations of 0..3; row k puts corner k first.
 LONE_FIRST = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 PAIR_FIRST = {3: [0, 1, 2, 3], 5: [0, 2, 3, 1], 9: [0, 3, 1, 2], 6: [1, 2, 0, 3], 10: [1, 3, 2, 0], 12: [2, 3, 0, 1]}
-# Dompierre et al. 1999: turn a prism so that its smallest node comes first, then split the two quadrilaterals there
-# from that node and the third from its own smallest; neighbours then agree without knowing of each other.
+# Same for two corners first, by the bit mask of their numbers.
+# Dompierre et al. 1999: rotate a prism so that its smallest node comes first, then split the two quadrilaterals there
+# from that node and the third from its own smallest; neighbouring prisms then conform without communication.
 TURN = np.array(
     [
         [0, 1, 2, 3, 4, 5],
@@ -31,26 +33,27 @@ TURN = np.array(
         [5, 4, 3, 2, 1, 0],
     ]
 )
+# Tetrahedra of a prism whose third quadrilateral is split along nodes 1-5, or along 2-4.
 SPLIT_15 = np.array([[0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3]])
 SPLIT_24 = np.array([[0, 1, 2, 4], [0, 4, 2, 5], [0, 4, 5, 3]])
 
 
 @dataclass(frozen=True)
 class IsosurfaceStuffingOptions:
-    """How far a cut pulls nodes onto its surface, and how exactly it finds where an edge crosses that.
+    """Snapping thresholds and edge intersection accuracy of `cut`.
 
     Parameters
     ----------
     snap_long, snap_short
-        Shares of a long and of a short edge of the lattice: a crossing nearer to a node pulls the node onto the
+        Fractions of a long and of a short lattice edge: a crossing nearer to a node than this snaps the node to the
         surface. Section 4 of the paper: this pair bounds every dihedral angle by 10.7 degrees on an ungraded lattice.
     snap_other
-        The share of an edge that ends at a node of an earlier cut, for which the paper has none.
+        Fraction of an edge that ends at a node of an earlier cut, for which the paper gives no value.
     snap_shortest
-        Farthest pull, as a share of the node's shortest edge. Where the lattice changes size, the shares of a long
-        edge would turn the small tetrahedra beside it inside out.
+        Maximum snapping distance, as a fraction of the node's shortest edge. Where the lattice changes size, the
+        fraction of a long edge would invert the small tetrahedra next to it.
     bisections
-        Halvings of an edge in search of the crossing: 24 leave 6e-8 of it.
+        Bisection steps per edge: 24 leave an error of 6e-8 of its length.
     """
 
     snap_long: float = 0.24999
@@ -62,7 +65,7 @@ class IsosurfaceStuffingOptions:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Tetrahedra that do not cross the surfaces cut so far.
+    """Tetrahedra that do not cross any surface cut before.
 
     nodes (V, 3) [m]; kind (V,): CENTRE, CORNER or CUT; tets (T, 4), positively oriented; inside (T,) bool and
     surface (V,) bool, both with respect to the last cut.
@@ -75,7 +78,7 @@ class Pieces:
     surface: np.ndarray
 
     def kept(self, keep: np.ndarray) -> Pieces:
-        """Return the tetrahedra marked in `keep` (T,), and their nodes, renumbered in order."""
+        """Return the tetrahedra marked in `keep` (T,) and their nodes, renumbered in order."""
         used = np.zeros(len(self.nodes), bool)
         used[self.tets[keep]] = True
         tets = (np.cumsum(used) - 1)[self.tets[keep]]
@@ -83,7 +86,7 @@ class Pieces:
 
 
 def build_whole(lattice: Lattice) -> Pieces:
-    """Return a lattice that nothing has cut yet."""
+    """Return an uncut lattice as pieces, all of it inside."""
     kind = np.where(lattice.centre, CENTRE, CORNER)
     everywhere = np.ones(len(lattice.tets), bool)
     return Pieces(lattice.nodes, kind, lattice.tets, everywhere, np.zeros(len(kind), bool))
@@ -95,9 +98,9 @@ def cut(
     pinned: np.ndarray | None = None,
     settings: IsosurfaceStuffingOptions = IsosurfaceStuffingOptions(),
 ) -> Pieces:
-    """Split `pieces` along the zero surface of `field`.
+    """Split `pieces` along the zero level set of `field`.
 
-    Nodes near the surface are pulled onto it, but for those `pinned` (V,), which count as lying on it where they are.
+    Nodes near the surface are moved onto it; `pinned` nodes (V,) stay in place and count as lying on it.
     """
     nodes = pieces.nodes.copy()
     values = field(nodes)
@@ -122,7 +125,7 @@ def cut(
 
 
 def _crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Edges (E, 2), smaller node first, whose ends lie strictly on different sides."""
+    """Return edges (E, 2), smaller node first, whose ends lie strictly on different sides."""
     sides = np.sign(values)[tets]
     crossed = tets[(sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)]
     edges = np.sort(crossed[:, EDGES].reshape(-1, 2), axis=1)
@@ -132,7 +135,7 @@ def _crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _crossings(field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.ndarray, bisections: int) -> np.ndarray:
-    """Where (E,) along each edge, in (0, 1), the field vanishes; by bisection, since it need only be continuous."""
+    """Return positions (E,) in (0, 1) of the field's zero on each edge, by bisection: the field may be non-smooth."""
     start, along = nodes[edges[:, 0]], nodes[edges[:, 1]] - nodes[edges[:, 0]]
     sign = np.sign(values[edges[:, 0]])
     low, high = np.zeros(len(edges)), np.ones(len(edges))
@@ -144,7 +147,7 @@ def _crossings(field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.nd
 
 
 def _snapping_reach(pieces: Pieces, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
-    """Return the share (E, 2) of each edge within which a crossing pulls either end."""
+    """Return the fraction (E, 2) of each edge within which a crossing snaps either end."""
     kinds = pieces.kind[edges]
     share = np.where(kinds[:, 0] == kinds[:, 1], settings.snap_long, settings.snap_short)
     share = np.where((kinds == CUT).any(axis=1), settings.snap_other, share)
@@ -160,9 +163,9 @@ def _lengths(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def _snapped(edges: np.ndarray, at: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (S,) to pull onto the surface and the edge (S,) whose crossing each is pulled to.
+    """Return nodes (S,) to move onto the surface, and the edge (S,) whose crossing each moves to.
 
-    The nearest pairs first: a pulled node takes the crossings of all its edges away, which may spare its neighbours.
+    Closest pairs come first: a moved node removes the crossings of all its edges, so neighbours may not need to move.
     """
     node, edge = edges.T.ravel(), np.tile(np.arange(len(edges)), 2)
     share = np.concatenate([at, 1.0 - at])
@@ -178,7 +181,7 @@ def _snapped(edges: np.ndarray, at: np.ndarray, reach: np.ndarray) -> tuple[np.n
 
 
 def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split tetrahedra at the middle nodes of crossed `edges`; these are numbered on from len(side), in order."""
+    """Split tetrahedra at the crossings of `edges`, numbered from len(side); return them and whether each is inside."""
     sides = side[tets]
     inner, outer = (sides < 0).sum(axis=1), (sides > 0).sum(axis=1)
     mixed = (inner > 0) & (outer > 0)
@@ -186,12 +189,12 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     keys = edges[:, 0] * len(side) + edges[:, 1]
 
     def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the node on edge a-b: its crossing, or the end b that lies on the surface itself."""
+        """Return the node on edge a-b: its crossing, or the end b if that lies on the surface."""
         key = np.minimum(a, b) * len(side) + np.maximum(a, b)
         crossing = np.searchsorted(keys, key) + len(side)
         return np.where(side[b] == 0, b, crossing)
 
-    # One corner against the rest: a tetrahedron at it, and a prism (degenerate where other corners lie on the surface).
+    # One corner against the others: a tetrahedron there, and a prism (degenerate if other corners lie on the surface).
     wanted = np.where(inner == 1, -1, 1)[lone]
     turned = np.take_along_axis(tets[lone], LONE_FIRST[np.argmax(sides[lone] == wanted[:, None], axis=1)], axis=1)
     apex, *others = turned.T
@@ -199,7 +202,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     tips = np.stack([apex, *base], axis=1)
     stumps, stump_of = _prisms_split(np.stack([*base, *others], axis=1))
 
-    # Two against two: a wedge on either side.
+    # Two corners against two: one wedge on each side.
     pairs = mixed & ~lone
     code = (sides[pairs] < 0) @ (1 << np.arange(4))
     order = np.array([PAIR_FIRST.get(number, [0, 1, 2, 3]) for number in range(16)])[code]
@@ -219,7 +222,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
 
 
 def _prisms_split(prisms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra (n, 4) of prisms (P, 6), and the prism (n,) of each; those with a repeated node are dropped."""
+    """Return tetrahedra (n, 4) of prisms (P, 6), and the prism (n,) of each; those with a repeated node are dropped."""
     turned = np.take_along_axis(prisms, TURN[np.argmin(prisms, axis=1)], axis=1)
     first = turned[:, [1, 5]].min(axis=1) < turned[:, [2, 4]].min(axis=1)
     tets = np.where(first[:, None, None], turned[:, SPLIT_15], turned[:, SPLIT_24]).reshape(-1, 4)

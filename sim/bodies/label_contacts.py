@@ -1,4 +1,4 @@
-"""Contacts between the labels of a volume, and meanings of labels that the anatomy contradicts."""
+"""Contact areas between labels of a volume, and detection of conventions that contradict the anatomy."""
 
 from __future__ import annotations
 
@@ -11,37 +11,38 @@ from scipy import ndimage
 from .conventions import CONVENTIONS, Convention
 from .label_map import LabelMap
 
-# Share of all labelled voxels: an oedema below it is noise.
+# Minimum oedema volume, as a fraction of all labelled voxels; smaller ones are noise.
 SPECK = 0.02
-# Share of an oedema's surface that faces unlabelled tissue: above SURE in every tumour, below HIDDEN in none.
-HIDDEN, SURE = 0.2, 0.4
-# Difference of two such shares that is no matter of chance.
+# Fraction of an oedema's surface that faces neither tumour nor oedema.
+HIDDEN = 0.2  # below it in no tumour
+SURE = 0.4  # above it in every tumour
+# Significant difference between two such fractions.
 MARGIN = 0.1
-# Share of the surface of enhancing tumour that touches necrosis: above it the necrosis lies outside.
+# Fraction of the enhancing tumour's surface at necrosis above which the necrosis lies outside.
 WRAPPED = 0.7
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Labels (n,) of a volume, 0 among them, the areas (n, n) [m^2] where they touch, and their voxels (n,)."""
+    """Labels (n,) of a volume including 0, contact areas (n, n) [m^2] between them, and voxel counts (n,)."""
 
     labels: np.ndarray
     areas: np.ndarray
     voxels: np.ndarray
 
     def share(self, of: Collection[int], other: Collection[int]) -> float:
-        """Share of the surface of labels that touches other labels; 0 where they have no surface."""
+        """Return the fraction of the surface of labels `of` that touches labels `other`; 0 without surface."""
         inside, there = np.isin(self.labels, list(of)), np.isin(self.labels, list(other))
         surface = self.areas[inside][:, ~inside].sum()
         return float(self.areas[inside][:, there & ~inside].sum() / surface) if surface else 0.0
 
     def volume(self, of: Collection[int]) -> float:
-        """Voxels of some labels as a share of all that are labelled."""
+        """Return the voxels of some labels as a fraction of all labelled voxels."""
         return float(self.voxels[np.isin(self.labels, list(of))].sum() / self.voxels[self.labels != 0].sum())
 
 
 def count_label_contacts(whole: LabelMap) -> Contacts:
-    """Contacts of the labels in the first layer; faces on the border of the volume do not count."""
+    """Return contacts of the labels in the first layer; faces on the border of the volume do not count."""
     layer, affine = whole.layers[..., 0], whole.affine[:3, :3]
     (box,) = ndimage.find_objects((layer != 0).astype(np.uint8))
     layer = layer[tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)]
@@ -58,16 +59,16 @@ def count_label_contacts(whole: LabelMap) -> Contacts:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Reason why labels cannot mean what a convention says; not `certain` of one that rare tumours show, too."""
+    """Reason why labels do not follow a convention; not `certain` if rare tumours show it as well."""
 
     reason: str
     certain: bool = True
 
 
 def find_contradiction(contacts: Contacts, convention: Convention) -> Contradiction | None:
-    """Compare a convention with the anatomy: necrosis lies inside enhancing tumour, oedema and cortex outside.
+    """Return a contradiction of a convention with the anatomy, or None.
 
-    Necrosis or oedema may be missing, or reach the surface of the brain. The rim of a tumour may be open.
+    Necrosis must lie inside enhancing tumour, oedema and cortex outside. Either may be missing or at the brain surface.
     """
     there = set(contacts.labels.tolist()) - {0}
     tumour, oedema, necrosis = (
@@ -97,9 +98,9 @@ def find_contradiction(contacts: Contacts, convention: Convention) -> Contradict
 
 
 def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
-    """Return function that says why the anatomy contradicts a convention; empty where it does not.
+    """Return a function that gives the reason why the anatomy contradicts a convention; empty if it does not.
 
-    What rare tumours show, too, is held against the `chosen` convention only where another one fits.
+    A contradiction that rare tumours show counts against the `chosen` convention only if another convention fits.
     """
     if whole.layers.shape[-1] > 1:
         return lambda _: ""

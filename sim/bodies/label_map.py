@@ -1,4 +1,4 @@
-"""Labels of voxels by number or by name, and masks of voxels that are brought from one grid onto another."""
+"""Labels of voxels by number or name, and resampling of masks between grids."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from ..runtime.file_limits import MOST_VOXELS
 from .volume import read_volume
 from .voxels import OF_BRAINS, Segment, VoxelGrid, Voxels
 
-# Difference of a label from a whole number that a slope of the file or a resampling leaves.
+# Maximum distance of a label from an integer, as left by scaling or resampling.
 ROUND_OFF = 1e-3
 
 Label = int | str
-"""A number, or what the file calls it."""
+"""Label number, or its name in the file."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelMap:
-    """Whole numbers of voxels.
+    """Integer label volume.
 
     Parameters
     ----------
     path
-        The file, as errors name it.
+        File path, for error messages.
     layers
-        (I, J, K, L) of whole numbers; most files have one layer.
+        Labels (I, J, K, L); most files have one layer.
     affine
         (4, 4) from indices to metres (RAS).
     notes
-        Sentences about what had to be assumed.
+        Notes on assumptions.
     segments
-        What the file calls its labels, if it does.
+        Named labels, if the file has names.
     """
 
     path: Path
@@ -49,37 +49,37 @@ class LabelMap:
 
     @cached_property
     def present(self) -> tuple[frozenset[int], ...]:
-        """Of each layer, the labels that some voxel has, without 0."""
+        """Labels that occur in each layer, without 0."""
         layers = np.moveaxis(self.layers, -1, 0)
         return tuple(frozenset(np.unique(layer.T).astype(int).tolist()) - {0} for layer in layers)
 
     @property
     def labels(self) -> frozenset[int]:
-        """The labels of all layers, without 0."""
+        """Labels of all layers, without 0."""
         return frozenset().union(*self.present)
 
     def mask(self, labels: Sequence[Label]) -> np.ndarray:
-        """Which voxels (I, J, K) have one of these labels; any label, if there are none.
+        """Return a mask (I, J, K) of voxels with one of these labels; of any label if the list is empty.
 
         Raises
         ------
         InputError
-            As `places`.
+            See `places`.
         """
         found = np.asarray(self.layers.any(axis=-1)) if not labels else np.zeros(self.layers.shape[:3], bool, order="F")
         places = self.places(labels)
         for layer in {layer for layer, _ in places}:
-            # Transposed: files have the first axis fastest, and NumPy copies what does not lie as it likes.
+            # Transposed: files have the first axis fastest, and NumPy would copy other memory layouts.
             found |= np.isin(self.layers[..., layer].T, [value for on, value in places if on == layer]).T
         return found
 
     def places(self, labels: Sequence[Label]) -> list[tuple[int, int]]:
-        """Return the layer and the number there of each label.
+        """Return layer and number of each label.
 
         Raises
         ------
         InputError
-            Labels that no voxel has, 0, or a number that several layers have.
+            Labels that do not occur, 0, or a number that several layers use.
         """
         found = [self._place(label) for label in labels]
         missing = [label for label, at in zip(labels, found, strict=True) if not at]
@@ -103,7 +103,7 @@ class LabelMap:
         return [(one.layer, one.value) for one in alike if one.value in self.present[one.layer]]
 
     def _several(self, label: Label, at: list[tuple[int, int]]) -> str:
-        """Words about segments at some places that one label means, and what to give in its place."""
+        """Format the conflict of several segments that match one label, and the remedy."""
         if isinstance(label, int):
             names = ", ".join(sorted(one.name for one in self.segments if (one.layer, one.value) in at))
             return f"have the label {label}: name one of {names}"
@@ -119,12 +119,12 @@ class LabelMap:
 
 
 def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
-    """Return the label map in a file; values within 1e-3 of whole numbers are rounded, with a note.
+    """Return the label map in a file; values within 1e-3 of integers are rounded, with a note.
 
     Raises
     ------
     InputError
-        What `read_volume` refuses; values that are not whole, or all 0.
+        Input that `read_volume` rejects; values that are not integers, or all 0.
     """
     volume = read_volume(path, voxels, layered=True)
     values, notes = volume.values, volume.notes
@@ -142,12 +142,12 @@ def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
 
 
 def has_whole_numbers(values: np.ndarray) -> bool:
-    """Return True if all values are whole numbers but for round-off of a scale."""
+    """Return True if all values are integers up to the round-off of a scale."""
     return bool((np.abs(values - np.rint(values)) <= ROUND_OFF).all())
 
 
 def format_labels(labels: Sequence[Label]) -> str:
-    """Return the first twenty, and how many there are."""
+    """Return the first twenty labels, and the total number if there are more."""
     shown = ", ".join(map(str, labels[:20]))
     return f"{shown}, ... ({len(labels)} in all)" if len(labels) > 20 else shown
 
@@ -168,7 +168,7 @@ class Mask:
         Raises
         ------
         InputError
-            Nothing is marked.
+            An empty mask.
         """
         rows = np.argwhere(self.marked.any(axis=2))
         if not len(rows):
@@ -180,16 +180,16 @@ class Mask:
 
     @property
     def grid(self) -> VoxelGrid:
-        """Where its voxels lie."""
+        """Voxel grid of the mask."""
         return VoxelGrid(self.path, self.marked.shape, self.affine)
 
     @property
     def box(self) -> np.ndarray:
-        """(2, 3) [m]: the lowest and the highest corner of a box (RAS) round the marked voxels' centres."""
+        """Lowest and highest corner (2, 3) [m] of the bounding box (RAS) of the marked voxels' centres."""
         return np.stack([self.outline.min(axis=0), self.outline.max(axis=0)])
 
     def onto(self, shape: tuple[int, ...], affine: np.ndarray) -> np.ndarray:
-        """Return marks (I, J, K) on the grid of another volume: those of the nearest voxels."""
+        """Return the mask (I, J, K) resampled to another grid by nearest neighbour."""
         if _alike(shape, affine, self):
             return self.marked
         matrix = np.linalg.inv(self.affine) @ affine
@@ -200,14 +200,14 @@ class Mask:
 
 
 def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple[np.ndarray, np.ndarray]:
-    """How many voxels (3, 2) a grid lacks at both ends of its axes to hold `other`, and its affine (4, 4) with them.
+    """Return padding (3, 2) [voxels] at both ends of each axis for a grid to hold `other`, and the new affine (4, 4).
 
-    A grid of its own is held with a voxel round it.
+    If the grids differ, a margin of one voxel is added.
 
     Raises
     ------
     InputError
-        A grid that would become too large.
+        A grid that would exceed `MOST_VOXELS`.
     """
     inverse = np.linalg.inv(affine)
     index = other.outline @ inverse[:3, :3].T + inverse[:3, 3]
@@ -217,7 +217,7 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
     voxels = float(np.prod(np.array(shape, float) + low + high))
     if voxels > MOST_VOXELS:
         raise InputError(
-            f"{other.path}: on the labels' grid it takes {voxels:.3g} voxels, and {MOST_VOXELS:.3g} are the most. "
+            f"{other.path}: on the labels' grid it takes {voxels:.3g} voxels; the maximum is {MOST_VOXELS:.3g}. "
             "Resample the labels more coarsely."
         )
     moved = affine.copy()
@@ -226,10 +226,10 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
 
 
 def _alike(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> bool:
-    """Whether a grid is that of a mask."""
+    """Return True if the grid is that of the mask."""
     return shape == other.marked.shape and np.allclose(affine, other.affine, rtol=0.0, atol=1e-9)
 
 
 def count_on_border(mask: np.ndarray) -> int:
-    """How many marked voxels (I, J, K) lie on the volume's border."""
+    """Count marked voxels (I, J, K) on the volume's border."""
     return int(mask.sum() - mask[1:-1, 1:-1, 1:-1].sum())

@@ -1,4 +1,4 @@
-"""A user's label volume as a subject: which voxels are brain, which tumour, and where the skull is opened."""
+"""Subject from a label volume: masks of brain and tumour, and the position of the craniotomy."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from .voxels import VoxelGrid
 
 @dataclass(frozen=True)
 class Labelling:
-    """What labels are taken for a brain and a tumour.
+    """Acceptance limits and smoothing of brain and tumour masks.
 
     Parameters
     ----------
     smallest_brain, largest_brain
-        [m^3] Bounds that hold every mammal's that is operated on, and that a wrong label or unit falls out of.
+        Volume limits [m^3]: they cover all mammals on which neurosurgery is performed, but not wrong labels or units.
     fewest_voxels
-        Of a tumour; fewer have no shape.
+        Minimum voxels of a tumour component, to resolve its shape.
     speck
-        Share of the tumour's volume; smaller components are noise.
+        Minimum volume of a component, as a fraction of the tumour; smaller ones are noise.
     extension
-        Voxels by which a tumour at the cortex goes on beyond it: farther than `blur` reaches.
+        Extension of a tumour beyond the cortex [voxels]; more than the range of `blur`.
     blur
-        Of both masks.
+        Smoothing of both masks.
     """
 
     smallest_brain: float = 20e-6
@@ -57,12 +57,12 @@ def volume_subject(
     t1: str | Path | None = None,
     settings: Labelling = Labelling(),
 ) -> Subject:
-    """Return the subject in a file of whole-number labels, of which some are `brain` and some `tumour`.
+    """Return the subject in an integer label file, given its `brain` and `tumour` labels.
 
     Raises
     ------
     InputError
-        What `read_head_masks` and `build_masked_subject` refuse.
+        Input that `read_head_masks` or `build_masked_subject` rejects.
     """
     return build_masked_subject(read_head_masks(Sources(to_path(path), tuple(brain), tuple(tumour))), t1, settings)
 
@@ -73,18 +73,18 @@ def build_masked_subject(
     settings: Labelling = Labelling(),
     regions: Sequence[str] = (),
 ) -> Subject:
-    """Return the subject whose brain and tumour are masks of voxels.
+    """Return the subject whose brain and tumour are voxel masks.
 
-    The solid is brain or tumour, its largest component, with holes filled; tumour components outside it are left out,
-    and each such change is noted. The skull is opened over the largest of them. `t1` is a volume of intensities in the
-    same space. Parts of brain and tumour named in `regions`, of `PART_LABELS`, become regions of their own.
+    The solid is the largest component of brain and tumour, with holes filled; tumour components outside it are dropped,
+    and each such change is noted. The craniotomy is above the largest of them. `t1` is an intensity volume in the
+    same space. Parts of brain and tumour named in `regions`, of `PART_LABELS`, become separate regions.
 
     Raises
     ------
     InputError
-        A region that is not known, or not marked. A T1 that `read_intensity` refuses, or in LPS that is stated as RAS
-        as far as it shows. A tumour of which more than half lies outside the brain. What `settings` refuse: by default
-        a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27 voxels.
+        A region that is unknown or not marked. A T1 that `read_intensity` rejects, or that is evidently LPS declared as
+        RAS. A tumour of which more than half lies outside the brain. By default,
+        a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27 voxels; see `settings`.
     """
     for name in regions:
         if name not in PART_LABELS or name not in masks.parts:
@@ -117,7 +117,7 @@ def build_masked_subject(
 
 
 def _septum(name: str, masks: HeadMasks) -> Septum:
-    """Return a sheet of dura where voxels mark it."""
+    """Return the dural sheet that voxels mark."""
     edges = masks.affine[:3, :3]
     points = np.argwhere(masks.parts[name]) @ edges.T + masks.affine[:3, 3]
     return Septum(name, points, 0.5 * float(np.sqrt((edges**2).sum())))
@@ -126,10 +126,10 @@ def _septum(name: str, masks: HeadMasks) -> Septum:
 def _parts(
     masks: HeadMasks, solid: np.ndarray, tumour: np.ndarray, regions: Sequence[str], settings: Labelling
 ) -> tuple[SubjectPart, ...]:
-    """Return the parts that become regions; their volumes are those that lie in brain or tumour, as the mesh has it."""
+    """Return the parts that become regions; each volume counts only voxels that the mesh will assign to it."""
     voxel, parts = abs(float(np.linalg.det(masks.affine[:3, :3]))), []
     taken = np.zeros_like(solid)
-    for name in reversed(regions):  # of two that overlap the later counts
+    for name in reversed(regions):  # if two regions overlap, the later one has priority
         mask, label = masks.parts[name], PART_LABELS[name]
         own = mask & (tumour if label == NECROSIS_LABEL else solid & ~tumour) & ~taken
         taken |= own
@@ -138,14 +138,12 @@ def _parts(
 
 
 def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelling()) -> np.ndarray:
-    """Return the voxels (I, J, K) bool of a head's brain and tumour in one piece without holes.
-
-    What is changed is noted.
+    """Return the mask (I, J, K) of a head's brain and tumour as one component without holes; changes are noted.
 
     Raises
     ------
     InputError
-        A brain of a volume that `settings` refuse.
+        A brain volume outside the limits of `settings`.
     """
     voxel = abs(float(np.linalg.det(masks.affine[:3, :3])))
     solid = _whole(masks.brain, masks.tumour, voxel, notes)
@@ -165,7 +163,7 @@ def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelli
 
 
 def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
-    """Return the component of brain or tumour that holds most of the brain, its holes filled."""
+    """Return the component of brain or tumour with most of the brain, its holes filled."""
     component, _ = cast(tuple[np.ndarray, int], ndimage.label(brain | tumour))
     solid = component == np.bincount(component[brain]).argmax()
     lost = int((brain & ~solid).sum())
@@ -186,7 +184,7 @@ def _inside(
     notes: list[str],
     settings: Labelling,
 ) -> np.ndarray:
-    """Return the tumour's components that lie in the solid, but for specks."""
+    """Return the tumour's components in the solid, without specks."""
     inside = tumour & solid
     if not inside.any():
         raise InputError(f"{name}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
@@ -215,9 +213,9 @@ def _inside(
 
 
 def _extended(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
-    """Return the tumour, and up to `by` voxels beside the brain those whose nearest one in the solid is tumour.
+    """Return the tumour extended outside the brain by up to `by` voxels whose nearest brain voxel is tumour.
 
-    A tumour that reaches the cortex then goes on beyond it, and its field crosses the cortex instead of touching it.
+    The field of a tumour at the cortex then crosses the cortex instead of touching it.
     """
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(tumour.astype(np.uint8)))
     wide = tuple(slice(max(part.start - by, 0), part.stop + by) for part in box)
@@ -230,7 +228,7 @@ def _extended(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
 
 
 def _pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
-    """Return the tumour's connected pieces, the largest first; of a piece's surface voxels the mean is its centre."""
+    """Return the tumour's connected components, the largest first; the centre is the mean of the surface voxels."""
     component, count = cast(tuple[np.ndarray, int], ndimage.label(tumour, np.ones((3, 3, 3))))
     voxel = abs(float(np.linalg.det(affine[:3, :3])))
     pieces = []

@@ -1,4 +1,4 @@
-"""Take away the tetrahedra that keep a carved body from being one piece with a clean surface."""
+"""Removal of tetrahedra so that a mesh is one component with a 2-manifold surface."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..geometry.tetmesh import FACES, compute_row_keys
 
 
 def find_largest_piece(tets: np.ndarray) -> np.ndarray:
-    """Which tetrahedra (T,) belong to the largest piece whose tetrahedra hang together by faces."""
+    """Return a mask (T,) of the tetrahedra in the largest face-connected component."""
     _, number, count = np.unique(
         compute_row_keys(tets[:, FACES].reshape(-1, 3)), return_inverse=True, return_counts=True
     )
@@ -22,10 +22,10 @@ def find_largest_piece(tets: np.ndarray) -> np.ndarray:
 
 
 def clean(tets: np.ndarray) -> np.ndarray:
-    """Which tetrahedra (T,) to keep so that they are one piece whose surface is a 2-manifold.
+    """Return a mask (T,) of tetrahedra to keep, so that they are one component with a 2-manifold surface.
 
-    The surface touches itself at an edge with more than two triangles, or at a node with more than one fan of them. The
-    tetrahedra behind these triangles are taken away, but for those behind the node's largest fan.
+    The surface touches itself at an edge of more than two triangles, or at a node with more than one triangle fan. The
+    tetrahedra behind these triangles are removed, except those behind the node's largest fan.
     """
     keep = np.ones(len(tets), bool)
     while True:
@@ -37,12 +37,12 @@ def clean(tets: np.ndarray) -> np.ndarray:
 
 
 def _pinching(tets: np.ndarray) -> np.ndarray:
-    """Numbers of the tetrahedra behind every surface fan but the largest at its node."""
+    """Return indices of the tetrahedra behind every surface fan except the largest at its node."""
     faces = tets[:, FACES].reshape(-1, 3)
     _, first, count = np.unique(compute_row_keys(faces), return_index=True, return_counts=True)
     outer = np.sort(first[count == 1])
     surface, behind = faces[outer], outer // 4
-    # One graph node for each corner of a triangle; corners at one mesh node join across a surface edge, if just two do.
+    # One graph node per triangle corner; corners at one mesh node are linked across edges with exactly two triangles.
     corner = np.arange(3 * len(surface)).reshape(-1, 3)
     sides = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]])
     ends = surface.ravel()[sides]
@@ -63,10 +63,10 @@ def _pinching(tets: np.ndarray) -> np.ndarray:
 
 
 def find_removable_tetrahedra(tets: np.ndarray, unwanted: np.ndarray) -> np.ndarray:
-    """Which of the tetrahedra marked `unwanted` (T,) can go and leave the surface a 2-manifold.
+    """Return a mask of the `unwanted` tetrahedra (T,) whose removal leaves the surface a 2-manifold.
 
-    A tetrahedron with three faces on the surface can, and one with two if the edge between the other two faces lies
-    within; of neighbours only one goes.
+    This holds for three faces on the surface, or two if the edge between the other two faces is an interior
+    edge; of tetrahedra that share a node only one is removed.
     """
     faces = tets[:, FACES].reshape(-1, 3)
     _, number, count = np.unique(compute_row_keys(faces), return_inverse=True, return_counts=True)
@@ -77,7 +77,7 @@ def find_removable_tetrahedra(tets: np.ndarray, unwanted: np.ndarray) -> np.ndar
     gone = np.zeros(len(tets), bool)
     taken = np.zeros(width, bool)
     for tet in np.flatnonzero(unwanted & (outer.sum(axis=1) >= 2)):
-        hidden = tets[tet][outer[tet]]  # corners opposite to outer faces: with two, the ends of the inner edge
+        hidden = tets[tet][outer[tet]]  # corners opposite outer faces: if two, the ends of the inner edge
         inner = len(hidden) == 3 or not np.isin(np.sort(hidden) @ [width, 1], surface_edges)
         if len(hidden) < 4 and inner and not taken[tets[tet]].any():
             gone[tet] = True

@@ -1,4 +1,4 @@
-"""Points, lines and curves that 3D Slicer wrote as `.mrk.json`, and points as `.fcsv`."""
+"""Reader for 3D Slicer markups: points, lines and curves in `.mrk.json`, and points in `.fcsv`."""
 
 from __future__ import annotations
 
@@ -16,36 +16,38 @@ from ..runtime.file_limits import FARTHEST
 from ..runtime.outside_files import read_as, to_path
 
 SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
-"""What coordinates become in RAS. Slicer writes LPS, and means it where a file does not say."""
+"""Sign of each coordinate in the conversion to RAS. Slicer writes LPS, the default of its files."""
 NUMBERED = {"0": "RAS", "1": "LPS"}
-"""What older files say in place of these words."""
+"""Codes of the coordinate system in older files."""
 REMEDY = "Save a point, a line or a closed curve from 3D Slicer's Markups."
-# Bytes of a file, points of a curve, and points that a curve is drawn with.
-LARGEST, MOST, DRAWN = 2**22, 5000, 256
-# In a row of `.fcsv` after a number or name: the coordinates, and whether they are placed, if it is said.
-PLACE, STATUS, DEFINED = slice(1, 4), 14, "2"
+LARGEST = 2**22  # maximum file size [bytes]
+MOST = 5000  # maximum points of a markup
+DRAWN = 256  # points of a sampled curve
+PLACE = slice(1, 4)  # columns of the coordinates in a row of `.fcsv`
+STATUS = 14  # column of the optional position status
+DEFINED = "2"  # position status of a placed point
 
 
 @dataclass(frozen=True, eq=False)
 class Markup:
-    """What a file holds: its kind in Slicer's words, and its points (n, 3) [m, RAS] that are placed."""
+    """Markup of a file: its kind as named by Slicer, and its placed points (n, 3) [m, RAS]."""
 
     path: Path
     kind: str
     points: np.ndarray
 
     def curve(self) -> np.ndarray:
-        """Points (256, 3) [m] of the smooth closed curve through the points of a `ClosedCurve`.
+        """Sample points (256, 3) [m] of the smooth closed curve through the points of a `ClosedCurve`.
 
         Raises
         ------
         InputError
-            Fewer than three points, or two that coincide.
+            Fewer than three points, or coincident consecutive points.
         """
         points = np.concatenate([self.points, self.points[:1]])
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if len(self.points) < 3 or steps.min() < 1e-6:
-            raise InputError(f"{self.path}: its curve needs three points or more, each at a place of its own. {REMEDY}")
+            raise InputError(f"{self.path}: its curve needs at least three distinct points. {REMEDY}")
         along = np.concatenate([[0.0], np.cumsum(steps)])
         spline = CubicSpline(along, points, bc_type="periodic")
         return spline(np.linspace(0.0, along[-1], DRAWN, endpoint=False))
@@ -57,8 +59,8 @@ def read_markup(path: str | Path) -> Markup:
     Raises
     ------
     InputError
-        A file that is none, or that has several markups. Another unit than mm, another system than LPS or RAS. No
-        point that is placed, or coordinates that are no numbers.
+        A file that is not a markup file, or has several markups. Units other than mm, a coordinate system other than
+        LPS or RAS. No placed points, or coordinates that are not finite.
     """
     path = to_path(path)
     with read_as(path, "markups of 3D Slicer", REMEDY):
@@ -68,36 +70,36 @@ def read_markup(path: str | Path) -> Markup:
         kind, system, placed = _fcsv(text) if path.name.lower().endswith(".fcsv") else _json(text)
         if system not in SIGNS:
             said = f"its coordinate system is {system!r}" if system else "it does not state its coordinate system"
-            raise InputError(f"{path}: {said}: LPS and RAS are known. {REMEDY}")
+            raise InputError(f"{path}: {said}: it must be LPS or RAS. {REMEDY}")
         if not 1 <= len(placed) <= MOST:
-            raise InputError(f"{path}: has {len(placed)} points that are placed; 1 to {MOST} are read. {REMEDY}")
+            raise InputError(f"{path}: has {len(placed)} placed points; must be 1 to {MOST}. {REMEDY}")
         points = np.array(placed, np.float64).reshape(-1, 3)
         if not np.isfinite(points).all():
-            raise InputError(f"{path}: has points whose coordinates are no numbers. {REMEDY}")
+            raise InputError(f"{path}: has points with non-finite coordinates. {REMEDY}")
         if np.abs(points).max() > 1e3 * FARTHEST:
             raise InputError(f"{path}: has points more than {FARTHEST:g} m away: coordinates are in mm. {REMEDY}")
         return Markup(path, kind, 1e-3 * points * SIGNS[system])
 
 
 def _json(text: str) -> tuple[str, str, list[list[float]]]:
-    """Kind, coordinate system, and placed points [mm] of the one markup in a `.mrk.json` file."""
+    """Parse kind, coordinate system, and placed points [mm] of the only markup in a `.mrk.json` file."""
     markups = json.loads(text)["markups"]
     if len(markups) != 1:
-        raise InputError(f"has {len(markups)} markups, and one is read. Save each to a file of its own.")
+        raise InputError(f"has {len(markups)} markups; only one is supported. Save each in a separate file.")
     (markup,) = markups
     units = markup.get("coordinateUnits", "mm")
     if set([units] if isinstance(units, str) else units) != {"mm"}:
-        raise InputError(f"its coordinates are in {units}, and mm are read. {REMEDY}")
+        raise InputError(f"its coordinates are in {units}; must be mm. {REMEDY}")
     controls = markup["controlPoints"]
     placed = [one["position"] for one in controls if one.get("positionStatus", "defined") == "defined"]
     return str(markup["type"]), str(markup.get("coordinateSystem", "LPS")), placed
 
 
 def _fcsv(text: str) -> tuple[str, str, list[list[float]]]:
-    """Kind, coordinate system (empty: not stated), and placed points [mm] of a `.fcsv` file.
+    """Parse kind, coordinate system (empty if not given), and placed points [mm] of a `.fcsv` file.
 
-    Its columns are id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID, and of Slicer 5 the status of the
-    point, before which Slicer for Windows leaves a carriage return.
+    Its columns are id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID, and in Slicer 5 the position
+    status, before which Slicer for Windows writes a carriage return.
     """
     stated = re.search(r"^# *CoordinateSystem *= *(\w+)", text, re.MULTILINE)
     lines = (line for line in text.replace("\r", "").split("\n") if line.strip() and not line.startswith("#"))

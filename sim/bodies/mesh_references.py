@@ -1,4 +1,4 @@
-"""Mesh files that refer to other files, or declare what they do not hold: refused before a library follows them."""
+"""Checks for mesh files with external references or oversized arrays, before a library opens them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 from ..errors import InputError
 from ..runtime.file_limits import INFLATION, MeshBytes, build_too_large_error
 
-# Of meshio's formats those whose readers end where a file is cut short (of .mdpa, .tec and .node they never do), and
-# whose files say how much they hold (of .gz they do not).
+# Formats of meshio whose readers terminate on truncated files (those of .mdpa, .tec and .node do not), and
+# whose files give their uncompressed size (.gz does not).
 ENDINGS = (
     *(".vtu", ".vtk", ".msh", ".inp", ".xdmf", ".xmf", ".mesh", ".meshb", ".bdf", ".nas", ".fem", ".med", ".cgns"),
     *(".h5m", ".hmf", ".avs", ".vol", ".su2", ".ugrid", ".f3grid", ".post", ".dato"),
@@ -17,14 +17,14 @@ ENDINGS = (
 
 
 def check_mesh_references(path: Path, limits: MeshBytes) -> None:
-    """Refuse other formats than `ENDINGS`, numbers that lie outside the file or its folder, HDF5 beyond the limits.
+    """Reject formats other than `ENDINGS`, numbers outside the file or its folder, and HDF5 beyond the limits.
 
     Raises
     ------
     InputError
-        Naming what it refers to, or the limit.
+        With the reference or the limit.
     """
-    import h5py  # as optional as meshio
+    import h5py  # optional dependency, like meshio
 
     suffix = path.suffix.lower()
     if suffix not in ENDINGS:
@@ -38,12 +38,12 @@ def check_mesh_references(path: Path, limits: MeshBytes) -> None:
 
 
 def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
-    """Refuse HDF5 that refers to other files, or whose arrays take more bytes than may be or than were stored.
+    """Reject HDF5 files with external references, or with arrays larger than the limit or than the stored bytes.
 
     Raises
     ------
     InputError
-        Naming the array or the link.
+        With the array or the link.
     """
     import h5py
 
@@ -57,7 +57,7 @@ def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 raise InputError(f"`{here}` is a link of {path.name} to another place. Store the array itself there.")
             found = group[name]
-            if found in seen:  # by another name
+            if found in seen:  # hard link to an object visited before
                 continue
             seen.add(found)
             if isinstance(found, h5py.Group):
@@ -66,7 +66,7 @@ def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
                 if found.is_virtual or found.external:
                     raise InputError(f"`{here}` of {path.name} lies in another file. Store the array itself there.")
                 if found.nbytes > INFLATION * found.id.get_storage_size():
-                    raise InputError(f"`{here}` of {path.name} declares more than it holds. Write the file anew.")
+                    raise InputError(f"`{here}` of {path.name} declares more than it holds. Write the file again.")
                 left -= found.nbytes
                 if left < 0:
                     raise build_too_large_error(most)
@@ -76,7 +76,7 @@ def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
 
 
 def _named(path: Path) -> set[Path]:
-    """Return the HDF5 files in its folder that an XDMF file names."""
+    """Return the HDF5 files, in the same folder, that an XDMF file refers to."""
     folder = path.resolve().parent
     named = set()
     for item in ElementTree.parse(path).iter():
@@ -85,11 +85,9 @@ def _named(path: Path) -> set[Path]:
             name = (item.text or "").strip().split(":")[0]
             other = (folder / name).resolve()
             if not other.is_relative_to(folder):
-                raise InputError(
-                    f"it refers to {name}, outside of its folder. Put that file beside it, under its name."
-                )
+                raise InputError(f"it refers to {name}, outside of its folder. Put that file into the folder.")
             if not other.is_file():
-                raise InputError(f"it refers to {name}, which is not there. Put that file beside it.")
+                raise InputError(f"it refers to {name}, which is not there. Put that file into the folder.")
             named.add(other)
         elif kind not in (None, "XML"):
             raise InputError(f"its numbers are of the format {kind}. Write them as HDF, or as XML.")

@@ -1,4 +1,4 @@
-"""Move nodes of a stuffed mesh: onto the best fit of its surfaces, and out of the way of bad dihedral angles."""
+"""Node relocation in a stuffed mesh: fit surfaces to level sets and improve dihedral angles."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from ..geometry.tetmesh import EDGES, FACES
 from .signed_distance import Field, project_onto_level
 
 Projection = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Points (n, 3) [m] wished for and their nodes (n,) -> the nearest points (n, 3) where those nodes may lie."""
+"""Function of desired points (n, 3) [m] and their nodes (n,) that returns the nearest admissible points (n, 3)."""
 
-# The faces that meet at each edge of a tetrahedron (a face carries the number of the corner opposite to it).
+# The two faces that meet at each edge of a tetrahedron (face k is opposite corner k).
 MEETING = np.array([[2, 3], [1, 3], [1, 2], [0, 3], [0, 2], [0, 1]])
-TRIALS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
+TRIALS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # 26 unit directions of a trial move
 TRIALS /= np.linalg.norm(TRIALS, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """How far nodes are moved for the sake of surfaces and angles, and how long this is tried.
+    """Limits of node moves for surface fitting and angle improvement.
 
     Parameters
     ----------
     good_angle
-        [degrees] Tetrahedra with a dihedral angle below it, or above 180 less it, are bad: their nodes are moved.
+        Tetrahedra with a dihedral angle below it or above 180 less it are bad, and their nodes are moved [degrees].
     rounds
-        Most rounds of moves.
+        Maximum number of iterations.
     largest_shift
-        [m] Farthest that a node leaves its surface to fit it better: half a voxel, since the image says no more.
+        Maximum distance of a node from its surface for a better fit [m]: half a voxel, the resolution of the image.
     largest_step, smallest_step
-        Shares of the shortest edge at a node: its first step, and the step below which it is left where it is.
+        Fractions of the shortest edge at a node: initial step, and minimum step below which the node is not moved.
     """
 
     good_angle: float = 18.0
@@ -44,16 +44,14 @@ class Smoothing:
 
     @property
     def good_sine(self) -> float:
-        """Sine of the good angle."""
+        """Sine of `good_angle`."""
         return float(np.sin(np.radians(self.good_angle)))
 
 
 def compute_smallest_sines(corners: np.ndarray) -> np.ndarray:
-    """Return the smallest sine (...,) of a dihedral angle in each tetrahedron of `corners` (..., 4, 3).
+    """Return the smallest sine (...,) of the dihedral angles of each tetrahedron in `corners` (..., 4, 3).
 
-    Negative if inverted.
-
-    Small for angles near 0 and near 180 degrees alike (Klingner & Shewchuk 2007).
+    Negative for inverted tetrahedra; small for angles near 0 and near 180 degrees (Klingner & Shewchuk 2007).
     """
     faces = corners[..., FACES, :]
     normals = np.cross(faces[..., 1, :] - faces[..., 0, :], faces[..., 2, :] - faces[..., 0, :])
@@ -72,11 +70,11 @@ def fit_nodes(
     volume: float | None = None,
     settings: Smoothing = Smoothing(),
 ) -> np.ndarray:
-    """Nodes (V, 3) [m], of which those `movable` (V,) moved so that the closed surface of triangles (S, 3) fits best.
+    """Return nodes (V, 3) [m] with `movable` ones (V,) moved so that the closed surface of triangles (S, 3) fits best.
 
-    With its nodes on a curved surface a triangle lies on the hollow side. Each node moves by the mean deviation of its
-    triangles. A deviation that vanishes at the corners of a triangle and is quadratic between them has 3/4 of its
-    middle's value as mean. A `volume` [m^3] to be enclosed shifts all of them alike by what is then missing.
+    With its nodes on a curved surface, a triangle lies on the concave side. Each node moves by the mean deviation of
+    its triangles. A deviation that vanishes at the corners of a triangle and is quadratic between them has a mean of
+    3/4 of its centre value. If a `volume` [m^3] is given, a uniform shift corrects the enclosed volume.
     """
     on = np.unique(triangles)
     on = on[movable[on]]
@@ -92,7 +90,7 @@ def fit_nodes(
     nodes = nodes.copy()
     nodes[on] = project_onto_level(field, nodes[on], level)
     if volume is not None:
-        moving = movable[triangles].mean(axis=1)  # a triangle sweeps in proportion to its corners that move
+        moving = movable[triangles].mean(axis=1)  # a triangle sweeps volume in proportion to its movable corners
         for _ in range(2):
             _, area = _middles_and_areas(nodes, triangles)
             missing = (volume - compute_enclosed_volume(nodes, triangles)) / (area @ moving)
@@ -102,7 +100,7 @@ def fit_nodes(
 
 
 def prevent_folds(nodes: np.ndarray, moved: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Nodes (V, 3) [m] as `moved` (V, 3), but where that turns a tetrahedron inside out: there they stay."""
+    """Return the nodes `moved` (V, 3) [m], except at tetrahedra that this would invert: there they keep `nodes`."""
     kept = moved.copy()
     while True:
         folded = np.unique(tets[compute_smallest_sines(kept[tets]) <= 0.0])
@@ -113,7 +111,7 @@ def prevent_folds(nodes: np.ndarray, moved: np.ndarray, tets: np.ndarray) -> np.
 
 
 def compute_enclosed_volume(nodes: np.ndarray, triangles: np.ndarray) -> float:
-    """Volume [m^3] inside a closed surface of triangles (S, 3), outwards."""
+    """Compute the volume [m^3] inside a closed surface of outward triangles (S, 3)."""
     a, b, c = (nodes[triangles[:, k]] for k in range(3))
     return float(np.einsum("ti,ti->", a, np.cross(b, c))) / 6.0
 
@@ -126,10 +124,10 @@ def _middles_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.nda
 def improve_mesh(
     nodes: np.ndarray, tets: np.ndarray, project: Projection, settings: Smoothing = Smoothing()
 ) -> np.ndarray:
-    """Nodes (V, 3) [m] moved until every dihedral angle is good, or no bad one can be raised further.
+    """Return nodes (V, 3) [m] moved until every dihedral angle is good or no bad one improves further.
 
-    In each round a set of nodes of bad tetrahedra, no two in one tetrahedron, tries 26 steps each. Each node takes the
-    step that makes the angles round it fall least short of that.
+    Each iteration moves a set of nodes of bad tetrahedra, no two in one tetrahedron. Each node tries 26 steps and takes
+    the one with the smallest sum of squared angle deficits around it.
     """
     nodes, good = nodes.copy(), settings.good_sine
     order = np.argsort(tets, axis=None, kind="stable")
@@ -169,7 +167,7 @@ def improve_mesh(
 
 
 def _independent(tets: np.ndarray, sines: np.ndarray, step: np.ndarray, settings: Smoothing) -> np.ndarray:
-    """Nodes of bad tetrahedra that may still move, the worst first, such that no two share a tetrahedron."""
+    """Return nodes of bad tetrahedra that may still move, worst first, no two in one tetrahedron."""
     bad = np.flatnonzero(sines < settings.good_sine)
     worst = np.full(len(step), np.inf)
     np.minimum.at(worst, tets[bad].ravel(), np.repeat(sines[bad], 4))
@@ -184,5 +182,5 @@ def _independent(tets: np.ndarray, sines: np.ndarray, step: np.ndarray, settings
 
 
 def _badness(sines: np.ndarray, good: float) -> np.ndarray:
-    """What a node's steps make smaller: how far angles fall short, squared so that the worst count most."""
+    """Return the squared deficit of the sines, the objective of node moves; squaring emphasises the worst angles."""
     return np.maximum(good - sines, 0.0) ** 2

@@ -1,4 +1,4 @@
-"""From two solids to one conforming mesh of brain and tumour with about as many nodes as asked for."""
+"""Conforming tetrahedral mesh of brain and tumour with a requested number of nodes."""
 
 from __future__ import annotations
 
@@ -20,41 +20,42 @@ from .placement import Piece
 from .signed_distance import Field, project_onto_level
 
 INTRICATE = "the surfaces are too intricate", "smooth the labels"
-"""Why a mesh does not show a solid, and what helps beside more nodes."""
+"""Reason why a mesh does not resolve a solid, and remedy other than more nodes."""
+# Message if a solid has no tetrahedra.
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
 
 
 @dataclass(frozen=True)
 class Meshing:
-    """How the number of nodes is searched for, where the mesh is fine, and how hard bad angles are mended.
+    """Mesh size, search for the number of nodes, and quality improvement.
 
     Parameters
     ----------
     tolerance, farthest
-        Shares of the number of nodes asked for: a mesh that near ends the search, and one farther off is refused.
+        Relative deviations from the requested number of nodes: the search ends within the first, fails beyond the last.
     trials
-        Most lattices that the search carves before it takes the nearest.
+        Maximum number of lattices in the search.
     fine
-        The cells at the tumour and the craniotomy, as a share of the coarsest: what is looked at and pressed is there.
+        Cell size at the tumour and the craniotomy, as a fraction of the coarsest: the regions of interest.
     cells_per_radius
-        Fewest cells across the tumour's radius: fewer do not show its shape.
+        Minimum cells per tumour radius, to resolve its shape.
     growth
-        By how much a cell's edge grows per distance from those places.
+        Growth of the cell edge per distance from those regions.
     rounding
-        A cell up to so many times larger than wanted is not halved: then cells are as often too large as too small.
+        Cells up to this factor above the requested size are not halved, so that sizes are correct on average.
     deepest
-        Most halvings of the coarsest cell: bounds the lattice round a very small tumour.
+        Maximum halvings of the coarsest cell: limits the lattice around a very small tumour.
     slacks
-        [m] How far nodes may leave their surface for better angles, attempt by attempt.
+        Allowed distances of nodes from their surface for better angles, one per attempt [m].
     largest_error
-        Of the tumour's volume, as a share. Outlines of one glioma by several raters agree less: Dice 74 to 85 %,
+        Maximum relative error of the tumour volume. Manual outlines of one glioma agree less: Dice 74 to 85 %,
         Menze et al. 2015.
     shown
-        A piece of the tumour of which a mesh shows a lesser share is lost.
+        A piece of the tumour is lost if the mesh contains less than this fraction of its volume.
     more
-        Times the nodes asked for, tried only to tell how many would do.
+        Factors of the number of nodes, tried only to recommend a sufficient number.
     stuffing, smoothing
-        Of the cuts, and of the nodes' moves after them.
+        Options of the cuts, and of the subsequent node moves.
     """
 
     tolerance: float = 0.03
@@ -75,20 +76,20 @@ class Meshing:
 
 @dataclass(frozen=True, eq=False)
 class Solids:
-    """What is to be meshed.
+    """Solids to be meshed.
 
     Parameters
     ----------
     brain, tumour
         Fields of the whole solid (brain and tumour together) and of the tumour.
     low, high
-        (3,) [m]: a box round the solid.
+        Corners (3,) [m] of a bounding box of the solid.
     tumour_volume
-        [m^3], held exactly as far as the nodes allow, but for pieces that a mesh does not show.
+        Prescribed volume [m^3], matched as far as the nodes allow, less pieces that the mesh does not resolve.
     interface, opening
-        Points (n, 3) [m] on the tumour's surface and on the cortex to be opened: there the mesh is fine.
+        Points (n, 3) [m] on the tumour's surface and on the cortex to be exposed, where the mesh is refined.
     pieces
-        Of the tumour, where it has several.
+        Pieces of the tumour, if several.
     """
 
     brain: Field
@@ -107,8 +108,8 @@ def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> Tet
     Raises
     ------
     InputError
-        A solid or a tumour's volume that so few nodes cannot show, with a number that can, if one of up to 2.5 times as
-        many does. A count that the search for a lattice size does not reach.
+        A solid or tumour volume that this number of nodes cannot resolve, with a sufficient number if up to 2.5 times
+        as many suffice. A count that the search for a lattice size does not reach.
     """
     mesh = _meshed(solids, count, settings)
     if isinstance(mesh, TetMesh):
@@ -119,7 +120,7 @@ def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> Tet
 def build_too_few_error(
     count: int, why: tuple[str, str], more: Sequence[float], would_do: Callable[[int], bool]
 ) -> InputError:
-    """What is said where `count` nodes do not show a solid: the first of `more` times as many that `would_do`."""
+    """Build the error if `count` nodes do not resolve a solid, with the first multiple in `more` that `would_do`."""
     reason, remedy = why
     numbers = (int(round(count * times, -2)) for times in more)
     enough = next(filter(would_do, numbers), None)
@@ -129,7 +130,7 @@ def build_too_few_error(
 def find_lost_pieces(
     pieces: Sequence[Piece], nodes: np.ndarray, tets: np.ndarray, settings: Meshing = Meshing()
 ) -> list[bool]:
-    """Which pieces of a tumour its tetrahedra (T, 4) do not show: each is of the piece whose surface is nearest."""
+    """Return True for each tumour piece that the tetrahedra (T, 4), assigned by nearest surface, do not resolve."""
     if len(pieces) < 2:
         return [False for _ in pieces]
     owner = np.repeat(np.arange(len(pieces)), [len(piece.surface) for piece in pieces])
@@ -140,7 +141,7 @@ def find_lost_pieces(
 
 
 def describe_lost_pieces(pieces: Sequence[Piece], lost: Sequence[bool]) -> str:
-    """How many pieces are lost, and their volume in all."""
+    """Format the number of lost pieces and their total volume."""
     volume = sum(piece.volume for piece, gone in zip(pieces, lost, strict=True) if gone)
     return f"{sum(lost)} of the tumour's {len(pieces)} pieces, {1e6 * volume:.2g} ml in all"
 
@@ -153,7 +154,7 @@ def _would_do(solids: Solids, count: int, settings: Meshing) -> bool:
 
 
 def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[str, str]:
-    """Return the mesh with `count` nodes, or what is amiss with it and what helps. Raises as `build_mesh`."""
+    """Return the mesh with `count` nodes, or reason and remedy if it fails. Raises as `build_mesh`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
     for _ in range(settings.trials):
@@ -166,12 +167,12 @@ def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[st
         edge *= float(np.clip((reached / count) ** 0.4, 0.5, 2.0))
     assert best is not None
     if abs(len(best.nodes) - count) > settings.farthest * count:
-        raise InputError(f"{count} nodes cannot be had for this anatomy ({len(best.nodes)} is next): ask for more.")
+        raise InputError(f"{count} nodes are not possible for this anatomy (closest: {len(best.nodes)}): request more.")
     return _finished(solids, best, settings)
 
 
 def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
-    """Return the solid on a lattice of coarsest cell `edge` [m], split along the tumour's surface."""
+    """Return the solid on a lattice with coarsest cell `edge` [m], split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
     fine, growth = settings.fine * edge, settings.growth
     wanted = (
@@ -195,7 +196,7 @@ def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
 
 
 def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tuple[str, str]:
-    """Return the pieces fitted and improved, in a second try without what folds them; else as `_meshed`."""
+    """Return the fitted and improved mesh, on failure retried without inverting moves; else reason and remedy."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
     lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
@@ -213,9 +214,9 @@ def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tu
 
 
 def _fitted(solids: Solids, pieces: Pieces, volume: float, settings: Meshing, fold: bool) -> Pieces:
-    """Nodes on the surfaces, the outer one first, with a `volume` [m^3] of tumour.
+    """Fit nodes to the outer surface, then to the tumour's with a `volume` [m^3]; return the updated pieces.
 
-    Unless it may `fold`, they stay where a piece would be inside out.
+    Unless `fold`, nodes keep their position where a tetrahedron would be inverted.
     """
     (surface, _), smoothing = _surfaces(pieces), settings.smoothing
     outer, inner = find_single_faces(pieces.tets), find_single_faces(pieces.tets[pieces.inside])
@@ -226,7 +227,7 @@ def _fitted(solids: Solids, pieces: Pieces, volume: float, settings: Meshing, fo
 
 
 def _improved(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
-    """What is flat on the surfaces trimmed, the bad angles improved."""
+    """Remove flat tetrahedra on the surfaces and improve bad angles."""
     for slack in settings.slacks:
         bad = compute_smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
         pieces = pieces.kept(~find_removable_tetrahedra(pieces.tets, bad))
@@ -236,7 +237,7 @@ def _improved(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
 
 
 def _surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """Which nodes (V,) lie on the outer surface, and which on the tumour's surface."""
+    """Return two masks (V,): nodes on the outer surface, and nodes on the tumour's surface."""
     marks = np.zeros((2, len(pieces.nodes)), bool)
     marks[0, find_single_faces(pieces.tets)] = True
     marks[1, find_single_faces(pieces.tets[pieces.inside])] = True
@@ -244,9 +245,9 @@ def _surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
-    """Return keeps each node within `slack` [m] of the levels of the fields on which it lies now."""
+    """Return a function that keeps each surface node within `slack` [m] of its current level of the fields."""
     surface, interface = _surfaces(pieces)
-    interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # cortex that is tumour
+    interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # tumour cortex
     levels = solids.brain(pieces.nodes), solids.tumour(pieces.nodes)
 
     def project(points: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -263,7 +264,7 @@ def _projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
 
 
 def compute_surface_errors(nodes: np.ndarray, triangles: np.ndarray, field: Field) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (15 S,) [m] from points spread over triangles (S, 3) to a field's surface, and their shares of area."""
+    """Return distances (15 S,) [m] of points on triangles (S, 3) from a field's surface, and their area weights."""
     spread = np.array([(i, j, 12 - i - j) for i in range(1, 12, 2) for j in range(1, 12 - i, 2)]) / 12.0
     corners = nodes[triangles]
     area = compute_areas(corners)

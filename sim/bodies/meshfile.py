@@ -1,4 +1,4 @@
-"""Mesh files: tetrahedra in most formats that meshio reads in, `.vtu` out, nothing half-written."""
+"""Mesh files: read tetrahedra in most formats of meshio, write `.vtu` atomically."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from .vtu_size import check_vtu_size
 if TYPE_CHECKING:
     import meshio
 
-UNITS = {"m": 1.0, "mm": 1e-3}
-# meshio's names of tetrahedra by their nodes; it brings every format's order of mid-edge nodes to VTK's.
+UNITS = {"m": 1.0, "mm": 1e-3}  # length units [m]
+# meshio's names of tetrahedra by number of nodes; it converts the mid-edge order of all formats to VTK's.
 CELLS = {4: "tetra", 10: "tetra10"}
 
 REMEDY = "Convert it to .vtu or .msh."
-# Longest part of meshio's reason that a message has, and of a VTK title that is read [characters].
-LONGEST, TITLE = 200, 400
+LONGEST = 200  # maximum length of meshio's reason in a message [characters]
+TITLE = 400  # maximum length of a VTK title line [characters]
 REASONS = {
     r"Incompatible cell data '([^']+)'": (
         "its `{}` is given of some cells only: put every volume into a group, and save it again."
@@ -51,15 +51,15 @@ REASONS = {
     r" string$": "it has an array of text (`string`): save it without, as arrays of numbers alone are read.",
 }
 """Messages by a pattern in meshio's reason, or in a line that meshio cannot read."""
-UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")
+UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")  # lines that meshio cannot read
 
-# An anatomy's longest side [m]: a mouse's brain has 15 mm, a whole head 0.3 m.
-SMALLEST, LARGEST = 5e-3, 1.0
+SMALLEST = 5e-3  # minimum of an anatomy's longest side [m]; a mouse brain has 15 mm
+LARGEST = 1.0  # maximum of an anatomy's longest side [m]; a whole head has 0.3 m
 
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """Mesh in metres, point data (as stored, but vectors in the mesh's space), and notes of what was changed."""
+    """Mesh in metres, point data (unscaled, vectors in the mesh's space), and notes on changes."""
 
     mesh: TetMesh
     point_data: Mapping[str, np.ndarray]
@@ -67,17 +67,17 @@ class MeshFile:
 
 
 def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES) -> MeshFile:
-    """Read tetrahedra with cell data `region`, or else with the groups of a mesher (absent: one region 0).
+    """Read tetrahedra with cell data `region`, or else with a mesher's groups (default: one region 0).
 
-    Quadratic ones (`tetra10`) are taken as they are, curved edges too. Points, lines and surfaces are dropped, nodes
-    that coincide are merged and tetrahedra of negative orientation are turned, each with a note. LPS in the title of a
-    `.vtk` becomes RAS, with a note. `limits` bound what a file may inflate to.
+    Quadratic ones (`tetra10`) keep their curved edges. Points, lines and surfaces are dropped, coincident
+    nodes are merged and negatively oriented tetrahedra are reoriented, each with a note. LPS in the title of a
+    `.vtk` is converted to RAS, with a note. `limits` bound the decompressed size.
 
     Raises
     ------
     InputError
         A file that is missing or unreadable, without tetrahedra, with both kinds or with other volume cells, or with
-        data that does not fit. Tetrahedra that are listed twice, or overlap. A title with a space that is not known.
+        inconsistent data. Tetrahedra that are listed twice, or overlap. A title with an unknown space.
     """
     path = to_path(path)
     if not path.is_file():
@@ -88,7 +88,7 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
         most = limits.of(path.stat().st_size)
         counted = path.suffix.lower() == ".vtu" and check_vtu_size(path, most)
         with warnings.catch_warnings(), nullcontext() if counted else limit_memory(limits.largest):
-            warnings.simplefilter("ignore")  # meshio warns of arrays that it skips
+            warnings.simplefilter("ignore")  # meshio warns about arrays that it skips
             check_mesh_references(path, limits)
             raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _by_meshio(path)
     with read_as(path, "a mesh", REMEDY):
@@ -96,16 +96,16 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
 
 
 def _by_meshio(path: Path) -> meshio.Mesh:
-    """Read a mesh of another format than Abaqus's.
+    """Read a mesh in a format other than Abaqus.
 
     Raises
     ------
     InputError
-        Passing on the reason that meshio gives itself. Its other exceptions show a damaged file.
+        With meshio's reason if it gives one. Its other exceptions indicate a damaged file.
     """
-    import meshio  # an optional reader: machines that only train have none
+    import meshio  # optional dependency: machines for training only lack it
 
-    printed = StringIO()  # meshio prints why it reads no file
+    printed = StringIO()  # meshio prints its reason
     try:
         with redirect_stdout(printed), redirect_stderr(StringIO()):
             return meshio.read(path)
@@ -125,7 +125,7 @@ def _by_meshio(path: Path) -> meshio.Mesh:
 
 
 def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
-    """Mesh of a file that was read, with lengths in units of `metre` [m]."""
+    """Build the mesh of a parsed file whose length unit is `metre` [m]."""
     kinds = {block.type for block in raw.cells}
     found = kinds.intersection(CELLS.values())
     if not found:
@@ -144,7 +144,7 @@ def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
     region, said = collect_regions(raw, blocks)
     table, turned = orient_tetrahedra(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
     data, places = {name: np.asarray(field) for name, field in raw.point_data.items()}, np.asarray(raw.points, float)
-    if _space_of(path) == "LPS":  # half a turn about z, which keeps orientations
+    if _space_of(path) == "LPS":  # half a turn about z, which preserves orientation
         places = places * SIGNS["LPS"]
         vectors = {name for name, field in data.items() if field.shape[1:] == (3,) and field.dtype.kind in "if"}
         data.update({name: data[name] * SIGNS["LPS"] for name in vectors})
@@ -161,7 +161,7 @@ def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
 
 
 def _space_of(path: Path) -> str:
-    """Space that the title of a `.vtk` states as 3D Slicer does (`SPACE=LPS`); empty where it states none."""
+    """Read the space in the title of a `.vtk`, as 3D Slicer writes it (`SPACE=LPS`); empty if absent."""
     if path.suffix.lower() != ".vtk":
         return ""
     with path.open("rb") as lines:
@@ -175,14 +175,14 @@ def _space_of(path: Path) -> str:
 
 
 def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray], space: str = "") -> None:
-    """Write `.vtu` in metres, with cell data `region`, `tetra10` cells where the mesh has mid-edge nodes.
+    """Write `.vtu` in metres, with cell data `region`; `tetra10` cells if the mesh has mid-edge nodes.
 
-    The file says its unit, and its `space` if that is known. It appears whole or not at all.
+    The file records its unit and, if given, its `space`. It is written atomically.
 
     Raises
     ------
     InputError
-        A name that does not end in .vtu, or a folder that cannot be written to.
+        A name that does not end in .vtu, or a folder that is not writable.
     """
     import meshio
 
@@ -200,7 +200,7 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
 def _said(space: str) -> str:
     """Return unit and space, as a comment and as field data.
 
-    Meshio, which wrote the file, reads no field data of text.
+    The name carries the information, since meshio cannot read text as field data.
     """
     name = f"{space}, metres per unit".removeprefix(", ")
     return (
@@ -215,11 +215,11 @@ def read_anatomy(path: str | Path) -> Anatomy:
     Raises
     ------
     InputError
-        As `read_mesh`; a mesh that lacks `held`, `slide_normal` or `craniotomy`, or has numbers there that are none. A
-        body that is too small or too large for one in metres.
+        As `read_mesh`; a mesh without `held`, `slide_normal` or `craniotomy`, or with non-finite values there. A
+        body outside the size limits for coordinates in metres.
     """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "the body measures", MeshWarning)  # it is refused instead
+        warnings.filterwarnings("ignore", "the body measures", MeshWarning)  # rejected below instead
         file = read_mesh(path)
     missing = [name for name in ("held", "slide_normal", "craniotomy") if name not in file.point_data]
     if missing:

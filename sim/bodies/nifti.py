@@ -1,4 +1,4 @@
-"""NIfTI volumes and FreeSurfer's as they come: any affine, in metres."""
+"""Reader for NIfTI and FreeSurfer volumes with any affine, in metres."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
     from nibabel.freesurfer.mghformat import MGHImage
     from nibabel.nifti1 import Nifti1Image
 
-# Share by which the square of a quaternion's length may exceed 1.
+# Tolerance by which a quaternion's squared length may exceed 1.
 ROUNDED = 1e-3
-METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}
+METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}  # length units [m]
 
 
 def read_nifti(path: Path, voxels: Voxels) -> Volume:
-    """Return the voxels of a NIfTI file of one part.
+    """Return the volume in a single-file NIfTI.
 
     Raises
     ------
     InputError
-        Another file, one that ends before its voxels do or that declares too many, a slope that is no number. nibabel's
-        own exceptions of a damaged one.
+        Another format, a truncated file or one that declares too many voxels, a non-finite slope. Exceptions of nibabel
+        for a damaged file.
     """
     image = load_nifti(path)
     with open_volume(path) as file:
-        header = type(image.header).from_fileobj(file, check=False)  # the image's own has forgotten slope and size
+        header = type(image.header).from_fileobj(file, check=False)  # the image's header lacks slope and size
     slope, shift = float(header["scl_slope"]), float(header["scl_inter"])
     _demand_few(path, image.shape)
     if not math.isfinite(slope) or not math.isfinite(shift):
@@ -52,20 +52,20 @@ def read_nifti(path: Path, voxels: Voxels) -> Volume:
 
 
 def load_nifti(path: Path) -> Nifti1Image:
-    """Return the image of a NIfTI file of one part, packed or not, whatever its name says.
+    """Return the image of a single-file NIfTI, compressed or not, whatever its suffix.
 
     Raises
     ------
     InputError
-        Another file, a qform that is no rotation, or a header that nibabel does not read. Its other exceptions of a
-        damaged one.
+        Another format, a qform that is not a rotation, or a header that nibabel rejects. Other exceptions of nibabel
+        for a damaged file.
     """
     import nibabel
     from nibabel.imageglobals import LoggingOutputSuppressor
     from nibabel.spatialimages import HeaderDataError
 
     with open_volume(path) as file:
-        start = file.read(540)  # a header of NIfTI-2
+        start = file.read(540)  # size of a NIfTI-2 header
     two = start[4:8] in (b"n+2\0", b"ni2\0")
     if not two and 348 not in (int.from_bytes(start[:4], "little"), int.from_bytes(start[:4], "big")):
         raise ValueError("no header of NIfTI")
@@ -79,11 +79,11 @@ def load_nifti(path: Path) -> Nifti1Image:
             f"{path}: its qform has a quaternion of length {(over + 1.0) ** 0.5:.4g}, which is no rotation: the length "
             "must be 1. Export it again, with its orientation."
         )
-    if 0.0 < over <= ROUNDED:  # half a turn, as in the format's reference code; nibabel allows single round-off
+    if 0.0 < over <= ROUNDED:  # half a turn, as the reference code assumes; nibabel allows single round-off
         rounded = type("Rounded", (kind.header_class,), {"quaternion_threshold": 2.0 * ROUNDED})
         kind = type("RoundedImage", (kind,), {"header_class": rounded})
     try:
-        with LoggingOutputSuppressor():  # remarks on fields that are repaired
+        with LoggingOutputSuppressor():  # nibabel logs repaired fields
             return kind.from_file_map({"image": _holder(path)})
     except HeaderDataError as error:
         raise InputError(f"{path}: nibabel reports `{error}`. {REMEDY}") from error
@@ -97,15 +97,13 @@ def _holder(path: Path) -> FileHolder:
 
 
 def read_mgh(path: Path, voxels: Voxels) -> Volume:
-    """Return the voxels of a volume that FreeSurfer wrote.
-
-    Its file is in millimetres, and `voxels` say nothing about it.
+    """Return the volume in a FreeSurfer file, in millimetres; its options `voxels` are ignored.
 
     Raises
     ------
     InputError
-        A file that ends before its voxels do, declares too many, or does not state its orientation. nibabel's own
-        exceptions of a damaged one.
+        A file that is truncated, declares too many voxels, or does not give its orientation. Exceptions of nibabel for
+        a damaged file.
     """
     import nibabel
 
@@ -116,7 +114,7 @@ def read_mgh(path: Path, voxels: Voxels) -> Volume:
     needed = header.get_data_offset() + math.prod(shape) * header.get_data_bytespervox()
     _demand_held(path, needed)
     with open_volume(path) as file:
-        flag = file.read(30)[28:]  # nibabel's own header has an orientation always
+        flag = file.read(30)[28:]  # nibabel's header always has an orientation
     if flag != b"\x00\x01":
         raise InputError(
             f"{path}: does not state how its axes lie in the head (goodRASFlag 0). Set its orientation, "
@@ -132,17 +130,17 @@ def _affine(image: Nifti1Image | MGHImage, metre: float) -> np.ndarray:
 
 
 def _demand_few(path: Path, shape: tuple[int, ...]) -> None:
-    """Refuse a file that declares more voxels than may be: no memory is taken before."""
+    """Reject a file that declares more than `MOST_VOXELS` voxels, before memory is allocated."""
     voxels = math.prod(shape)
     if voxels > MOST_VOXELS:
-        raise InputError(f"{path}: has {voxels:.3g} voxels, and {MOST_VOXELS:.3g} are the most. Resample it.")
+        raise InputError(f"{path}: has {voxels:.3g} voxels; the maximum is {MOST_VOXELS:.3g}. Resample it.")
 
 
 def _demand_held(path: Path, needed: int) -> None:
-    """Refuse a file that has fewer bytes than it declares: no memory is taken before."""
+    """Reject a file with fewer bytes than it declares, before memory is allocated."""
     held = 0
     with open_volume(path) as file:
-        while piece := file.read(PIECE):  # to its end, where gzip has its checksum
+        while piece := file.read(PIECE):  # to the end, where gzip stores its checksum
             held += len(piece)
             if held > needed + SURPLUS:
                 break
@@ -151,17 +149,17 @@ def _demand_held(path: Path, needed: int) -> None:
 
 
 def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Affine (4, 4) to metres (RAS) of an image whose affine is in units of `metre` [m], and a note on a doubt.
+    """Return the affine (4, 4) to metres (RAS) of an image in units of `metre` [m], and notes on inconsistencies.
 
     Raises
     ------
     InputError
-        An image that does not state its orientation, unless `voxels` do; axes that are none.
+        An image without orientation, unless `voxels` give it; invalid axes.
     """
     sform = image.get_sform(coded=True)[0]
     try:
         qform = image.get_qform(coded=True)[0]
-    except ValueError:  # no rotation is stored there; where the sform is good, nibabel does not look at it
+    except ValueError:  # the qform is not a rotation; nibabel ignores it if the sform is valid
         qform = None
     if sform is None and qform is None:
         return _turned(path, image, metre, voxels.axes), ()
@@ -181,10 +179,10 @@ def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tup
 
 
 def _turned(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:
-    """Affine (4, 4) to metres of a volume about its middle, whose axes point as the letters `axes` say."""
+    """Return the affine (4, 4) to metres of a volume centred at the origin, with axis directions `axes`."""
     if not axes:
         raise InputError(
-            f"{path}: has neither sform nor qform, so nobody knows where left is. Export it with its orientation, or "
+            f"{path}: has neither sform nor qform, so its left side is unknown. Export it with its orientation, or "
             "state where its axes point, such as --axes RAS or --axes LPS."
         )
     rows = [next((row for row, ends in enumerate(("LR", "PA", "IS")) if letter in ends), 3) for letter in axes.upper()]

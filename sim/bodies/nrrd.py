@@ -1,4 +1,4 @@
-"""NRRD volumes, in one file or with their voxels beside, and the segmentations that 3D Slicer writes as `.seg.nrrd`."""
+"""Reader for NRRD volumes, with attached or detached data, and for 3D Slicer segmentations (`.seg.nrrd`)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ SIGNS = {
     "left-anterior-superior": (-1.0, 1.0, 1.0),
     "left-posterior-superior": (-1.0, -1.0, 1.0),
 }
-"""Of each space that says where a patient's sides are, what its axes become in RAS."""
-SHORT = {"".join(word[0] for word in space.split("-")): space for space in SIGNS}
-METRES = {"mm": 1e-3, "": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6}
-TYPES = {
+"""Sign of each coordinate in the conversion to RAS, for each anatomical space."""
+SHORT = {"".join(word[0] for word in space.split("-")): space for space in SIGNS}  # spaces by their initials
+METRES = {"mm": 1e-3, "": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6}  # length units [m]
+TYPES = {  # NumPy types by NRRD names, without byte order
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
     **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
     **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
@@ -37,24 +37,22 @@ TYPES = {
     "float": "f4",
     "double": "f8",
 }
-ENDIAN = {"little": "<", "big": ">"}
-# Characters of a line of a header, and lines: a segmentation of a hundred segments has a thousand.
-LONGEST, MOST_LINES = 2**16, 2**14
+ENDIAN = {"little": "<", "big": ">"}  # NumPy byte order
+LONGEST = 2**16  # maximum length of a header line [characters]
+MOST_LINES = 2**14  # maximum header lines; 100 segments take 1,000
 ONE_FILE = "Save it as one file (.nrrd), with its header and voxels together."
 
 
 def read_nrrd(path: Path, voxels: Voxels) -> Volume:
-    """Return the voxels of an NRRD file, or of the one file beside it that it names.
+    """Return the volume in an NRRD file or in its detached data file; layers of segments are (I, J, K, L).
 
-    Of layers of segments, (I, J, K, L).
-
-    NRRD states its unit, millimetres if none, and one affine: `voxels` say nothing about it.
+    NRRD gives its unit, millimetres by default, and one affine: the options `voxels` are ignored.
 
     Raises
     ------
     InputError
-        A file that is none, or whose header is not whole; one that does not state a space of a patient's sides.
-        Voxels in several files, in a folder of their own, or in another coding than raw, gzip or bzip2. Fewer of them
+        A file of another format, or with an incomplete header or without an anatomical space.
+        Voxels in several files, in another folder, or in an encoding other than raw, gzip or bzip2. Fewer voxels
         than declared, or too many.
     """
     with path.open("rb") as file:
@@ -64,7 +62,7 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
             raise InputError(f"{path}: its sizes do not match its dimension. Save it again.")
         if math.prod(sizes) > MOST_VOXELS:
             raise InputError(
-                f"{path}: has {math.prod(sizes):.3g} voxels, and {MOST_VOXELS:.3g} are the most. Resample it."
+                f"{path}: has {math.prod(sizes):.3g} voxels; the maximum is {MOST_VOXELS:.3g}. Resample it."
             )
         dtype = _dtype(path, fields)
         needed = math.prod(sizes) * dtype.itemsize
@@ -80,9 +78,9 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
 
 
 def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]:
-    """Fields by their names in lower case, and keys of the writer's own; the file is then at its voxels."""
+    """Read the fields, by names in lower case, and the custom keys; the file is then positioned at its voxels."""
     if not re.fullmatch(rb"(\xef\xbb\xbf)?NRRD000[1-5]\s*", file.readline(LONGEST)):
-        raise InputError(f"{path}: does not begin as an NRRD file does. {REMEDY}")
+        raise InputError(f"{path}: does not begin with an NRRD header. {REMEDY}")
     fields, keys = {}, {}
     for _ in range(MOST_LINES):
         line = file.readline(LONGEST)
@@ -105,20 +103,20 @@ def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]
 
 
 def _named(fields: Mapping[str, str]) -> str:
-    """Return the name of the file that holds the voxels; empty where it is this one."""
+    """Return the name of the detached data file; empty if the data is attached."""
     return fields.get("data file", fields.get("datafile", ""))
 
 
 def _beside(path: Path, fields: Mapping[str, str]) -> Path | None:
-    """Return the file beside this one that holds the voxels; None where this one does."""
+    """Return the path of the detached data file, in the same folder; None if the data is attached."""
     name = _named(fields)
     if not name:
         return None
     if name != PureWindowsPath(name).name or name == "..":
-        raise InputError(f"{path}: has its voxels in {name!r}, and only a file beside it is read. {ONE_FILE}")
+        raise InputError(f"{path}: has its voxels in {name!r}, and only a file in the same folder is read. {ONE_FILE}")
     found = path.parent / name
     if not found.is_file():
-        raise InputError(f"{path}: has its voxels in {name!r}, and no such file is beside it. {ONE_FILE}")
+        raise InputError(f"{path}: has its voxels in {name!r}, and no such file is in the same folder. {ONE_FILE}")
     return found
 
 
@@ -136,14 +134,14 @@ def _dtype(path: Path, fields: Mapping[str, str]) -> np.dtype:
         return np.dtype(TYPES[kind])
     endian = _field(path, fields, "endian").lower()
     if endian not in ENDIAN:
-        raise InputError(f"{path}: states its endian as {endian!r}: little or big are known. Save it again.")
+        raise InputError(f"{path}: states its endian as {endian!r}: must be little or big. Save it again.")
     return np.dtype(ENDIAN[endian] + TYPES[kind])
 
 
 def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) -> bytes:
-    """All bytes of the voxels: no memory is taken for what the file cannot hold."""
+    """Read all bytes of the voxels; memory is allocated only for data that the file can contain."""
     if any(float(fields.get(skip, 0)) for skip in ("byte skip", "byteskip", "line skip", "lineskip")):
-        raise InputError(f"{path}: skips a part of itself before its voxels. {ONE_FILE}")
+        raise InputError(f"{path}: skips bytes before its voxels. {ONE_FILE}")
     coding = _field(path, fields, "encoding").lower()
     if coding in ("gzip", "gz"):
         stream = gzip.GzipFile(fileobj=file)
@@ -152,12 +150,12 @@ def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) 
     elif coding == "raw":
         stream = file
     else:
-        raise InputError(f"{path}: its voxels are coded as {coding!r}: raw, gzip and bzip2 are read. Save it so.")
+        raise InputError(f"{path}: its voxels are coded as {coding!r}: must be raw, gzip or bzip2. Save it again.")
     size = path.stat().st_size
     if needed > (size if stream is file else max(LITTLE * (coding[0] == "b"), INFLATION * size)):
         raise InputError(f"{path}: is too short for its {needed:,} bytes of voxels. Copy or save it again.")
     held = bytearray()
-    while len(held) < needed + SURPLUS and (piece := stream.read(PIECE)):  # to the end, where gzip has its checksum
+    while len(held) < needed + SURPLUS and (piece := stream.read(PIECE)):  # to the end, where gzip stores its checksum
         held += piece
     if len(held) < needed:
         raise InputError(f"{path}: ends after {len(held):,} of {needed:,} bytes of voxels. Copy or save it again.")
@@ -165,13 +163,13 @@ def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) 
 
 
 def _affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarray, list[int]]:
-    """From indices to metres (RAS), and the axes that do not lie in space: at most one."""
+    """Return the affine (4, 4) from indices to metres (RAS), and the non-spatial axes: at most one."""
     stated = fields.get("space", "").lower()
     space = SHORT.get(stated, stated)
     if space not in SIGNS:
-        said = f"its space is stated as {stated!r}" if stated else "it does not state its space"
+        said = f"its space is {stated!r}" if stated else "it does not state its space"
         raise InputError(
-            f"{path}: {said}, so nobody knows where left is. Save it from 3D Slicer, or state "
+            f"{path}: {said}, so its left side is unknown. Save it from 3D Slicer, or state "
             f"`space: {next(reversed(SIGNS))}` if that is so; known are {', '.join(SIGNS)}."
         )
     vectors = re.findall(r"none|\([^)]*\)", _field(path, fields, "space directions").lower())
@@ -189,7 +187,7 @@ def _affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarra
 
 
 def _segments(path: Path, keys: Mapping[str, str], layers: int) -> tuple[Segment, ...]:
-    """What 3D Slicer calls the labels. Its old files have a layer of ones for each segment, and do not say so."""
+    """Read Slicer's segment names and labels. Old files have a layer of ones for each segment, without layer keys."""
     numbers = sorted({int(found[1]) for key in keys if (found := re.match(r"Segment(\d+)_", key))})
     segments = tuple(
         Segment(
@@ -200,5 +198,5 @@ def _segments(path: Path, keys: Mapping[str, str], layers: int) -> tuple[Segment
         for number in numbers
     )
     if any(not 0 <= segment.layer < layers for segment in segments):
-        raise InputError(f"{path}: has a segment in a layer that is not there. Save it again.")
+        raise InputError(f"{path}: has a segment in a missing layer. Save it again.")
     return segments

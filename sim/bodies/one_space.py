@@ -1,4 +1,4 @@
-"""Whether several files are of one space, and not one of them in LPS that is stated as RAS."""
+"""Consistency of the spaces of several files; detects LPS declared as RAS."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from ..errors import InputError
 from .label_map import Mask
 from .voxels import LPS, VoxelGrid
 
-# Share of what has to lie inside that does: less is amiss, and so much after x and y are negated says why.
-AMISS, EXPLAINED = 0.5, 0.9
-SAMPLED = 500
-ONE_OF_BOTH = "one of the two states LPS as RAS. Export that one anew."
+AMISS = 0.5  # fraction of points inside, below which the spaces differ
+EXPLAINED = 0.9  # fraction inside after negating x and y, above which LPS is the cause
+SAMPLED = 500  # approximate number of tested points
+ONE_OF_BOTH = "one of the two states LPS as RAS. Export that one again."
 
 
 def has_one_space(brain: Mask, tumour: Mask) -> bool:
-    """Whether a brain and a tumour of grids of their own would fit as well if x and y of one were negated.
+    """Return True if brain and tumour, on different grids, would also fit with x and y of one negated.
 
     Raises
     ------
     InputError
-        A tumour beside the brain, and LPS that is stated as RAS as far as it shows.
+        A tumour outside the brain, and LPS that is evidently declared as RAS.
     """
     check_not_negated(brain.grid, tumour.grid)
     boxes = [mask.box for mask in (brain, tumour)]
@@ -45,12 +45,12 @@ def has_one_space(brain: Mask, tumour: Mask) -> bool:
 
 
 def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -> None:
-    """Refuse a scan in LPS that is stated as RAS, as far as it shows; `grids` are of the files that mark the `brain`.
+    """Reject a scan that is evidently LPS declared as RAS; `grids` are those of the files that mark the `brain`.
 
     Raises
     ------
     InputError
-        A grid that is one of those with x and y negated, or a scan that would hold the brain if they were.
+        A grid that equals one of `grids` with x and y negated, or a scan that would contain the brain if they were.
     """
     for grid in grids:
         check_not_negated(grid, scan)
@@ -64,12 +64,12 @@ def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -
 
 
 def check_not_negated(one: VoxelGrid, other: VoxelGrid) -> None:
-    """Refuse two grids of which one is the other with x and y negated.
+    """Reject two grids of which one equals the other with x and y negated.
 
     Raises
     ------
     InputError
-        Such grids.
+        For such grids.
     """
     negated = np.array([*LPS, 1.0])[:, None] * other.affine
     if _same(one, VoxelGrid(other.path, other.shape, negated)):
@@ -81,30 +81,30 @@ def _same(one: VoxelGrid, other: VoxelGrid) -> bool:
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
-    """Return some `SAMPLED` of them, at least."""
+    """Return a regular subset of at least `SAMPLED` points, or all."""
     return points[:: max(1, len(points) // SAMPLED)]
 
 
 def _places(grid: VoxelGrid, index: np.ndarray) -> np.ndarray:
-    """Places (n, 3) [m] of voxels (n, 3)."""
+    """Return the positions (n, 3) [m] of voxel indices (n, 3)."""
     return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
 def share_on(shape: tuple[int, ...], affine: np.ndarray, points: np.ndarray) -> float:
-    """Return the share of points (n, 3) [m] that lie in a voxel (I, J, K), whose affine (4, 4) leads to metres."""
+    """Return the fraction of points (n, 3) [m] that lie in a volume (I, J, K) with an affine (4, 4) to metres."""
     inverse = np.linalg.inv(affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3])
     return float(((index >= 0) & (index < np.array(shape))).all(axis=1).mean())
 
 
 def _corners(mask: Mask) -> np.ndarray:
-    """Points (n, 3) [m] on both sides of the outline: a mask of one slice has a hull, too."""
+    """Return the outline shifted by half a voxel to both sides (n, 3) [m], so that a single slice has a convex hull."""
     half = 0.5 * mask.affine[:3, :3].sum(axis=1)
     return np.concatenate([mask.outline - half, mask.outline + half])
 
 
 def _share_within(planes: np.ndarray, points: np.ndarray) -> float:
-    """Return the share of points (n, 3) that no plane of a convex hull cuts off."""
+    """Return the fraction of points (n, 3) inside all planes of a convex hull."""
     outermost = np.full(len(points), -np.inf)
     for part in np.array_split(planes, max(1, len(planes) // 64)):
         np.maximum(outermost, (points @ part[:, :3].T + part[:, 3]).max(axis=1), out=outermost)

@@ -1,4 +1,4 @@
-"""The open cortex of an anatomy: its frame, its rim, and places on it where a tool can press."""
+"""Exposed cortex of an anatomy: local coordinate system, craniotomy edge, and contact points of a tool."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from ..errors import InputError
 from ..geometry.closest_point import find_closest_points
 from ..geometry.surface import compute_areas, compute_vertex_normals, normalise_vectors
 
-# A place so near to the rim [m] lies on it.
+# Distance below which a point counts as on the edge [m].
 ON_RIM = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A material point of the open cortex.
+    """Material point of the exposed cortex.
 
     Parameters
     ----------
     point
-        (3,) [m], at rest.
+        Undeformed position (3,) [m].
     inward
-        (3,) unit normal of the surface there, into the brain.
+        Unit surface normal (3,) there, into the brain.
     vertices, weights
         Mesh vertices (3,) of its triangle, and barycentric weights (3,).
     """
@@ -37,24 +37,24 @@ class Place:
     weights: np.ndarray
 
     def carried(self, positions: np.ndarray) -> np.ndarray:
-        """Where it is (3,) when the mesh's vertices are at positions (V, 3) [m]."""
+        """Return the deformed position (3,) [m], given vertex positions (V, 3) [m]."""
         return self.weights @ positions[self.vertices]
 
 
 @dataclass(frozen=True, eq=False)
 class OpenCortex:
-    """The open cortex and its frame.
+    """Exposed cortex and its coordinate system.
 
     Parameters
     ----------
     anatomy
-        The body.
+        Anatomy with a craniotomy.
     origin
-        (3,) [m] its middle, on the surface.
+        Centroid (3,) [m] of the exposed surface, projected onto it.
     axis
-        (3,) the mean inward normal.
+        Mean inward normal (3,).
     right, up
-        (3,) span the tangent plane; `up` is as superior as the surface allows.
+        Vectors (3,) that span the tangent plane; `up` points in the most superior tangent direction.
     """
 
     anatomy: Anatomy
@@ -65,17 +65,17 @@ class OpenCortex:
 
     @cached_property
     def corners(self) -> np.ndarray:
-        """Of its triangles (S, 3, 3) [m]."""
+        """Corners (S, 3, 3) [m] of its triangles."""
         return self.anatomy.mesh.nodes[self.anatomy.open_surface]
 
     @cached_property
     def radius(self) -> float:
-        """Radius of the circle of its area [m]."""
+        """Radius of the circle with its area [m]."""
         return float(np.sqrt(compute_areas(self.corners).sum() / np.pi))
 
     @cached_property
     def clearance(self) -> float:
-        """Radius of the largest circle round the origin, across the axis, that it fills [m]."""
+        """Radius of the largest circle around the origin, perpendicular to the axis, inside the exposed cortex [m]."""
         rim = find_border_edges(self.anatomy.mesh.nodes, self.anatomy.open_surface) - self.origin
         return float(compute_distances(rim - (rim @ self.axis)[..., None] * self.axis, np.zeros((1, 3)))[0])
 
@@ -84,23 +84,23 @@ class OpenCortex:
         return -compute_vertex_normals(self.anatomy.mesh.nodes, self.anatomy.open_surface)
 
     def across(self, points: np.ndarray) -> np.ndarray:
-        """Distance (n,) [m] of points (n, 3) from the line through the origin along the axis."""
+        """Return distances (n,) [m] of points (n, 3) from the line through the origin along the axis."""
         arm = points - self.origin
         return np.linalg.norm(arm - np.outer(arm @ self.axis, self.axis), axis=1)
 
     def nearest(self, point: np.ndarray) -> Place:
-        """Return the place that is nearest to a point (3,) [m]."""
+        """Return the place nearest to a point (3,) [m]."""
         at, triangle, weights = (found[0] for found in find_closest_points(point[None], self.corners))
         vertices = self.anatomy.open_surface[triangle]
         return Place(at, normalise_vectors((weights @ self._inward[vertices])[None])[0], vertices, weights)
 
     def place(self, right_mm: float = 0.0, up_mm: float = 0.0) -> Place:
-        """Return the place so many millimetres to the right of the middle, and up, in the tangent plane.
+        """Return the place at an offset from the origin to the right and up in the tangent plane [mm].
 
         Raises
         ------
         InputError
-            What is no number, or not one; a place outside the open cortex.
+            A value that is not a finite number; a place outside the exposed cortex.
         """
         for name, value in (("right_mm", right_mm), ("up_mm", up_mm)):
             given = check_numbers_array(name, value)
@@ -117,12 +117,12 @@ class OpenCortex:
 
 
 def open_cortex(anatomy: Anatomy) -> OpenCortex:
-    """Find the frame of an anatomy's open cortex.
+    """Return the exposed cortex of an anatomy with its coordinate system.
 
     Raises
     ------
     InputError
-        An anatomy without open cortex.
+        An anatomy without exposed cortex.
     """
     triangles = anatomy.open_surface
     if len(triangles) == 0:
@@ -133,7 +133,7 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
     axis = -area.sum(axis=0) / np.linalg.norm(area.sum(axis=0))
     size = np.linalg.norm(area, axis=1)
     middle = (size @ (a + b + c)) / (3.0 * size.sum())
-    # Superior, or anterior where the craniotomy looks straight up.
+    # superior, or anterior if the craniotomy faces up or down
     reference = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
     right = np.cross(axis, reference)
     right /= np.linalg.norm(right)
@@ -141,14 +141,14 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
 
 
 def find_border_edges(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Edges (E, 2, 3) [m] that belong to one only of triangles (S, 3) of points (V, 3) [m]."""
+    """Return edges (E, 2, 3) [m] that belong to exactly one of the triangles (S, 3) of points (V, 3) [m]."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, count = np.unique(edges, axis=0, return_counts=True)
     return points[edges[count == 1]]
 
 
 def compute_distances(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distances (B,) [m] from `points` (B, 3) to the nearest of `edges` (E, 2, 3)."""
+    """Return distances (B,) [m] from `points` (B, 3) to the nearest of `edges` (E, 2, 3)."""
     start, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     offset = points[:, None] - start
     square = np.einsum("ei,ei->e", along, along)

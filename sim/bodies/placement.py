@@ -1,4 +1,4 @@
-"""Where things lie in a head: which cortex can be reached over a point, and what clinicians call a place."""
+"""Positions in a head: cortex accessible through the skull, openings, and anatomical directions."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from scipy.spatial import ConvexHull, KDTree
 from ..errors import InputError
 
 AXES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
-"""Of RAS: what small and large coordinates are called."""
+"""Names of the negative and positive direction of each RAS axis."""
 
 
-AT_ONCE = 256  # points that are held against all planes of a hull
+AT_ONCE = 256  # points per block in the test against all hull planes
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a brain is held, where its skull can be opened, and what counts as its midline.
+    """Limits of brainstem, craniotomy and midline.
 
     Parameters
     ----------
     stem
-        The brainstem's reach from the lowest point, as a share of the brain's height: in the template 21 mm, the
-        medulla and what touches it.
+        Radius of the brainstem around the lowest point, as a fraction of the brain's height: 21 mm in the template, the
+        medulla and adjacent tissue.
     hull_depth
-        [m] under the convex hull: deeper cortex lies in a fissure and cannot be reached through the skull.
+        Maximum depth under the convex hull [m]: deeper cortex lies in a fissure, inaccessible through the skull.
     base
-        Share of the brain's height, under which the skull is not opened unless the tumour lies there too.
+        Minimum height of an opening, as a fraction of the brain's height, unless the tumour is lower.
     near
-        [m] A point farther from the surface does not say which cortex is meant.
+        Maximum distance of a point from the surface [m], for the intended cortex to be unambiguous.
     outside
-        [m] A point that is to lie in the brain may be so far outside: coordinates are read off images.
+        Maximum distance of a point outside the brain [m]: coordinates read from images are inexact.
     midline
-        Share of the brain's width, to either side of its middle.
+        Half width of the midline strip, as a fraction of the brain's width.
     fewest_open
-        Nodes of a craniotomy; fewer do not carry a tool.
+        Minimum nodes of a craniotomy, to support a tool.
     """
 
     stem: float = 0.15
@@ -50,7 +50,7 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One connected piece of a tumour: volume [m^3], centre (3,) [m], points (n, 3) [m] on its surface."""
+    """Connected component of a tumour: volume [m^3], centre (3,) [m], points (n, 3) [m] on its surface."""
 
     volume: float
     centre: np.ndarray
@@ -58,9 +58,9 @@ class Piece:
 
 
 def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Placement = Placement()) -> str:
-    """Words for a place (3,) [m] in a brain's box `low` to `high` (3,), RAS: "left anterior superior" and the like.
+    """Describe a place (3,) [m] in a brain's box `low` to `high` (3,), RAS: "left anterior superior" and the like.
 
-    Left and right are stated but for a midline strip; of the other axes, the outer thirds.
+    Left or right is given outside a midline strip; directions of the other axes in the outer thirds.
     """
     share = (np.asarray(point) - low) / (high - low)
     words = []
@@ -74,18 +74,18 @@ def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings
 
 
 def find_reachable_site(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
-    """Return the point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that can be reached through the skull."""
+    """Return the point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that is accessible through the skull."""
     floor = min(cortex[:, 2].min() + settings.base * np.ptp(cortex[:, 2]), centre[2])
     return _nearest_outer(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
 
 
 def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
-    """Return the reachable point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) at the surface.
+    """Return the accessible point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) at the surface.
 
     Raises
     ------
     InputError
-        A point that is not finite, or more than `near` from there; one over the brainstem.
+        A point that is not finite, or farther than `near` from there; one over the brainstem.
     """
     _demand_finite(point, "--opening-at")
     site = _nearest_outer(cortex, point, cortex, settings)
@@ -101,12 +101,12 @@ def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement =
 def find_opening_over(
     cortex: np.ndarray, point: np.ndarray, depth: float, settings: Placement = Placement()
 ) -> np.ndarray:
-    """The reachable point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) `depth` [m] below the brain's surface.
+    """Return the accessible point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) at a `depth` [m] in the brain.
 
     Raises
     ------
     InputError
-        A point that is not finite, or farther `outside` the brain; one over the brainstem.
+        A point that is not finite, or more than `outside` outside the brain; one over the brainstem.
     """
     _demand_finite(point, "--opening-over")
     if not depth > -settings.outside:
@@ -118,12 +118,12 @@ def find_opening_over(
 
 
 def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
-    """The reachable point (3,) [m] of `cortex` (n, 3) that is nearest to the middle of an opening's outline (m, 3).
+    """Return the accessible point (3,) [m] of `cortex` (n, 3) nearest to the centre of an opening's outline (m, 3).
 
     Raises
     ------
     InputError
-        As `find_opening_at`; an outline that does not lie at the surface.
+        As `find_opening_at`; an outline that is not at the surface.
     """
     apart = float(KDTree(cortex).query(outline)[0].max())
     if apart > settings.near:
@@ -136,9 +136,9 @@ def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Place
 
 
 def find_within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """(n,) bool: which points (n, 3) lie within a closed curve (m, 3), seen across the plane that fits it best.
+    """Return a mask (n,) of points (n, 3) within a closed curve (m, 3), projected onto its best-fit plane.
 
-    Points farther from that plane than the curve is wide are not meant: they lie on the head's other side.
+    Points farther from that plane than the radius of the curve are excluded: they lie on the head's other side.
     """
     middle = outline.mean(axis=0)
     axes = np.linalg.svd(outline - middle, full_matrices=False)[2]
@@ -155,7 +155,7 @@ def find_within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
 
 
 def _nearest_outer(points: np.ndarray, place: np.ndarray, cortex: np.ndarray, settings: Placement) -> np.ndarray:
-    """Of `points` (k, 3) of the `cortex` (n, 3) near its convex hull, the nearest to a place (3,)."""
+    """Return the point nearest to a place (3,) among `points` (k, 3) of the `cortex` (n, 3) near its convex hull."""
     hull = ConvexHull(cortex).equations
     order = np.argsort(np.linalg.norm(points - place, axis=1), kind="stable")
     parts = (points[order[first : first + AT_ONCE]] for first in range(0, len(order), AT_ONCE))

@@ -1,4 +1,4 @@
-"""The same body on a finer mesh: everywhere, or near the open cortex."""
+"""Red-green refinement of an anatomy's mesh, everywhere or near the exposed cortex."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from ..errors import InputError
 from ..geometry.surface import compute_edge_lengths
 from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh, orient_tetrahedra
 
-# Nodes of a quadratic tetrahedron: four children keep a corner each; the octahedron between them is cut along one of
-# its three diagonals, round which its other four nodes stand in this order.
+# Local nodes of a quadratic tetrahedron: four children with one corner each; the octahedron between them is cut along
+# one of its three diagonals, around which its other four nodes lie in this order.
 CORNERS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3]])
 DIAGONALS = np.array([[4, 9], [5, 7], [6, 8]])
 ROUND = np.array([[6, 7, 8, 5], [4, 6, 9, 8], [4, 5, 9, 7]])
+# Local node at the midpoint of each edge.
 MIDDLE = {frozenset(edge): 4 + k for k, edge in enumerate(QUADRATIC_EDGES.tolist())}
 
 
 def _patterns() -> dict[tuple[int, ...], list[list[int]]]:
-    """Children of a tetrahedron by which of its edges are halved: none, one, two opposite ones, or those of a face."""
+    """Return the children of a tetrahedron by its halved edges: none, one, two opposite ones, or those of a face."""
     found: dict[tuple[int, ...], list[list[int]]] = {(): [[0, 1, 2, 3]]}
     for a, b in combinations(range(4), 2):
         c, d = (k for k in range(4) if k not in (a, b))
@@ -36,30 +37,31 @@ def _patterns() -> dict[tuple[int, ...], list[list[int]]]:
     return found
 
 
-PATTERNS = _patterns()
+PATTERNS = _patterns()  # children by halved edges
 
 
 def _closed() -> np.ndarray:
-    """Smallest pattern (64, 6) bool that holds each set of halved edges; all six where no smaller one does."""
+    """Return the smallest pattern (64, 6) bool that contains each set of halved edges; all six if no other does."""
     sets = (np.arange(64)[:, None] >> np.arange(6)) & 1 > 0
     known = np.array([np.isin(np.arange(4, 10), one) for one in sorted(PATTERNS, key=len)] + [np.ones(6, bool)])
     return known[(sets[:, None] <= known).all(axis=2).argmax(axis=1)]
 
 
-CLOSED = _closed()
+CLOSED = _closed()  # smallest pattern by the bit mask of halved edges
 
 
 def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
-    """Halve every edge, or those whose middle is within an edge's mean length of the open cortex.
+    """Return the anatomy with every edge halved, or those near the exposed cortex.
 
-    The body's own nodes come first and stay. Held and sliding nodes are those of quadratic elements. A tetrahedron
-    becomes eight, and two or four at the edge of what is refined: red and green refinement, Bey 1995, "Tetrahedral
-    grid refinement", Computing 55:355-378. Bey's fixed diagonal of the octahedron inside is the shortest one here.
+    Near: the midpoint is within a mean edge length of it. Original nodes come first and keep their numbers. Fixed
+    and sliding nodes are those of quadratic elements. A tetrahedron becomes eight, at the border of the refined region
+    two or four: red and green refinement, Bey 1995, "Tetrahedral grid refinement", Computing 55:355-378. Bey's fixed
+    diagonal of the inner octahedron is replaced by the shortest one.
 
     Raises
     ------
     InputError
-        A mesh with mid-edge nodes of its own.
+        A mesh with mid-edge nodes.
     """
     mesh = anatomy.mesh
     if mesh.middles is not None:
@@ -85,7 +87,7 @@ def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
 
 
 def _conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
-    """Nodes (N,) bool: those given, and middles of further edges, until each tetrahedron has a pattern."""
+    """Return the marked nodes (N,) bool with further edge midpoints added, until each tetrahedron has a pattern."""
     halved, middles = halved.copy(), table[:, 4:]
     while True:
         asked = halved[middles]
@@ -96,7 +98,7 @@ def _conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
 
 
 def _children(nodes: np.ndarray, table: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra (C, 4) and their parents (C,), in the parents' order; `cut` (T, 6) are the edges that are halved."""
+    """Return children (C, 4) and their parents (C,), in the parents' order; `cut` (T, 6) marks the halved edges."""
     tets, parent = [], []
     for pattern, parts in PATTERNS.items():
         rows = np.flatnonzero((cut == np.isin(np.arange(4, 10), pattern)).all(axis=1))

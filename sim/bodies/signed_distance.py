@@ -1,4 +1,4 @@
-"""Solids as fields: negative inside, zero on the surface, and the field of a mask of voxels."""
+"""Solids as level set functions, negative inside and zero on the surface; level sets of voxel masks."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from scipy import ndimage, special
 
 Field = Callable[[np.ndarray], np.ndarray]
-"""A solid: values (n,) at points (n, 3) [m], negative inside, continuous; near its surface the distance to it [m]."""
+"""Level set of a solid: values (n,) at points (n, 3) [m], continuous; near its surface the signed distance [m]."""
 
 
 @dataclass(frozen=True)
 class Blur:
-    """How the field of a mask of voxels is made smooth.
+    """Smoothing of a voxel mask.
 
     Parameters
     ----------
     voxels
-        Standard deviation: takes the staircase off a mask and leaves what is wider than two voxels where it is.
+        Standard deviation [voxels]: smooths the steps of a mask and preserves features wider than two voxels.
     reach
-        Standard deviations from the surface beyond which a blurred mask tells no more than inside or outside.
+        Distance from the surface [standard deviations] beyond which only the sign is accurate.
     margin
-        Voxels of surroundings that a field keeps round its mask: more than the blur reaches.
+        Margin of a field around its mask [voxels]; larger than the range of the blur.
     """
 
     voxels: float = 0.7
@@ -34,25 +34,25 @@ class Blur:
 
 @dataclass(frozen=True, eq=False)
 class LevelSet:
-    """A field sampled on voxels, trilinear between them and constant beyond.
+    """Level set sampled on voxels, trilinear between them and constant outside.
 
-    values (I, J, K) float32 [m]; inverse (4, 4): homogeneous points [m] to voxel indices.
+    values (I, J, K) float32 [m]; inverse (4, 4) from homogeneous points [m] to voxel indices.
     """
 
     values: np.ndarray
     inverse: np.ndarray
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Values (n,) [m] at points (n, 3) [m]."""
+        """Return the values (n,) [m] at points (n, 3) [m]."""
         index = self.inverse[:3, :3] @ points.T + self.inverse[:3, 3:]
         return ndimage.map_coordinates(self.values, index, order=1, mode="nearest", output=np.float64)
 
 
 def mask_field(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> LevelSet:
-    """Return the field of the voxels `mask` (I, J, K) bool whose indices `affine` (4, 4) takes to metres.
+    """Return the level set of the voxels `mask` (I, J, K) bool with an `affine` (4, 4) from indices to metres.
 
-    The mask is blurred and the blur of a plane, P = Phi(-d / sigma), is solved for the distance d.
-    Where voxels are oblong the mean of the three blurs stands for sigma, so that distances are right to a factor.
+    The mask is blurred, and the blur of a half-space, P = Phi(-d / sigma), is solved for the distance d.
+    For anisotropic voxels, sigma is the geometric mean of the three axes, so that distances have a scale error.
     """
     mask, affine = crop_to(mask, affine, blur.margin)
     sigma = blur.voxels * abs(np.linalg.det(affine[:3, :3])) ** (1.0 / 3.0)
@@ -63,7 +63,7 @@ def mask_field(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> Lev
 
 
 def crop_to(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the part of a mask within `margin` voxels of what is marked, padded with zeros, and its affine (4, 4)."""
+    """Return the part of a mask within `margin` voxels of marked ones, zero-padded, and its affine (4, 4)."""
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(mask.astype(np.uint8)))
     low = np.array([part.start for part in box]) - margin
     shifted = affine.copy()
@@ -72,19 +72,19 @@ def crop_to(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarr
 
 
 def compute_gradient(field: Field, points: np.ndarray, probe: float = 2e-4) -> np.ndarray:
-    """Gradient (n, 3) of a field at points (n, 3) [m], by differences `probe` [m] to both sides.
+    """Compute the gradient (n, 3) of a field at points (n, 3) [m] by central differences with step `probe` [m].
 
-    The default is below a voxel and above round-off.
+    The default is less than a voxel and well above round-off.
     """
     steps = probe * np.eye(3)
     return np.stack([field(points + step) - field(points - step) for step in steps], axis=1) / (2.0 * probe)
 
 
 def project_onto_level(field: Field, points: np.ndarray, level: np.ndarray, flat: float = 0.1) -> np.ndarray:
-    """Points (n, 3) [m] moved along the gradient to where the field has the value `level` (n,): two Newton steps.
+    """Return points (n, 3) [m] moved along the gradient to the level `level` (n,) of a field, by two Newton steps.
 
-    A distance has slope 1. Slopes below `flat` lie between two surfaces or far from any, and their direction is noise:
-    the flatter the field, the shorter the step.
+    A distance field has slope 1. Slopes below `flat` occur between two surfaces or far from any, where the direction is
+    noise; there the step is shortened.
     """
     for _ in range(2):
         slope = compute_gradient(field, points)

@@ -1,4 +1,4 @@
-"""A head before it is meshed: what the template and a user's labels have in common."""
+"""Head model before meshing, common to the template and to label volumes."""
 
 from __future__ import annotations
 
@@ -20,28 +20,30 @@ from .placement import Piece, Placement, find_within_outline
 from .refine import refined
 from .signed_distance import Field
 
-FEWEST_NODES, MOST_NODES = 2_000, 250_000
-# Points spread over a tetrahedron (20, 4), by their shares of its corners.
+FEWEST_NODES = 2_000  # minimum mesh nodes
+MOST_NODES = 250_000  # maximum mesh nodes
+# Barycentric coordinates (20, 4) of sample points in a tetrahedron.
 SPREAD = np.array([corners for corners in product(range(4), repeat=4) if sum(corners) == 3]) / 4.0 + 1.0 / 16.0
-SMALLEST_CRANIOTOMY, LARGEST_CRANIOTOMY = 0.015, 0.120  # [m]
+SMALLEST_CRANIOTOMY = 0.015  # minimum diameter [m]
+LARGEST_CRANIOTOMY = 0.120  # maximum diameter [m]
 
 
 @dataclass(frozen=True)
 class MeshPlan:
-    """How a subject becomes an anatomy.
+    """Parameters of the mesh of a subject.
 
     Parameters
     ----------
     nodes
-        Wanted in the mesh.
+        Requested number of nodes.
     craniotomy
-        [m] Diameter of the opening along the cortex.
+        Diameter of the craniotomy along the cortex [m].
     meshing
-        How the mesh is searched for and smoothed.
+        Mesh generation and smoothing.
     placement
-        Where the brain is held, and how many nodes an opening needs.
+        Limits of brainstem and craniotomy.
     fine_opening
-        Whether cells at the open cortex are halved, beyond the nodes wanted: contact forces depend less on the mesh.
+        True to halve edges at the exposed cortex, in addition to `nodes`: contact forces depend less on the mesh.
 
     Raises
     ------
@@ -67,9 +69,9 @@ class MeshPlan:
 
 @dataclass(frozen=True, eq=False)
 class SubjectPart:
-    """A part of brain or tumour that has a stiffness of its own: region label, field, and volume [m^3] in the labels.
+    """Part of brain or tumour with its own stiffness: region label, level set, and volume [m^3] in the labels.
 
-    Necrosis is a part of the tumour, all else of the brain.
+    Necrosis is a part of the tumour, all others of the brain.
     """
 
     label: int
@@ -79,30 +81,30 @@ class SubjectPart:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A brain with a tumour, in the volume's RAS frame [m].
+    """Brain with a tumour, in RAS coordinates of the volume [m].
 
     Parameters
     ----------
     brain, tumour
-        Fields of the whole solid (brain and tumour together) and of the tumour.
+        Level sets of the whole solid (brain and tumour together) and of the tumour.
     cortex, interface
-        Points (n, 3) [m] at the solid's surface and at the tumour's.
+        Points (n, 3) [m] on the solid's surface and on the tumour's.
     tumour_volume
-        [m^3].
+        Volume of the tumour [m^3].
     site
-        (3,) [m]: the point of the cortex over which the skull is opened.
+        Centre (3,) [m] of the craniotomy on the cortex.
     intensity
-        T1 intensities, where they are known.
+        T1 intensities, if available.
     notes
-        Sentences about what was changed in reading.
+        Notes on changes made while reading.
     pieces
-        Of the tumour, the largest first.
+        Connected components of the tumour, largest first.
     parts
-        Regions of their own; of two that overlap the later counts.
+        Parts that become regions; if two overlap, the later one has priority.
     septa
-        Sheets of dura that do not move.
+        Fixed sheets of dura.
     outline
-        (n, 3) [m]: a closed curve round the opening, in place of a disc.
+        Closed curve (n, 3) [m] around the opening, instead of a disc.
     """
 
     brain: Field
@@ -120,12 +122,12 @@ class Subject:
 
 
 def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
-    """Mesh a subject and bound it. The same subject and plan give the same anatomy, bit by bit.
+    """Mesh a subject and add its boundary conditions; the result is deterministic, bit by bit.
 
     Raises
     ------
     InputError
-        What `build_mesh` and `add_boundary_conditions` refuse.
+        Input that `build_mesh` or `add_boundary_conditions` rejects.
     """
     opening = subject.cortex[find_opened_cortex(subject, plan.craniotomy)]
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
@@ -140,7 +142,7 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
 def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
     """Return the mesh with the regions of the subject's parts.
 
-    Each has those tetrahedra that lie in it with the largest share, as many as come nearest to its volume.
+    Each part takes the tetrahedra with the largest fraction inside, until their volume is closest to its own.
     """
     region = mesh.region.copy()
     for part in reversed(subject.parts):
@@ -155,9 +157,9 @@ def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
 
 
 def find_opened_cortex(subject: Subject, craniotomy: float) -> np.ndarray:
-    """(n,) bool: which points of a subject's cortex lie under its outlined opening, or one of such a diameter [m].
+    """Return a mask (n,) of the subject's cortex points under its outlined opening, or under one of this diameter [m].
 
-    Distances are straight here. The mesh is opened by those along its surface, which are a little longer.
+    Distances are Euclidean; those on the mesh are geodesic and slightly longer.
     """
     if subject.outline is not None:
         return find_within_outline(subject.cortex, subject.outline)
@@ -165,7 +167,7 @@ def find_opened_cortex(subject: Subject, craniotomy: float) -> np.ndarray:
 
 
 def find_rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
-    """Centres (n, 3) [m] of the voxels of `mask` (I, J, K) that touch its outside."""
+    """Return the centres (n, 3) [m] of boundary voxels of `mask` (I, J, K)."""
     padded = np.pad(mask, 1)
     index = np.argwhere(padded & ~cast(np.ndarray, ndimage.binary_erosion(padded))) - 1
     return index @ affine[:3, :3].T + affine[:3, 3]

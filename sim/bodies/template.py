@@ -1,4 +1,4 @@
-"""A tumour drawn in a healthy head, and the built-in one: the MNI152 brain of the nilearn wheel, of a person's size."""
+"""Synthetic tumour in a healthy head; by default the MNI152 brain in the nilearn wheel, scaled to a typical volume."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .signed_distance import Field, mask_field
 from .subject import Subject, find_rim
 
 MIDDLE = (0.0, -17.4, 5.4)
-"""[mm] Middle of the template's box, from which the sites are seen."""
+"""Centre of the template's bounding box, the origin of the directions in `SITES` [mm]."""
 SITES = {
     "frontal": (32.0, 42.0, 36.0),
     "central": (40.0, -14.0, 58.0),
@@ -25,27 +25,29 @@ SITES = {
     "temporal": (66.0, -22.0, 2.0),
     "occipital": (28.0, -92.0, 14.0),
 }
-"""Directions, from the template's middle, of points on the right hemisphere's convexity: MNI152 coordinates [mm]."""
+"""Named points on the right hemisphere's convexity, seen from `MIDDLE`: MNI152 coordinates [mm]."""
 
-Shape = Literal["sphere", "lobed"]
-SMALLEST_RADIUS, LARGEST_RADIUS = 3e-3, 35e-3
-SMALLEST_COVER, LARGEST_COVER = 1e-3, 60e-3
+Shape = Literal["sphere", "lobed"]  # tumour shapes
+SMALLEST_RADIUS = 3e-3  # minimum tumour radius [m]
+LARGEST_RADIUS = 35e-3  # maximum tumour radius [m]
+SMALLEST_COVER = 1e-3  # minimum depth of the tumour's top under the cortex [m]
+LARGEST_COVER = 60e-3  # maximum depth of the tumour's top under the cortex [m]
 
 
 @dataclass(frozen=True)
 class Head:
-    """What is made of the template, and what room a tumour needs in it.
+    """Scaling of the template and requirements of a synthetic tumour.
 
     Parameters
     ----------
     volume
-        [m^3] of the scaled brain; the mask itself has 1,883 ml, more than a person.
+        Volume of the scaled brain [m^3]; the mask has 1,883 ml, more than a typical brain.
     threshold
-        Share of the template's brightest voxel above which a voxel is brain: nilearn's own mask.
+        Intensity threshold of brain voxels, as a fraction of the maximum: that of nilearn's own mask.
     smooth
-        [m] The cortex is levelled over this length to find which way is in.
+        Length over which the cortex is averaged for its inward normal [m].
     clearance
-        [m] of brain that must lie round the tumour.
+        Minimum brain around the tumour [m].
     """
 
     volume: float = 1470e-6
@@ -56,16 +58,16 @@ class Head:
 
 @dataclass(frozen=True)
 class Lobes:
-    """What a lobed tumour looks like: how many lobes of which height, and how pointed they are.
+    """Shape parameters of a lobed tumour.
 
     Parameters
     ----------
     count
-        Lobes, in random directions.
+        Number of lobes, in random directions.
     height
-        Of the largest one, as a share of the radius; the smallest has 0.3 of that.
+        Maximum height of a lobe, as a fraction of the radius; the minimum is 0.3 of it.
     sharpness
-        Of all lobes: s in `Lobed`.
+        Sharpness s of all lobes, see `Lobed`.
     """
 
     count: int = 6
@@ -75,25 +77,25 @@ class Lobes:
 
 @dataclass(frozen=True)
 class Tumour:
-    """A tumour to be placed.
+    """Size, shape and position of a synthetic tumour.
 
     Parameters
     ----------
     radius
-        [m] of the ball of the same volume.
+        Radius of the ball of the same volume [m].
     cover
-        [m] Depth of its cap under the cortex of the `site`, one of the names in `SITES`.
+        Distance from the cortex at the `site`, a name in `SITES`, to the top of the tumour [m].
     shape, lobes
-        "sphere" or "lobed", and then how.
+        "sphere" or "lobed", and parameters of the lobes.
     seed
-        Of the lobes' directions and heights.
+        Random seed of the lobes' directions and heights.
     middle
-        (x, y, z) [m], RAS, in place of `cover` and `site`.
+        Centre (x, y, z) [m], RAS, instead of `cover` and `site`.
 
     Raises
     ------
     InputError
-        A radius outside 3 to 35 mm, a cover outside 1 to 60 mm, a shape or site that is not known, or a middle that
+        A radius outside 3 to 35 mm, a cover outside 1 to 60 mm, an unknown shape or site, or a centre that
         is not finite.
     """
 
@@ -126,7 +128,7 @@ class Tumour:
 
     @property
     def place(self) -> str:
-        """Where it is to lie, in words."""
+        """Description of the position, for messages."""
         if self.middle is not None:
             return f"at {', '.join(f'{1e3 * value:g}' for value in self.middle)} mm"
         return f"with {self.cover * 1e3:g} mm of cover at the {self.site} site"
@@ -134,18 +136,18 @@ class Tumour:
 
 @dataclass(frozen=True, eq=False)
 class HealthyHead:
-    """A head without a tumour.
+    """Head without a tumour.
 
     Parameters
     ----------
     mask, affine
-        Voxels (I, J, K) bool of the brain, and (4, 4) from their indices to metres (RAS).
+        Brain voxels (I, J, K) bool, and affine (4, 4) from their indices to metres (RAS).
     intensity
-        Grey values in the same space, if there are any.
+        Grey values in the same space, if any.
     middle
-        (3,) [m] from which the directions of `SITES` are taken; None for the middle of its own box.
+        Origin (3,) [m] of the directions in `SITES`; None for the centre of the brain's box.
     notes
-        Sentences about what had to be assumed.
+        Notes on assumptions.
     """
 
     mask: np.ndarray
@@ -157,9 +159,9 @@ class HealthyHead:
 
 @dataclass(frozen=True, eq=False)
 class Lobed:
-    """A star-shaped solid: its radius in the unit direction n is scale * (1 + sum_k height_k exp(s (n . d_k - 1))).
+    """Star-shaped solid whose radius in unit direction n is scale * (1 + sum_k height_k exp(s (n . d_k - 1))).
 
-    middle (3,) [m]; directions (L, 3) of unit length; heights (L,); scale [m]; sharpness s. A ball has no lobes.
+    middle (3,) [m]; unit directions (L, 3); heights (L,); scale [m]; sharpness s. A ball has no lobes.
     """
 
     middle: np.ndarray
@@ -169,35 +171,35 @@ class Lobed:
     sharpness: float = Lobes.sharpness
 
     def radius(self, directions: np.ndarray) -> np.ndarray:
-        """Distance (n,) [m] from the middle to the surface in unit directions (n, 3)."""
+        """Return the distance (n,) [m] from the centre to the surface in unit directions (n, 3)."""
         lobes = np.exp(self.sharpness * (directions @ self.directions.T - 1.0))
         return self.scale * (1.0 + lobes @ self.heights)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Distance (n,) [m] beyond the surface along the ray from the middle, at points (n, 3) [m]."""
+        """Return the signed distance (n,) [m] of points (n, 3) [m] from the surface along the ray from the centre."""
         arm = points - self.middle
         length = np.linalg.norm(arm, axis=1)
         return length - self.radius(arm / np.maximum(length, 1e-12)[:, None])
 
 
 def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
-    """The template with a tumour, in the template's own RAS frame, scaled to a person's about the brain's centroid.
+    """Return the template with a tumour, in the template's RAS coordinates, scaled about the brain's centroid.
 
     Raises
     ------
     InputError
-        A tumour that would reach out of the brain.
+        A tumour that would extend beyond the brain.
     """
     return build_synthetic_subject(tumour, _scaled_template(head), head)
 
 
 def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> Subject:
-    """Return a healthy head with a tumour drawn in it. Of `head`, volume and threshold do not count here.
+    """Return a healthy head with a synthetic tumour; volume and threshold of `head` are ignored.
 
     Raises
     ------
     InputError
-        A tumour that would reach out of the brain.
+        A tumour that would extend beyond the brain.
     """
     brain, cortex = mask_field(healthy.mask, healthy.affine), find_rim(healthy.mask, healthy.affine)
     if tumour.middle is None:
@@ -220,7 +222,7 @@ def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = H
 
 
 def scale_affine(affine: np.ndarray, centre: np.ndarray, factor: float, place: np.ndarray) -> np.ndarray:
-    """An affine (4, 4) whose space is scaled by a factor about a `centre` (3,) that comes to lie at `place` (3,)."""
+    """Return the affine (4, 4) scaled by a factor about a `centre` (3,), which is moved to `place` (3,)."""
     moved = affine.copy()
     moved[:3, 3] -= centre
     moved[:3] *= factor
@@ -229,7 +231,7 @@ def scale_affine(affine: np.ndarray, centre: np.ndarray, factor: float, place: n
 
 
 def measure_size(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centroid (3,) and volume of the voxels `mask` (I, J, K), in the units of their affine (4, 4)."""
+    """Return centroid (3,) and volume of the voxels `mask` (I, J, K), in the units of their affine (4, 4)."""
     centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]
     return centre, float(mask.sum() * abs(np.linalg.det(affine[:3, :3])))
 
@@ -251,7 +253,7 @@ def _scaled_template(head: Head) -> HealthyHead:
 def _site(
     brain: Field, cortex: np.ndarray, seen_from: tuple[float, float, float] | None, name: str, smooth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where (3,) [m] the ray from the brain's middle leaves it at a named site, and the inward normal (3,) there."""
+    """Return the point (3,) [m] where the ray to a named site leaves the brain, and the inward normal (3,) there."""
     middle = 0.5 * (cortex.min(axis=0) + cortex.max(axis=0))
     outward = 1e-3 * np.array(SITES[name]) - (middle if seen_from is None else np.array(seen_from))
     outward /= np.linalg.norm(outward)
@@ -263,7 +265,7 @@ def _site(
 
 
 def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
-    """Return the tumour round a `middle` (3,) [m], given its shape at unit scale and its scale [m]."""
+    """Return the tumour around a `middle` (3,) [m], a function of its shape at unit scale and its scale [m]."""
     rng, lobes = np.random.default_rng(tumour.seed), tumour.lobes
     directions = rng.normal(size=(lobes.count if tumour.shape == "lobed" else 0, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -274,7 +276,7 @@ def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobe
 
 
 def _sphere(count: int) -> np.ndarray:
-    """Unit directions (count, 3), spread evenly (a Fibonacci lattice): a mean over them is one over the sphere."""
+    """Return unit directions (count, 3) of a Fibonacci lattice, uniform on the sphere."""
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     flat = np.sqrt(1.0 - z * z)

@@ -1,4 +1,4 @@
-"""How far the tip of a tool is from the tumour, both where they are in the deformed brain."""
+"""Distance from the tip of a tool to the tumour in the deformed brain."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from .open_cortex import OpenCortex, open_cortex
 
 @dataclass(frozen=True, eq=False)
 class TipGauge:
-    """Measures from the tip of a round tool to the closest point of the tumour's surface.
+    """Distance of a round tool's tip from the closest point of the tumour's surface.
 
-    A tool that pushes is a ball of its footprint's radius. It comes down along the open cortex's inward axis until it
-    rests on the deformed open cortex. Its line goes through the point that it pushes, where the tissue has carried
-    that. Its tip is its lowest point along that axis. Where poses are given, the tip is where they have it.
+    A pushing tool is a ball with its footprint's radius. It is lowered along the exposed cortex's inward axis until
+    it touches the deformed surface, on a line through the deformed position of the pushed point. The tip is its lowest
+    point along that axis. For tool poses, the tip follows from the pose.
 
     Parameters
     ----------
     anatomy
-        The body.
+        Anatomy with exposed cortex.
     together
-        Cases whose tumours are looked at together: bounds the memory that it takes.
+        Load cases per block, which limits memory.
 
     Raises
     ------
     InputError
-        An anatomy without open cortex.
+        An anatomy without exposed cortex.
     """
 
     anatomy: Anatomy
@@ -42,17 +42,17 @@ class TipGauge:
 
     @cached_property
     def cortex(self) -> OpenCortex:
-        """The open cortex and its frame."""
+        """Exposed cortex and its coordinate system."""
         return open_cortex(self.anatomy)
 
     @cached_property
     def nodes(self) -> np.ndarray:
-        """Sorted mesh vertices (n,) whose motion it needs: open cortex, and the tumour's surface."""
+        """Sorted mesh vertices (n,) whose displacement is required: exposed cortex, and the tumour's surface."""
         return np.union1d(self._open[0], self._tumour[0])
 
     @cached_property
     def _open(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mesh vertices (m,) of the open cortex, and its triangles (S, 3) of them."""
+        """Mesh vertices (m,) of the exposed cortex, and its triangles (S, 3) of them."""
         return np.unique(self.anatomy.open_surface, return_inverse=True)
 
     @cached_property
@@ -67,33 +67,33 @@ class TipGauge:
         tool: BuiltIn | None = None,
         lift: float = 0.0,
     ) -> np.ndarray:
-        """Distances (B,) [m] from tip to tumour.
+        """Return distances (B,) [m] from tip to tumour.
 
         Parameters
         ----------
         loads
             B pushes, or poses of one tool.
         displacement, nodes
-            (B, n, 3) [m] of mesh vertices (n,), among them all of `self.nodes`.
+            Displacements (B, n, 3) [m] of mesh vertices (n,), which include all of `self.nodes`.
         tool
-            The one whose poses the loads are.
+            Tool of the poses.
         lift
-            How far [m] a tool that pushes has been lifted off, against the axis.
+            Distance [m] by which a pushing tool has been retracted against the axis.
 
         Raises
         ------
         InputError
-            Loads of another kind, poses of an unknown tool, vertices that are missing, an anatomy without
-            tumour, or a ball that passes the open cortex by.
+            Other loads, poses of an unknown tool, missing vertices, an anatomy without
+            tumour, or a ball that misses the exposed cortex.
         """
         if not len(self.anatomy.tumour_nodes):
-            raise InputError("the anatomy has no tumour, from which a tip had a distance: make one that has.")
+            raise InputError("the anatomy has no tumour: use one with a tumour to measure the distance of a tip.")
         row = np.full(len(self.anatomy.mesh.nodes), -1)
         row[nodes] = np.arange(len(nodes))
         if (row[self.nodes] < 0).any():
             raise InputError(
-                f"the distance from tip to tumour needs vertex {self.nodes[row[self.nodes] < 0][0]}, which this answer "
-                "does not know: ask for the open cortex and the tumour."
+                f"the distance from tip to tumour needs vertex {self.nodes[row[self.nodes] < 0][0]}, which the "
+                "displacements lack: request the open cortex and the tumour."
             )
         tips = self._tips(loads, displacement, row[self._open[0]], tool, lift)
         found, at = np.empty(len(loads)), row[self._tumour[0]]
@@ -107,13 +107,13 @@ class TipGauge:
     def _tips(
         self, loads: Loads, displacement: np.ndarray, row: np.ndarray, tool: BuiltIn | None, lift: float
     ) -> np.ndarray:
-        """Of the tool (B, 3) [m]; `row` (m,) of the open cortex's vertices in `displacement`."""
+        """Return the tool tips (B, 3) [m]; `row` (m,) are the rows of the exposed cortex in `displacement`."""
         axis, touching = self.cortex.axis, loads.of(Touching)
         if touching is not None and tool is not None:
             return find_foremost_points(tool, touching.pose[:, 0], axis)
         pushed = loads.of(Pushed)
         if pushed is None:
-            raise InputError("there is no tip where no tool pushes, and no known tool is moved.")
+            raise InputError("the loads have no tip: give pushing tools, or poses and their tool.")
         nodes, triangles = self._open
         rest, tips = self.anatomy.mesh.nodes[nodes], np.empty((len(loads), 3))
         for first in range(0, len(loads), self.together):
@@ -128,5 +128,5 @@ class TipGauge:
 
 @lru_cache(8)
 def build_tip_gauge(anatomy: Anatomy) -> TipGauge:
-    """Return the gauge of an anatomy; every frame asks for it."""
+    """Return the cached gauge of an anatomy; every frame uses it."""
     return TipGauge(anatomy)

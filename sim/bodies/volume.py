@@ -1,4 +1,4 @@
-"""Volumes of voxels from files of several formats: any affine, in metres, RAS."""
+"""Reader for voxel volumes of several formats, with any affine, in metres, RAS."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ READERS = {
     ".nrrd": ("NRRD", read_nrrd),
     ".nhdr": ("NRRD", read_nrrd),
 }
-"""Endings of names, what they say of a file, and what reads it."""
+"""Format name and reader by file suffix."""
 
 
 def read_volume(path: str | Path, voxels: Voxels = OF_BRAINS, finite: bool = True, layered: bool = False) -> Volume:
-    """Read one volume of numbers from a file; unless `finite` is off, all of them must be finite.
+    """Read one numeric volume from a file; unless `finite` is False, all values must be finite.
 
-    Where `layered`, the values of a segmentation may be (I, J, K, L), in layers that overlap.
+    If `layered`, the values of a segmentation may be (I, J, K, L), in layers that overlap.
 
     Raises
     ------
     InputError
-        A path that is no readable file of these formats, or a file that ends before its voxels do. Several volumes, a
-        slice, colours or complex numbers. Values or a slope that are not finite. A space that is not stated, an affine
-        that is singular. Voxels that are too coarse or too fine, or too many of them.
+        A path that is not a readable file of these formats, or a truncated file. Several volumes, a slice, colours or
+        complex numbers. Values or a slope that are not finite. A missing orientation, a singular
+        affine. Voxels that are too coarse, too fine, or too many.
     """
     path = to_path(path)
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {REMEDY}")
     ending = next((one for one in READERS if path.name.lower().endswith(one)), None)
     if ending is None:
-        raise InputError(f"{path}: is not called {', '.join(READERS)}. {REMEDY}")
+        raise InputError(f"{path}: unsupported file type; expected {', '.join(READERS)}. {REMEDY}")
     kind, read = READERS[ending]
     with read_as(path, kind, REMEDY):
         volume = read(path, voxels)
-        if kind != "NIfTI":  # whose reader uses `axes` where a file states none
+        if kind != "NIfTI":  # the NIfTI reader itself uses `axes` for files without orientation
             volume = replace(volume, notes=(*volume.notes, *voxels.ignored_axes))
         return check_volume(path, volume, voxels, finite, layered)

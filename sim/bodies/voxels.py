@@ -1,4 +1,4 @@
-"""A volume of voxels as it is read from a file of any format, and what voxels a volume of a brain may have."""
+"""Voxel volume read from a file, and limits of a brain volume."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from ..errors import InputError
 
 REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd, .seg.nrrd or .nhdr)."
 LPS = np.array([-1.0, -1.0, 1.0])
-"""What makes RAS of LPS, and the other way."""
-# What lies behind the voxels and is read for the checksum after them [bytes], and what is read at once.
-SURPLUS, PIECE = 2**24, 2**20
-# Bytes of a file whose name does not say how it is packed: it is unpacked in memory.
+"""Signs of the conversion between LPS and RAS."""
+SURPLUS = 2**24  # maximum data after the voxels, read for a checksum [bytes]
+PIECE = 2**20  # block size of reading [bytes]
+# Maximum decompressed size of a file whose suffix does not show its compression [bytes].
 MOST_UNPACKED = 2**31
 
 
 @dataclass(frozen=True)
 class Voxels:
-    """Which voxels a volume of a brain may have.
+    """Limits and options of a brain volume.
 
     Parameters
     ----------
     finest, coarsest
-        [m] Edges: no scanner of a brain resolves less, and larger voxels do not show its surface.
+        Limits of the voxel edges [m]: no brain scanner is finer, and coarser voxels do not resolve the surface.
     same_place
-        [m] An sform and a qform that place a voxel less far apart differ by round-off.
+        Maximum distance between the sform and qform positions of a voxel, to allow for round-off [m].
     axes
-        Directions of the axes of a NIfTI file that states none, such as RAS or LPS; empty: it is rejected.
+        Axis directions of a NIfTI file without orientation, such as RAS or LPS; if empty, such a file is rejected.
     """
 
     finest: float = 1e-5
@@ -45,17 +45,17 @@ class Voxels:
 
     @property
     def ignored_axes(self) -> tuple[str, ...]:
-        """A note for a file that states its orientation itself, where `axes` are given."""
+        """Note that `axes` are ignored since the file has its own orientation; () without `axes`."""
         return (f"its own orientation is used: axes {self.axes} are ignored",) if self.axes else ()
 
 
 OF_BRAINS = Voxels()
-"""What a scanner of brains makes."""
+"""Default limits, for brain scanners."""
 
 
 @dataclass(frozen=True)
 class Segment:
-    """What a segmentation calls a label: its name, the layer that it lies in, and its number there."""
+    """Segment of a segmentation: name, layer, and label value in that layer."""
 
     name: str
     layer: int
@@ -64,18 +64,18 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Voxels, and where they lie.
+    """Voxels and their position.
 
     Parameters
     ----------
     values
-        (I, J, K), or (I, J, K, L) where a segmentation has several layers.
+        (I, J, K), or (I, J, K, L) for a segmentation with several layers.
     affine
         (4, 4) from their indices to metres (RAS).
     notes
-        Sentences about what had to be assumed.
+        Notes on assumptions.
     segments
-        What the file calls its labels, if it does.
+        Named segments, if the file has any.
     """
 
     values: np.ndarray
@@ -86,7 +86,7 @@ class Volume:
 
 @dataclass(frozen=True, eq=False)
 class VoxelGrid:
-    """Where the voxels of a file lie: how many there are along each axis, and (4, 4) from indices to metres (RAS)."""
+    """Voxel grid of a file: number of voxels along each axis, and affine (4, 4) from indices to metres (RAS)."""
 
     path: Path
     shape: tuple[int, ...]
@@ -94,7 +94,7 @@ class VoxelGrid:
 
 
 def open_volume(path: Path) -> Any:
-    """Return a file opened at its first byte, unpacked as its content says, whatever it is called.
+    """Open a file for reading, decompressed according to its content, not its name.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def open_volume(path: Path) -> Any:
 
 
 def unpack_file(path: Path) -> str | BytesIO:
-    """What nibabel opens a file by: its name where that says how the content is packed, else its unpacked bytes."""
+    """Return the file name if it shows the compression to nibabel, else the decompressed bytes."""
     named = gzip.open if path.name.lower().endswith(("gz", "mgz")) else open
     if _opener(path) is named:
         return str(path)
@@ -123,15 +123,15 @@ def _opener(path: Path) -> Callable[..., Any]:
 
 
 def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: bool) -> Volume:
-    """Return the volume without axes of one voxel beyond the third, if it is one of numbers with a place.
+    """Return the volume without singleton axes beyond the third, if it is numeric and has a position.
 
-    `layered` lets several layers of a segmentation pass, as (I, J, K, L).
+    `layered` accepts several layers of a segmentation, as (I, J, K, L).
 
     Raises
     ------
     InputError
-        Colours or complex numbers; a slice or several volumes; segments that overlap, unless `layered`. Unless not
-        `finite`, values that are no numbers. An affine that is singular, and voxels too fine or too coarse.
+        Colours or complex numbers; a slice or several volumes; segments that overlap, unless `layered`. If `finite`,
+        non-finite values. A singular affine, and voxels that are too fine or too coarse.
     """
     values, affine = volume.values, volume.affine
     shape = " x ".join(map(str, values.shape))
@@ -151,7 +151,7 @@ def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layer
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
     if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) <= 1e-6 * spacing.prod():
         raise InputError(
-            f"{path}: its affine is singular, so its voxels have no place. Export it with its orientation."
+            f"{path}: its affine is singular, so its voxels have no position. Export it with its orientation."
         )
     if spacing.min() < voxels.finest:
         raise InputError(
@@ -161,7 +161,7 @@ def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layer
     if spacing.max() > voxels.coarsest:
         voxel = " x ".join(f"{edge * 1e3:.3g}" for edge in spacing)
         raise InputError(
-            f"{path}: its voxels measure {voxel} mm; {voxels.coarsest * 1e3:g} mm is the most that shows a brain."
+            f"{path}: its voxels measure {voxel} mm; {voxels.coarsest * 1e3:g} mm is the maximum for a brain."
         )
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]

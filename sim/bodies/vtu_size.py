@@ -1,4 +1,4 @@
-"""How much a `.vtu` file inflates to, found without inflating it whole: a few bytes may stand for gigabytes."""
+"""Uncompressed size of a `.vtu` file, measured in bounded memory: a few bytes may expand to gigabytes."""
 
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ import numpy as np
 from ..errors import InputError
 from ..runtime.file_limits import build_too_large_error
 
-# What meshio takes for the start of raw bytes.
+# Start of raw appended data, as meshio finds it.
 RAW = re.compile(rb'<AppendedData[^>]+">')
-# Bytes inflated at once.
+# Block size of decompression [bytes].
 PIECE = 2**20
+# Decompressor by VTK name.
 OPENERS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompressor": lzma.LZMADecompressor}
-WORDS = {"UInt32": "u4", "UInt64": "u8"}
+WORDS = {"UInt32": "u4", "UInt64": "u8"}  # header word type
 
 
 def check_vtu_size(path: Path, most: int) -> bool:
-    """Refuse a file whose packed arrays inflate to more than `most` bytes in all, or to more than they declare.
+    """Reject a file whose compressed arrays expand to more than `most` bytes, or to more than they declare.
 
-    False of a file whose arrays it cannot count, or not as surely as meshio reads them: no XML, raw, or not packed.
+    Return False if the arrays cannot be measured as reliably as meshio reads them: not XML, raw or uncompressed data.
 
     Raises
     ------
     InputError
-        Naming the limit.
+        With the limit.
     """
     text, behind = path.read_bytes(), None
     try:
         root = ElementTree.fromstring(text)
-    except ElementTree.ParseError:  # raw bytes, which no XML may hold
+    except ElementTree.ParseError:  # raw bytes are not valid XML
         raw = RAW.search(text)
         if raw is None:
             return False
@@ -50,7 +51,7 @@ def check_vtu_size(path: Path, most: int) -> bool:
             return False
     headed = root.get("header_type", "UInt32")
     if headed not in WORDS:
-        raise InputError(f"its header_type is {headed!r}. Write it anew with {' or '.join(WORDS)}.")
+        raise InputError(f"its header_type is {headed!r}. Write it again with {' or '.join(WORDS)}.")
     opener = OPENERS.get(root.get("compressor", ""))
     if opener is None:
         if root.get("compressor"):
@@ -74,15 +75,15 @@ def check_vtu_size(path: Path, most: int) -> bool:
             for block in blocks:
                 declared -= _inflated(opener, block, declared)
                 if declared < 0:
-                    raise InputError("an array inflates to more than its header says. Write the file anew.")
+                    raise InputError("an array inflates to more than its header says. Write the file again.")
     return not raw
 
 
 def _packed(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
-    """Bytes that an array declares, and its packed blocks.
+    """Return the size an array declares [bytes], and its compressed blocks.
 
-    They lie behind a header of their number, the size of a block and of the last one, and the packed size of each.
-    `inside` is raw, or the header and the blocks are in base64.
+    They follow a header: number of blocks, size of a block and of the last one, compressed size of each.
+    `inside` is raw, or the header and the blocks are base64.
     """
 
     def part(place: int, size: int) -> bytes:
@@ -99,12 +100,12 @@ def _packed(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
 
 
 def _letters(size: int) -> int:
-    """Letters of base64 for so many bytes."""
+    """Return the base64 characters for `size` bytes."""
     return -(-size // 3) * 4
 
 
 def _inflated(opener: Callable[[], Any], block: bytes, most: int) -> int:
-    """Bytes that a block inflates to, all its streams together, or some number above `most`."""
+    """Return the decompressed size of all streams of a block [bytes], or any number above `most`."""
     total, rest = 0, block
     while rest and total <= most:
         opened = opener()

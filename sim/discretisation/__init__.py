@@ -1,1 +1,1 @@
-"""Elements, constraints, footprints, the Term protocol and the sum of terms, a problem."""
+"""Elements, constraints, footprints, the Term interface, and the problem as a sum of terms."""

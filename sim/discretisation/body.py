@@ -1,4 +1,4 @@
-"""What a term is built from: a body, its discretisation and its surface on one device."""
+"""Arguments from which a term is built: anatomy, discretisation, surface and device."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .space import Discretisation
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A body as the solver has it: N nodes, of which the mesh's own vertices come first.
+    """Discretised body with N nodes; the mesh vertices come first.
 
-    `space.count` is N; `space.nodes` (N, 3) [m] are at rest; `skin` is what tools press; `device` makes arrays and
-    launches kernels. Resection makes a new body of the same vertices, and preconditioners may ask for one of another
+    `space.count` is N; `space.nodes` (N, 3) [m] are undeformed; `skin` is the surface for tools; `device` allocates
+    arrays and launches kernels. Resection creates a new body with the same vertices. Preconditioners may use another
     element.
     """
 

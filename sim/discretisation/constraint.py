@@ -1,8 +1,8 @@
-"""Held, prescribed and sliding nodes, and footprints that a tool moves: one projection for all of them.
+"""Boundary conditions as one projection: fixed, prescribed and sliding nodes, and footprints with prescribed motion.
 
-Every constraint is linear, C u = value. `project` takes a gradient or a direction to the space of motions that the
-constraints leave free; `close_gap` is the least motion that satisfies them. Nodes come first: P projects each by
-itself. A footprint's mean motion W^T u then adds the three rows W^T P, with their Gram matrix G = W^T P W.
+Every constraint is linear, C u = value. `project` maps a gradient or a direction to the subspace of admissible
+motions; `close_gap` returns the smallest motion that satisfies the constraints. The node projection P acts on each
+node separately. A footprint's mean motion W^T u adds the three rows W^T P, with their Gram matrix G = W^T P W.
 """
 
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from ..runtime.device import Device, forward_kernel
 
 @dataclass(frozen=True)
 class MinFreeDofs:
-    """How little may be left free before it counts as held.
+    """Thresholds below which a node or a footprint counts as fixed.
 
     Parameters
     ----------
     normal
-        A normal, of which held components leave less than this, says nothing about the others.
+        Minimum norm of a slide normal's free components; below it, the normal has no effect on them.
     footprint
-        Of a footprint that a tool moves, at least this share of the squared weights must be free in every direction.
+        Minimum free fraction of a footprint's squared weights in every direction.
     """
 
     normal: float = 1e-6
@@ -35,7 +35,7 @@ class MinFreeDofs:
 
 @dataclass(frozen=True)
 class ConstraintKernels:
-    """Constraint arithmetic of one scalar type."""
+    """Constraint kernels for one scalar type."""
 
     project: wp.Kernel
     close: wp.Kernel
@@ -45,7 +45,7 @@ class ConstraintKernels:
 
 @cache
 def build_kernels(device: Device) -> ConstraintKernels:
-    """Kernels of a device's scalar type."""
+    """Build the kernels for a device's scalar type."""
     scalar, vec = device.scalar, device.vector
     chunk = CHUNK
 
@@ -56,7 +56,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         v: wp.array2d(dtype=scalar),
     ):
-        """v_i -= n (n . v_i); held components of v are zero."""
+        """Project onto the admissible motions: v_i -= n (n . v_i); fixed components of v are zero."""
         i, c = wp.tid()
         x = vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c])
         n = normal[i]
@@ -74,7 +74,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         gap: wp.array2d(dtype=scalar),
     ):
-        """gap_i = value - u where held, n (drag . value - n . u) where sliding, zero elsewhere."""
+        """Compute gap_i = value - u if fixed, n (drag . value - n . u) if sliding, zero elsewhere."""
         i, c = wp.tid()
         x = vec(u[3 * i, c], u[3 * i + 1, c], u[3 * i + 2, c])
         n = normal[i]
@@ -91,7 +91,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """out_kc += sum over a chunk of nodes of w_ic v_(3i+k)c."""
+        """Add the weighted mean over a chunk of nodes: out_kc += sum of w_ic v_(3i+k)c."""
         block, c = wp.tid()
         total = vec()
         for i in range(block * chunk, wp.min((block + 1) * chunk, weight.shape[0])):
@@ -106,7 +106,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         v: wp.array2d(dtype=scalar),
     ):
-        """v_(3i+k)c += w_ic amount_kc."""
+        """Distribute amounts to nodes: v_(3i+k)c += w_ic amount_kc."""
         i, c = wp.tid()
         for k in range(3):
             v[3 * i + k, c] += weight[i, c] * amount[k, c]
@@ -115,19 +115,19 @@ def build_kernels(device: Device) -> ConstraintKernels:
 
 
 class Constraint:
-    """Which motions of N nodes are free.
+    """Boundary conditions of N nodes.
 
     Parameters
     ----------
     held
-        (N, 3) bool: components whose value is prescribed.
+        Mask (N, 3) of components with prescribed values.
     normal
-        (N, 3): unit normals of sliding nodes, zero elsewhere. Where components of a sliding node are held, the
+        Unit normals (N, 3) of sliding nodes, zero elsewhere. If components of a sliding node are fixed, the
         others follow them along the plane.
     device
-        Where its arrays live.
+        Device of the arrays.
     freedom
-        What counts as held.
+        Thresholds below which motion counts as fixed.
     """
 
     def __init__(self, held: np.ndarray, normal: np.ndarray, device: Device, freedom: MinFreeDofs = MinFreeDofs()):
@@ -142,14 +142,14 @@ class Constraint:
         self._target, self._gram = np.zeros((3, 0)), np.zeros((0, 3, 3))
 
     def begin(self, value: np.ndarray | None, weight: np.ndarray | None, target: np.ndarray | None) -> None:
-        """Take a batch of values (3N, b) [m] for held components; None holds them at zero.
+        """Set the values (3N, b) [m] of fixed components for a batch; None for zero.
 
-        Footprint weights (N, b) whose mean motion is `target` (3, b) [m], or None.
+        Footprint weights (N, b) with prescribed mean motion `target` (3, b) [m], or None.
 
         Raises
         ------
         InputError
-            A footprint of which too little is free to move.
+            A footprint that is too constrained to move.
         """
         self._value = None if value is None else self.device.array(value)
         self._weight = None
@@ -161,11 +161,11 @@ class Constraint:
             share = np.linalg.eigvalsh(self._gram)[:, 0] / square.sum(axis=0)
             if (share < self._freedom.footprint).any():
                 raise InputError(
-                    f"load {np.argmin(share)} moves a footprint that is held, wholly or nearly: choose a free place."
+                    f"load {np.argmin(share)} moves a footprint that is (nearly) fixed: choose a free place."
                 )
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these columns (k,) of the batch."""
+        """Keep these load cases (k,) of the batch."""
         if self._value is not None:
             self._value = gather_columns(self.device, self._value, columns)
         if self._weight is not None:
@@ -174,28 +174,28 @@ class Constraint:
 
     @property
     def nodes(self) -> tuple[wp.array, wp.array]:
-        """What `project_nodes` needs, on the device: held components (N, 3) int8 and normals (N,)."""
+        """Arrays of `project_nodes` on the device: fixed components (N, 3) int8 and normals (N,)."""
         return self._held, self._normal
 
     @property
     def imposes(self) -> bool:
-        """Whether the batch moves held components or footprints."""
+        """True if the batch prescribes nonzero values or footprint motions."""
         return self._value is not None or self._weight is not None
 
     def project(self, v: wp.array) -> None:
-        """Remove from v (3N, b) what the constraints forbid, in place."""
+        """Project v (3N, b) onto the admissible motions, in place."""
         self.project_nodes(v)
         if self._weight is not None:
             self._spread(-self._average(v), v)
             self.project_nodes(v)
 
     def project_nodes(self, v: wp.array) -> None:
-        """Remove from v (3N, b) what held and sliding nodes forbid, in place, whatever the loads."""
+        """Project v (3N, b) onto the motions that fixed and sliding nodes admit, in place, regardless of the loads."""
         dim = (len(self.held), v.shape[1])
         self.device.launch(build_kernels(self.device).project, dim, [self._held, self._normal], [v])
 
     def close_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
-        """The least motion (3N, b) that takes u (3N, b) to the constraints, and its largest component (b,) [m]."""
+        """Return the smallest motion (3N, b) from u (3N, b) to the constraints, and its largest component (b,) [m]."""
         gap = self.device.zeros(*u.shape)
         value = self._value if self._value is not None else gap
         inputs = [self._held, self._normal, self._drag, value, u]
@@ -209,7 +209,7 @@ class Constraint:
         return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
 
     def compute_footprint_force(self, gradient: wp.array) -> np.ndarray | None:
-        """Return the multipliers (3, b) [N]: the force with which the tool moves its footprint, or None without one.
+        """Return the multipliers (3, b) [N], the force of the tool on its footprint, or None without one.
 
         In equilibrium P gradient = P W force. The gradient (3N, b) is projected in place.
         """
@@ -219,14 +219,14 @@ class Constraint:
         return self._solved(self._average(gradient))
 
     def basis(self) -> sp.csc_array:
-        """Orthonormal basis (3N, n) of the motions that held and sliding nodes leave free, sparse."""
+        """Return a sparse orthonormal basis (3N, n) of the motions that fixed and sliding nodes admit."""
         sliding = (self.normal != 0.0).any(axis=1)
         rows = [np.flatnonzero(~self.held & ~sliding[:, None])]
         columns, values = [np.arange(len(rows[0]))], [np.ones(len(rows[0]))]
         count = len(rows[0])
-        for fixed in range(2):  # with two components held a sliding node has no direction left
+        for fixed in range(2):  # with two fixed components a sliding node is fully constrained
             node = np.flatnonzero(sliding & (self.held.sum(axis=1) == fixed))
-            # Free directions: the orthogonal complement of the held axes and the normal.
+            # Free directions: orthogonal complement of the fixed axes and the normal.
             axes = np.eye(3)[np.nonzero(self.held[node])[1]].reshape(len(node), fixed, 3)
             free = np.linalg.svd(np.concatenate([axes, self.normal[node, None]], axis=1))[2][:, fixed + 1 :]
             number = count + np.arange(len(node) * (2 - fixed))
@@ -253,11 +253,9 @@ class Constraint:
 
 
 def _within_free(held: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return normals (N, 3) with their held components removed, of unit length again.
+    """Return the unit normals (N, 3) of sliding nodes without their fixed components; zero if these leave too little.
 
-    Zero where next to nothing is left.
-
-    And (N, 3) the motion along them that a unit of each held component causes: normal . u stays zero.
+    Also return `drag` (N, 3), the motion along them per unit of each fixed component, so that normal . u = 0.
     """
     inside = np.where(held, 0.0, normal)
     length = np.linalg.norm(inside, axis=1, keepdims=True)

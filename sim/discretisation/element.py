@@ -1,4 +1,4 @@
-"""Finite elements as tables: node numbers, shape gradients and quadrature weights."""
+"""Finite elements as arrays: node numbers, shape function gradients and quadrature weights."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import scipy.sparse as sp
 from ..errors import InputError
 from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh
 
-# Eight points of degree 3, the corners and the middles of the faces. With the four points that quadratic shapes need at
-# rest, elements under a tool fold at their corners, where no point looks.
+# Quadrature of degree 3 with eight points, the corners and the face centres. With the four points that suffice
+# for small strain, elements under a tool fold at their corners, where there is no point.
 EIGHT_POINTS = np.vstack([np.eye(4), (np.ones((4, 4)) - np.eye(4)) / 3.0])
-EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)
+EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)  # fractions of the volume
 
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """T elements of at most n nodes with q quadrature points.
+    """T elements with at most n nodes and q quadrature points.
 
-    table (T, n) are node numbers. gradient (T, q, n, 3) is that of the shape functions in the rest configuration [1/m].
-    weight (T, q) is the rest volume of each quadrature point [m^3]. nodes is how many nodes the discretisation has.
-    owner (T,) is the mesh's tetrahedron whose tissue each element has. marks (T, k) are vertices and labels that
-    distinguish each from all others, whatever is cut from the mesh. size (T,) is how many of the n places a row uses,
-    the first ones; None: all.
+    table (T, n) node numbers. gradient (T, q, n, 3) of the shape functions in the undeformed configuration [1/m].
+    weight (T, q) undeformed volume of each quadrature point [m^3]. nodes: number of nodes of the discretisation.
+    owner (T,) tetrahedron of the mesh from which each element takes its tissue. marks (T, k) vertices and labels that
+    identify each element, whatever is cut from the mesh. size (T,) number of nodes of each row, which
+    come first; None: all n.
     """
 
     table: np.ndarray
@@ -36,12 +36,12 @@ class Elements:
     size: np.ndarray | None = None
 
     def on(self, nodes: np.ndarray) -> Elements:
-        """Return the same elements, of a body that has these nodes (n,) alone, ascending: theirs among them."""
+        """Return the elements renumbered to a subset of nodes (n,), ascending, that contains all of theirs."""
         return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), nodes=len(nodes))
 
 
 def build_linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
-    """Linear tetrahedra: one quadrature point, gradients constant. `chosen` (T,) bool picks elements."""
+    """Build linear tetrahedra with one quadrature point; the mask `chosen` (T,) selects elements."""
     tets = mesh.tets[chosen]
     corners = mesh.nodes[tets]
     jacobian = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
@@ -52,15 +52,15 @@ def build_linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
 
 
 def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> Elements:
-    """Ten-node tetrahedra, straight or curved, eight quadrature points of degree 3.
+    """Build ten-node tetrahedra, straight or curved, with eight quadrature points of degree 3.
 
     Zienkiewicz, Taylor 2005, "The Finite Element Method", section 4.7. nodes (N, 3) [m]; table (T, 10): corners, then
-    the middles of `QUADRATIC_EDGES`; `chosen` (T,) bool picks elements.
+    midpoints of `QUADRATIC_EDGES`; the mask `chosen` (T,) selects elements.
 
     Raises
     ------
     InputError
-        An element that its mid-edge nodes fold over.
+        An element folded by its mid-edge nodes.
     """
     table = table[chosen]
     slope = compute_quadratic_slopes(EIGHT_POINTS)
@@ -78,13 +78,13 @@ def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.nd
 
 
 def compute_quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Shape functions (..., n) of a quadratic simplex at corner coordinates (..., d): L (2 L - 1), and 4 L_i L_j."""
+    """Return quadratic shape functions (..., n) at barycentric points (..., d): L (2 L - 1) and 4 L_i L_j."""
     middle = 4.0 * corner[..., edges[:, 0]] * corner[..., edges[:, 1]]
     return np.concatenate([corner * (2.0 * corner - 1.0), middle], axis=-1)
 
 
 def compute_quadratic_slopes(corner: np.ndarray) -> np.ndarray:
-    """Return derivatives (q, 10, 3) of the ten shape functions by corner coordinates 1, 2, 3 at points (q, 4)."""
+    """Return derivatives (q, 10, 3) of the shape functions by barycentric coordinates 1, 2, 3 at points (q, 4)."""
     slope = np.zeros((len(corner), 10, 4))
     slope[:, np.arange(4), np.arange(4)] = 4.0 * corner - 1.0
     for place, (i, j) in enumerate(QUADRATIC_EDGES, start=4):
@@ -95,11 +95,11 @@ def compute_quadratic_slopes(corner: np.ndarray) -> np.ndarray:
 def assemble_hooke_stiffness(
     elements: Elements, mu: np.ndarray, lam: np.ndarray, together: int = 8_000_000
 ) -> sp.csc_array:
-    """Stiffness at rest (3N, 3N) [N/m] of isotropic elements with Lamé's mu, lam (T,) [Pa].
+    """Assemble the undeformed stiffness (3N, 3N) [N/m] of isotropic elements with Lamé parameters mu, lam (T,) [Pa].
 
-    K = integral of 2 mu E^T E + lambda D^T D, with the strains E and the change of volume D of a motion. See Hughes
-    2000, "The Finite Element Method", section 2.8. It is summed by products of sparse matrices, as elements have any
-    number of nodes. Parts of so many numbers `together` bound the memory that it takes.
+    K = integral of 2 mu E^T E + lambda D^T D, with the operators of strain E and volume change D. See Hughes
+    2000, "The Finite Element Method", section 2.8. It is a sum of sparse matrix products, since elements have any
+    number of nodes. Blocks of at most `together` numbers limit the memory.
     """
     total = sp.csr_array((3 * elements.nodes,) * 2)
     count, points, most = elements.gradient.shape[:3]
@@ -120,12 +120,12 @@ def assemble_hooke_stiffness(
 
 
 def _volume_change(slope: np.ndarray) -> np.ndarray:
-    """Blocks (M, 1, 3) of the divergence, of shape functions with gradients (M, 3)."""
+    """Return the blocks (M, 1, 3) of the divergence for shape functions with gradients (M, 3)."""
     return slope[:, None]
 
 
 def _strain(slope: np.ndarray) -> np.ndarray:
-    """Blocks (M, 6, 3) of the small strain in Mandel's order (xx, yy, zz, and root 2 times yz, xz, xy)."""
+    """Return the blocks (M, 6, 3) of the small strain, Mandel's order (xx, yy, zz, root 2 times yz, xz, xy)."""
     blocks = np.zeros((len(slope), 6, 3))
     for i in range(3):
         blocks[:, i, i] = slope[:, i]

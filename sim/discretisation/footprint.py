@@ -1,8 +1,8 @@
-"""A round tool on a triangulated surface: how its weight falls on the mesh's vertices.
+"""Footprint of a round tool on a triangulated surface: distribution of its force over the vertices.
 
-The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is that of a flat punch's smooth counterpart (Hertz). It is
-integrated over triangles subdivided until they are small against the footprint: force and moment do not depend on the
-mesh.
+The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is the Hertz pressure of a smooth indenter. It is
+integrated over triangles subdivided until they are small compared with the footprint, so that force and moment are
+independent of the mesh.
 """
 
 from dataclasses import dataclass
@@ -15,24 +15,24 @@ import warp as wp
 from ..errors import InputError
 from ..runtime.device import Device, find_device, forward_kernel
 
-# Triangles that one thread searches, and findings of which it takes the nearest.
+# Triangles per search thread, and candidates per reduction thread.
 CHUNK = wp.constant(16)
 
-vec6d = wp.types.vector(length=6, dtype=wp.float64)
+vec6d = wp.types.vector(length=6, dtype=wp.float64)  # numbers of a quadratic triangle
 
 
 @dataclass(frozen=True)
 class EdgeSubdivision:
-    """Into how many pieces each edge of a triangle is divided under a footprint.
+    """Subdivision of triangle edges under a footprint.
 
     Parameters
     ----------
     fineness
-        Triangles are divided until their longest edge is below this share of the footprint's radius.
+        Maximum edge length of the subdivision, as a fraction of the footprint's radius.
     fewest
-        Pieces of each edge at least, and then twice as many until that is fine enough.
+        Minimum subdivisions per edge, doubled until fine enough.
     most
-        No edge is cut into more: a footprint of 0.1 mm needs them on a triangle of 50 m.
+        Maximum subdivisions per edge: needed for a footprint of 0.1 mm on a triangle of 50 m.
     """
 
     fineness: float = 0.12
@@ -42,7 +42,7 @@ class EdgeSubdivision:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """How B tools press M nodes: a force F puts weight / total x F on every node.
+    """Footprints of B tools on M nodes: a force F adds weight / total x F to every node.
 
     nodes (M,) numbers; weight (M, B) float64 and sums (B,) of 4-vectors on the device: the total, and the sum of
     weight x position [m].
@@ -53,23 +53,23 @@ class Footprints:
     sums: wp.array
 
     def rows(self, count: int) -> sp.csr_array:
-        """Shares (B, `count`) of all nodes of a mesh, each row summing to one, on the host."""
+        """Return normalised weights (B, `count`) over all nodes of a mesh, each row with sum one, on the host."""
         weight, total = self.weight.numpy().T, self.sums.numpy().reshape(-1, 4)[:, 0]
         tool, place = np.nonzero(weight)
         share = weight[tool, place] / total[tool]
         return sp.csr_array((share, (tool, self.nodes[place])), shape=(len(weight), count))
 
     def centres(self) -> np.ndarray:
-        """Where each force acts (B, 3) [m], on the host."""
+        """Return the centre (B, 3) [m] of each force, on the host."""
         sums = self.sums.numpy().reshape(-1, 4)
         return sums[:, 1:] / sums[:, :1]
 
 
 @dataclass(frozen=True, eq=False)
 class FootprintArrays:
-    """Arrays on the device in which B tools press: (B,) of point and radius [m], and of where each touches first.
+    """Device arrays for B footprints: `tools` (B,) point and radius [m], `touched` (B,) contact point and distance.
 
-    `found` (n, B) on the way there, fewer each time; weight (M, B) and sums (B,) as `Footprints`.
+    `found` (n, B) reduction levels of the nearest points; weight (M, B) and sums (B,) as in `Footprints`.
     """
 
     tools: wp.array
@@ -80,20 +80,20 @@ class FootprintArrays:
 
 
 class ContactSurface:
-    """A surface that tools touch, on a device.
+    """Surface for tool contact, on a device.
 
     Parameters
     ----------
     nodes
-        (N, 3) [m].
+        Nodes (N, 3) [m].
     triangles
-        (S, 3), or (S, 6) with the middles of `TRIANGLE_EDGES` if quadratic. The corners say where they lie.
+        Triangles (S, 3), or quadratic (S, 6) with midpoints of `TRIANGLE_EDGES`; geometry is that of the corners.
     device
-        Where its arrays live.
+        Device of the arrays.
     name
-        What a sentence calls it.
+        Name for messages.
     division
-        Of its triangles under a footprint.
+        Subdivision of its triangles under a footprint.
     """
 
     def __init__(
@@ -119,33 +119,30 @@ class ContactSurface:
         self._last: tuple[bytes, Footprints] | None = None
 
     def nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest points (B, 3) [m] to `points` (B, 3) and how far they are.
-
-        Inf if not `within` (B,) [m].
-        """
+        """Return the nearest points (B, 3) [m] to `points` (B, 3), and distances (B,), inf if > `within` (B,) [m]."""
         imprint = self.imprint(self._tools(points, within))
         self._touch(imprint)
         touched = imprint.touched.numpy().reshape(-1, 4)
         return touched[:, :3], touched[:, 3]
 
     def press(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
-        """Footprints of tools at `points` (B, 3) with `radii` (B,) [m].
+        """Return the footprints of tools at `points` (B, 3) with `radii` (B,) [m].
 
-        A point off the surface is moved to its nearest point on it, by at most its radius. The last answer is kept: a
-        solve asks for its tools more than once.
+        A point off the surface is moved to the nearest surface point, by at most its radius. The last result is cached,
+        since a solve requests its tools more than once.
 
         Raises
         ------
         InputError
-            A footprint that does not touch the surface, or is too small to be integrated over its triangles.
+            A footprint that does not touch the surface, or is too small for the subdivision of its triangles.
         """
         key, last = np.column_stack([points, radii]).tobytes(), self._last
         if last is None or last[0] != key:
             last = self._last = key, self._pressed(points, radii)
-        return last[1]  # another thread may have pressed elsewhere since
+        return last[1]  # another thread may have replaced self._last since
 
     def imprint(self, tools: wp.array) -> FootprintArrays:
-        """Where tools (B,) are about to press."""
+        """Allocate the footprint arrays of tools (B,)."""
         count, device = len(tools), self.device.name
         found, left = [], len(self._ball)
         while left > 1 or not found:
@@ -156,7 +153,7 @@ class ContactSurface:
         return FootprintArrays(tools, found[-1].flatten(), tuple(found), weight, sums)
 
     def put(self, imprint: FootprintArrays) -> None:
-        """Let the tools press, on the device alone; infinitely far away, and no weight, where one does not touch."""
+        """Compute the footprints on the device alone; distance inf and weight 0 for a tool without contact."""
         self._touch(imprint)
         imprint.weight.zero_()
         imprint.sums.zero_()
@@ -165,12 +162,12 @@ class ContactSurface:
         self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
 
     def check_tools_touch(self, points: np.ndarray, radii: np.ndarray) -> None:
-        """Refuse tools, as `press` has them, of which one does not touch the surface.
+        """Reject tools, with arguments as `press`, if one does not touch the surface.
 
         Raises
         ------
         InputError
-            Naming the first of them.
+            With the first such tool.
         """
         self._demand(points, radii, self.nearest(points, radii)[1])
 
@@ -187,7 +184,7 @@ class ContactSurface:
         return Footprints(self.nodes, imprint.weight, imprint.sums)
 
     def _demand(self, points: np.ndarray, radii: np.ndarray, away: np.ndarray) -> None:
-        """Refuse tools that are infinitely far `away` (B,) from the surface."""
+        """Reject tools whose distance `away` (B,) from the surface is infinite."""
         missed = np.flatnonzero(np.isinf(away))
         if len(missed):
             number = missed[0]
@@ -200,7 +197,7 @@ class ContactSurface:
         return self.device.array(np.column_stack([points, radii]), wp.vec4d)
 
     def _touch(self, imprint: FootprintArrays) -> None:
-        """Where each tool touches first, and how far that is from its point; inf if beyond its radius."""
+        """Find the first contact point of each tool and its distance; inf if larger than its radius."""
         inputs = [self._corners, self._ball, imprint.tools]
         self.device.launch(_search, imprint.found[0].shape, inputs, [imprint.found[0]])
         for some, fewer in pairwise(imprint.found):
@@ -223,7 +220,7 @@ def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 @wp.func
 def _on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """Return the point nearest to `point` between a and b."""
+    """Return the point nearest to `point` on the segment a-b."""
     edge = b - a
     square = wp.dot(edge, edge)
     along = wp.float64(0.0)
@@ -234,7 +231,7 @@ def _on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def _nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """Whichever is nearer to `point`."""
+    """Return the one nearer to `point`."""
     return wp.where(wp.length_sq(one - point) <= wp.length_sq(other - point), one, other)
 
 
@@ -242,12 +239,12 @@ def _nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 def on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
     """Return the point nearest to `point` on a triangle.
 
-    Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the plane's foot where it lies inside, else the
-    nearest of the three edges. A needle has no foot to round-off: its edges serve.
+    Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the projection onto the plane if it lies inside, else
+    the nearest point of the edges. Degenerate triangles use their edges only.
     """
     nearest = _nearer(_nearer(_on_edge(a, b, point), _on_edge(b, c, point), point), _on_edge(c, a, point), point)
     first, second, offset = b - a, c - a, point - a
-    # Corner coordinates of the foot from the Gram matrix of two edges.
+    # barycentric coordinates of the projection from the Gram matrix of two edges
     aa, ab, bb = wp.dot(first, first), wp.dot(first, second), wp.dot(second, second)
     pa, pb = wp.dot(offset, first), wp.dot(offset, second)
     area = aa * bb - ab * ab
@@ -259,7 +256,7 @@ def on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.ve
 
 @wp.func
 def _place(of: wp.vec4d) -> wp.vec3d:
-    """Centre of a ball, point of a tool; the fourth component is its radius."""
+    """Return the centre of a ball or the point of a tool; the fourth component is its radius."""
     return wp.vec3d(of[0], of[1], of[2])
 
 
@@ -276,7 +273,7 @@ def _search(
     # outputs
     found: wp.array2d(dtype=wp.vec4d),
 ):
-    """The nearest point of a chunk of triangles, and how far it is; inf where none is near enough."""
+    """Find the nearest point on a chunk of triangles and its distance; inf if none is in range."""
     chunk, c = wp.tid()
     point = _place(tools[c])
     best = tools[c][3]
@@ -297,7 +294,7 @@ def _settle(
     # outputs
     nearest: wp.array2d(dtype=wp.vec4d),
 ):
-    """The nearest of some."""
+    """Reduce groups of candidates to their nearest."""
     group, c = wp.tid()
     best = found[group * CHUNK, c]
     for k in range(1, CHUNK):
@@ -322,9 +319,9 @@ def _press(
     weight: wp.array2d(dtype=wp.float64),
     sums: wp.array(dtype=wp.vec4d),
 ):
-    """Add the integral of w N_a over a triangle, up to a factor, by the centres of n^2 equal pieces.
+    """Add the integral of w N_a over a triangle, up to a factor, by the centroids of n^2 equal parts.
 
-    A row of pieces, y constant, meets the footprint in an interval: where A j^2 + 2 B j + C < 0 at its j-th piece.
+    A row of parts, y constant, meets the footprint in an interval: A j^2 + 2 B j + C < 0 at its j-th part.
     """
     s, c = wp.tid()
     point, radius = _place(touched[c]), tools[c][3]
@@ -340,9 +337,9 @@ def _press(
     h = one / wp.float64(n)
     step = h * second
     A = wp.length_sq(step)
-    # Moments of w over the triangle for corner coordinates (1 - y - z, y, z): of 1, y, z, and of y^2, y z, z^2.
+    # Moments of w over the triangle in barycentric coordinates (1 - y - z, y, z): of 1, y, z, and of y^2, y z, z^2.
     m, mm = wp.vec3d(), wp.vec3d()
-    # Upright pieces have their centres a third of the way, those turned round two thirds.
+    # centroids: upright parts at 1/3, rotated parts at 2/3
     for turned in range(2):
         third = wp.float64(turned + 1) / wp.float64(3.0)
         for i in range(n - turned):
@@ -366,7 +363,7 @@ def _press(
     scale = wp.length(wp.cross(first, second)) * h * h / radius
     x, y, z = m[0] - m[1] - m[2], m[1], m[2]
     share = vec6d(x, y, z, zero, zero, zero)
-    if table.shape[1] == 6:  # L (2 L - 1) at corners, 4 L_i L_j between them
+    if table.shape[1] == 6:  # L (2 L - 1) at corners, 4 L_i L_j at midpoints
         xy, yz, zx = y - mm[0] - mm[1], mm[1], z - mm[1] - mm[2]
         halves = vec6d(xy + zx, xy + yz, yz + zx, -two * xy, -two * yz, -two * zx)
         share -= two * halves

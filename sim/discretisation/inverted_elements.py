@@ -1,4 +1,4 @@
-"""Which tetrahedra lie inside out: a body may be in equilibrium there, but no tissue is."""
+"""Detection of inverted tetrahedra: an equilibrium may have them, but it is not physical."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .space import Discretisation
 
 @cache
 def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Kernel:
-    """Return the kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, column)."""
+    """Build the kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, load case)."""
     scalar, vec = device.scalar, device.vector
 
     @forward_kernel(module="unique")
@@ -25,7 +25,7 @@ def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Ker
         # outputs
         out: wp.array(dtype=wp.int32),
     ):
-        """n += 1 where det F <= least at some point, F = I + sum over nodes of u_a (x) grad N_a."""
+        """Add 1 to n if det F <= least at some point, F = I + sum over nodes of u_a (x) grad N_a."""
         e, c = wp.tid()
         for q in range(points):
             F = wp.identity(n=3, dtype=scalar)
@@ -40,11 +40,11 @@ def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Ker
 
 
 class Inversion:
-    """Counts tetrahedra that lie inside out, or collapsed, at some quadrature point.
+    """Counter of tetrahedra that are inverted or collapsed at some quadrature point.
 
-    Linear tetrahedra have one point, quadratic ones eight. Smoothed strains are averages: there too every tetrahedron
-    is looked at by itself. A volume below the share `collapsed` of its rest value is collapsed: round-off decides on
-    which side of zero it lies. `bounded`: the law is infinite where what it sees is inside out.
+    Linear tetrahedra have one point, quadratic ones eight. With smoothed strains, which are averages, single
+    tetrahedra are still tested. A tetrahedron with J below `collapsed` counts as collapsed, since round-off determines
+    the sign. `bounded`: the law's energy is infinite for inverted (averaged) deformation gradients.
     """
 
     def __init__(self, space: Discretisation, device: Device, bounded: bool = False, collapsed: float = 1e-6):
@@ -61,21 +61,21 @@ class Inversion:
         self._gradient = device.array(elements.gradient, device.vector)
 
     def doubtful(self, inverted: np.ndarray) -> np.ndarray:
-        """Which states (B,) with so many (B,) inside out may be those of a body that is turned over.
+        """Return a mask (B,) of states with `inverted` (B,) > 0 tetrahedra that may be unphysical equilibria.
 
-        None where the law sees averages alone, and no descent can take these through its infinity. There a strong load
-        may turn single tetrahedra, from rest as from any other start.
+        All False if the law is `bounded` and sees averages only: then a descent cannot invert these, and a strong load
+        may invert single tetrahedra from any start.
         """
         return self._telling & (inverted > 0)
 
     def count(self, u: wp.array) -> np.ndarray:
-        """How many (B,) in u (3N, B) [m], on the device."""
+        """Count inverted tetrahedra (B,) in u (3N, B) [m], on the device."""
         out = wp.zeros(u.shape[1], dtype=wp.int32, device=self._device.name)
         self.add_count(u, out)
         return out.numpy()
 
     def add_count(self, u: wp.array, out: wp.array) -> None:
-        """Add how many in u (3N, B) [m] to out (B,) int32, on the device alone."""
+        """Add the number of inverted tetrahedra in u (3N, B) [m] to out (B,) int32, on the device alone."""
         _, points, size = self._gradient.shape
         inputs = [u, self._table, self._gradient]
         kernel = build_kernel(self._device, size, points, self._collapsed)

@@ -1,4 +1,4 @@
-"""Where a rigid tool's core comes nearest to triangles, and how far it is from places on them."""
+"""Nearest points of triangles to a rigid tool's core, and distances."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import warp as wp
 from ..runtime.device import forward_kernel, load
 from .footprint import on_triangle
 
-# How often a place on a triangle and the nearest one of a core that is no point take turns.
+# Number of alternating projections between a triangle and an extended core.
 TURNS = 16
 
 
 class NearestPlaces(NamedTuple):
-    """Corner coordinates (S, 3) of places, how far they are (S,) [m], and the directions to them (S, 3)."""
+    """Barycentric coordinates (S, 3) of surface points, distances (S,) [m], and directions from the core (S, 3)."""
 
     share: np.ndarray
     distance: np.ndarray
@@ -25,9 +25,9 @@ class NearestPlaces(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlacedBox:
-    """A box where it stands, of which a tool is all within a radius: a point of a ball, a line of a rod.
+    """Core of a tool in its pose, a box with the tool within a radius around it; a point for a ball, a line for a rod.
 
-    A flat one, of a blade, has tissue below it alone. What came through it is as far inside as it is above.
+    The flat core of a blade contacts tissue below it only: penetration depth is the height above it.
 
     middle (3,) [m]; axes (3, 3), as columns; half (3,) [m].
     """
@@ -37,25 +37,25 @@ class PlacedBox:
     half: np.ndarray
 
     def moved(self, way: np.ndarray) -> PlacedBox:
-        """Return the same, moved by (3,) [m]."""
+        """Return the box translated by (3,) [m]."""
         return replace(self, middle=self.middle + way)
 
     @property
     def corners(self) -> np.ndarray:
-        """Of the box (8, 3) [m]."""
+        """Corners (8, 3) [m] of the box."""
         signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
         return self.middle + (signs * self.half) @ self.axes.T
 
     def nearest(self, corners: np.ndarray) -> NearestPlaces:
-        """Return the places nearest to it on triangles with `corners` (S, 3, 3) [m].
+        """Return the points nearest to the box on triangles with `corners` (S, 3, 3) [m].
 
-        A place of one takes turns with the nearest of the other, with momentum (Beck, Teboulle 2009, "A fast iterative
+        Alternating projections with momentum (Beck, Teboulle 2009, "A fast iterative
         shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2:183-202, equations 4.1 to 4.3).
         """
         return Nearest(len(corners)).to(self, corners)
 
     def distances(self, corners: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far (n,) [m] the places of corner coordinates (n, 3) are from it, and the directions (n, 3)."""
+        """Return distances (n,) [m] and directions (n, 3) from the box to points of barycentric coordinates (n, 3)."""
         place = np.einsum("nc,nci->ni", share, corners) - self.middle
         local = place @ self.axes
         away = place - np.clip(local, -self.half, self.half) @ self.axes.T
@@ -68,7 +68,7 @@ class PlacedBox:
 
 
 class Nearest:
-    """Finds the places nearest to cores on so many triangles, again and again, in memory of its own."""
+    """Nearest point search on a fixed number of triangles, with reused memory."""
 
     def __init__(self, count: int):
         self._corners = np.empty((count, 3, 3))
@@ -78,14 +78,14 @@ class Nearest:
         given = zip((self._corners, *self._found), kinds, strict=True)
         arrays = [wp.array(each, dtype=kind, device="cpu", copy=False) for each, kind in given]
         stands = [wp.vec3d(), wp.mat33d(), wp.vec3d(), 1]
-        # A launch that is recorded costs a tenth of one that is not.
+        # A recorded launch costs a tenth of another one.
         self._launch = wp.launch(
             _nearest, count, [arrays[0], *stands], arrays[1:], device="cpu", record_cmd=True, record_tape=False
         )
 
     def to(self, core: PlacedBox, corners: np.ndarray) -> NearestPlaces:
-        """As `PlacedBox.nearest`; what it gave before is overwritten."""
-        if self._launch is None:  # of no triangles
+        """Return the points as `PlacedBox.nearest`; overwrites the previous result."""
+        if self._launch is None:  # no triangles
             return self._found
         self._corners[:] = corners
         stands = wp.vec3d(*core.middle), wp.mat33d(*core.axes.ravel()), wp.vec3d(*core.half)
@@ -106,12 +106,15 @@ def _nearest(
     distance: wp.array(dtype=wp.float64),
     normal: wp.array(dtype=wp.vec3d),
 ):
-    """y = x + (t - 1) / t' (x - x'), x the triangle's place nearest to the box's nearest to y; t' = (1 + r) / 2."""
+    """Iterate y = x + (t - 1) / t' (x - x'), x the triangle point nearest to the box point nearest to y.
+
+    The momentum parameter is t' = (1 + sqrt(1 + 4 t^2)) / 2.
+    """
     face = wp.tid()
     a, b, c = corners[face, 0], corners[face, 1], corners[face, 2]
     one, pace = wp.float64(1.0), wp.float64(1.0)
     place = (a + b + c) / wp.float64(3.0)
-    ahead = wp.vec3d(place)  # copies, as a plain assignment would be another name of the same
+    ahead = wp.vec3d(place)  # copies, since plain assignment would alias
     for _turn in range(turns):
         last, before = wp.vec3d(place), wp.float64(pace)
         place = on_triangle(a, b, c, _of_box(ahead, middle, axes, half))
@@ -144,7 +147,7 @@ def _nearest(
 
 @wp.func
 def _through(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.float64:
-    """How far above a flat box a point is that came through it; negative where it did not."""
+    """Return the height of a point above a flat box if it is over the face; else -1."""
     none = wp.float64(0.0)
     local = wp.transpose(axes) @ (point - middle)
     within = wp.abs(local[0]) <= half[0] and wp.abs(local[1]) <= half[1] and local[2] >= none
@@ -153,7 +156,7 @@ def _through(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d)
 
 @wp.func
 def _of_box(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.vec3d:
-    """Return the box's place that is nearest to a point."""
+    """Return the point of the box nearest to a point."""
     local = wp.transpose(axes) @ (point - middle)
     for i in range(3):
         local[i] = wp.clamp(local[i], -half[i], half[i])

@@ -1,4 +1,4 @@
-"""A problem: the sum of its terms over the motions that its constraints leave free."""
+"""Boundary value problem: sum of energy terms under constraints."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .term import Barrier, Cases, Paced, Strained, Term
 
 @dataclass(frozen=True, eq=False)
 class Imposed:
-    """What loads impose on the constraints; as `Constraint.begin` takes it."""
+    """Prescribed values of a batch, the arguments of `Constraint.begin`."""
 
     value: np.ndarray | None = None
     weight: np.ndarray | None = None
@@ -30,17 +30,17 @@ class Imposed:
 
 
 def build_no_imposed(loads: Loads) -> Imposed:
-    """Held components stay at zero and no footprint is moved."""
+    """Return zero values for fixed components, and no footprint motion."""
     return Imposed()
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Terms, constraints, and how loads impose displacements; N nodes on one device.
+    """Terms, constraints, and displacements prescribed by loads; N nodes on one device.
 
-    Arrays are (3N, b): one column per live load case. `barriers` are those of the terms that bodies touch.
-    `elastic`: nothing but elasticity resists by itself; an effect of somebody's own might. A gap of up to `closed` last
-    digits of the largest displacement is closed.
+    Arrays are (3N, b), one column per active load case. `barriers` are the contact terms.
+    `elastic`: only elastic terms resist deformation; user-defined effects may be others. A constraint gap of up to
+    `closed` units of round-off of the largest displacement counts as closed.
     """
 
     terms: tuple[Term, ...]
@@ -53,43 +53,43 @@ class Problem:
 
     @property
     def rows(self) -> int:
-        """3N."""
+        """Number of unknowns 3N."""
         return self.constraint.held.size
 
     @property
     def plain(self) -> bool:
-        """Whether forces that stay as they are act on what only ever resists: what shortcuts are made for."""
+        """True if only constant loads and purely resisting terms act, as solver accelerations require."""
         return self.elastic and all(term.constant or term.passive for term in self.terms)
 
     @property
     def bounded(self) -> bool:
-        """Whether all that is elastic is infinite where its elements are inside out."""
+        """True if the energy of all elastic terms is infinite for inverted elements."""
         return self.elastic and all(term.bounded for term in self.terms if isinstance(term, Strained))
 
     @property
     def steep(self) -> bool:
-        """Whether a term is steep."""
+        """True if the tangent of a term may differ strongly from the undeformed stiffness."""
         return any(term.steep for term in self.terms)
 
     @property
     def paced(self) -> bool:
-        """Whether the stiffness depends on the step in time."""
+        """True if the stiffness depends on the time step."""
         return any(isinstance(term, Paced) for term in self.terms)
 
     def overlaps(self, u: wp.array) -> np.ndarray:
-        """Columns (2, b) bool as `Barrier.overlaps` of any barrier."""
+        """Return a mask (2, b) of load cases with overlaps in any barrier, as `Barrier.overlaps`."""
         none = np.zeros((2, u.shape[1]), bool)
         return np.logical_or.reduce([none, *(term.overlaps(u) for term in self.barriers)])
 
     def begin(self, cases: Cases) -> None:
-        """Take a batch of load cases."""
+        """Set the load cases of a batch."""
         imposed = self.impose(cases.loads)
         self.constraint.begin(imposed.value, imposed.weight, imposed.target)
         for term in self.terms:
             term.begin(cases)
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these columns (k,): the others have left the batch."""
+        """Keep these load cases (k,) of the batch."""
         self.constraint.keep(columns)
         for term in self.terms:
             term.keep(columns)
@@ -100,23 +100,23 @@ class Problem:
         return {name: memory for name, memory in kept.items() if memory is not None}
 
     def energy(self, u: wp.array) -> np.ndarray:
-        """Total potential (b,) [J]; +inf outside the domain."""
+        """Return the total potential energy (b,) [J]; +inf outside the domain."""
         out = wp.zeros(u.shape[1], dtype=wp.float64, device=self.device.name)
         for term in self.terms:
             term.energy(u, out)
         return out.numpy()
 
     def gradient(self, u: wp.array) -> wp.array:
-        """Return the terms' summed gradient (3N, b) [N]."""
+        """Return the gradient (3N, b) [N] of the total potential energy."""
         out = self.device.zeros(*u.shape)
         for term in self.terms:
             term.add_gradient(u, out)
         return out
 
     def residual(self, u: wp.array) -> tuple[wp.array, np.ndarray, np.ndarray]:
-        """Return the free gradient (3N, b) [N], its 2-norm (b,), and the scale (b,) that it is measured against.
+        """Return the residual (3N, b) [N] (projected gradient), its 2-norm (b,), and its scale (b,).
 
-        The scale is the largest 2-norm among the terms' own gradients and the reaction at constrained nodes.
+        The scale is the largest 2-norm among the gradients of the terms and the reaction at constrained nodes.
         """
         total, scale = self.device.zeros(*u.shape), np.zeros(u.shape[1])
         for term in self.terms:
@@ -127,16 +127,16 @@ class Problem:
         whole = compute_norms(self.device, total)
         self.constraint.project(total)
         free = compute_norms(self.device, total)
-        with np.errstate(invalid="ignore", over="ignore"):  # forces that overflowed: the caller sees it in `free`
+        with np.errstate(invalid="ignore", over="ignore"):  # overflow is visible to the caller in `free`
             reaction = np.sqrt(np.maximum(whole**2 - free**2, 0.0))  # the projection is orthogonal
             scale = np.maximum(scale, reaction)
-        # Where forces overflowed that are not free, nothing else would look out of balance.
+        # Report inf if constrained forces overflowed, which the free residual does not show.
         return total, np.where(np.isfinite(scale), free, np.inf), scale
 
     def gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
-        """The least motion (3N, b) [m] from u (3N, b) to the constraints, and which columns (b,) are off them at all.
+        """Return the smallest motion (3N, b) [m] from u (3N, b) to the constraints, and a mask (b,) of open gaps.
 
-        What round-off leaves open counts as closed, and its motion is zero.
+        A gap of the order of round-off counts as closed and gives zero motion.
         """
         gap, size = self.constraint.close_gap(u)
         with run_in_order(self.device):
@@ -145,32 +145,32 @@ class Problem:
         return combine_columns(self.device, gap, off - 1.0, gap, gap), off
 
     def linearise(self, u: wp.array, definite: np.ndarray) -> None:
-        """Fix where `add_curvature` is taken; definite (b,) asks for positive semi-definite curvature."""
+        """Set the linearisation point u; `definite` (b,) requests a positive semi-definite tangent stiffness."""
         flags = self.device.array(definite.astype(np.int32), wp.int32)
         for term in self.terms:
             term.linearise(u, flags)
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """Add K p (3N, b) [N], not projected."""
+        """Add the tangent stiffness times p, K p (3N, b) [N], not projected."""
         for term in self.terms:
             term.add_curvature(p, out)
 
     def diagonal(self, columns: int) -> wp.array:
-        """3 x 3 diagonal blocks (N, b) of the curvature [N/m]."""
+        """Return the 3 x 3 diagonal blocks (N, b) of the tangent stiffness [N/m]."""
         out = wp.zeros((self.rows // 3, columns), dtype=self.device.matrix, device=self.device.name)
         for term in self.terms:
             term.add_diagonal(out)
         return out
 
     def rest_curvature(self, step: float = math.inf) -> sp.csc_array:
-        """Assembled curvature at rest (3N, 3N) [N/m] of the terms that offer one, over a step in time [s]."""
+        """Assemble the undeformed stiffness (3N, 3N) [N/m] of the terms that provide one, for a time step [s]."""
         offered = [matrix for matrix in (term.rest_curvature() for term in self.terms) if matrix is not None]
         if step < math.inf:
             offered += [term.curvature_at_pace(step) for term in self.terms if isinstance(term, Paced)]
         return reduce(lambda a, b: a + b, offered, sp.csc_array((self.rows, self.rows)))
 
     def longest_step(self, u: wp.array, du: wp.array) -> np.ndarray:
-        """Return the longest fraction (b,), at most 1, of du (3N, b) that every term allows."""
+        """Return the largest fraction (b,), at most 1, of du (3N, b) that every term allows."""
         out = wp.full(u.shape[1], 1.0, dtype=self.device.scalar, device=self.device.name)
         for term in self.terms:
             term.longest_step(u, du, out)

@@ -1,4 +1,4 @@
-"""What is left of a body after each step of a resection, and what came loose."""
+"""Remaining body after each step of a resection, and its disconnected parts."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from .rigid_modes import check_held, find_loose_tetrahedra
 
 @dataclass(frozen=True, eq=False)
 class RemainingBody:
-    """A body after so many steps.
+    """Remaining body after a number of resection steps.
 
     Parameters
     ----------
     done
-        Steps.
+        Number of steps.
     anatomy
-        What is left, under the whole body's vertex numbers.
+        Remaining anatomy, with the vertex numbers of the whole body.
     loose
-        (n,) the whole body's tetrahedra that no step took: nothing held them any more, and they went too.
+        Tetrahedra (n,) of the whole body, removed because they lost contact with all fixed nodes.
     """
 
     done: int
@@ -32,7 +32,7 @@ class RemainingBody:
     loose: np.ndarray
 
     def __str__(self) -> str:
-        """Return the sentence that a user reads."""
+        """Return the description for users."""
         said = f"{self.done} step{'' if self.done == 1 else 's'} done"
         if not len(self.loose):
             return said
@@ -40,7 +40,7 @@ class RemainingBody:
 
 
 def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
-    """Return `compute_remains` under effects with a `Resection`, without tissue that none of them holds.
+    """Return the remaining bodies under effects with a `Resection`; `Anatomy.held` counts only if they include `Held`.
 
     Raises
     ------
@@ -56,19 +56,19 @@ def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[
 
 
 def compute_remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[RemainingBody, ...]:
-    """What is left after 0, 1, ... all steps; `slides`: slide normals keep tissue on the skull.
+    """Return the remaining bodies after 0, 1, ... all steps; `slides`: slide normals support tissue.
 
     Raises
     ------
     InputError
-        A body that is not held; a step that takes a tetrahedron that the mesh does not have, or the last of the body.
+        A body that is not fixed; a step with a tetrahedron that the mesh does not have, or the last of the body.
     """
     return tuple(_remains(anatomy, effect, slides))
 
 
 def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[RemainingBody]:
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
-    check_held(anatomy.mesh, anatomy.held, normal)  # else all of it would count as loose
+    check_held(anatomy.mesh, anatomy.held, normal)  # else all of it would count as disconnected
     yield RemainingBody(0, anatomy, np.zeros(0, np.int64))
     taken: set[int] = set()
     for done, step in enumerate(effect.steps, start=1):

@@ -1,4 +1,4 @@
-"""Whether the constraints hold a body: no part of it may move rigidly without resistance."""
+"""Rigid body modes: test that the constraints prevent rigid motion of every part of a body."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from ..geometry.tetmesh import FACES, TetMesh, compute_row_keys
 
 
 def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float = 1e-6) -> None:
-    """Refuse a body, or a part of one, that can translate or rotate freely.
+    """Reject a body with a part that can translate or rotate freely.
 
-    held (V, 3) bool and normal (V, 3) are the constraints. A node of no element must be held: nothing else stops it.
-    Elements joined by faces make a rigid cluster; clusters that share a corner or an edge only are hinged there. A
-    rigid motion is felt when the constraints move by more than the share `felt` of it, in the mean.
+    held (V, 3) bool and normal (V, 3) are the constraints. A node without element must be fixed.
+    Elements joined by faces form a rigid cluster; clusters that share only a corner or an edge are hinged there. A
+    rigid motion is resisted if it moves the constraints by more than a fraction `felt` of it, on average.
 
     Raises
     ------
     InputError
-        Naming the part and what is missing.
+        With the part and the missing constraints.
     """
     count = len(mesh.nodes)
     used = np.zeros(count, bool)
@@ -52,7 +52,7 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float 
 
 
 def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, felt: float = 1e-6) -> np.ndarray:
-    """Tetrahedra (n,) that can move rigidly: joined by faces to nothing held, nor borne by what slides, if it does."""
+    """Return tetrahedra (n,) that can move rigidly: without fixed nodes or, if `slides`, sufficient slide normals."""
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
     cluster, nodes = _clusters(anatomy.mesh.tets), anatomy.mesh.nodes
     loose = []
@@ -67,13 +67,13 @@ def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, felt: float = 1
 
 
 def _components(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
-    """Component numbers (count,) of a graph with edges (first, second)."""
+    """Return the component numbers (count,) of a graph with edges (first, second)."""
     graph = sp.coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
     return sp.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def _clusters(tets: np.ndarray) -> np.ndarray:
-    """Numbers (T,) of the clusters of elements that are joined by faces."""
+    """Return the cluster (T,) of each element; face neighbours belong to one cluster."""
     keys = compute_row_keys(tets[:, FACES].reshape(-1, 3))
     order = np.argsort(keys)
     same = keys[order[1:]] == keys[order[:-1]]
@@ -83,10 +83,10 @@ def _clusters(tets: np.ndarray) -> np.ndarray:
 def _free_motions(
     nodes: np.ndarray, held: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray, felt: float
 ) -> tuple[int, int]:
-    """How many rigid motions of clusters nothing resists, and the cluster that moves most in one of them.
+    """Return the number of unresisted rigid motions, and the cluster that moves most in one of them.
 
-    `cluster` (m,) and `node` (m,) pair the clusters with their nodes. Six unknowns a cluster, and as equations: held
-    components and normals do not move, nodes that clusters share move alike.
+    `cluster` (m,) and `node` (m,) pair the clusters with their nodes. There are six unknowns per cluster. Equations:
+    fixed components and normals do not move, nodes shared by clusters move equally.
     """
     names, local = np.unique(cluster, return_inverse=True)
     size = np.bincount(local)

@@ -1,9 +1,9 @@
-"""Linear tetrahedra whose strain is averaged over edges and nodes: no locking, no nodes besides the mesh's own.
+"""Linear tetrahedra with strain averaged over edges and nodes: no locking, no additional nodes.
 
 Selective edge- and node-based smoothing, "ES/NS-FEM-T4": Onishi, Amaya 2014, Int. J. Numer. Meth. Eng. 99:354-371,
 after Liu, Nguyen-Thoi 2010, "Smoothed Finite Element Methods". The displacement gradient is averaged over the elements
-round an edge, each lending a sixth of its volume, and this average resists a change of shape. The average over the
-elements round a node, a quarter of each, resists a change of volume.
+around an edge, weighted by a sixth of their volumes, and determines the deviatoric response. The average over the
+elements around a node, with a quarter of each, determines the volumetric response.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from .element import Elements, build_linear_elements
 
 
 def build_edge_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
-    """One element for each edge and region, over the `chosen` (T,) bool tetrahedra round it."""
+    """Build one element per edge and region, over the `chosen` tetrahedra (T,) bool around it."""
     ends = np.sort(mesh.tets[chosen][:, EDGES].reshape(-1, 2))
     return _averaged(mesh, chosen, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
 
 
 def build_node_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
-    """One element for each node and region, over the `chosen` (T,) bool tetrahedra round it."""
+    """Build one element per node and region, over the `chosen` tetrahedra (T,) bool around it."""
     corners = mesh.tets[chosen].astype(np.int64)
     return _averaged(mesh, chosen, corners, corners.reshape(-1, 1))
 
 
 def _averaged(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.ndarray) -> Elements:
-    """One element for each distinct number in `key` (T, k), where tetrahedron t lends V_t / k to each of its numbers.
+    """Build one element per distinct number in `key` (T, k); tetrahedron t adds V_t / k to each of its numbers.
 
-    `vertices` (T k, n) are those that each number stands for. Regions are never mixed: their tissues differ.
+    `vertices` (T k, n) are the mesh vertices of each number. Regions are not mixed, since their tissues differ.
     """
     linear = build_linear_elements(mesh, chosen)
     count, lent = key.shape
@@ -38,7 +38,7 @@ def _averaged(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.n
     _, first, domain = np.unique(key.ravel(), return_index=True, return_inverse=True)
     share = np.repeat(linear.weight[:, 0] / lent, lent)
     volume = np.bincount(domain, share)
-    # Every corner of every tetrahedron of a domain adds its gradient to the domain's place for that node.
+    # Every corner of every tetrahedron of a domain adds its gradient to the domain's entry for that node.
     tet = np.repeat(np.arange(count), lent)
     gradient = (share / volume[domain])[:, None, None] * linear.gradient[tet, 0]
     pair, place = np.unique(domain[:, None] * np.int64(linear.nodes) + linear.table[tet], return_inverse=True)

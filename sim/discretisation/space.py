@@ -1,4 +1,4 @@
-"""The nodes of an element type over a mesh. The mesh's own come first; nothing outside this room knows the others."""
+"""Nodes and elements of an element type over a mesh; mesh vertices come first."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .smoothed import build_edge_elements, build_node_elements
 
 @dataclass(frozen=True, eq=False)
 class ElementPart:
-    """Elements, and which of a tissue's stiffness they carry: "whole", "shape" or "volume"."""
+    """Elements and the part of the stiffness they carry: "whole", "shape" or "volume"."""
 
     elements: Elements
     carries: str
@@ -28,7 +28,7 @@ class ElementPart:
 class Discretisation:
     """N nodes: the mesh's V, then one on each of `edges` (E, 2), for quadratic elements on a linear mesh.
 
-    table (T, n) node numbers of the tetrahedra: corners, and the middles of `QUADRATIC_EDGES` if quadratic.
+    table (T, n) node numbers of the tetrahedra: corners, and midpoints of `QUADRATIC_EDGES` if quadratic.
     """
 
     mesh: TetMesh
@@ -38,22 +38,22 @@ class Discretisation:
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number of nodes N."""
         return len(self.mesh.nodes) + len(self.edges)
 
     @cached_property
     def nodes(self) -> np.ndarray:
-        """Rest positions (N, 3) [m]."""
+        """Undeformed positions (N, 3) [m]."""
         return self.interpolate_field(self.mesh.nodes)
 
     @property
     def marks(self) -> np.ndarray:
-        """What tells each node (N, 2) from all others, whatever is cut: the vertex twice, or the ends of its edge."""
+        """Unique key (N, 2) of each node, whatever is cut: its vertex twice, or the ends of its edge."""
         return np.concatenate([np.repeat(np.arange(len(self.mesh.nodes))[:, None], 2, axis=1), self.edges])
 
     @cached_property
     def corner_interpolation(self) -> sp.csr_array:
-        """(N, C): values at the C nodes that are corners to all nodes, linear along each edge."""
+        """Interpolation matrix (N, C) from the C corner nodes to all nodes, linear along each edge."""
         corner = np.unique(self.table[:, :4])
         place = np.zeros(self.count, np.int64)
         place[corner] = np.arange(len(corner))
@@ -66,7 +66,7 @@ class Discretisation:
 
     @cached_property
     def surface(self) -> np.ndarray:
-        """Surface triangles (S, 3) or, if quadratic, (S, 6): corners, then the middles of `TRIANGLE_EDGES`."""
+        """Surface triangles (S, 3) or, if quadratic, (S, 6): corners, then midpoints of `TRIANGLE_EDGES`."""
         corners = self.mesh.surface
         if self.table.shape[1] == 4:
             return corners
@@ -77,12 +77,12 @@ class Discretisation:
         return np.column_stack([corners, middles.reshape(-1, 3)])
 
     def parts(self, chosen: np.ndarray) -> tuple[ElementPart, ...]:
-        """Elements over the `chosen` (T,) bool tetrahedra.
+        """Build the elements over the `chosen` tetrahedra (T,) bool.
 
         Raises
         ------
         InputError
-            Quadratic elements that are folded over.
+            Quadratic elements that are folded.
         """
         if self.element == "p1":
             return (ElementPart(build_linear_elements(self.mesh, chosen), "whole"),)
@@ -92,9 +92,9 @@ class Discretisation:
         return ElementPart(edges, "shape"), ElementPart(nodes, "volume")
 
     def held(self, held: np.ndarray) -> np.ndarray:
-        """Held components (N, 3) from the mesh's own (V, 3).
+        """Return the fixed components (N, 3) of all nodes from those of the mesh (V, 3).
 
-        An added node is held where its edge lies on a surface triangle whose corners are all held.
+        An added node is fixed if its edge lies on a surface triangle whose corners are all fixed.
         """
         out = np.zeros((self.count, 3), bool)
         out[: len(held)] = held
@@ -104,12 +104,12 @@ class Discretisation:
         return out
 
     def sliding(self, normal: np.ndarray, held: np.ndarray, facing: float = 0.75) -> np.ndarray:
-        """Slide normals (N, 3) from the mesh's own (V, 3); held (V, 3) bool.
+        """Return the slide normals (N, 3) of all nodes from those of the mesh (V, 3); held (V, 3) bool.
 
-        An added node slides where its edge lies on a surface triangle whose corners all slide or are held. Its normal
-        is along the integral of its shape function's gradient over all triangles that meet there: no volume passes.
-        Where these do not face as its ends do (at the edge of a box, say), the normal is of those triangles alone. A
-        cosine between the normals of up to `facing` is another wall's.
+        An added node slides if its edge lies on a surface triangle whose corners all slide or are fixed. Its normal
+        is the integral of its shape function's gradient over all adjacent triangles, so no volume passes through.
+        If that normal deviates from its ends' (at the edge of a box, for example), only the sliding triangles count.
+        Normals deviate if their cosine is at most `facing`.
         """
         out = np.zeros((self.count, 3))
         out[: len(normal)] = normal
@@ -130,39 +130,39 @@ class Discretisation:
         return out
 
     def interpolate_field(self, field: np.ndarray) -> np.ndarray:
-        """(..., N, 3) from (..., V, 3): linear along each edge."""
+        """Interpolate a field (..., V, 3) to all nodes (..., N, 3), linear along each edge."""
         return np.concatenate([field, field[..., self.edges, :].mean(axis=-2)], axis=-2)
 
 
-@lru_cache(2)  # effects, tissues and diagnostics share them: a tenth of a locator's set-up on a graphics card
+@lru_cache(2)  # shared by effects, tissues and diagnostics: 10 % of a locator's set-up on a GPU
 def _smoothed(mesh: TetMesh, chosen: bytes) -> tuple[Elements, Elements]:
-    """Edge and node elements over the `chosen` tetrahedra (T,), as bytes of bool."""
+    """Build edge and node elements over the `chosen` tetrahedra (T,), given as bytes of bool."""
     tets = np.frombuffer(chosen, bool)
     return build_edge_elements(mesh, tets), build_node_elements(mesh, tets)
 
 
 def recommend_element(mesh: TetMesh) -> str:
-    """Return the element of who names none: `RECOMMENDED`, or p2 on a mesh that brings mid-edge nodes of its own."""
+    """Return the default element: `RECOMMENDED`, or p2 for a mesh with mid-edge nodes."""
     return RECOMMENDED if mesh.middles is None else "p2"
 
 
 def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     """Return the nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
 
-    None: that of `recommend_element`.
+    None selects `recommend_element`.
 
     Raises
     ------
     InputError
-        An unknown type; a linear type on a mesh that brings mid-edge nodes of its own.
+        An unknown type; a linear type on a mesh with mid-edge nodes.
     """
     element = recommend_element(mesh) if element is None else element
-    if element not in tuple(ELEMENTS):  # which need not be hashable
+    if element not in tuple(ELEMENTS):  # tuple, since `element` may be unhashable
         raise InputError(f"no element is called {element!r}: choose one of {', '.join(ELEMENTS)}.")
     none = np.zeros((0, 2), np.int32)
     if mesh.middles is not None:
         if element != "p2":
-            raise InputError(f"the mesh has quadratic tetrahedra, which are no {element}: take p2, or a linear mesh.")
+            raise InputError(f"the mesh has quadratic tetrahedra, not {element}: use p2, or a linear mesh.")
         return Discretisation(mesh, element, mesh.table, none)
     if element != "p2":
         return Discretisation(mesh, element, mesh.tets, none)

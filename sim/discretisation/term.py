@@ -1,4 +1,4 @@
-"""The Term protocol: what it costs to have an effect (energy, gradient, curvature)."""
+"""Interface of energy terms: energy, gradient and tangent stiffness, for effects and their accelerations."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .element import Elements
 
 @dataclass(frozen=True, eq=False)
 class Cases:
-    """The load cases of a batch: what acts, since when, and what each term remembers of the past.
+    """Load cases of a batch: loads, start times, and memories of the terms.
 
-    loads have B rows; start_time is (B,) [s]. memory is, by term name, arrays with B rows, as `Term.end` returned them.
-    displacement (B, N, 3) [m] is that of the element's nodes at the start, or None: at rest. share (B,) is that of the
-    way from where they were that tools have gone, 1 if None. anew (B,) bool says whose descent begins at rest, where
-    nothing is touched yet; none if None. warm is what an earlier answer left to make this one faster, rows (B, ...).
+    loads have B rows; start_time is (B,) [s]. memory: by term name, arrays with B rows, as `Term.end` returned them.
+    displacement (B, N, 3) [m] of the nodes at the start; None: undeformed. share (B,): path fraction that tools have
+    covered, 1 if None. `anew` (B,) bool: descents that start undeformed and without
+    contact; none if None. warm: data of an earlier solution that speed up this one, rows (B, ...).
     """
 
     loads: Loads
@@ -35,17 +35,17 @@ class Cases:
 
     @property
     def gone(self) -> np.ndarray:
-        """Shares (B,) of their way that tools have gone."""
+        """Path fractions (B,) that tools have covered."""
         return np.ones(len(self.loads)) if self.share is None else self.share
 
     @property
     def steps(self) -> np.ndarray:
-        """How much time (B,) [s] has passed since the start.
+        """Time (B,) [s] since the start.
 
         Raises
         ------
         InputError
-            Loads that lie before their start.
+            Loads before their start.
         """
         steps = self.loads.times - self.start_time
         if (steps < 0.0).any():
@@ -57,7 +57,7 @@ class Cases:
         return steps
 
     def rows(self, index: slice | np.ndarray) -> Cases:
-        """Return some of the cases."""
+        """Return a subset of the cases."""
         memory = {name: value[index] for name, value in self.memory.items()}
         displacement = None if self.displacement is None else self.displacement[index]
         share = None if self.share is None else self.share[index]
@@ -66,18 +66,18 @@ class Cases:
         return Cases(self.loads.rows(index), self.start_time[index], memory, displacement, share, anew, warm)
 
     def past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """What the term `name` remembers, (B, *shape) float64; zeros if nothing.
+        """Return the memory of the term `name`, (B, *shape) float64; zeros without one.
 
         Raises
         ------
         InputError
-            A memory of another body or discretisation, or of other tools.
+            A memory of another body, discretisation or set of tools.
         """
         whole = (len(self.loads), *shape)
         found = self.memory.get(name)
         if found is not None and found.shape != whole:
             raise InputError(
-                f"the start's memory of {name} has shape {found.shape}, not {whole}: start from an answer of the same "
+                f"the start's memory of {name} has shape {found.shape}, not {whole}: start from a solution of the same "
                 "mesh, element and tools, or from rest."
             )
         return np.zeros(whole) if found is None else np.asarray(found, np.float64)
@@ -85,38 +85,38 @@ class Cases:
 
 @runtime_checkable
 class Term(Protocol):
-    """One summand of the total potential, for b load cases at once.
+    """Summand of the total potential energy, for b load cases at once.
 
-    Arrays are Warp's, on the problem's device, batch last: (3N, b), one column per live load case; N counts the
-    element's nodes. Every `out` is added to, except in `longest_step`, where the least value wins.
+    Arrays are Warp's, on the problem's device, batch last: (3N, b), one column per active load case; N counts the
+    discretisation's nodes. Results are added to `out`, except in `longest_step`, which takes the minimum.
     """
 
     @property
     def name(self) -> str:
-        """Unique in a problem; the key of its memory."""
+        """Name, unique in a problem; key of its memory."""
         ...
 
     @property
     def constant(self) -> bool:
-        """Whether the gradient depends on the cases alone, not on where the nodes are."""
+        """True if the gradient depends on the cases only, not on the displacement."""
         ...
 
     @property
     def passive(self) -> bool:
-        """Whether it only ever resists, as elastic tissue does: no gradient at rest, whatever the cases."""
+        """True if it only resists, as elastic tissue does: zero gradient in the undeformed state, for all cases."""
         ...
 
     @property
     def steep(self) -> bool:
-        """Whether its curvature may be far from what the rest stiffness knows, as where bodies touch."""
+        """True if its tangent may differ strongly from the undeformed stiffness, as in contact."""
         ...
 
     def begin(self, cases: Cases) -> None:
-        """Take the loads, times and memory of every column."""
+        """Set loads, times and memory of every load case."""
         ...
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these columns (k,), in this order: the others have left the batch."""
+        """Keep these load cases (k,), in this order: the others have left the batch."""
         ...
 
     def energy(self, u: wp.array, out: wp.array) -> None:
@@ -124,142 +124,142 @@ class Term(Protocol):
         ...
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """Add the energy's gradient [N] at u (3N, b) to out (3N, b); not finite outside the domain.
+        """Add the gradient of the energy [N] at u (3N, b) to out (3N, b); not finite outside the domain.
 
-        If it is not `constant`: on the device alone, for batches of one width always in the same arrays, as a graphics
-        card replays it.
+        Unless `constant`: computed on the device alone, and with the same arrays for all batches of one width, since
+        CUDA graphs replay it.
         """
         ...
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Remember u (3N, b) for `add_curvature`; definite (b,) int32: 1 asks for positive semi-definite curvature."""
+        """Set the linearisation point u (3N, b); definite (b,) int32: 1 requests a positive semi-definite tangent."""
         ...
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """Add the curvature at the last `linearise` times p (3N, b) [m] to out (3N, b) [N]."""
+        """Add the tangent stiffness at the last `linearise` times p (3N, b) [m] to out (3N, b) [N]."""
         ...
 
     def add_diagonal(self, out: wp.array) -> None:
-        """Add the 3 x 3 diagonal blocks of the curvature at the last `linearise` to out (N, b) of matrices [N/m]."""
+        """Add the 3 x 3 diagonal blocks of the tangent stiffness at the last `linearise` to out (N, b) [N/m]."""
         ...
 
     def rest_curvature(self) -> sp.csc_array | None:
-        """Curvature at rest (3N, 3N) [N/m], assembled, for factorised preconditioners; None leaves the term out.
+        """Return the undeformed stiffness (3N, 3N) [N/m] for factorised preconditioners, or None to be left out.
 
-        A steep term may offer what stands better for where it is going.
+        A steep term may return a better approximation of its later tangent.
         """
         ...
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Lower out (b,) to the longest fraction of du (3N, b) that stays inside the domain; on the device alone."""
+        """Reduce out (b,) to the largest fraction of du (3N, b) that stays inside the domain; on the device alone."""
         ...
 
     def end(self, u: wp.array) -> Any:
-        """What must travel to the next call, rows first (B, ...), or None."""
+        """Return the memory for the next call, rows first (B, ...), or None."""
         ...
 
 
 @runtime_checkable
 class Paced(Term, Protocol):
-    """A Term whose curvature grows as steps in time shrink, which preconditioners must know."""
+    """Term whose stiffness grows as time steps shrink, which preconditioners must include."""
 
     def curvature_at_pace(self, step: float) -> sp.csc_array:
-        """What it adds to the curvature at rest (3N, 3N) [N/m] over a step in time [s]."""
+        """Return the addition to the undeformed stiffness (3N, 3N) [N/m] for a time step [s]."""
         ...
 
 
 @runtime_checkable
 class Remembering(Term, Protocol):
-    """A Term whose memory, if it has any, is of elements or nodes: rows (B, n, width), one for each."""
+    """Term whose memory, if any, belongs to elements or nodes: (B, n, width), one row for each."""
 
     @property
     def marks(self) -> np.ndarray:
-        """Vertices and other numbers (n, k) that tell each row from all others, whatever is cut from the mesh."""
+        """Unique key (n, k) of each row by vertices and other numbers, whatever is cut from the mesh."""
         ...
 
     @property
     def width(self) -> int:
-        """How long a row is."""
+        """Length of a row."""
         ...
 
 
 @runtime_checkable
 class Strained(Term, Protocol):
-    """A Term of elements, which resist more or less where they are strained; H is the displacement gradient."""
+    """Term of elements whose stiffness depends on the strain; H is the displacement gradient."""
 
     @property
     def bounded(self) -> bool:
-        """Whether it is infinite where its elements are inside out."""
+        """True if its energy is infinite for inverted elements."""
         ...
 
     def second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
-        """Its elements (T,), half the second derivative (k, 9, 9, 9) [Pa] of each tissue's stress at rest, and whose.
+        """Return elements (T,), half the second stress derivative (k, 9, 9, 9) [Pa] by tissue, tissue indices (T,).
 
-        Of stress component a by gradient components b and c, row by row; the last (T,) says which tissue.
+        Derivative of stress component a by gradient components b and c, row-major, in the undeformed configuration.
         """
         ...
 
     def elements_on(self, nodes: np.ndarray) -> np.ndarray:
-        """Those elements (k,) that lie wholly on some nodes (N,) bool."""
+        """Return the elements (k,) whose nodes are all marked in `nodes` (N,) bool."""
         ...
 
     def raise_strain(self, some: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
-        """Raise out (N, k) to |H| at the nodes of some elements (m,) int32, in some columns (k,) int32 of u (3N, b)."""
+        """Raise out (N, k) to |H| at the nodes of some elements (m,) int32, for load cases (k,) int32 of u (3N, b)."""
         ...
 
     def add_stiffening(
         self, some: wp.array, u: wp.array, columns: wp.array, least: wp.array, place: wp.array, out: wp.array
     ) -> None:
-        """Add what the curvature at u is more than at rest [N/m], of the same, to out (k, p, p) float64.
+        """Add the tangent stiffness minus the undeformed one [N/m] of these elements to out (k, p, p) float64.
 
-        Only where |H| is more than the `least` (k,) of its column. Rows 3 `place` (N, k) of out are a node's first.
+        Only points with |H| above `least` (k,) count. Rows 3 `place` (N, k) of out are the first of a node.
         """
         ...
 
 
 class Barrier(Term, Protocol):
-    """A Term of bodies that tissue touches: they keep a gap, which a descent may open first; some move, as tools do."""
+    """Term for contact with a gap, which a descent may widen at first; tools may move."""
 
     def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """The longest share (B,), at most 1, of their way that the tools may go at once, the body at u (3N, B) [m]."""
+        """Return the path fraction (B,), at most 1, that tools may move at once, with the body at u (3N, B) [m]."""
         ...
 
     def gaps(self, cases: Cases) -> np.ndarray:
-        """How many times (B,) the gap the tools go on their whole way, or tissue may."""
+        """Return the motion (B,) of the tools on their whole path, or of the tissue, in units of the gap."""
         ...
 
     def buried(self, u: wp.array) -> np.ndarray:
-        """In which columns (b,) a tool is inside the body at u (3N, b) [m], where it may touch none of its surface."""
+        """Return a mask (b,) of load cases with a tool inside the body at u (3N, b) [m], even without contact."""
         ...
 
     def overlaps(self, u: wp.array) -> np.ndarray:
-        """Columns (2, b) bool in which a tool contains touchable surface at u (3N, b) [m], or undeformed bone."""
+        """Return masks (2, b) of load cases where a tool overlaps touchable surface at u (3N, b) [m], or bone."""
         ...
 
     def widen(self, times: float) -> None:
-        """Until the next batch begins the gap is so many times as wide."""
+        """Widen the gap by a factor until the next batch begins."""
         ...
 
     def reaction(self, u: wp.array) -> np.ndarray:
-        """(b, tools, 6): force [N] and moment about its origin [N m] that each tool exerts at u (3N, b) [m]."""
+        """Return force [N] and moment about its origin [N m] that each tool exerts at u (3N, b) [m]: (b, tools, 6)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class BlockFunctions:
-    """What blocks of threads compute of a Barrier, as functions of Warp. All threads of a block must call them.
+    """Warp functions of a Barrier for thread blocks; all threads of a block must call them.
 
     Parameters
     ----------
     stage, near
-        Structs that they take: what the barrier is, and what of it may be felt, which they keep up to date.
+        Structs of their arguments: the barrier, and its near pairs, which they update.
     add_force
-        (x, stage, near, column, thread, out): add its gradient at x (3n, b) to out (3n, b).
+        (x, stage, near, column, thread, out): add the gradient at x (3n, b) to out (3n, b).
     add_matrix
-        (x, stage, near, definite, place, column, thread, out): add its curvature to out (b, 3m, 3m), as
-        `Reduction.curvature`, after `add_force` at the same place.
+        (x, stage, near, definite, place, column, thread, out): add the tangent stiffness to out (b, 3m, 3m), as
+        `Reduction.curvature`, after `add_force` at the same x.
     longest
-        (x, way, stage, near, column, thread): the share of a way, at most 1, that stays inside the domain.
+        (x, way, stage, near, column, thread): return the fraction of a step, at most 1, that stays inside the domain.
     """
 
     stage: Any
@@ -270,63 +270,63 @@ class BlockFunctions:
 
 
 class Reduction(Protocol):
-    """A Barrier of b columns on the n nodes that can be touched: a function of where they go, w (3n, b) [m].
+    """Barrier of b load cases on the n touchable nodes, as a function of their displacement w (3n, b) [m].
 
     Arrays are those of `views.library`, float64.
     """
 
     @property
     def functions(self) -> BlockFunctions:
-        """Its functions for kernels."""
+        """Warp functions for kernels."""
         ...
 
     def stage(self, columns: np.ndarray) -> tuple[Any, Any]:
-        """Return the structs `stage` and `near` for some columns (k,)."""
+        """Return the structs `stage` and `near` for some load cases (k,)."""
         ...
 
     def slope(self, w: Any) -> Any:
-        """Its gradient (3n, b) [N]."""
+        """Return the gradient (3n, b) [N]."""
         ...
 
     def curvature(self, w: Any, place: Any, size: int, definite: np.ndarray) -> Any:
-        """Its curvature (b, 3 size, 3 size) [N/m] between the nodes that have a `place` (n, b) >= 0 in their column.
+        """Return the tangent stiffness (b, 3 size, 3 size) [N/m] between the nodes with `place` (n, b) >= 0.
 
-        Positive semi-definite where it is to be `definite` (b,).
+        It is positive semi-definite for load cases marked `definite` (b,).
         """
         ...
 
 
 @runtime_checkable
 class Local(Barrier, Protocol):
-    """A Barrier that only some nodes can ever feel."""
+    """Barrier that acts on a subset of the nodes only."""
 
     @property
     def touchable(self) -> np.ndarray:
-        """These nodes (n,), ascending."""
+        """Nodes (n,), ascending, on which it can act."""
         ...
 
     def around(self, most: int) -> np.ndarray:
-        """Nodes (k,), so many at most beside the touchable: these first, then the nearest to them."""
+        """Return the touchable nodes, followed by the nearest others up to `most` in total: (k,)."""
         ...
 
     def reduced(self, columns: np.ndarray) -> Reduction | None:
-        """On these nodes alone, in some columns (k,), as it stands now; None where there is nothing to touch.
+        """Return the barrier on these nodes, for some load cases (k,), in its current state; None without contact.
 
-        There is one: it is as whoever asked last wanted it.
+        The object is reused: it reflects the latest call.
         """
         ...
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which (a,) of these n nodes feel it at the last linearisation, of one column, and its curvature there.
+        """Return active nodes (a,) of these n at the last linearisation, of one load case, and their tangent stiffness.
 
-        (3a, 3a) [N/m], positive semi-definite.
+        The matrix (3a, 3a) [N/m] is positive semi-definite.
         """
         ...
 
 
 class Curved(Term, Protocol):
-    """A Term whose curvature can be had as a matrix."""
+    """Term that provides its tangent stiffness as a matrix."""
 
     def curvature(self) -> sp.csc_array:
-        """Assembled K(u) (3N, 3N) [N/m] at the last linearisation, of one column."""
+        """Assemble K(u) (3N, 3N) [N/m] at the last linearisation, of one load case."""
         ...

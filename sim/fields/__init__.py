@@ -1,1 +1,1 @@
-"""A body's displacement on a grid: within it, smoothly round it, and the other way."""
+"""Displacement fields on regular grids: interpolation in a body, smooth extension around it, and inversion."""

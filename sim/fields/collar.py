@@ -1,4 +1,4 @@
-"""What a body's field goes on to just outside its surface."""
+"""Extrapolation of a body's field to points just outside its surface."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from scipy.spatial import KDTree
 from ..geometry.closest_point import find_closest_points
 from ..geometry.tetmesh import find_single_faces
 
-# Triangles, of which one is the closest, and points that are looked at together.
-NEAR, TOGETHER = 16, 4096
-# Of the surface's value, by which a point outside may differ: what is at rest is left at rest.
-SHARE, TINY = 0.5, 1e-30
+NEAR = 16  # candidate triangles for the closest point
+TOGETHER = 4096  # points per block
+SHARE = 0.5  # maximum extrapolated change, as a fraction of the surface value: zero stays zero
+TINY = 1e-30  # guard against division by 0
 
 
 def extrapolate_beyond_surface(
     nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Values (n, 3) at points (n, 3) [m] near the surface of tetrahedra (T, 4), from those at vertices (V, 3) of each.
+    """Return values (n, 3) at points (n, 3) [m] near the surface of tetrahedra (T, 4), from values at vertices (V, 3).
 
-    A point has the value of the closest place of the surface, and goes on from there as the field does inside. That is
-    by the mean gradient of the tetrahedra round each vertex, and at most by half of the value.
+    A point takes the value of the closest surface point plus a linear extrapolation. The gradient is
+    the mean over the tetrahedra around each vertex; the change is limited to half of the value.
     """
     surface = find_single_faces(tets)
     corners, slopes = nodes[surface], compute_vertex_gradients(nodes, tets, values)
@@ -40,7 +40,7 @@ def extrapolate_beyond_surface(
 
 
 def compute_vertex_gradients(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Gradients (V, 3, 3) of values (V, 3): the mean of the tetrahedra round each vertex, by volume."""
+    """Compute gradients (V, 3, 3) of values (V, 3): volume-weighted means over the tetrahedra around each vertex."""
     corners, at = nodes[tets], values[tets]
     edges = corners[:, 1:] - corners[:, :1]
     gradients = np.linalg.solve(edges, at[:, 1:] - at[:, :1]).transpose(0, 2, 1)

@@ -1,19 +1,19 @@
-"""A field beyond where it is known: it goes on as at the nearest place where it is, and fades."""
+"""Extension of a field outside its domain: nearest known value, faded to zero."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
 
-# Times that what was filled in is smoothed: where two places are equally near, it would jump.
+# Smoothing iterations on filled nodes, against jumps where two known nodes are equally near.
 SWEEPS = 6
 
 
 def extend_field(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
-    """Return the field (3, I, J, K) with nodes that are not known (I, J, K) filled in; zero from `reach` [nodes] on.
+    """Return the field (3, I, J, K) with nodes outside the mask `known` (I, J, K) filled; zero beyond `reach` [nodes].
 
-    They have the nearest known value, the less of it the farther away it is, and are smoothed. No value exceeds those
-    that are known.
+    Filled nodes take the nearest known value, scaled down with distance, and are smoothed. Their values do not exceed
+    the known ones.
     """
     filled = np.where(known, field, np.float32(0.0))
     moving = np.argwhere(filled.any(axis=0))
@@ -27,10 +27,10 @@ def extend_field(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarr
 
 
 def _fill(field: np.ndarray, known: np.ndarray, reach: float) -> None:
-    """As `extend_field`, in place, where what is known and moves is farther than that from the edge."""
+    """Fill as `extend_field`, in place; known nonzero nodes must be farther than `reach` from the edge."""
     nearest = np.empty((3, *known.shape), np.int32)
     ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True, indices=nearest)
-    square = np.zeros(known.shape, np.int32)  # of the distance; SciPy's takes twice the time and memory
+    square = np.zeros(known.shape, np.int32)  # squared distance; SciPy's distances take twice the time and memory
     for at, side in zip(nearest, np.indices(known.shape, np.int32, sparse=True), strict=True):
         step = at - side
         square += step * step
@@ -44,9 +44,9 @@ def _fill(field: np.ndarray, known: np.ndarray, reach: float) -> None:
 
 
 def smooth(field: np.ndarray, free: np.ndarray, sweeps: int) -> None:
-    """Replace free nodes (I, J, K), but those at the edge, of a field (3, I, J, K) by the mean of their six neighbours.
+    """Replace nodes marked `free` (I, J, K), except at the edge, by the mean of their six neighbours, `sweeps` times.
 
-    It is done in place, so many times.
+    The field (3, I, J, K) is changed in place.
     """
     middle = slice(1, -1)
     inner = free[1:-1, 1:-1, 1:-1]

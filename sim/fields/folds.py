@@ -1,4 +1,4 @@
-"""Whether a field folds space, and how folds are undone."""
+"""Detection and removal of folds (negative Jacobian determinants) in displacement fields."""
 
 from __future__ import annotations
 
@@ -8,30 +8,33 @@ from scipy.optimize import minimize
 
 from .extension import smooth
 
-# Cells so much compressed or worse are mended, until they have so much of their volume.
-TIGHT, WANTED = 0.05, 0.15
-# Nodes so near to such a cell may move; so often it is tried, in so many steps each.
-ROUND, TIMES, STEPS = 2, 12, 200
-# From this turn on folds are smoothed so often first: a minimum was found in which they stay.
-STUCK, SWEEPS = 4, 3
-# A move of one node by one spacing costs as much as so much lost volume of one cell: of a body, its collar, beyond.
-STIFF, COLLAR, SOFT = 1.0, 0.1, 1e-4
-# A cell whose edges change by less has no corner that folds.
+TIGHT = 0.05  # Jacobian determinant below which a cell is corrected
+WANTED = 0.15  # target determinant of the correction
+ROUND = 2  # margin of movable nodes around such a cell
+TIMES = 12  # maximum attempts
+STEPS = 200  # maximum iterations per attempt
+STUCK = 4  # attempt from which folds are smoothed first, to leave local minima
+SWEEPS = 3  # smoothing iterations of such an attempt
+# Weights of a node's squared move [spacings] relative to a cell's squared volume deficit.
+STIFF = 1.0  # in the body
+COLLAR = 0.1  # in the collar
+SOFT = 1e-4  # elsewhere
+# Relative edge change below which no corner of a cell can fold.
 GENTLE = 0.15
-# Slices that are looked at together: bounds the memory that it takes.
+# Slices per block, to limit memory.
 TOGETHER = 4
-# A cell's corners, and from each the three nodes along its edges, in the order that keeps the sign of a volume.
+# Corners of a cell, and for each corner its three edge neighbours, ordered for a volume of consistent sign.
 CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 ALONG = np.array([[corner, *np.where(np.eye(3, dtype=int), 1 - corner, corner)] for corner in CORNERS])
 SIGNS = (1.0 - 2.0 * CORNERS).prod(axis=1)
 
 
 def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
-    """Least determinants (I - 1, J - 1, K - 1) of 1 + the gradient of a field (3, I, J, K) [m], cells of a spacing [m].
+    """Return least determinants (I - 1, J - 1, K - 1) of 1 + gradient of a field (3, I, J, K) [m], at a `spacing` [m].
 
-    A cell has eight corners; at each, gradients are differences along the three edges that meet there. These are the
-    gradients of what is read between nodes. Below 0 the field folds there. Of cells that hardly change one corner is
-    looked at.
+    At each of a cell's eight corners, gradients are differences along its three edges, which are
+    the gradients of trilinear interpolation. The field folds where the determinant is negative. For cells with small
+    deformation, one corner is evaluated.
     """
     found = np.empty(tuple(side - 1 for side in field.shape[1:]), np.float32)
     for first in range(0, len(found), TOGETHER):
@@ -62,23 +65,23 @@ def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def find_corner_nodes(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Numbers (n, 8, 4) of nodes in a grid of a shape: each corner of cells (n, 3), and the ends of its edges."""
+    """Return node numbers (n, 8, 4) in a grid: each corner of cells (n, 3), and the ends of its edges."""
     return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(cells[:, None, None] + ALONG, -1, 0)), shape))
 
 
 def compute_corner_volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Volumes (n, 8) at the corners (n, 8, 4) of cells, from the places (N, 3) of nodes in units of the spacing."""
+    """Return signed volumes (n, 8) at the corners (n, 8, 4) of cells, from node positions (N, 3) [spacings]."""
     at = places[corners]
     return SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
 
 
 def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
-    """Change a field (3, I, J, K) [m] in place where it folds, or nearly: least at nodes inside a body (I, J, K).
+    """Remove folds of a field (3, I, J, K) [m] in place, and return the least determinant that remains.
 
-    Nodes of the collar round it (I, J, K) come before those inside, and after all others: between these and the body
-    lies its surface. What corners of cells lack in volume is made small, in squares. So do Escobar et al. with meshes
-    (Simultaneous untangling and smoothing of tetrahedral meshes, 2003). Folds that stay are smoothed, and tried again:
-    there the body itself may fold. Returns the least determinant that is left.
+    Nodes inside the body (I, J, K) move least, then those of the collar (I, J, K) around it, since the body's surface
+    lies between these and the rest. The squared volume deficit of cell corners is minimised, as Escobar et al. do
+    for meshes (Simultaneous untangling and smoothing of tetrahedral meshes, 2003). Persistent folds are smoothed and
+    tried again; there the body itself may fold.
     """
     found = compute_jacobians(field, spacing)
     for turn in range(TIMES):
@@ -102,7 +105,7 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
 
 
 def _mend(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float) -> None:
-    """Move nodes (I, J, K) that are near of a part of a field (3, I, J, K) [m] until its cells have volume."""
+    """Move nodes marked `near` (I, J, K) of a field part (3, I, J, K) [m] until its cells have positive volume."""
     shape = near.shape
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
     cells = np.argwhere(ndimage.maximum_filter(near, 2, origin=-1)[:-1, :-1, :-1])

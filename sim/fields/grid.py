@@ -1,4 +1,4 @@
-"""Regular grids along the axes of the patient's space."""
+"""Regular grid along the patient's coordinate axes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy import ndimage
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Nodes at `origin` (3,) + `spacing` (i, j, k) [m], RAS, for i, j, k below `shape`."""
+    """Grid of nodes `origin` (3,) + `spacing` (i, j, k) [m], RAS, for i, j, k below `shape`."""
 
     origin: np.ndarray
     spacing: float
@@ -18,21 +18,21 @@ class Grid:
 
     @property
     def affine(self) -> np.ndarray:
-        """From indices to metres (4, 4)."""
+        """Affine (4, 4) from indices to metres."""
         affine = np.diag([self.spacing] * 3 + [1.0])
         affine[:3, 3] = self.origin
         return affine
 
     def index(self, points: np.ndarray) -> np.ndarray:
-        """Return indices (..., 3), not whole, of points (..., 3) [m]."""
+        """Return fractional indices (..., 3) of points (..., 3) [m]."""
         return (points - self.origin) / self.spacing
 
     def points(self, numbers: np.ndarray) -> np.ndarray:
-        """Places (n, 3) [m] of nodes by their numbers (n,) in the flat grid."""
+        """Return the positions (n, 3) [m] of nodes by their numbers (n,) in the flat grid."""
         return self.origin + self.spacing * np.stack(np.unravel_index(numbers, self.shape), axis=-1)
 
     def corners(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (n, 8) of the nodes of the cells in which points (n, 3) [m] lie, and their weights (n, 8)."""
+        """Return node numbers (n, 8) of the cells that contain points (n, 3) [m], and trilinear weights (n, 8)."""
         index = self.index(points)
         first = np.clip(np.floor(index).astype(int), 0, np.array(self.shape) - 2)
         share = index - first
@@ -43,15 +43,15 @@ class Grid:
         return numbers, weights.reshape(-1, 8)
 
     def read(self, field: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return a field (3, I, J, K) at points (n, 3) [m]: linear between nodes, and zero (n, 3) outside."""
+        """Interpolate a field (3, I, J, K) at points (n, 3) [m], trilinearly; zero outside: (n, 3)."""
         index = self.index(points).T
         return np.stack([ndimage.map_coordinates(part, index, order=1) for part in field], axis=-1)
 
 
 def build_grid_around(points: np.ndarray, spacing: float, margin: float) -> Grid:
-    """Return the grid of a spacing [m] round points (n, 3) [m], with a margin [m].
+    """Return the grid of a spacing [m] around points (n, 3) [m], with a margin [m].
 
-    Nodes lie at multiples of the spacing.
+    Nodes are at multiples of the spacing.
     """
     low = np.floor((points.min(axis=0) - margin) / spacing)
     high = np.ceil((points.max(axis=0) + margin) / spacing)

@@ -1,4 +1,4 @@
-"""What lies between the vertices of tetrahedra, at the nodes of a grid."""
+"""Interpolation of vertex values in tetrahedra at the nodes of a grid."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 from .grid import Grid
 
-# Lines of nodes that are looked at together: bounds the memory that it takes.
+# Grid lines per block, to limit memory.
 TOGETHER = 500_000
-# A node so little outside [spacings] is inside: nodes on a face belong to both sides.
+# Tolerance of the inside test [spacings], so that nodes on a face belong to both sides.
 ROUNDING = 1e-7
 
 
 class _Hits(NamedTuple):
-    """Nodes in tetrahedra: their number (n,), the tetrahedron (n,), and weights (n, 3) of its last three corners."""
+    """Nodes in tetrahedra: node number (n,), tetrahedron (n,), and weights (n, 3) of its last three corners."""
 
     node: np.ndarray
     tet: np.ndarray
@@ -28,7 +28,7 @@ def interpolate_in_tetrahedra(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate values (V, 3) at vertices `nodes` (V, 3) [m] of tetrahedra (T, 4), linearly within each.
 
-    Returns the field (3, I, J, K) in float32, zero outside, and which nodes are inside (I, J, K).
+    Returns the field (3, I, J, K) in float32, zero outside, and a mask (I, J, K) of nodes inside.
     """
     count = int(np.prod(grid.shape))
     field, inside = np.zeros((3, count), np.float32), np.zeros(count, bool)
@@ -40,9 +40,9 @@ def interpolate_in_tetrahedra(
 
 
 def _lines(shape: tuple[int, int, int], corners: np.ndarray) -> Iterator[_Hits]:
-    """Nodes in tetrahedra of corners (T, 4, 3), in indices: line by line along the last axis, many lines together."""
+    """Yield the grid nodes in tetrahedra with corners (T, 4, 3) [indices], in blocks of lines along the last axis."""
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
-    gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)  # of the weights
+    gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)  # barycentric
     slack = ROUNDING * np.linalg.norm(gradients, axis=2)
     low = np.maximum(np.ceil(corners.min(axis=1) - ROUNDING), 0).astype(np.int64)
     high = np.minimum(np.floor(corners.max(axis=1) + ROUNDING), np.array(shape) - 1).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The inverse of a field on a grid, where no tetrahedra say what it is."""
+"""Inverse of a displacement field on a grid, outside the tetrahedra."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ import numpy as np
 
 from .grid import Grid
 
-# The inverse is found so exactly [m], in so many steps, none of them longer than so many nodes.
-EXACT, STEPS, LONGEST = 1e-6, 25, 2.0
-# A fixed point whose steps do not get shorter by this factor is looked for by Newton's method.
+EXACT = 1e-6  # tolerance [m]
+STEPS = 25  # maximum iterations
+LONGEST = 2.0  # maximum Newton step [spacings]
+# Required contraction of fixed-point steps; points that miss it use Newton's method.
 SHORTER = 0.6
 
 
 def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Find d (n, 3) [m] with d = -forward(y + d) at points y (n, 3) [m], from a guess (n, 3).
+    """Solve d = -forward(y + d) for d (n, 3) [m] at points y (n, 3) [m], from a guess (n, 3).
 
-    Most are found as the fixed point of that equation. It is no way to all: where tissue is sheared by more than 45
-    degrees, each step leads farther away. There Newton's method goes on.
+    Most points converge by fixed-point iteration. It diverges where tissue is sheared by more than 45
+    degrees; these points use Newton's method.
     """
     found, going, left = guess.copy(), np.arange(len(points)), []
     last = np.full(len(points), np.inf)
@@ -35,7 +36,7 @@ def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.
 
 
 def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """As `invert_field`, by Newton's method; of a point that is not found, the best try comes back."""
+    """Invert as `invert_field`, by Newton's method; a point that does not converge returns its best iterate."""
     best, least = guess.copy(), np.full(len(points), np.inf)
     trial, going, share = guess.copy(), np.arange(len(points)), np.ones(len(points))
     step = np.zeros_like(guess)
@@ -45,7 +46,7 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
         size = np.linalg.norm(rest, axis=1)
         good = size < least[going]
         best[going[good]], least[going[good]] = trial[going[good]], size[good]
-        share[going] = np.where(good, 1.0, 0.5 * share[going])  # half of a step that led away
+        share[going] = np.where(good, 1.0, 0.5 * share[going])  # halve a step that increased the residual
         fresh = going[good]
         step[fresh] = _newton(grid, forward, points[fresh] + best[fresh], rest[good])
         going = going[least[going] > EXACT]
@@ -56,7 +57,7 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
 
 
 def _newton(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Newton's step (n, 3) [m] at places (n, 3) [m] that are off by `rest` (n, 3)."""
+    """Return the Newton step (n, 3) [m] at places (n, 3) [m] with residuals `rest` (n, 3)."""
     half = 0.25 * grid.spacing
     columns = []
     for axis in np.eye(3):

@@ -1,4 +1,4 @@
-"""Values of a grid between which a body's field is read with the least error, where sampling it is not exact enough."""
+"""L2 projection of a body's field onto a grid, where sampling at the nodes is not accurate enough."""
 
 from __future__ import annotations
 
@@ -15,23 +15,26 @@ from scipy.sparse.linalg import cg
 from ..geometry.tetmesh import find_single_faces
 from .grid import Grid
 
-# Tetrahedra in which the sampled field is off by more [m] are fitted.
+# Interpolation error above which tetrahedra are fitted [m].
 ENOUGH = 2e-5
-# Points along a tetrahedron's longest edge for each node of the grid, to find those and to fit them; and the most.
-LOOKED, FITTED, MOST = 1.0, 1.5, 10
-# The same along a triangle's edge; the square of the error on a cell's face of surface counts as in so many cells.
-ON_SURFACE, SURFACE = 2.0, 10.0
-# Points that are looked at together: bounds the memory that it takes.
+LOOKED = 1.0  # points per grid spacing along a tetrahedron's longest edge, in the error test
+FITTED = 1.5  # the same in the fit
+MOST = 10  # maximum subdivisions of an edge
+ON_SURFACE = 2.0  # points per grid spacing along a surface triangle's longest edge
+SURFACE = 10.0  # weight of a cell face of surface, relative to a cell's volume
+# Points per block, to limit memory.
 TOGETHER = 200_000
-# Against the square of the error: of a change, of a change from node to node, of a bend outside the body.
-SMALL, EVEN, STRAIGHT = 1e-3, 1e-2, 3e-3
-# The equations are solved so exactly, in so many steps at most.
-EXACT, STEPS = 1e-3, 300
+# Penalty weights relative to the squared error.
+SMALL = 1e-3  # change of the field
+EVEN = 1e-2  # differences of the change between nodes
+STRAIGHT = 3e-3  # second differences of the field in the collar
+EXACT = 1e-3  # relative tolerance of the linear solver
+STEPS = 300  # maximum iterations of the linear solver
 
 
 @dataclass(frozen=True, eq=False)
 class NodalField:
-    """A field (V, 3) [m] of vertices `nodes` (V, 3) [m], linear in each of the tetrahedra (T, 4)."""
+    """Field (V, 3) [m] at vertices `nodes` (V, 3) [m], linear in each of the tetrahedra (T, 4)."""
 
     nodes: np.ndarray
     tets: np.ndarray
@@ -39,7 +42,7 @@ class NodalField:
 
 
 class _Samples(NamedTuple):
-    """Points (n, 3) [m]: their values (n, 3), their weights (n,), and their tetrahedra or triangles (n,)."""
+    """Sample points (n, 3) [m], their values (n, 3), weights (n,), and tetrahedra or triangles (n,)."""
 
     points: np.ndarray
     values: np.ndarray
@@ -48,11 +51,11 @@ class _Samples(NamedTuple):
 
 
 def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: NodalField) -> None:
-    """Change a field (3, I, J, K), sampled inside a body and in a collar (I, J, K) round it, to fit it between nodes.
+    """Fit a field (3, I, J, K), sampled in a body (mask `inside`) and its `collar`, to the body's field between nodes.
 
-    It is done in place, where sampling is off by more than 0.02 mm, and in the collar where it moves. The square of the
-    error is least over points of the tetrahedra and of their surface (a projection in L2). There the field has a kink,
-    and what lies outside is free to bear it. A small weight keeps changes small and even, and the field straight in
+    Changed in place are nodes at interpolation errors above 0.02 mm, in the collar only where it moves. The squared
+    error is minimised over points of the tetrahedra and of their surface (L2 projection). The field has a kink at the
+    surface, which nodes outside represent. Small weights keep changes small and even, and the field straight in
     the collar.
     """
     flat = field.reshape(3, -1)
@@ -87,12 +90,12 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
 
 
 def _read(flat: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return a flat field (3, N) between nodes: (n, 3)."""
+    """Interpolate a flat field (3, N) by node numbers and weights: (n, 3)."""
     return np.stack([np.einsum("nc,nc->n", part[numbers], weights) for part in flat], axis=-1)
 
 
 def _samples(grid: Grid, body: NodalField, which: np.ndarray, density: float) -> Iterator[_Samples]:
-    """Points in some tetrahedra, so many to a node's distance along the longest edge; by their share of a cell."""
+    """Yield `density` points per grid spacing along the longest edge of some tetrahedra, weighted by volume [cells]."""
     corners = body.nodes[body.tets[which]]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / (6.0 * grid.spacing**3)
     for some in _lattices(grid, body, body.tets[which], volumes, density):
@@ -100,7 +103,7 @@ def _samples(grid: Grid, body: NodalField, which: np.ndarray, density: float) ->
 
 
 def _on_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
-    """Points of the surface's triangles of which a vertex is touched (V,)."""
+    """Yield points of the surface triangles with a vertex in `touched` (V,)."""
     faces = find_single_faces(body.tets)
     faces = faces[touched[faces].any(axis=1)]
     a, b, c = body.nodes[faces].transpose(1, 0, 2)
@@ -111,7 +114,7 @@ def _on_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_
 def _lattices(
     grid: Grid, body: NodalField, simplices: np.ndarray, weights: np.ndarray, density: float
 ) -> Iterator[_Samples]:
-    """Points of simplices (n, c) of vertices, each of a lattice, evenly; they share the weights (n,)."""
+    """Yield regular lattice points of simplices (n, c) of vertices; the points of one share its weight (n,)."""
     corners = body.nodes[simplices]
     size = simplices.shape[1]
     first, second = np.triu_indices(size, 1)
@@ -132,14 +135,14 @@ def _lattices(
 
 @cache
 def _lattice(order: int, size: int) -> np.ndarray:
-    """Weights (n, size) of a simplex's corners at the points that cut its edges into so many parts."""
+    """Return barycentric weights (n, size) of the lattice points that divide a simplex's edges into `order` parts."""
     parts = np.indices((order + 1,) * (size - 1)).reshape(size - 1, -1)
     weights = np.stack([*parts, order - parts.sum(axis=0)], axis=1)
     return weights[weights[:, -1] >= 0] / order
 
 
 def _rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> sparse.csr_matrix:
-    """Return sums (n, free) of nodes (n, m) by weights (n, m), those that are free."""
+    """Build the sparse matrix (n, free) that sums nodes (n, m) with weights (n, m), without fixed nodes."""
     columns = column[numbers]
     free = columns >= 0
     row = np.repeat(np.arange(len(numbers)), free.sum(axis=1))
@@ -150,7 +153,7 @@ def _rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> spars
 def _penalties(
     grid: Grid, flat: np.ndarray, nodes: np.ndarray, column: np.ndarray, inside: np.ndarray, collar: np.ndarray
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """What keeps changes small and even, and the field straight where it leaves the body: matrix, right side (n, 3)."""
+    """Return matrix and right side (n, 3) of the penalties on size, unevenness and curvature."""
     pairs, bends = [], []
     for index, side, stride in zip(
         np.unravel_index(nodes, grid.shape), grid.shape, (grid.shape[1] * grid.shape[2], grid.shape[2], 1), strict=True

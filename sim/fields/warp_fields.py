@@ -1,4 +1,4 @@
-"""The displacement of a body and of all round it, both ways, on a grid."""
+"""Displacement fields of a body and its surroundings on a grid, forward and backward."""
 
 from __future__ import annotations
 
@@ -18,33 +18,36 @@ from .in_tetrahedra import interpolate_in_tetrahedra
 from .inversion import invert_field
 from .projection import NodalField, project
 
-# Beyond the body the field fades to zero within so much [m], and so many times what the body moves by.
-LEAST_REACH, REACHES = 5e-3, 2.0
-# Nodes from there to the edge of the grid; what moves less [m] has no inverse to look for.
-EDGE, STILL, TINY = 3, 1e-5, 1e-30
-FAINT, SHARE = 2e-5, 2.5e-3
-"""What moves by less than this [m], or this share of the most, is left where it is; twice as much is not touched."""
+LEAST_REACH = 5e-3  # constant part of the distance over which the field fades to zero [m]
+REACHES = 2.0  # variable part of that distance [maximum displacements]
+EDGE = 3  # margin of the grid beyond that distance [nodes]
+STILL = 1e-5  # displacement below which no inverse is computed [m]
+TINY = 1e-30  # guard against division by 0
+FAINT = 2e-5
+"""Displacement below which it is set to 0 [m]; above twice the limit it is unchanged."""
+SHARE = 2.5e-3
+"""Maximum of that limit, as a fraction of the maximum displacement."""
 
 
 @dataclass(frozen=True, eq=False)
 class WarpFields:
-    """How tissue went, on a grid.
+    """Forward and backward displacement fields of tissue on a grid.
 
     Parameters
     ----------
     grid
-        It holds the body at rest and deformed, with a margin.
+        Grid that contains the undeformed and the deformed body, with a margin.
     forward
-        (3, I, J, K) [m]: what was at a node x at rest is now at x + forward(x). Also called *modelling*.
+        (3, I, J, K) [m]: undeformed position x moves to x + forward(x). Also called *modelling*.
     backward
-        (3, I, J, K) [m]: what is at a node y now was at y + backward(y). Also called *resampling*.
+        (3, I, J, K) [m]: deformed position y was at y + backward(y). Also called *resampling*.
     gone
-        (I, J, K) bool: nodes at rest in tissue that was taken away.
+        (I, J, K) bool: nodes in resected tissue, in the undeformed configuration.
     least
-        The least determinants of the two fields' gradients, and the least volume of a tetrahedron as a share of that
-        at rest. Where one is not above 0 something folds: the fields, or the body and not they.
+        Least Jacobian determinants of the two fields, and least relative volume of a tetrahedron.
+        If one is not above 0, the fields fold, or only the body does.
     reach
-        How far from the body the field fades to zero [m].
+        Distance from the body over which the field fades to zero [m].
     """
 
     grid: Grid
@@ -56,29 +59,29 @@ class WarpFields:
 
     @property
     def folds(self) -> bool:
-        """Whether one of the fields folds."""
+        """True if one of the fields folds."""
         return not min(self.least[:2]) > 0.0
 
 
 def compute_reach(displacement: np.ndarray) -> float:
-    """How far from the body the field of displacements (..., 3) [m] fades to zero [m]."""
+    """Return the distance [m] over which the field of displacements (..., 3) [m] fades to zero."""
     return LEAST_REACH + REACHES * float(np.linalg.norm(displacement, axis=-1).max())
 
 
 def compute_faint_threshold(displacement: np.ndarray) -> float:
-    """What is too faint to count of displacements (..., 3) [m], so that the grid need not hold all of a body [m]."""
+    """Return the limit [m] below which displacements (..., 3) [m] are neglected, so that the grid can be smaller."""
     return min(FAINT, SHARE * float(np.linalg.norm(displacement, axis=-1).max()))
 
 
 def remove_faint(displacement: np.ndarray) -> np.ndarray:
-    """Displacements (..., 3) [m] without those that are too faint to count."""
+    """Return displacements (..., 3) [m] with negligible ones set to zero."""
     size = np.linalg.norm(displacement, axis=-1, keepdims=True)
     share = np.clip(size / max(compute_faint_threshold(displacement), TINY) - 1.0, 0.0, 1.0)
     return displacement * (share * share * (3.0 - 2.0 * share))
 
 
 def warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Grid:
-    """The grid of a spacing [m] for what moves of a body by displacements (B, V, 3) [m], and for all round that."""
+    """Build the grid with a spacing [m] around the part of a body that displacements (B, V, 3) [m] move."""
     mesh = anatomy.mesh
     moves = np.asarray(displacements.any(axis=(0, 2)))
     tets, faces = (of[moves[of].any(axis=1)] for of in (mesh.tets, mesh.surface))
@@ -91,15 +94,15 @@ def warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Gr
 
 
 def find_collar(inside: np.ndarray) -> np.ndarray:
-    """Nodes (I, J, K) outside a body that are corners of its surface's cells, by the nodes inside."""
+    """Return the nodes (I, J, K) outside a body that are neighbours of nodes inside."""
     return np.asarray(ndimage.maximum_filter(inside, 3) & ~inside)
 
 
 def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the field (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
+    """Return the field (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian determinant.
 
-    It is linear in each tetrahedron, and fitted where sampling that is not exact between the grid's nodes. Just outside
-    it goes on as it is, so that what is read there is right up to the surface. From there it fades to zero.
+    It is linear in each tetrahedron, and fitted where sampling is not accurate between grid nodes. It is
+    extrapolated just outside, to be accurate up to the surface, and then fades to zero.
     """
     nodes, tets = body.mesh.nodes, body.mesh.tets
     field, inside = interpolate_in_tetrahedra(grid, nodes, tets, displacement)
@@ -114,9 +117,9 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
 def invert_on_grid(
     grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the inverse (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian.
+    """Return the inverse (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian determinant.
 
-    Within the deformed body it is linear in each tetrahedron, and fitted. Outside it is the forward field's inverse.
+    In the deformed body it is linear in each tetrahedron, and fitted. Outside it is the forward field's inverse.
     """
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
     field, inside = interpolate_in_tetrahedra(grid, now, tets, -displacement)
@@ -136,10 +139,10 @@ def warp_fields(
     left: Anatomy | None = None,
     made: Callable[[], object] = lambda: None,
 ) -> WarpFields:
-    """Return the fields of a displacement (V, 3) [m] on a grid of a spacing [m].
+    """Return the fields of a displacement (V, 3) [m] on a grid with a spacing [m].
 
-    `left` is what is left of a body that was cut. Round a body nothing is known: there the fields fade. `made` is
-    called when either field is made.
+    `left` is the remaining body after a resection. Outside the body the fields fade. `made` is
+    called after each of the two fields.
     """
     displacement = remove_faint(displacement)
     body, grid = left or anatomy, warp_grid(anatomy, displacement[None], spacing)

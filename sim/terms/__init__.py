@@ -1,1 +1,1 @@
-"""One file per effect and law: its Warp functions, kernels and host class."""
+"""Energy terms, one file per effect or material law: Warp functions, kernels and host class."""

@@ -1,4 +1,4 @@
-"""Forces that keep size and direction while the tissue moves: nodal forces, and tractions on a footprint."""
+"""Dead loads, constant in magnitude and direction under deformation: nodal forces, and tractions on a footprint."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from ..runtime.device import Device, forward_kernel
 
 @dataclass(frozen=True)
 class DeadForceKernels:
-    """Arithmetic on the loaded nodes in one scalar type."""
+    """Kernels on loaded nodes for one scalar type."""
 
     spread: wp.Kernel
     subtract: wp.Kernel
@@ -25,7 +25,7 @@ class DeadForceKernels:
 
 @cache
 def build_kernels(device: Device) -> DeadForceKernels:
-    """Kernels of a device's scalar type."""
+    """Build the kernels for a device's scalar type."""
     scalar = device.scalar
     chunk = CHUNK
 
@@ -37,7 +37,7 @@ def build_kernels(device: Device) -> DeadForceKernels:
         # outputs
         force: wp.array2d(dtype=scalar),
     ):
-        """f_(3i+k)c += w_ic / (sum of w)_c F_ck."""
+        """Distribute tool forces F by footprint weights w: f_(3i+k)c += w_ic / (sum of w)_c F_ck."""
         i, c = wp.tid()
         for k in range(3):
             force[3 * i + k, c] += scalar(weight[i, c] / sums[c][0] * whole[c, k])
@@ -49,7 +49,7 @@ def build_kernels(device: Device) -> DeadForceKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """g -= f."""
+        """Subtract the loads from the gradient: g -= f."""
         i, c = wp.tid()
         for k in range(3):
             out[3 * nodes[i] + k, c] -= force[3 * i + k, c]
@@ -62,7 +62,7 @@ def build_kernels(device: Device) -> DeadForceKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E_c -= sum over a chunk of nodes of f . u, in double precision."""
+        """Subtract the work in double precision: E_c -= sum over a chunk of nodes of f . u."""
         block, c = wp.tid()
         total = wp.float64(0.0)
         for i in range(block * chunk, wp.min((block + 1) * chunk, nodes.shape[0])):
@@ -75,14 +75,14 @@ def build_kernels(device: Device) -> DeadForceKernels:
 
 @dataclass(frozen=True, eq=False)
 class Forces:
-    """Forces on k nodes, on the device: nodes (k,) int32, each once, and force (3k, b) [N]."""
+    """Nodal forces on the device: nodes (k,) int32, unique, and force (3k, b) [N]."""
 
     nodes: wp.array
     force: wp.array
 
 
 def build_pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> Forces | None:
-    """Nodal forces of pushing tools on a body's surface; None without any.
+    """Return the nodal forces of pushing tools on a body's surface; None if no tool pushes.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def build_pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> F
 
 
 def build_nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | None:
-    """Return forces given at a mesh's own vertices, of those that carry any; None without any.
+    """Return the forces prescribed at mesh vertices, on loaded vertices only; None if there are none.
 
     Raises
     ------
@@ -118,16 +118,16 @@ def build_nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | 
 
 
 class DeadForce:
-    """A Term: E = -f . u, with f assembled from the loads once a batch.
+    """Term for dead loads: E = -f . u, with f assembled from the loads once per batch.
 
     Parameters
     ----------
     name
-        Unique in its problem.
+        Name, unique in the problem.
     assemble
-        Loads -> `Forces`, or None where nothing acts: then nothing is launched.
+        Function Loads -> `Forces`, or None without forces: then no kernel is launched.
     device
-        Where its arrays live.
+        Device of the arrays.
     """
 
     constant, passive, steep = True, False, False
@@ -139,46 +139,46 @@ class DeadForce:
         self._forces: Forces | None = None
 
     def begin(self, cases: Cases) -> None:
-        """Assemble the nodal forces of every column."""
+        """Assemble the nodal forces of every load case."""
         self.take(self._assemble(cases.loads))
 
     def take(self, forces: Forces | None) -> None:
-        """These forces act on the batch."""
+        """Set the forces of the batch."""
         self._forces = forces
 
     def keep(self, columns: np.ndarray) -> None:
-        """Drop the forces of the others."""
+        """Keep the forces of these load cases only."""
         if self._forces is not None:
             self._forces = Forces(self._forces.nodes, gather_columns(self._device, self._forces.force, columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E -= f . u."""
+        """Add the energy: E -= f . u."""
         if self._forces is not None:
             dim = (-(-len(self._forces.nodes) // CHUNK), u.shape[1])
             inputs = [self._forces.nodes, self._forces.force, u]
             self._device.launch(build_kernels(self._device).subtract_work, dim, inputs, [out])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """g -= f."""
+        """Add the gradient: g -= f."""
         if self._forces is not None:
             dim = (len(self._forces.nodes), u.shape[1])
             inputs = [self._forces.nodes, self._forces.force]
             self._device.launch(build_kernels(self._device).subtract, dim, inputs, [out])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """A dead force has no curvature."""
+        """Do nothing: a dead load has no tangent stiffness."""
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """A dead force has no curvature."""
+        """Do nothing: a dead load has no tangent stiffness."""
 
     def add_diagonal(self, out: wp.array) -> None:
-        """A dead force has no curvature."""
+        """Do nothing: a dead load has no tangent stiffness."""
 
     def rest_curvature(self) -> None:
-        """A dead force has no curvature."""
+        """Return None: a dead load has no tangent stiffness."""
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """A dead force allows every step."""
+        """Do nothing: a dead load does not limit the step."""
 
     def end(self, u: wp.array) -> None:
-        """A dead force remembers nothing."""
+        """Return None: a dead load has no history."""

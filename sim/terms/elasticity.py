@@ -1,4 +1,4 @@
-"""Elastic energy of one region: the integral of psi(H) over the rest volume, for any law and element."""
+"""Elastic energy of one region: integral of psi(H) over the undeformed volume, for any law and element."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,13 +19,13 @@ from .element_kernels import build_kernels, build_spreading_kernel
 from .laws.law import Law
 from .state_source import StateSource
 
-# The step of a difference in the displacement gradient.
+# Step of finite differences in the displacement gradient.
 BEND = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Elements from the first on: how many; sizes, node numbers and shape gradients; weights; coefficients."""
+    """Block of elements: first index and count; sizes, node numbers and shape gradients; weights; coefficients."""
 
     first: int
     count: int
@@ -35,25 +35,25 @@ class _Part:
 
 
 class ElasticTerm:
-    """A Term: hyperelastic energy of some elements.
+    """Term for the hyperelastic energy of a set of elements.
 
     Parameters
     ----------
     name
-        Unique in its problem.
+        Name, unique in the problem.
     law
-        The energy density.
+        Energy density.
     elements
-        T elements.
+        Set of T elements.
     coefficients
-        (T, k) of the law.
+        Coefficients (T, k) of the law.
     lame
-        (T, 2) Lamé's mu and lambda at small strain [Pa].
+        Lamé parameters mu and lambda (T, 2) at small strain [Pa].
     device
-        Where its arrays live.
+        Device of the arrays.
     sources
-        What the law takes at every point in every case beside its coefficients, from the inside of the law outwards. At
-        most one has a memory.
+        Sources of further coefficients per quadrature point and load case, from the innermost law to the outermost.
+        At most one has a memory.
     """
 
     constant, steep = False, False
@@ -109,23 +109,23 @@ class ElasticTerm:
 
     @property
     def marks(self) -> np.ndarray:
-        """Of each point (T q, k): its element's, and its number there."""
+        """Unique key (T q, k) of each quadrature point: key of its element, and index in it."""
         elements = self._rest[0]
         count, points = elements.weight.shape
         return np.column_stack([np.repeat(elements.marks, points, axis=0), np.tile(np.arange(points), count)])
 
     @property
     def width(self) -> int:
-        """Of what a source remembers."""
+        """Values per point in a source's memory."""
         return max((source.width for source in self._sources), default=0)
 
     @property
     def bounded(self) -> bool:
-        """Whether the law needs J > 0."""
+        """Return True if the law requires J > 0."""
         return self._kernels.bound_step is not None
 
     def begin(self, cases: Cases) -> None:
-        """Take what varies, if anything does."""
+        """Compute the varying coefficients, if there are any sources."""
         if self._sources:
             self._cases, numbers = cases, self._numbers.of(len(cases.loads))
             points, own = numbers.shape[:2], self._tissue[1].shape[1]
@@ -136,36 +136,36 @@ class ElasticTerm:
                 own += source.count
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep what varies of these columns."""
+        """Keep the varying coefficients of these load cases only."""
         if self._cases is not None:
             self.begin(self._cases.rows(columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E += sum of w psi(H)."""
+        """Add the elastic energy: E += sum of w psi(H)."""
         self._launch(self._kernels.add_energy, [u], out, u.shape[1])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """f += internal forces."""
+        """Add the internal forces: f += sum of w P grad N."""
         self._launch(self._kernels.add_gradient, [u], out, u.shape[1])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Curvature is recomputed from u; where `definite`, Hooke's at rest stands in: positive definite."""
+        """Set the linearisation point u; `definite` load cases use Hooke's stiffness, which is positive definite."""
         self._at, self._definite = wp.clone(u), definite
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """f += K(u) p."""
+        """Add the tangent stiffness times p: f += K(u) p."""
         self._launch(self._kernels.add_curvature, [p, self._at, self._definite], out, p.shape[1])
 
     def add_diagonal(self, out: wp.array) -> None:
-        """Blocks += diagonal of K(u)."""
+        """Add the diagonal 3 x 3 blocks of K(u)."""
         self._launch(self._kernels.add_diagonal, [self._at, self._definite], out, out.shape[1])
 
     def rest_curvature(self) -> sp.csc_array:
-        """Hooke's stiffness, which every law meets at rest."""
+        """Return the linear elastic stiffness (3N, 3N), the tangent of every law in the undeformed configuration."""
         return assemble_hooke_stiffness(*self._rest)
 
     def curvature(self) -> sp.csc_array:
-        """K(u) (3N, 3N) [N/m] of one column, assembled: each element by itself, along every motion of its nodes."""
+        """Assemble K(u) (3N, 3N) [N/m] of one load case from element stiffnesses."""
         assert self._at is not None
         elements = self._rest[0]
         count, size = len(elements.table), 3 * elements.table.shape[1]
@@ -180,21 +180,21 @@ class ElasticTerm:
 
     @cached_property
     def _apart(self) -> "ElasticTerm":
-        """The same elements, each with nodes of its own."""
+        """Copy of the term whose elements share no nodes."""
         elements, law, coefficients = self._rest[0], *self._tissue
         table = np.arange(elements.table.size, dtype=np.int32).reshape(elements.table.shape)
         apart = replace(elements, table=table, nodes=table.size)
         return ElasticTerm(self.name, law, apart, coefficients, np.column_stack(self._rest[1:]), self._device)
 
     def second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
-        """As `Strained.second_order`: from the law's stress by central differences, of fourth order in the step."""
+        """Return second-order tensors as `Strained.second_order`, by fourth-order central differences of the stress."""
         elements, (law, coefficients) = self._rest[0], self._tissue
         tissues, kind = np.unique(coefficients, axis=0, return_inverse=True)
         one = _single(elements)
         unit = np.eye(9)
         both = (unit[:, None] + unit).reshape(-1, 9)
         size = BEND * np.concatenate([both, -both, 2.0 * both, -2.0 * both, np.zeros((1, 9))])
-        # Node 1 is moved by the gradient's first column, and so on.
+        # u of node k + 1 is column k of the displacement gradient
         u = np.zeros((3 * one.nodes, len(size)))
         u[3:12] = size.reshape(-1, 3, 3).transpose(2, 1, 0).reshape(9, -1)
         tensors = []
@@ -205,13 +205,13 @@ class ElasticTerm:
             stress = out.numpy()[3:12].reshape(3, 3, -1).transpose(2, 1, 0).reshape(-1, 9)
             up, down, above, below = np.split(stress[:-1], 4)
             whole = (16.0 * (up + down) - (above + below) - 30.0 * stress[-1]) / (24.0 * BEND**2)
-            whole = whole.reshape(9, 9, 9)  # P2(a + b, a + b), by a and b
+            whole = whole.reshape(9, 9, 9)  # P2(a + b, a + b), indexed by a and b
             own = 0.25 * whole[np.arange(9), np.arange(9)]
             tensors.append(0.5 * (whole - own[:, None] - own).transpose(2, 0, 1))
         return elements, np.array(tensors), kind.ravel()
 
     def elements_on(self, nodes: np.ndarray) -> np.ndarray:
-        """Those elements (k,) that lie wholly on some nodes (N,) bool."""
+        """Return the elements (k,) whose nodes are all marked in `nodes` (N,) bool."""
         elements = self._rest[0]
         places = np.arange(elements.table.shape[1])
         used = places < (len(places) if elements.size is None else elements.size[:, None])
@@ -224,20 +224,20 @@ class ElasticTerm:
         return build_kernels(*self._of)
 
     def raise_strain(self, some: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
-        """As `Strained.raise_strain`."""
+        """Raise `out` to the elements' strain, as `Strained.raise_strain`."""
         inputs = [u, columns, *self._shape]
         self._of_some(self._strain_kernels.strain, some, inputs, out, np.maximum)
 
     def add_stiffening(
         self, some: wp.array, u: wp.array, columns: wp.array, least: wp.array, place: wp.array, out: wp.array
     ) -> None:
-        """As `Strained.add_stiffening`."""
+        """Add the elements' stiffness increments, as `Strained.add_stiffening`."""
         coefficients = self._numbers.of(u.shape[1]) if self._sources else self._constants
         inputs = [u, columns, least, place, *self._shape, self._weight, coefficients]
         self._of_some(self._strain_kernels.stiffen, some, inputs, out, np.add)
 
     def _of_some(self, kernel: wp.Kernel, some: wp.array, inputs: list, out: wp.array, joined: np.ufunc) -> None:
-        """Some elements (k,), in as many parts as run at the same time, each into an output of its own."""
+        """Launch a kernel on some elements (k,) in parallel blocks with separate outputs, and combine these."""
         if not len(some):
             return
         ends = np.linspace(0, len(some), len(self._parts) + 1).astype(int).tolist()
@@ -254,7 +254,7 @@ class ElasticTerm:
             joined(out.numpy(), other.numpy(), out=out.numpy())
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Bound the step where the law needs J > 0."""
+        """Bound the step by the fraction at which the law still has J > 0."""
         kernel = self._kernels.bound_step
         if kernel is not None:
             bounds = [out, *(wp.clone(out) for _ in self._parts[1:])]
@@ -263,7 +263,7 @@ class ElasticTerm:
                 np.minimum(out.numpy(), bound.numpy(), out=out.numpy())
 
     def end(self, u: wp.array) -> np.ndarray | None:
-        """What a source remembers; elasticity by itself remembers nothing."""
+        """Return the new memory of a source; elasticity alone has none."""
         if self._cases is None or not self.width:
             return None
         strains = self._strains.of(u.shape[1])
@@ -273,7 +273,7 @@ class ElasticTerm:
         return next((memory for memory in kept if memory is not None), None)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
-        """Add to `out` whatever a kernel adds."""
+        """Launch a kernel on all blocks and add the results to `out`."""
         sums = [out, *(wp.zeros_like(out) for _ in self._parts[1:])]
         numbers = self._numbers.of(columns) if self._sources else None
 
@@ -288,7 +288,7 @@ class ElasticTerm:
     def _each(
         self, kernel: wp.Kernel, inputs: Callable[[_Part], list], outputs: Sequence[wp.array], columns: int
     ) -> None:
-        """All parts at the same time, each into an output of its own."""
+        """Launch a kernel on all blocks in parallel, each with a separate output."""
         run_together(
             [
                 partial(self._device.launch, kernel, (part.count, columns), inputs(part), [out])
@@ -298,7 +298,7 @@ class ElasticTerm:
 
 
 def _single(elements: Elements) -> Elements:
-    """One element, as many places and points as these have: of a unit volume, its first four nodes a corner's."""
+    """Return one element of unit volume, with node and point counts as these and unit edge vectors from node 0."""
     points, most = elements.gradient.shape[1:3]
     slope = np.zeros((1, points, most, 3))
     slope[:, :, :4] = np.vstack([-np.ones(3), np.eye(3)])
@@ -309,5 +309,5 @@ def _single(elements: Elements) -> Elements:
 
 
 def _rows(array: wp.array, first: int, stop: int) -> wp.array:
-    """Return a view of some rows; of nothing, nothing."""
+    """Return a view of some rows; an empty array unchanged."""
     return array[first:stop] if len(array) else array

@@ -1,4 +1,4 @@
-"""The compiled loops over elements: energy, forces, curvature and bounds of any law on any element."""
+"""Warp kernels over elements: energy, forces, tangent stiffness and step bounds of any law on any element."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -10,13 +10,13 @@ from .element_functions import build_functions
 from .laws.invariants import cofactor
 from .laws.law import Law
 
-# A step must leave every volume above this share of what it was: the logarithm and its curvature stay moderate.
+# Minimum J after a step, as a fraction of J before: bounds the logarithm and its second derivative.
 VOLUME_KEPT = 0.1
 
 
 @dataclass(frozen=True)
 class ElementKernels:
-    """The compiled loops over elements of one law."""
+    """Kernels over the elements of one law."""
 
     add_energy: wp.Kernel
     add_gradient: wp.Kernel
@@ -28,7 +28,7 @@ class ElementKernels:
 
 @cache
 def build_spreading_kernel(device: Device) -> wp.Kernel:
-    """Kernel that gives every point in every case its element's coefficients."""
+    """Build the kernel that copies each element's coefficients to every point and load case."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -37,7 +37,7 @@ def build_spreading_kernel(device: Device) -> wp.Kernel:
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
-        """n_eqic = k_ei."""
+        """Copy coefficients to all points and load cases: n_eqic = k_ei."""
         e, q, i, c = wp.tid()
         out[e, q, i, c] = coefficients[e, i]
 
@@ -46,10 +46,10 @@ def build_spreading_kernel(device: Device) -> wp.Kernel:
 
 @cache
 def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKernels:
-    """Kernels for elements of `size` nodes and laws of `count` coefficients.
+    """Build kernels for elements of `size` nodes and laws of `count` coefficients.
 
-    Each launches over (element, column). Elements of `size` 0 have as many nodes as `sizes` says, each its own number.
-    Coefficients are of elements (T,), or where they vary numbers (T, q, count, b) at every point of every case.
+    Each launches over (element, load case). If `size` is 0, the number of nodes per element is in `sizes`.
+    Coefficients are per element (T,), or if they vary numbers (T, q, count, b) per point and load case.
     """
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
@@ -69,7 +69,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         c: int,
         out: wp.array2d(dtype=scalar),
     ):
-        """f_a += P grad N_a; they sum to zero."""
+        """Add element forces f_a += P grad N_a, whose sum is zero."""
         total = vec()
         for a in range(1, size if size else sizes[e]):
             i = 3 * table[e, a]
@@ -92,7 +92,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E += sum over points of w psi(H)."""
+        """Add the energy: E += sum over points of w psi(H)."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             H = gradient_of(u, sizes, table, gradient, e, q, c)
@@ -109,7 +109,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f_a += sum over points of w P(H) grad N_a."""
+        """Add the internal forces: f_a += sum over points of w P(H) grad N_a."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             H = gradient_of(u, sizes, table, gradient, e, q, c)
@@ -129,7 +129,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f_a += sum over points of w dP(H; D) grad N_a; `definite` columns take the curvature at rest."""
+        """Add K D: f_a += sum over points of w dP(H; D) grad N_a; `definite` columns use the undeformed tangent."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             k = at(coefficients, e, q, c)
@@ -144,7 +144,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
 
     @wp.func
     def along(H: mat, of: constants, k: int, m: int):
-        """dP for dF = e_k (x) e_m."""
+        """Return dP for dF = e_k (x) e_m."""
         D = mat()
         D[k, m] = scalar(1.0)
         return stress_change(H, D, of)
@@ -162,7 +162,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """K_aa += sum over points of w dP(H; e_j (x) grad N_a) grad N_a, column j of the block.
+        """Add the diagonal blocks K_aa += sum over points of w dP(H; e_j (x) grad N_a) grad N_a, column j of the block.
 
         Nine stress changes serve all nodes of a point.
         """
@@ -211,12 +211,12 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
             floor = scalar(kept) * a0
             t = out[c]
             zero = scalar(0.0)
-            # Most steps are so short that nothing has to be looked at closely.
+            # Fast path: a lower bound of the cubic already exceeds the limit for most steps.
             if a0 + t * (wp.min(a1, zero) + t * (wp.min(a2, zero) + t * wp.min(a3, zero))) >= floor:
                 continue
             for _ in range(40):
                 low = a0 + t * (a1 + t * (a2 + t * a3))
-                # Stationary points of the cubic inside (0, t), by the root formula that does not cancel.
+                # Stationary points of the cubic in (0, t), by the root formula without cancellation.
                 root = a2 * a2 - scalar(3.0) * a1 * a3
                 if root > scalar(0.0):
                     s = -(a2 + wp.where(a2 >= scalar(0.0), one, -one) * wp.sqrt(root))
@@ -242,7 +242,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array3d(dtype=mat),
     ):
-        """H at every point."""
+        """Compute the displacement gradient H at every point."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             out[e, q, c] = gradient_of(u, sizes, table, gradient, e, q, c)

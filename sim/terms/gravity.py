@@ -1,4 +1,4 @@
-"""The change of weight since the scan: other posture, other level of the fluid round the brain."""
+"""Change of weight since the scan, due to another posture or another fluid level around the brain."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ STANDARD_GRAVITY = 9.80665  # [m/s^2]
 
 
 def change_of_weight(effect: Gravity, space: Discretisation, device: Device) -> DeadForce:
-    """Return the term of `Gravity` on the nodes of `space`: dead forces, the weight now less the weight in the scan."""
+    """Return the term of `Gravity` on the nodes of `space`: dead loads, current weight minus weight in the scan."""
     return DeadForce("gravity", build_weight_change(effect, space, device), device)
 
 
 def build_weight_change(
     effect: Gravity, space: Discretisation, device: Device, kept: int = 64
 ) -> Callable[[Loads], Forces | None]:
-    """Return loads -> the nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
+    """Return a function loads -> nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
 
-    w_a = g d integral of (rho - rho_csf [x is under the level]) N_a(x) dV in the rest configuration, N_a the elements'
-    own shape functions. The part of an element under the level is cut out exactly: the total is
-    g d (rho V - rho_csf V_under). A level that moves changes the forces continuously. (A curved element is cut where
-    the plane meets it before it is bent.) So many postures are weighed once and `kept`: a solver takes the same loads
+    w_a = g d integral of (rho - rho_csf [x is below the level]) N_a(x) dV in the undeformed configuration, with the
+    shape functions N_a. The part of an element below the level is cut out exactly: the total is
+    g d (rho V - rho_csf V_under). Forces are continuous in the level. (A curved element is cut as if its
+    edges were straight.) The weights of the last `kept` postures are cached, since a solver uses the same loads
     several times.
     """
     table, count = space.table, space.count
@@ -43,7 +43,7 @@ def build_weight_change(
 
     @lru_cache(kept)
     def weights(*posture: float) -> np.ndarray:
-        """How much each node weighs (N, 3) [N] in a posture: direction, then level [m]."""
+        """Return the weight (N, 3) [N] of each node in a posture: direction, then level [m]."""
         direction, level = np.array(posture[:3]), posture[3]
         height = (-space.nodes @ direction - level)[table[:, :4]]
         corners_under = (height < 0.0).sum(axis=1)
@@ -67,14 +67,14 @@ def build_weight_change(
 
 
 def normalise_gravity(direction: np.ndarray) -> np.ndarray:
-    """Directions (B, 3) of any length but none, at unit length."""
+    """Normalise nonzero directions (B, 3) to unit length."""
     return normalise_vectors(direction / np.abs(direction).max(axis=1, keepdims=True))
 
 
 def integrate_nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Integrals (m, n) [m^3] of the shape functions of tetrahedra `owner` (m,) over a part of each.
+    """Integrate the shape functions of tetrahedra `owner` (m,) over a part of each: (m, n) [m^3].
 
-    parts (m, 4, 4): corner coordinates of the part's own corners. Eight points of degree 3: exact for straight
+    parts (m, 4, 4): barycentric coordinates of the part's corners. Eight points of degree 3: exact for straight
     elements, and for the volume of curved ones.
     """
     points = EIGHT_POINTS @ parts
@@ -88,28 +88,28 @@ def integrate_nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.
 
 
 def sum_by_node(table: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Values (m, n) of the nodes in `table` (m, n), summed by node (N,)."""
+    """Sum values (m, n) of the nodes in `table` (m, n) by node: (N,)."""
     return np.bincount(table.ravel(), values.ravel(), count)
 
 
-# A part's own corners lie on edges of the tetrahedron, whose corners are numbered from the lowest to the highest:
-# (i, j) is where the plane meets the edge from i to j, and (i, i) corner i itself. By how many corners are under it.
+# Corners of the part below the plane lie on edges of the tetrahedron, whose corners are sorted by height: (i, j) is the
+# intersection of the plane with edge i-j, and (i, i) is corner i. Keys: number of corners below the plane.
 ENDS = {
     1: np.array([[0, 0], [0, 1], [0, 2], [0, 3]]),
     2: np.array([[0, 0], [0, 2], [0, 3], [1, 1], [1, 2], [1, 3]]),
     3: np.array([[0, 0], [1, 1], [2, 2], [0, 3], [1, 3], [2, 3]]),
 }
-# A prism between the triangles 0, 1, 2 and 3, 4, 5 is three tetrahedra.
+# A prism between the triangles 0, 1, 2 and 3, 4, 5 consists of three tetrahedra.
 PRISM = np.array([[0, 1, 2, 5], [0, 1, 4, 5], [0, 3, 4, 5]])
-PARTS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}
+PARTS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}  # tetrahedra of the part, by number of corners below
 
 
 def cut_below_plane(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra that together are what lies under a plane, none of them inside another.
+    """Split the part of each tetrahedron below a plane into disjoint tetrahedra; return their owners and corners.
 
-    height (n, 4) [m] of the corners of n tetrahedra above the plane, which has one to three of them below zero. The
-    tetrahedron (m,) that each part belongs to, and the corner coordinates (m, 4, 4) of each part's own corners. The
-    part has |determinant| of the whole's volume, which changes continuously as the plane moves.
+    height (n, 4) [m] of the corners of n tetrahedra above the plane; one to three of them are negative. Returns the
+    tetrahedron (m,) that each part belongs to, and the barycentric coordinates (m, 4, 4) of the part's corners. The
+    volume fraction of a part is |determinant|, which is continuous in the position of the plane.
     """
     order = np.argsort(height, axis=1)
     corner, sorted_height = np.eye(4)[order], np.take_along_axis(height, order, axis=1)

@@ -1,4 +1,4 @@
-"""Inertia with mass-proportional damping, one step of backward Euler as the minimum of an incremental potential."""
+"""Inertia with mass-proportional damping: one backward Euler step as the minimum of an incremental potential."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -13,14 +13,15 @@ from ..discretisation.term import Cases
 from ..runtime.columns import CHUNK, Workspaces
 from ..runtime.device import Device, forward_kernel
 
-# Shares of a quadratic tetrahedron's mass: its consistent mass matrix' diagonal, scaled to the whole. Row sums would be
-# negative at corners.
-CORNER, MIDDLE = 1.0 / 36.0, 4.0 / 27.0
+# Mass fractions of a quadratic tetrahedron's nodes: diagonal of the consistent mass matrix, scaled to the total mass.
+# Row sums would be negative at corners.
+CORNER = 1.0 / 36.0  # each corner
+MIDDLE = 4.0 / 27.0  # each midpoint
 
 
 @dataclass(frozen=True)
 class InertiaKernels:
-    """Arithmetic of lumped masses in one scalar type."""
+    """Kernels of lumped masses for one scalar type."""
 
     add_energy: wp.Kernel
     add_force: wp.Kernel
@@ -29,7 +30,7 @@ class InertiaKernels:
 
 @cache
 def build_kernels(device: Device) -> InertiaKernels:
-    """Kernels of a device's scalar type."""
+    """Build the kernels for a device's scalar type."""
     scalar, mat = device.scalar, device.matrix
     chunk = CHUNK
 
@@ -42,7 +43,7 @@ def build_kernels(device: Device) -> InertiaKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E_c += w_c / 2 sum over a chunk of nodes of m_i |u_i - a_i|^2, in double precision."""
+        """Add the energy in double precision: E_c += w_c / 2 sum over a chunk of nodes of m_i |u_i - a_i|^2."""
         block, c = wp.tid()
         total = wp.float64(0.0)
         for i in range(block * chunk, wp.min((block + 1) * chunk, mass.shape[0])):
@@ -61,7 +62,7 @@ def build_kernels(device: Device) -> InertiaKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f_i += m_i w_c (x_i - a_i), where anything is aimed at."""
+        """Add inertial forces f_i += m_i w_c (x_i - aimed a_i); `aimed` is 0 or 1."""
         i, c = wp.tid()
         for k in range(3):
             out[3 * i + k, c] += mass[i] * weight[c] * (x[3 * i + k, c] - aimed * aim[3 * i + k, c])
@@ -73,7 +74,7 @@ def build_kernels(device: Device) -> InertiaKernels:
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """K_ii += m_i w_c I."""
+        """Add the diagonal blocks K_ii += m_i w_c I."""
         i, c = wp.tid()
         out[i, c] += mass[i] * weight[c] * wp.identity(n=3, dtype=scalar)
 
@@ -81,9 +82,9 @@ def build_kernels(device: Device) -> InertiaKernels:
 
 
 def compute_lumped_mass(density: float, space: Discretisation) -> np.ndarray:
-    """Mass of every node (N,) [kg], positive, in sum density x volume.
+    """Return the positive mass (N,) [kg] of every node; the sum is density x volume.
 
-    A quarter of each linear tetrahedron's; of a quadratic one's as Hinton, Rock, Zienkiewicz 1976, "A note on mass
+    Linear tetrahedra: a quarter per node. Quadratic: Hinton, Rock, Zienkiewicz 1976, "A note on mass
     lumping and related processes in the finite element method", Earthq. Eng. Struct. Dyn. 4:245-249.
     """
     every = np.ones(len(space.table), bool)
@@ -96,22 +97,22 @@ def compute_lumped_mass(density: float, space: Discretisation) -> np.ndarray:
 
 
 class InertiaTerm:
-    """A Term: E = w/2 |u - a|^2_M, M the lumped mass, w = (1/dt + damping) / dt, a = u_n + dt v_n / (1 + damping dt).
+    """Inertia term: E = w/2 |u - a|^2_M, lumped mass M, w = (1/dt + damping) / dt, a = u_n + dt v_n / (1 + damping dt).
 
     Its gradient is M ((v - v_n) / dt + damping v) with v = (u - u_n) / dt: backward Euler (Martin, Thomaszewski,
     Grinspun, Gross 2011, "Example-Based Elastic Materials", ACM Trans. Graph. 30(4), section 4). History: velocities
-    (B, N, 3) [m/s]. Where no time passes there is no motion to resist, and velocities stay: w = 0.
+    (B, N, 3) [m/s]. In load cases without elapsed time, w = 0 and velocities are unchanged.
 
     Parameters
     ----------
     mass
-        (N,) [kg].
+        Nodal masses (N,) [kg].
     damping
-        [1/s].
+        Mass-proportional damping [1/s].
     marks
-        (N, k) numbers that tell each node from all others, whatever is cut.
+        Unique key (N, k) of each node, unchanged by cuts.
     device
-        Where its arrays live.
+        Device of the arrays.
     """
 
     name = "inertia"
@@ -127,12 +128,12 @@ class InertiaTerm:
         self._cases: Cases | None = None
 
     def begin(self, cases: Cases) -> None:
-        """Aim every column at where its motion would carry it.
+        """Compute weight and predicted position a of every load case.
 
         Raises
         ------
         InputError
-            Loads that lie before their start; a memory of another body.
+            Loads before their start; a memory of another body.
         """
         steps, count = cases.steps, len(cases.loads)
         self._cases = cases
@@ -143,43 +144,43 @@ class InertiaTerm:
         self._aim.of(count).assign(np.ascontiguousarray(aim.reshape(count, 3 * len(self._masses)).T))
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep the aims of these columns."""
+        """Keep the weights and positions of these load cases only."""
         assert self._cases is not None
         self.begin(self._cases.rows(columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E += w/2 |u - a|^2_M."""
+        """Add the energy: E += w/2 |u - a|^2_M."""
         inputs = [self._mass, self._weight.of(u.shape[1]), self._aim.of(u.shape[1]), u]
         self._device.launch(self._kernels.add_energy, (-(-len(self._mass) // CHUNK), u.shape[1]), inputs, [out])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """f += w M (u - a)."""
+        """Add the gradient: f += w M (u - a)."""
         self._add_force(u, self._aim.of(u.shape[1]), 1.0, out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """The curvature is the same everywhere."""
+        """Do nothing: the tangent is constant."""
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """f += w M p."""
+        """Add the tangent stiffness times p: f += w M p."""
         self._add_force(p, p, 0.0, out)
 
     def add_diagonal(self, out: wp.array) -> None:
-        """Blocks += w M."""
+        """Add the diagonal blocks of w M."""
         self._device.launch(self._kernels.add_blocks, out.shape, [self._mass, self._weight.of(out.shape[1])], [out])
 
     def rest_curvature(self) -> None:
-        """Of an infinite step, none; of a shorter one see `curvature_at_pace`."""
+        """Return None, the limit of an infinite step; see `curvature_at_pace` for finite ones."""
 
     def curvature_at_pace(self, step: float) -> sp.csc_array:
-        """W M (3N, 3N) [N/m] over a step [s]."""
+        """Return the tangent stiffness w M (3N, 3N) [N/m] for a time step [s]."""
         weight = (1.0 + self._damping * step) / step**2
         return sp.csc_array(sp.diags_array(np.repeat(weight * self._masses, 3)))
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Inertia allows every step."""
+        """Do nothing: inertia does not limit the step."""
 
     def end(self, u: wp.array) -> np.ndarray:
-        """Velocities (B, N, 3) [m/s] at the end of the step."""
+        """Return the velocities (B, N, 3) [m/s] at the end of the step."""
         assert self._cases is not None
         now = u.numpy().astype(np.float64).T.reshape(u.shape[1], len(self._masses), 3)
         steps = self._cases.steps[:, None, None]
@@ -187,12 +188,12 @@ class InertiaTerm:
         return np.where(steps > 0.0, (now - self._start(self._cases)) / passes, self._velocity(self._cases))
 
     def _start(self, cases: Cases) -> np.ndarray:
-        """Where the nodes were (B, N, 3) [m]."""
+        """Return the displacement (B, N, 3) [m] at the start of the step."""
         still = np.zeros((len(cases.loads), len(self._masses), 3))
         return still if cases.displacement is None else cases.displacement
 
     def _velocity(self, cases: Cases) -> np.ndarray:
-        """How fast they were (B, N, 3) [m/s]."""
+        """Return the velocities (B, N, 3) [m/s] at the start of the step."""
         return cases.past(self.name, (len(self._masses), 3))
 
     def _add_force(self, x: wp.array, aim: wp.array, aimed: float, out: wp.array) -> None:

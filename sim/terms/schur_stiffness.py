@@ -1,4 +1,4 @@
-"""What lies around a part of a body, as stiff as at rest: a dense stiffness between the nodes that both share."""
+"""Static condensation of the surrounding body: undeformed Schur complement stiffness on the shared nodes."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ..runtime.device import Device
 
 
 class Exterior:
-    """A Term: u . F u / 2 over some rows of u.
+    """Term for a linear surrounding body: u . F u / 2 on some rows of u.
 
     Parameters
     ----------
     rows
-        (m,) of the part's 3N, each once.
+        Rows (m,) of the part's 3N unknowns, unique.
     stiffness
-        F (m, m) [N/m], symmetric.
+        Symmetric stiffness F (m, m) [N/m].
     count
-        3N.
+        Number of unknowns 3N.
     device
-        Where its arrays live.
+        Device of the arrays.
     """
 
     name = "exterior"
@@ -38,30 +38,30 @@ class Exterior:
         self._rooms: dict[int, tuple[wp.array, wp.array]] = {}
 
     def begin(self, cases: Cases) -> None:
-        """The exterior remembers nothing."""
+        """Do nothing: the exterior has no history."""
 
     def keep(self, columns: np.ndarray) -> None:
-        """Columns are all alike to the exterior."""
+        """Do nothing: F is the same in all load cases."""
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E += u . F u / 2."""
+        """Add the energy: E += u . F u / 2."""
         x, force = self._multiplied(u)
         add_dots(self._device, combine_columns(self._device, x, -0.5, x, x), force, out)
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """f += F u."""
+        """Add the gradient: f += F u."""
         _, force = self._multiplied(u)
         add_rows(self._device, force, self._rows, out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """It is linear."""
+        """Do nothing: the term is linear."""
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """f += F p."""
+        """Add the tangent stiffness times p: f += F p."""
         self.add_gradient(p, out)
 
     def add_diagonal(self, out: wp.array) -> None:
-        """Blocks += those of F."""
+        """Add the diagonal blocks of F."""
         rows, stiffness, count = self._rest
         blocks = np.zeros((count // 3, 3, 3))
         same = rows[:, None] // 3 == rows // 3
@@ -70,19 +70,19 @@ class Exterior:
         out.assign(out.numpy() + blocks[:, None])
 
     def rest_curvature(self) -> sp.csc_array:
-        """F."""
+        """Return F on all rows (3N, 3N)."""
         rows, stiffness, count = self._rest
         place = np.repeat(rows, len(rows)), np.tile(rows, len(rows))
         return sp.csc_array(sp.coo_array((stiffness.ravel(), place), shape=(count, count)))
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """It allows every step."""
+        """Do nothing: a linear term does not limit the step."""
 
     def end(self, u: wp.array) -> None:
-        """It remembers nothing."""
+        """Return None: the exterior has no history."""
 
     def _multiplied(self, u: wp.array) -> tuple[wp.array, wp.array]:
-        """Return the rows (m, b) of u, and F times them; batches as wide as a room find both where the last one did."""
+        """Return rows (m, b) of u and F times them, in a workspace reused for batches of the same width."""
         shape = (len(self._rows), u.shape[1])
         if u.shape[1] not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}

@@ -1,4 +1,4 @@
-"""What a law may take at every point in every load case beside its element's coefficients."""
+"""Interface of coefficients that a law takes per quadrature point and load case."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from .laws.law import Law
 
 
 class StateSource(Protocol):
-    """Numbers that vary from point to point and from case to case, and the law that takes them.
+    """Source of coefficients that vary between points and load cases, and of the law that uses them.
 
-    Numbers are Warp's (T, q, n, b) in the device's scalar type: element, point, number, column.
+    Coefficients are a Warp array (T, q, n, b) in the device's scalar type: element, point, coefficient, load case.
     """
 
     @property
     def count(self) -> int:
-        """How many there are at a point."""
+        """Number of coefficients per point."""
         ...
 
     @property
     def width(self) -> int:
-        """How many numbers of each point must travel, as `end` has them."""
+        """Number of values per point in the memory that `end` returns."""
         ...
 
     def law(self, inner: Law, count: int) -> Law:
-        """The law that `inner`, which takes `count` numbers, becomes: it takes these first, and then the source's."""
+        """Wrap `inner`, a law of `count` coefficients, in a law that takes these first and then the source's."""
         ...
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
-        """Write the numbers of these cases to out (T, q, n, b), from number `first` on."""
+        """Write the coefficients of these cases to out (T, q, n, b), from index `first`."""
         ...
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray | None:
-        """What must travel to the next call (B, ...), or None; strains (T, q, b): the displacement gradients now.
+        """Return the memory (B, ...) for the next call, or None; strains (T, q, b) are current displacement gradients.
 
-        A source that accounts for some of them leaves the rest there: those inside of it come after it.
+        A source that explains a part of the strains removes it in place, before the sources inside it see them.
         """
         ...

@@ -1,4 +1,4 @@
-"""The compiled loops over strained elements: how far each is from rest, and how much stiffer it is there."""
+"""Warp kernels over strained elements: magnitude of the displacement gradient, and stiffness increment."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +12,7 @@ from .laws.law import Law
 
 @dataclass(frozen=True)
 class StrainKernels:
-    """The compiled loops over some elements of one law."""
+    """Kernels over a subset of the elements of one law."""
 
     strain: wp.Kernel
     stiffen: wp.Kernel
@@ -20,7 +20,7 @@ class StrainKernels:
 
 @cache
 def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKernels:
-    """Kernels as those of `element_kernels.build_kernels`; each launches over (place in `some`, in `columns`)."""
+    """Build kernels like `element_kernels.build_kernels`; each launches over (index in `some`, index in `columns`)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     stress_change = law.stress_change
@@ -38,7 +38,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKern
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """s_a = max over points of |H|, at every node of the elements."""
+        """Compute s_a = max over points of |H|, at every node of the elements."""
         i, c = wp.tid()
         e, of = some[i], columns[c]
         most = scalar(0.0)
@@ -50,7 +50,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKern
 
     @wp.func
     def stiffer(H: mat, k: constants, rest: constants, i: int, j: int):
-        """dP(H; D) - dP(0; D) for D = e_i (x) e_j."""
+        """Return dP(H; D) - dP(0; D) for D = e_i (x) e_j."""
         D = mat()
         D[i, j] = scalar(1.0)
         return stress_change(H, D, k) - stress_change(mat(), D, rest)
@@ -71,7 +71,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKern
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """K_ab += w grad N_a . (dP(H) - dP(0)) . grad N_b of points with |H| above the least, at the nodes' places."""
+        """Add K_ab += w grad N_a . (dP(H) - dP(0)) . grad N_b of points with |H| > least, at indices `place`."""
         i, c = wp.tid()
         e, of = some[i], columns[c]
         nodes = wp.int32(size)

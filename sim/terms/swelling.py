@@ -1,7 +1,7 @@
-"""Tissue that swells with its blood: any law in F / (1 + theta)^(1/3), which is at rest where F only swells.
+"""Tissue swelling due to blood volume: any law in F / (1 + theta)^(1/3), stress-free under pure swelling.
 
 Rodriguez, Hoger, McCulloch 1994, "Stress-dependent finite growth in soft elastic tissues", J. Biomech. 27:455-467, with
-growth of the same size in all directions: psi per volume before it is (1 + theta) psi(F_e), F = (1 + theta)^(1/3) F_e.
+isotropic growth: psi per undeformed volume is (1 + theta) psi(F_e), F = (1 + theta)^(1/3) F_e.
 """
 
 from collections.abc import Callable
@@ -18,14 +18,14 @@ from .laws.law import Law
 
 @cache
 def build_swollen_law(law: Law, device: Device, count: int) -> Law:
-    """Return the law on `count` numbers that also takes r = (1 + theta)^(1/3) - 1."""
+    """Return the law on `count` coefficients that also takes r = (1 + theta)^(1/3) - 1."""
     scalar, mat = device.scalar, device.matrix
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1))
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
 
     @wp.func
     def of_law(c: whole):
-        """What the law itself takes."""
+        """Return the coefficients of the wrapped law."""
         k = inner()
         for i in range(count):
             k[i] = c[i]
@@ -33,36 +33,36 @@ def build_swollen_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def elastic(H: mat, c: whole):
-        """F_e - I = (H - r I) / (1 + r)."""
+        """Return the elastic displacement gradient F_e - I = (H - r I) / (1 + r)."""
         return (H - c[count] * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + c[count])
 
     @wp.func
     def energy(H: mat, c: whole):
-        """(1 + r)^3 psi(F_e) [Pa]."""
+        """Return the energy density (1 + r)^3 psi(F_e) [Pa]."""
         s = scalar(1.0) + c[count]
         return s * s * s * own_energy(elastic(H, c), of_law(c))
 
     @wp.func
     def stress(H: mat, c: whole):
-        """P = (1 + r)^2 P(F_e) [Pa]."""
+        """Return the stress P = (1 + r)^2 P(F_e) [Pa]."""
         s = scalar(1.0) + c[count]
         return s * s * own_stress(elastic(H, c), of_law(c))
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
-        """dP [Pa] for dF = D: (1 + r) dP(F_e; D)."""
+        """Return dP [Pa] for dF = D: (1 + r) dP(F_e; D)."""
         return (scalar(1.0) + c[count]) * own_change(elastic(H, c), D, of_law(c))
 
     @wp.func
     def same(k: inner):
-        """Of what does not vary."""
+        """Return the coefficients unchanged."""
         return k
 
     own_rest = law.at_rest or same
 
     @wp.func
     def at_rest(c: whole):
-        """r = 0, and the law's own numbers at rest."""
+        """Return coefficients with r = 0 and those of the wrapped law in the undeformed state."""
         k, own = whole(), own_rest(of_law(c))
         for i in range(count):
             k[i] = own[i]
@@ -73,7 +73,7 @@ def build_swollen_law(law: Law, device: Device, count: int) -> Law:
 
 @dataclass(frozen=True)
 class SwellingKernels:
-    """How much wider every point is; each launches over (element, point, column)."""
+    """Kernels of the swelling ratio; each launches over (element, point, column)."""
 
     fill: wp.Kernel
     shrink: wp.Kernel
@@ -81,7 +81,7 @@ class SwellingKernels:
 
 @cache
 def build_kernels(device: Device) -> SwellingKernels:
-    """Kernels of a device's scalar type."""
+    """Build the kernels for a device's scalar type."""
     scalar, mat = device.scalar, device.matrix
 
     @forward_kernel(module="unique")
@@ -92,7 +92,7 @@ def build_kernels(device: Device) -> SwellingKernels:
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
-        """r_eqc = s_e r_c."""
+        """Write the swelling ratio r_eqc = s_e r_c."""
         e, q, c = wp.tid()
         out[e, q, place, c] = swells[e] * wider[c]
 
@@ -103,7 +103,7 @@ def build_kernels(device: Device) -> SwellingKernels:
         # outputs
         strain: wp.array3d(dtype=mat),
     ):
-        """H <- F_e - I = (H - r I) / (1 + r)."""
+        """Replace H by its elastic part F_e - I = (H - r I) / (1 + r)."""
         e, q, c = wp.tid()
         r = swells[e] * wider[c]
         strain[e, q, c] = (strain[e, q, c] - r * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + r)
@@ -112,16 +112,16 @@ def build_kernels(device: Device) -> SwellingKernels:
 
 
 class Swelling:
-    """A Source: how much wider tissue is than it would be by itself. It remembers nothing.
+    """StateSource for the relative volume change theta of swelling tissue, without history.
 
     Parameters
     ----------
     theta
-        Times (B,) [s] -> shares of volume (B,) more than there are at rest.
+        Function of times (B,) [s] that returns the relative volume increase theta (B,).
     swells
-        (T,) bool: elements that do.
+        Mask (T,) of elements that swell.
     device
-        Where its arrays live.
+        Device of the arrays.
     """
 
     count, width = 1, 0
@@ -131,19 +131,19 @@ class Swelling:
         self._swells = device.array(swells.astype(np.float64))
 
     def law(self, inner: Law, count: int) -> Law:
-        """Return the law of what is left of the motion beside the swelling."""
+        """Return the law of the elastic part of the deformation."""
         return build_swollen_law(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
-        """r at every point."""
+        """Write r at every point."""
         inputs = [self._swells, self._wider(cases), first]
         self._device.launch(build_kernels(self._device).fill, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> None:
-        """Swelling depends on the time alone; what is elastic of the strains is left to what remembers it."""
+        """Replace strains by their elastic part, for the memory of inner sources; swelling has none."""
         inputs = [self._swells, self._wider(cases)]
         self._device.launch(build_kernels(self._device).shrink, strains.shape, inputs, [strains])
 
     def _wider(self, cases: Cases) -> wp.array:
-        """R (b,), accurate for small theta too."""
+        """Return r (b,), accurate for small theta too."""
         return self._device.array(np.expm1(np.log1p(self._theta(cases.loads.times)) / 3.0))

@@ -1,4 +1,4 @@
-"""Viscoelasticity in shape: any law's stress of shape relaxes in a Prony series, a step at a time.
+"""Finite-strain viscoelasticity: the deviatoric stress of any law relaxes by a Prony series, in time steps.
 
 Simo 1987, "On a fully three-dimensional finite-strain viscoelastic damage model", Comput. Methods Appl. Mech. Eng.
 60:153-173; Simo, Hughes 1998, "Computational Inelasticity", section 10.3; Holzapfel 2000, "Nonlinear Solid Mechanics",
@@ -7,13 +7,13 @@ section 6.10. The step is the derivative of an incremental potential: with Fb = 
     f psi(F) + (1 - f) psi(J^(1/3) I) + Cb : A / 2,  f = 1 - sum_i g_i (1 - exp(-dt / (2 tau_i))),
     A = sum_i (exp(-dt / tau_i) H_i - g_i exp(-dt / (2 tau_i)) S),
 
-S the deviatoric stress of the law itself, pulled back by the last step's Fb, and H_i the parts of it that fade. Where a
-law parts shape from volume, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), and this is what the papers have. Of the
-others psi(Fb) must not be taken away from psi(F): it outgrows it where tissue is crushed, which then collapses.
+S the deviatoric stress of the law, pulled back by the last step's Fb, and H_i the overstresses of the Prony terms. If
+the law splits into deviatoric and volumetric parts, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), as in the papers.
+For other laws, psi(Fb) must not be subtracted from psi(F): it grows faster under compression, so tissue collapses.
 
-The stable neo-Hookean law is finite where J = 0, and Cb is not: whatever pulls on Cb makes it collapse. It is parted in
-its own way (`build_own_split`): mu relaxes and K does not. The step's potential is psi - (1 - f) psi_shape + C : A / 2,
-and S pulls on C = F^T F, as in finite linear viscoelasticity. Source: Christensen 1980, "A Nonlinear Theory of
+The stable neo-Hookean law is finite at J = 0, but Cb is not: any load on Cb makes it collapse. It has a
+separate split (`build_own_split`): mu relaxes, K does not. The step's potential is psi - (1 - f) psi_shape + C : A / 2,
+and S acts on C = F^T F, as in finite linear viscoelasticity. Source: Christensen 1980, "A Nonlinear Theory of
 Viscoelasticity for Application to Elastomers", J. Appl. Mech. 47:762-768.
 """
 
@@ -31,13 +31,13 @@ from .laws.invariants import exp_less_one
 from .laws.isochoric_split import split_of
 from .laws.law import Law
 
-# A symmetric tensor's components.
+# components of a symmetric tensor
 SIX = 6
 
 
 @cache
 def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
-    """Return the law on `count` numbers that also takes f - 1 and the components xx, yy, zz, yz, zx, xy of A [Pa]."""
+    """Return the law on `count` coefficients that also takes f - 1 and components xx, yy, zz, yz, zx, xy of A [Pa]."""
     scalar, mat = device.scalar, device.matrix
     parts = split_of(law, device)
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + SIX))
@@ -45,7 +45,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def of_law(c: whole):
-        """What the law itself takes."""
+        """Return the coefficients of the wrapped law."""
         k = inner()
         for i in range(count):
             k[i] = c[i]
@@ -53,7 +53,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def pull(c: whole):
-        """Return a."""
+        """Return the symmetric tensor A [Pa]."""
         xx, yy, zz, yz, zx, xy = (
             c[count + 1],
             c[count + 2],
@@ -66,22 +66,22 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def energy(H: mat, c: whole):
-        """psi + (f - 1) psi_shape + A : E [Pa]."""
+        """Return the step's energy density psi + (f - 1) psi_shape + A : E [Pa]."""
         return own_energy(H, of_law(c), c[count], pull(c))
 
     @wp.func
     def stress(H: mat, c: whole):
-        """P + (f - 1) P_shape + the derivative of A : E."""
+        """Return the stress P + (f - 1) P_shape + the derivative of A : E."""
         return own_stress(H, of_law(c), c[count], pull(c))
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
-        """dP for dF = D: the derivative of `stress`."""
+        """Return dP for dF = D, the derivative of `stress`."""
         return own_change(H, D, of_law(c), c[count], pull(c))
 
     @wp.func
     def at_rest(c: whole):
-        """Nothing has faded, nothing pulls."""
+        """Return coefficients without relaxation or overstress."""
         k = c
         for i in range(count, count + 1 + SIX):
             k[i] = scalar(0.0)
@@ -92,7 +92,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
 
 @dataclass(frozen=True)
 class ViscoelasticKernels:
-    """A step of the Prony series at every point."""
+    """Kernels of one step of the Prony series at every point."""
 
     fade: wp.Kernel
     advance: wp.Kernel
@@ -100,7 +100,7 @@ class ViscoelasticKernels:
 
 @cache
 def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
-    """Kernels for a law of `count` coefficients; each launches over (element, point, column)."""
+    """Build kernels for a law of `count` coefficients; each launches over (element, point, column)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     overstress = split_of(law, device).overstress
@@ -116,7 +116,7 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
-        """f - 1, and A; past (b, points, 6 (n + 1)): S, then each H_i."""
+        """Compute f - 1 and A; past (b, points, 6 (n + 1)): S, then each H_i."""
         e, q, c = wp.tid()
         p = e * out.shape[1] + q
         less = scalar(0.0)
@@ -141,7 +141,7 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
         # outputs
         out: wp.array3d(dtype=scalar),
     ):
-        """S at H, and H_i <- exp(-dt / tau) H_i + g exp(-dt / (2 tau)) (S - its last value)."""
+        """Update the history: S at H, and H_i <- exp(-dt / tau) H_i + g exp(-dt / (2 tau)) (S - its last value)."""
         e, q, c = wp.tid()
         p = e * strain.shape[1] + q
         S = overstress(strain[e, q, c], coefficients[e])
@@ -157,20 +157,20 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
 
 
 class Prony:
-    """A Source: what is left of the stress of earlier steps. History: S, then each H_i, (B, points, 6 (n + 1)) [Pa].
+    """StateSource for a Prony series. History: S, then each H_i, (B, points, 6 (n + 1)) [Pa].
 
     Parameters
     ----------
     name
         Key of its memory.
     law
-        The law itself, of `coefficients` (T, k).
+        Relaxing law, with `coefficients` (T, k).
     pairs
-        The series (g, tau [s]) of each of T elements' tissues, of any lengths.
+        Series (g, tau [s]) of the tissue of each of T elements; lengths may differ.
     points
-        How many points an element has.
+        Quadrature points per element.
     device
-        Where its arrays live.
+        Device of the arrays.
     """
 
     count = 1 + SIX
@@ -190,22 +190,22 @@ class Prony:
         self._shape = len(coefficients) * points, self.width
 
     def law(self, inner: Law, count: int) -> Law:
-        """Return the law, and its part of shape again, which relaxes."""
+        """Return the law with a relaxing deviatoric part."""
         return build_relaxing_law(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
-        """f - 1 and A."""
+        """Write f - 1 and A at every point."""
         self._device.launch(
             self._kernels.fade, (*out.shape[:2], out.shape[3]), [*self._series, *self._since(cases), first], [out]
         )
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray:
-        """S and H_i now."""
+        """Return the updated S and H_i."""
         out = self._device.zeros(len(cases.loads), *self._shape)
         inputs = [*self._series, *self._since(cases), self._coefficients, strains]
         self._device.launch(self._kernels.advance, strains.shape, inputs, [out])
         return out.numpy()
 
     def _since(self, cases: Cases) -> list[wp.array]:
-        """Return steps (b,) [s] and what there was before them (b, points, 6 (n + 1))."""
+        """Return time steps (b,) [s] and the previous history (b, points, 6 (n + 1))."""
         return [self._device.array(cases.steps), self._device.array(cases.past(self._name, self._shape))]

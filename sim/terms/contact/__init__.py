@@ -1,1 +1,1 @@
-"""What touches: rigid tools, and the skull."""
+"""Contact with rigid tools and with the skull."""

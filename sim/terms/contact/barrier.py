@@ -1,23 +1,23 @@
-"""What keeps two surfaces apart: a pressure that grows without end as the gap between them closes.
+"""Contact barrier between two surfaces: its pressure increases as their gap closes.
 
     b(d) = -k (d - g)^2 ln(d / g) for 0 < d < g, 0 beyond: Li et al. 2020, "Incremental Potential Contact", eq. 6.
 
-Below a hundredth of g it goes on as the parabola that meets it there (a relaxed barrier: Feller, Ebenbauer 2017, IEEE
-Trans. Autom. Control 62:1223-1238): a tool that has moved into tissue pushes it out again, and no start is forbidden.
-With k = mu / g, mu the tissue's shear modulus, the pressure there is 107 mu: tissue that bears less stays outside.
+Below g / 100 it continues as the parabola with the same value, slope and curvature (relaxed barrier: Feller, Ebenbauer
+2017, IEEE Trans. Autom. Control 62:1223-1238), so penetrating tools push tissue out and any initial state is feasible.
+With k = mu / g, mu the tissue's shear modulus, the pressure there is 107 mu: lower pressures leave a gap.
 """
 
 from typing import Any
 
 import warp as wp
 
-# The share of the gap below which the barrier is a parabola.
+# Fraction of the gap below which the barrier is a parabola.
 RELAXED = wp.constant(0.01)
 
 
 @wp.func
 def barrier(d: Any, g: Any):
-    """b(d) / k [m^2]."""
+    """Return the barrier function b(d) / k [m^2] at distance d with gap g."""
     zero = type(d)(0.0)
     if d >= g:
         return zero
@@ -31,7 +31,7 @@ def barrier(d: Any, g: Any):
 
 @wp.func
 def barrier_slope(d: Any, g: Any):
-    """b'(d) / k [m]: never positive, so that nothing is ever pulled."""
+    """Return the first derivative b'(d) / k [m], never positive: contact is purely repulsive."""
     if d >= g:
         return type(d)(0.0)
     low = type(d)(RELAXED) * g
@@ -44,7 +44,7 @@ def barrier_slope(d: Any, g: Any):
 
 @wp.func
 def barrier_curvature(d: Any, g: Any):
-    """b''(d) / k: never negative."""
+    """Return the second derivative b''(d) / k, never negative."""
     if d >= g:
         return type(d)(0.0)
     e = wp.max(d, type(d)(RELAXED) * g)

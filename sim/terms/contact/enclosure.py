@@ -1,6 +1,6 @@
-"""Whether points lie inside a body's surface, of many bodies at once.
+"""Point-in-surface test for a batch of deformed bodies.
 
-By the solid angle that it fills: van Oosterom, Strackee 1983, "The solid angle of a plane triangle", IEEE Trans.
+Based on the solid angle of the surface: van Oosterom, Strackee 1983, "The solid angle of a plane triangle", IEEE Trans.
 Biomed. Eng. 30:125-126, equation 8.
 """
 
@@ -14,7 +14,7 @@ from ...runtime.device import Device, forward_kernel
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """It launches over (triangle, column)."""
+    """Build the solid angle kernel, launched over (triangle, column)."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -26,7 +26,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """Half the solid angle [sr] under which points (p, b) see a triangle."""
+        """Add half the solid angle [sr] of a triangle seen from points (p, b)."""
         s, c = wp.tid()
         corners = wp.mat33d()
         for row in range(3):
@@ -45,7 +45,7 @@ def build_kernel(device: Device) -> wp.Kernel:
 def find_enclosing_columns(
     device: Device, points: np.ndarray, rest: wp.array, triangles: wp.array, u: wp.array
 ) -> np.ndarray:
-    """In which columns (b,) any of their points (b, p, 3) [m] lies inside the surface, outwards, moved by u (3N, b)."""
+    """Return a mask (b,) of load cases with a point (b, p, 3) [m] inside the outward surface displaced by u (3N, b)."""
     points = np.ascontiguousarray(points.swapaxes(0, 1))
     angle = wp.zeros(points.shape[:2], dtype=wp.float64, device=device.name)
     inputs = [device.array(points, wp.vec3d), rest, triangles, u]

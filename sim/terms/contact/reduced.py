@@ -1,4 +1,4 @@
-"""The barrier of tools on the nodes that they can touch, in double precision."""
+"""Tool contact barrier restricted to the nodes that tools can touch, in double precision."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ from .tool_blocks import ContactStage, NearPairs, build_functions
 
 
 class DenseTerm(Term, Protocol):
-    """A Term that few nodes feel, so that its curvature is a small dense matrix."""
+    """Term on few nodes, whose tangent stiffness is a small dense matrix."""
 
     def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
-        """Its surface, and its tools as they stand in some columns (k,); room for what is near."""
+        """Return surface and tools of some load cases (k,), and the workspace for near pairs."""
         ...
 
     def add_matrix(self, u: wp.array, definite: wp.array, place: wp.array, out: wp.array) -> None:
-        """Add K(u) of b columns, u (3N, b), to out (b, 3m, 3m), float64, between nodes of a `place` (N, b), not -1."""
+        """Add K(u) (3N, b) to out (b, 3m, 3m), float64, between nodes with index `place` (N, b) >= 0."""
         ...
 
 
 class Reduced:
-    """A `Reduction`.
+    """Reduced barrier, a `Reduction`.
 
     Parameters
     ----------
     term
-        The barrier of these n nodes alone, in double precision.
+        Barrier of these n nodes alone, in double precision.
     count, nodes
-        n, and how many of them a surface triangle has.
+        Number of nodes n, and nodes per surface triangle.
     device
-        Where it lives.
+        Device of the arrays.
     """
 
     def __init__(self, term: DenseTerm, count: int, nodes: int, device: Device):
         self._term, self._count, self._nodes, self._device = term, count, nodes, device
-        # To make an array takes as long as a launch.
+        # Allocating an array takes as long as a launch.
         self._arrays = lru_cache(2)(self._made)
 
     @property
     def functions(self) -> BlockFunctions:
-        """As `Reduction.functions`."""
+        """Warp functions as `Reduction.functions`."""
         return build_functions(self._device, self._nodes)
 
     def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
-        """As `Reduction.stage`."""
+        """Return the structs as `Reduction.stage`."""
         return self._term.stage(columns)
 
     def slope(self, w: Any) -> Any:
-        """As `Reduction.slope`."""
+        """Return the gradient as `Reduction.slope`."""
         at, force = self._arrays(w.shape[1])[:2]
         view(at)[:] = w
         force.zero_()
@@ -62,7 +62,7 @@ class Reduced:
         return view(force) + 0.0  # a copy
 
     def curvature(self, w: Any, place: Any, size: int, definite: np.ndarray) -> Any:
-        """As `Reduction.curvature`."""
+        """Return the tangent stiffness as `Reduction.curvature`."""
         at, _, numbers = self._arrays(w.shape[1])
         view(at)[:], view(numbers)[:] = w, place
         out = wp.zeros((w.shape[1], 3 * size, 3 * size), dtype=wp.float64, device=self._device.name)
@@ -70,6 +70,6 @@ class Reduced:
         return view(out)
 
     def _made(self, columns: int) -> tuple[wp.array, wp.array, wp.array]:
-        """Places and forces (3n, b), and numbers (n, b)."""
+        """Allocate displacements and forces (3n, b), and node indices (n, b)."""
         at, force = (self._device.zeros(3 * self._count, columns) for _ in range(2))
         return at, force, wp.zeros((self._count, columns), dtype=wp.int32, device=self._device.name)

@@ -1,10 +1,10 @@
-"""A skull that brain rests against and comes away from: each node has a bone of its own, curved, with an end.
+"""Unilateral contact of brain and skull: each node has its own curved bone surface, which ends at the craniotomy.
 
     h = g - n . u - u . H u / 2,    r = r_0 + e . u,    d = |max((h + R, r + R), 0)| - R,
 
-under the bone and inside its opening. With the normal n and its change H along the skull, a brain that turns slides
-along the skull, and not off its planes. With the way e into the opening, open cortex rises in it, and not beyond its
-edge, of radius R.
+h is the distance to bone, r the distance inside the craniotomy. With the normal n and its derivative H along the skull,
+a rotating brain slides along the curved skull, not along tangent planes. With the direction e into the craniotomy,
+exposed cortex can rise through it, but not through its edge, of radius R.
 """
 
 from dataclasses import dataclass
@@ -22,21 +22,21 @@ from ...runtime.device import Device, forward_kernel
 from .barrier import RELAXED, barrier, barrier_curvature, barrier_slope
 from .skull_surface import BONE, Bone, BoneSettings, build_bone
 
-# A step takes no node farther than this share of its distance to the bone.
+# Maximum displacement per step, as a fraction of a node's distance to the bone.
 ROOM_KEPT = wp.constant(0.9)
 
 
 @dataclass(frozen=True)
 class SkullBarrier:
-    """How stiff preconditioners take the skull to be, and how wide its barrier is at first.
+    """Contact stiffness in preconditioners, and initial width of the skull barrier.
 
     Parameters
     ----------
     half_shut
-        Preconditioners count the skull as stiff as this share of the shear modulus over what is felt: between open and
-        shut.
+        Contact stiffness in preconditioners, as a fraction of shear modulus / activation distance: between
+        open and closed contact.
     at_first, again
-        [m] How far brain may come at once, from rest and from where it was: the barrier is as wide at first.
+        Initial barrier width: maximum displacement per step, from the undeformed or from a previous state [m].
     """
 
     half_shut: float = 0.2
@@ -46,7 +46,7 @@ class SkullBarrier:
 
 @dataclass(frozen=True)
 class SkullKernels:
-    """Loops over (skull node, column)."""
+    """Kernels over (skull node, load case)."""
 
     add_energy: wp.Kernel
     add_gradient: wp.Kernel
@@ -57,9 +57,9 @@ class SkullKernels:
 
 @wp.struct
 class Wall:
-    """Nodes, normals and bends [1/m] of their bones, ways into the opening, how far inside they are [m].
+    """Node numbers, bone normals and curvatures [1/m], directions into the craniotomy, distances inside it [m].
 
-    How near bone is felt [m], and how many times that far now; areas [m^2]; gap and radius of the bone's edge [m];
+    Activation distances [m] and their current factor; areas [m^2]; gap and radius of the bone's edge [m];
     shear modulus [Pa].
     """
 
@@ -78,7 +78,7 @@ class Wall:
 
 @wp.func
 def place(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
-    """(h + R, r + R); where bone is felt farther off, it has stepped back by as much."""
+    """Return (h + R, r + R) of node s at displacement x; a widened barrier makes the bone recede by as much."""
     gap = wall.gap + (wall.times - wp.float64(1.0)) * wall.felt[s]
     h = gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.bend[s] * x)
     return wp.vec2d(h + wall.edge, wall.inside[s] + wp.dot(wall.way[s], x) + wall.edge)
@@ -86,7 +86,7 @@ def place(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
 
 @wp.func
 def share(p: wp.vec2d) -> wp.vec2d:
-    """How much d grows as h does, and as r does: of a unit vector away from the bone."""
+    """Return the gradient of d with respect to (h, r): a unit vector away from the bone."""
     if wp.max(p[0], p[1]) > wp.float64(0.0):
         return wp.normalize(wp.vec2d(wp.max(p[0], wp.float64(0.0)), wp.max(p[1], wp.float64(0.0))))
     if p[0] >= p[1]:
@@ -96,32 +96,32 @@ def share(p: wp.vec2d) -> wp.vec2d:
 
 @wp.func
 def distance(wall: Wall, p: wp.vec2d) -> wp.float64:
-    """d."""
+    """Return the distance d to the bone [m]."""
     return wp.dot(share(p), p) - wall.edge
 
 
 @wp.func
 def turned(wall: Wall, s: int, x: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.vec3d:
-    """What h falls by, and what r grows by, in such shares."""
+    """Return the displacement direction that reduces h by `along` and increases r by `across`."""
     return along * (wall.normal[s] + wall.bend[s] * x) + across * wall.way[s]
 
 
 @wp.func
 def slope(wall: Wall, s: int, x: wp.vec3d, p: wp.vec2d) -> wp.vec3d:
-    """m: d falls by m . du."""
+    """Return m = -grad d: d decreases by m . du."""
     at = share(p)
     return turned(wall, s, x, at[0], -at[1])
 
 
 @wp.func
 def stiffness(wall: Wall, s: int) -> wp.float64:
-    """w k = w mu / felt [N/m^2]."""
+    """Return the stiffness w k = w mu / (activation distance) [N/m^2]."""
     return wall.area[s] * wall.shear / (wall.times * wall.felt[s])
 
 
 @wp.func
 def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
-    """w k (b'' m (x) m + b' d''), without what may be negative of it, the edge's bend, where `definite`."""
+    """Return the block w k (b'' m (x) m + b' d''); if `definite`, without the edge curvature, which may be negative."""
     p = place(wall, s, x)
     d, m, at = distance(wall, p), slope(wall, s, x, p), share(p)
     felt = wall.times * wall.felt[s]
@@ -135,7 +135,7 @@ def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
 
 @wp.func
 def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
-    """t at which a distance that is distance - t falls - t^2 bends / 2, bends >= 0, has lost what it may at once."""
+    """Return the largest t <= 1 with distance - t falls - t^2 bends / 2 >= (1 - ROOM_KEPT) distance; bends >= 0."""
     lost = wp.float64(ROOM_KEPT) * distance
     root = falls + wp.sqrt(falls * falls + wp.float64(2.0) * lost * bends)
     if root > wp.float64(2.0) * lost:
@@ -145,12 +145,12 @@ def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.f
 
 @cache
 def build_kernels(device: Device) -> SkullKernels:
-    """Kernels of a device's scalar type; distances are in double precision."""
+    """Build kernels for a device's scalar type; distances are in double precision."""
     scalar, mat = device.scalar, device.matrix
 
     @wp.func
     def motion(u: wp.array2d(dtype=scalar), i: int, c: int) -> wp.vec3d:
-        """u_i in double precision."""
+        """Return the displacement u_i of a node in double precision."""
         return wp.vec3d(wp.float64(u[3 * i, c]), wp.float64(u[3 * i + 1, c]), wp.float64(u[3 * i + 2, c]))
 
     @forward_kernel(module="unique")
@@ -160,7 +160,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E += sum over nodes of w k b(d)."""
+        """Add the energy: E += sum over nodes of w k b(d)."""
         s, c = wp.tid()
         d, felt = distance(wall, place(wall, s, motion(u, wall.nodes[s], c))), wall.times * wall.felt[s]
         if d < felt:
@@ -173,7 +173,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """g -= w k b'(d) m."""
+        """Add the gradient: g -= w k b'(d) m."""
         s, c = wp.tid()
         x = motion(u, wall.nodes[s], c)
         p = place(wall, s, x)
@@ -191,7 +191,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f += K_ii p_i."""
+        """Add the tangent stiffness times p: f += K_ii p_i."""
         s, c = wp.tid()
         f = block_of(wall, s, motion(u, wall.nodes[s], c), definite[c]) * motion(p, wall.nodes[s], c)
         for k in range(3):
@@ -205,7 +205,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """K_ii."""
+        """Add the diagonal blocks K_ii."""
         s, c = wp.tid()
         K = block_of(wall, s, motion(u, wall.nodes[s], c), definite[c])
         block = mat()
@@ -222,7 +222,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array(dtype=scalar),
     ):
-        """d(u + t du) >= (1 - kept) d: no node that is on its side leaves it at once; d is convex in h and r."""
+        """Bound t by d(u + t du) >= (1 - kept) d: no node crosses the bone; d is convex in h and r."""
         s, c = wp.tid()
         x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
         p = place(wall, s, x)
@@ -235,20 +235,20 @@ def build_kernels(device: Device) -> SkullKernels:
 
 
 class Skull:
-    """A Term: the barrier of `barrier.py` between nodes and the bone that was over them at rest.
+    """Skull contact as a Term: the barrier of `barrier.py` between nodes and the bone that covers them.
 
     Parameters
     ----------
     bone
-        Where it is.
+        Bone over the nodes.
     count
-        N.
+        Number of nodes N.
     shear
         Shear modulus [Pa] of the tissue.
     device
-        Where its arrays live.
+        Device of the arrays.
     settings
-        Of its barrier.
+        Options of the barrier.
     """
 
     name = "skull contact"
@@ -273,11 +273,11 @@ class Skull:
         self._rest = sp.csc_array(sp.coo_array((blocks.ravel(), place), shape=(3 * count, 3 * count)))
 
     def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """Return the skull stays where it is."""
+        """Return 1 for every load case: the skull does not move."""
         return np.ones(len(cases.loads))
 
     def gaps(self, cases: Cases) -> np.ndarray:
-        """As far as brain may have to come from rest, or else from where it was."""
+        """Return the initial barrier width in units of its normal width (b,): larger if the start is undeformed."""
         known = np.zeros(len(cases.loads), bool)
         if cases.displacement is not None:
             known |= cases.displacement.any(axis=(1, 2))
@@ -286,58 +286,58 @@ class Skull:
         return np.where(known, self._settings.again, self._settings.at_first) / self._bone.felt.min()
 
     def buried(self, u: wp.array) -> np.ndarray:
-        """Return the skull is never inside what it holds."""
+        """Return False for every load case: the skull never penetrates the body."""
         return np.zeros(u.shape[1], bool)
 
     def overlaps(self, u: wp.array) -> np.ndarray:
-        """Return the skull is no tool."""
+        """Return False for every load case: the skull is not a tool."""
         return np.zeros((2, u.shape[1]), bool)
 
     def widen(self, times: float) -> None:
-        """The barrier as many times as wide, and as much softer; the bone steps back by as much."""
+        """Widen the barrier by a factor and soften it by the same factor; the bone recedes by the added width."""
         self._wall.times = times
 
     def reaction(self, u: wp.array) -> np.ndarray:
-        """Nobody holds the skull: no tools."""
+        """Return an empty array (b, 0, 6): there are no tools."""
         return np.zeros((u.shape[1], 0, 6))
 
     def begin(self, cases: Cases) -> None:
-        """The gap is its own again."""
+        """Reset the barrier to its own width."""
         self.widen(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
-        """Columns are all alike to the skull."""
+        """Do nothing: the skull is the same in all load cases."""
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E += barriers."""
+        """Add the barrier energies."""
         self._launch(self._kernels.add_energy, [u], out)
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """g += their slopes."""
+        """Add the barrier gradients."""
         self._launch(self._kernels.add_gradient, [u], out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Curvature is recomputed from u; where `definite`, the bone's edge counts as straight."""
+        """Set the linearisation point u; in `definite` load cases the bone's edge counts as straight."""
         self._at = [wp.clone(u), definite]
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """f += K(u) p."""
+        """Add the tangent stiffness times p: f += K(u) p."""
         self._launch(self._kernels.add_curvature, [p, *self._at], out)
 
     def add_diagonal(self, out: wp.array) -> None:
-        """Blocks += diagonal of K(u)."""
+        """Add the diagonal blocks of K(u)."""
         self._launch(self._kernels.add_diagonal, self._at, out)
 
     def rest_curvature(self) -> sp.csc_array:
-        """A skull half shut everywhere, for preconditioners: at rest nothing touches, under load some nodes do."""
+        """Return the half-closed contact stiffness (3N, 3N) for preconditioners: under load, some nodes touch."""
         return self._rest
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Nodes stay on their side of the bone; those that are behind it are pushed back."""
+        """Bound the step so that no node crosses the bone; penetrating nodes do not limit it."""
         self._launch(self._kernels.bound_step, [u, du], out)
 
     def end(self, u: wp.array) -> None:
-        """The skull remembers nothing."""
+        """Return None: the skull has no history."""
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array) -> None:
         self._device.launch(kernel, (len(self._bone.nodes), out.shape[-1]), [*inputs, self._wall], [out])

@@ -1,4 +1,4 @@
-"""The bone over a brain as each node of its surface meets it, and where it ends: the rim of the opening."""
+"""Bone over the nodes of a brain surface, and its edge at the craniotomy."""
 
 from __future__ import annotations
 
@@ -19,30 +19,31 @@ from ...geometry.surface import (
     normalise_vectors,
 )
 
-# What was under bone stays so far [m] from where it ends, and is barred wherever it goes.
+# Distance [m] inside the craniotomy assigned to nodes under bone, so that these stay covered wherever they move.
 UNDER_BONE = -1.0
-# Of a quadratic triangle's area each corner's share, and each middle's: all positive, so that no node is forgotten.
-CORNER, MIDDLE = 1.0 / 12.0, 1.0 / 4.0
+# Area fractions of a quadratic triangle's nodes: all positive, so that every node has an area.
+CORNER = 1.0 / 12.0  # each corner
+MIDDLE = 1.0 / 4.0  # each midpoint
 
 
 @dataclass(frozen=True)
 class BoneSettings:
-    """From where bone is felt, and how its bend and its edge are read off a mesh.
+    """Activation distance of skull contact, and estimation of the bone's curvature and edge from a mesh.
 
     Parameters
     ----------
     felt
-        [m] The skull is felt in the last of the gap: so far from it, or within all of a narrower one.
+        Maximum activation distance [m]; smaller if the gap is narrower.
     edge_felt
-        The edge of an opening is as round as a mesh can show, and felt from this share of its radius. On a sharp or a
-        hard edge nodes would snap from above it to below.
+        Activation distance at the craniotomy's edge, as a fraction of its radius, which depends on the mesh size. At a
+        sharp or stiff edge, nodes would snap from above it to below.
     blur
-        The blur through which bone over an opening goes on from that beside it, in the radii of the edge.
+        Standard deviation of the blur that extends the bone normals over the craniotomy [edge radii].
     neighbours, facing
-        The wall's bend at a node is read off so many nearest nodes, of those with a larger cosine between their
+        Number of nearest nodes for the bone's curvature at a node, and minimum cosine between their
         normals.
     far
-        Blurs from the edge, beyond which too little of it is seen.
+        Distance from the edge beyond which its direction is unreliable [standard deviations of the blur].
     """
 
     felt: float = 1e-4
@@ -54,28 +55,28 @@ class BoneSettings:
 
 
 BONE = BoneSettings()
-"""Bone as it is felt unless settings are given."""
+"""Default bone settings."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bone:
-    """What stands over k nodes of a surface.
+    """Bone over k nodes of a surface.
 
     Parameters
     ----------
     nodes
-        (k,) their numbers.
+        Node numbers (k,).
     normal, bend
-        (k, 3) unit vectors towards the bone; (k, 3, 3) [1/m] how they change along it, none of them hollow.
+        Unit vectors (k, 3) towards the bone; their derivatives (k, 3, 3) [1/m] along it, positive semi-definite.
     inside, way
-        (k,) [m] how far each is inside the opening, negative under bone; (k, 3) unit vectors into it, or zero where it
-        is too far.
+        Distances (k,) [m] inside the craniotomy, negative under bone; unit vectors (k, 3) into it, zero if too
+        far.
     felt, area
-        (k,) [m] how near each feels bone, [m^2] of surface that it stands for.
+        Activation distances (k,) [m], and tributary areas (k,) [m^2].
     gap
-        [m] between them at rest.
+        Undeformed distance between surface and bone [m].
     edge
-        [m], the radius of the opening's edge.
+        Radius of the craniotomy's edge [m].
     """
 
     nodes: np.ndarray
@@ -90,20 +91,18 @@ class Bone:
 
 
 def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneSettings = BONE) -> Bone:
-    """Over what a skull covers, and over the craniotomy near its edge; `gap` [m] at rest. Held nodes stay.
+    """Return the bone over covered nodes and over those of the craniotomy near its edge; fixed nodes have none.
 
     Raises
     ------
     InputError
-        An anatomy none of whose nodes could touch.
+        An anatomy without nodes that can touch the skull.
     """
     held = space.held(anatomy.held).all(axis=1)
     normal = space.sliding(anatomy.slide_normal, anatomy.held)
     slides = (normal != 0.0).any(axis=1) & ~held
     if not slides.any():
-        raise InputError(
-            "SkullContact finds no node that could touch: this anatomy has no slide normals, or holds all."
-        )
+        raise InputError("SkullContact finds no node that can touch: all slide normals are zero, or their nodes fixed.")
     inside, way = np.full(space.count, UNDER_BONE), np.zeros_like(normal)
     felt = np.full(space.count, min(settings.felt, gap))
     edge, rim = 0.0, find_opening_edge(anatomy)
@@ -133,21 +132,21 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
 
 
 def _areas(space: Discretisation) -> np.ndarray:
-    """Of the surface, what each node (N,) [m^2] stands for."""
+    """Return the tributary area (N,) [m^2] of each node on the surface."""
     area = compute_areas(space.nodes[space.surface[:, :3]])
     shares = np.full(3, 1.0 / 3.0) if space.surface.shape[1] == 3 else np.repeat([CORNER, MIDDLE], 3)
     return np.bincount(space.surface.ravel(), (area[:, None] * shares).ravel(), space.count)
 
 
 def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE) -> np.ndarray:
-    """How unit normals (k, 3) at points (k, 3) [m] of a wall change along it: (k, 3, 3) [1/m], symmetric.
+    """Estimate derivatives (k, 3, 3) [1/m], symmetric, of unit normals (k, 3) along a wall at points (k, 3) [m].
 
-    The least-squares fit of n_j - n_i = H (x_j - x_i) to the nearest points whose normals face the same way, along the
-    wall alone. Where the wall is hollow (a negative curvature) it counts as flat.
+    Least-squares fit of n_j - n_i = H (x_j - x_i) in the tangent plane, to the nearest points with similar
+    normals. Negative (concave) principal curvatures are set to 0.
     """
     count = min(settings.neighbours, len(points))
     near = KDTree(points).query(points, count)[1].reshape(len(points), count)
-    across = np.linalg.svd(normal[:, None])[2][:, 1:]  # two directions along the wall
+    across = np.linalg.svd(normal[:, None])[2][:, 1:]  # two tangents of the wall
     step = np.einsum("kja,kia->kij", across, points[near] - points[:, None])
     turn = np.einsum("kja,kia->kij", across, normal[near] - normal[:, None])
     weight = np.einsum("kia,ka->ki", normal[near], normal) > settings.facing
@@ -165,40 +164,40 @@ def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BON
 
 
 def find_opening_edge(anatomy: Anatomy) -> np.ndarray:
-    """Surface triangles (R, 3) that the edge of the craniotomy crosses: part open, part under bone."""
+    """Return surface triangles (R, 3) that cross the craniotomy's edge: some corners open, some under bone."""
     around = anatomy.mesh.surface[find_triangles_about_opening(anatomy)]
     opened = anatomy.craniotomy[around]
     return around[opened.any(axis=1) & ~opened.all(axis=1)]
 
 
 def compute_edge_radius(nodes: np.ndarray, rim: np.ndarray) -> float:
-    """How round [m] an edge looks across triangles (R, 3) of nodes (V, 3) [m]: as theirs are long, on average."""
+    """Return the edge radius [m] that triangles (R, 3) of nodes (V, 3) [m] resolve: their mean edge length."""
     return float(compute_edge_lengths(nodes[rim]).mean())
 
 
 def measure_inside_opening(
     anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float, far: float = BONE.far
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How far (n,) [m] points (n, 3) [m] of the surface are inside the craniotomy, and which way its middle is (n, 3).
+    """Return distances (n,) [m] of surface points (n, 3) [m] inside the craniotomy, and inward directions (n, 3).
 
-    Negative under bone. The way is of unit length and across the points' unit normals (n, 3); it is zero more than
-    `far` blurs from the edge.
+    Distances are negative under bone. Directions are unit vectors perpendicular to the unit normals (n, 3), or zero
+    more than `far` blurs from the edge.
 
-    Of a straight edge a Gaussian of standard deviation `blur` [m] leaves the share Phi(r / blur) of what is open to a
-    point that is r inside. That is inverted.
+    A Gaussian of standard deviation `blur` [m] at distance r inside a straight edge sees an open fraction
+    Phi(r / blur), which is inverted.
     """
     mesh, opened = anatomy.mesh, anatomy.craniotomy
     triangles = mesh.surface[find_triangles_about_opening(anatomy)]
     a, b, c = np.moveaxis(mesh.nodes[triangles], 1, 0)
     twice, middle, bare = np.cross(b - a, c - a), (a + b + c) / 3.0, opened[triangles].mean(axis=1)
     seen = KDTree(points).sparse_distance_matrix(KDTree(middle), BlurRange.reach * blur, output_type="coo_matrix")
-    # The other side of a thin body is not seen.
+    # exclude the opposite side of a thin body
     facing = np.einsum("ki,ki->k", normal[seen.row], twice[seen.col]).clip(0.0)
     seen.data = facing * np.exp(-0.5 * (seen.data / blur) ** 2)
     seen = seen.tocsr()
     whole, part = seen @ np.ones(len(bare)), seen @ bare
     share = np.divide(part, whole, out=np.zeros_like(part), where=whole > 0.0)
-    # The share's gradient, but for a positive factor.
+    # gradient of `share`, up to a positive factor
     uphill = seen @ (middle * bare[:, None]) - share[:, None] * (seen @ middle)
     across = normalise_vectors(uphill - (uphill * normal).sum(axis=1, keepdims=True) * normal)
     inside = ndtri(share).clip(-far, far)
@@ -206,6 +205,6 @@ def measure_inside_opening(
 
 
 def find_triangles_about_opening(anatomy: Anatomy) -> np.ndarray:
-    """(S,) bool: surface triangles whose corners all lie in the craniotomy or under bone."""
+    """Return a mask (S,) of surface triangles whose corners all lie in the craniotomy or under bone."""
     covered = np.logical_or(anatomy.slide_normal.any(axis=1), anatomy.held.all(axis=1))
     return np.all(np.logical_or(anatomy.craniotomy, covered)[anatomy.mesh.surface], axis=1)

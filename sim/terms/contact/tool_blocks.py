@@ -1,4 +1,4 @@
-"""Contact of columns that each have a block of threads: its forces, its curvature, and how far one may go."""
+"""Tool contact by one thread block per load case: forces, tangent stiffness and step bounds."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from .tool_functions import build_functions as at_triangles
 
 @wp.struct
 class ContactStage:
-    """Surface and tools, how they repel, and into how many rows of parts a triangle is cut at most."""
+    """Surface, tools and barrier, and the maximum number of sample rows per triangle."""
 
     surface: Surface
     tools: Tools
@@ -23,7 +23,7 @@ class ContactStage:
 
 @wp.struct
 class NearPairs:
-    """Pairs of a triangle and a tool that may be near: room for all (b, S T); how many (b,), and a number (b,)."""
+    """Workspace for near triangle-tool pairs: all pairs (b, S T), their number (b,), and a scalar (b,)."""
 
     pairs: wp.array2d(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
@@ -32,7 +32,7 @@ class NearPairs:
 
 @cache
 def build_functions(device: Device, size: int) -> BlockFunctions:
-    """Functions for surface triangles of `size` nodes, 3 or 6."""
+    """Build functions for surface triangles of `size` nodes, 3 or 6."""
     down, across = get_block_shape(device)
     threads, one = down * across, at_triangles(device, size)
 
@@ -45,7 +45,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
     def look(
         x: wp.array2d(dtype=wp.float64), reach: wp.float64, stage: ContactStage, near: NearPairs, c: int, me: int
     ) -> int:
-        """Find what may be within a reach; how many rows of parts these pairs have at most."""
+        """Find the pairs within `reach`; return the maximum number of their sample rows."""
         if me == 0:
             near.count[c] = 0
         wait()
@@ -68,7 +68,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """f_a += sum over points of w k b'(d) n N_a; what is near at x is known from now on."""
+        """Add forces f_a += sum over points of w k b'(d) n N_a; stores the near pairs at x."""
         tools, gap = stage.tools.radius.shape[0], stage.scale.gap
         for item in range(me, look(x, gap, stage, near, c, me), threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows
@@ -94,7 +94,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """K_ab += sum over points of w k H N_a N_b between nodes that have a place, with what is known to be near."""
+        """Add K_ab += sum over points of w k H N_a N_b between nodes with `place` >= 0, over the stored near pairs."""
         tools = stage.tools.radius.shape[0]
         for item in range(me, stage.rows * near.count[c], threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows
@@ -113,7 +113,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         c: int,
         me: int,
     ) -> wp.float64:
-        """Return the share of a way from x, at most 1, that may be gone; what is near is no longer known."""
+        """Return the fraction of a step from x, at most 1, that is allowed; overwrites the near pairs."""
         far = wp.float64(0.0)
         for i in range(me, x.shape[0] // 3, threads):
             far = wp.max(far, wp.length(wp.vec3d(way[3 * i, c], way[3 * i + 1, c], way[3 * i + 2, c])))

@@ -1,4 +1,4 @@
-"""Frictionless contact of a body's surface with rigid tools that are moved by pose."""
+"""Frictionless contact of a body's surface with rigid tools of prescribed pose."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,35 +24,35 @@ from .tool_functions import Scale, Surface, Tools
 from .tool_kernels import build_kernels
 from .tool_path import TOUCH, ContactSampling, ToolPath, approach
 
-# Of a triangle cut into smaller ones, the farthest point is so many of their edges from the nearest centre.
+# Distance from a point in a subdivided triangle to the nearest sample point, at most [edges of the subdivision].
 FARTHEST = 2.0 / 3.0
 
 
 class ToolContactTerm:
-    """A Term: the barrier between a body's surface and rigid tools, integrated over the surface at rest.
+    """Tool contact as a Term: barrier between a body's surface and rigid tools, integrated over the undeformed surface.
 
     Parameters
     ----------
     name
-        Unique in its problem.
+        Name, unique in the problem.
     tools
-        Their shapes.
+        Shapes of the tools.
     way
-        Cases -> from where to where they go; None where no tool is there.
+        Function Cases -> tool path; None if there is no tool.
     nodes, triangles
-        (N, 3) [m] at rest; (S, 3) or (S, 6), what may be touched of the surface.
+        Undeformed nodes (N, 3) [m]; triangles (S, 3) or (S, 6) of the surface that can be touched.
     whole
-        (W, 3) corners of the whole surface, outwards.
+        Corners (W, 3) of the whole surface, outwards.
     bone
-        (K, 3) or (K, 6), the surface where it is fixed or covered by the skull: no tool can be there.
+        Triangles (K, 3) or (K, 6) of the surface that is fixed or under the skull: no tool can be there.
     gap
-        Distance [m] at which tissue begins to feel a tool; it is never touched quite.
+        Activation distance of contact [m]; the surfaces never quite touch.
     shear
-        Shear modulus [Pa] of the tissue: contact is as stiff as fits it.
+        Shear modulus [Pa] of the tissue, to scale the contact stiffness.
     device
-        Where its arrays live.
+        Device of the arrays.
     touch
-        How finely the surface is looked at, and how far tools go at once.
+        Sampling of the surface, and maximum tool motion per step.
     """
 
     constant, passive, steep = False, False, True
@@ -90,12 +90,12 @@ class ToolContactTerm:
         self._asked, self._gap, self._shear = gap, (1.0 - touch.sag) * gap, shear
         self.widen(1.0)
         self._pose: np.ndarray | None = None
-        # A step asks for the same poses several times.
+        # a step needs the same poses several times
         self._stood = lru_cache(4)(self._brought)
         self._single: list[Tools] = []
 
     def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """As `ToolPath.stride`: through the air a tool goes as far as it can touch nothing."""
+        """Return the path fraction as `ToolPath.stride`, given each tool's clearance from the surface."""
         way = self._way(cases)
         if way is None:
             return np.ones(len(cases.loads))
@@ -106,12 +106,12 @@ class ToolContactTerm:
         return way.stride(self._shapes, of_tools.clip(0.0), self._touch)
 
     def gaps(self, cases: Cases) -> np.ndarray:
-        """As the farthest-moved tool goes."""
+        """Return the travel of the farthest-moved tool in units of the gap (B,)."""
         way = self._way(cases)
         return np.zeros(len(cases.loads)) if way is None else way.travel(self._shapes).max(axis=1) / self._gap
 
     def buried(self, u: wp.array) -> np.ndarray:
-        """In which columns (b,) the middle of a tool, or a corner of what it is made of, is inside the body."""
+        """Return a mask (b,) of load cases with a tool's centre, or a corner of its cores, inside the body."""
         if self._pose is None:
             return np.zeros(u.shape[1], bool)
         points = [
@@ -121,7 +121,7 @@ class ToolContactTerm:
         return find_enclosing_columns(self._device, np.concatenate(points, axis=1), self._surface.rest, self._closed, u)
 
     def overlaps(self, u: wp.array) -> np.ndarray:
-        """As `Barrier.overlaps`: deeper than the gap."""
+        """Return overlaps as `Barrier.overlaps`, for penetration deeper than the gap."""
         if self._pose is None:
             return np.zeros((2, u.shape[1]), bool)
         dim, found = (len(self._owner), u.shape[1]), []
@@ -133,58 +133,58 @@ class ToolContactTerm:
         return np.stack(found)
 
     def widen(self, times: float) -> None:
-        """The barrier as many times as wide, and as much softer."""
+        """Widen the barrier by a factor and soften it by the same factor."""
         self._scale = Scale()
         self._scale.gap, self._scale.stiffness = times * self._gap, self._shear / (times * self._gap)
 
     def begin(self, cases: Cases) -> None:
-        """Put the tools where they are after their share of the way; the gap is its own again."""
+        """Place the tools at their fraction of the path, and reset the gap."""
         way = self._way(cases)
         self._stand(None if way is None else way.at(cases.gone))
         self.widen(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
-        """Leave the others' tools."""
+        """Keep the tools of these load cases only."""
         self._stand(None if self._pose is None else self._pose[columns])
 
     def energy(self, u: wp.array, out: wp.array) -> None:
-        """E += barriers."""
+        """Add the barrier energies."""
         self._launch(self._kernels.add_energy, [u], out, u.shape[1])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """g += their slopes."""
+        """Add the barrier gradients."""
         self._launch(self._kernels.add_gradient, [u], out, u.shape[1])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Curvature is recomputed from u; where `definite`, tools count as flat."""
+        """Set the linearisation point u; in `definite` load cases tools count as flat."""
         self._at = [wp.clone(u), definite]
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """f += K(u) p."""
+        """Add the tangent stiffness times p: f += K(u) p."""
         self._launch(self._kernels.add_curvature, [p, *self._at], out, p.shape[1])
 
     def add_diagonal(self, out: wp.array) -> None:
-        """Blocks += diagonal of K(u)."""
+        """Add the diagonal blocks of K(u)."""
         self._launch(self._kernels.add_diagonal, self._at, out, out.shape[1])
 
     def rest_curvature(self) -> None:
-        """Nothing is touched at rest."""
+        """Return None: there is no contact in the undeformed configuration."""
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """No point of the surface passes through a tool."""
+        """Bound the step so that no point of the surface passes through a tool."""
         self._launch(self._kernels.bound_step, [u, du], out, u.shape[1])
 
     def add_matrix(self, u: wp.array, definite: wp.array, place: wp.array, out: wp.array) -> None:
-        """As `DenseTerm.add_matrix`."""
+        """Add the tangent stiffness as `DenseTerm.add_matrix`."""
         self._launch(self._kernels.add_matrix, [u, definite, place], out, u.shape[1])
 
     @cached_property
     def touchable(self) -> np.ndarray:
-        """The nodes (n,), ascending, of the surface that tools can touch."""
+        """Nodes (n,), ascending, of the surface that tools can touch."""
         return np.unique(self._triangles)
 
     def around(self, most: int) -> np.ndarray:
-        """As `Local.around`."""
+        """Return nodes as `Local.around`."""
         own = self.touchable
         far, _ = KDTree(self._nodes[own]).query(self._nodes)
         far[own] = -1.0
@@ -193,7 +193,7 @@ class ToolContactTerm:
 
     @cached_property
     def _alone(self) -> "tuple[ToolContactTerm, Reduced]":
-        """The same on the touchable nodes alone, and as a function of where these go."""
+        """Term on the touchable nodes alone, and the same as a `Reduction`."""
         nodes, own = self._nodes[self.touchable], np.searchsorted(self.touchable, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = ToolContactTerm(
@@ -203,7 +203,7 @@ class ToolContactTerm:
         return term, Reduced(term, len(nodes), own.shape[1], exact)
 
     def reduced(self, columns: np.ndarray) -> Reduced | None:
-        """As `Local.reduced`."""
+        """Return the reduced barrier as `Local.reduced`."""
         if self._pose is None:
             return None
         term, reduced = self._alone
@@ -212,7 +212,7 @@ class ToolContactTerm:
         return reduced
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
-        """As `Local.pressed`."""
+        """Return active nodes and their tangent stiffness as `Local.pressed`."""
         barrier = self.reduced(np.zeros(1, int))
         if barrier is None:
             return np.zeros(0, int), np.zeros((0, 0))
@@ -222,13 +222,13 @@ class ToolContactTerm:
         return np.flatnonzero(felt), barrier.curvature(w, place, int(felt.sum()), np.ones(1, bool))[0]
 
     def reaction(self, u: wp.array) -> np.ndarray:
-        """(b, tools, 6): force [N] and moment [N m] about its origin that each tool exerts at u (3N, b) [m]."""
+        """Return force [N] and moment about its origin [N m] that each tool exerts at u (3N, b): (b, tools, 6)."""
         out = wp.zeros((u.shape[1], len(self._owner), 6), dtype=wp.float64, device=self._device.name)
         self._launch(self._kernels.add_reaction, [u], out, u.shape[1])
         return np.add.reduceat(out.numpy(), self._first, axis=1)
 
     def end(self, u: wp.array) -> np.ndarray | None:
-        """Where the tools are (b, tools, 4, 4): the next way begins there."""
+        """Return the poses (b, tools, 4, 4), at which the next path begins."""
         return self._pose
 
     def _stand(self, pose: np.ndarray | None) -> None:
@@ -239,7 +239,7 @@ class ToolContactTerm:
             self._tools = self._placed(self._tools)
 
     def _placed(self, tools: Tools) -> Tools:
-        """Return the same, where those of a single column always are: a captured graph reads them there."""
+        """Copy the tools of a single load case to fixed arrays, which a captured graph reads."""
         if not self._single:
             self._single.append(self._brought(np.ascontiguousarray(self._pose, np.float64).tobytes()))
         for mine, its in ((self._single[0].rotation, tools.rotation), (self._single[0].origin, tools.origin)):
@@ -250,7 +250,7 @@ class ToolContactTerm:
         return self._stood(np.ascontiguousarray(pose, np.float64).tobytes())
 
     def _brought(self, pose: bytes) -> Tools:
-        """Tools at poses (b, tools, 4, 4) in double precision."""
+        """Return the tools at poses (b, tools, 4, 4) in double precision."""
         of_cores = np.frombuffer(pose).reshape(-1, len(self._shapes), 4, 4)[:, self._owner].swapaxes(0, 1)
         out = Tools()
         out.centre, out.half, out.radius = self._cores
@@ -259,7 +259,7 @@ class ToolContactTerm:
         return out
 
     def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
-        """As `DenseTerm.stage`."""
+        """Return the structs as `DenseTerm.stage`."""
         if self._pose is None:
             raise ValueError("no tool is there")
         out, near, name = ContactStage(), NearPairs(), self._device.name
@@ -286,12 +286,12 @@ def build_tool_contact(
     device: Device,
     touch: ContactSampling = TOUCH,
 ) -> ToolContactTerm:
-    """Return the term of an effect on tissue with a shear modulus [Pa]."""
+    """Return the contact term of an effect on tissue with a shear modulus [Pa]."""
     contact = isinstance(effect, ToolContact)
     name, tools = ("tool contact", effect.tools) if contact else ("retraction", (effect.blade,))
     triangles = space.surface[anatomy.bare]
     if not len(triangles):
-        raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is held or slides.")
+        raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is fixed or under the skull.")
     touchable, reach = np.unique(triangles), _reach(space.nodes, triangles)
     points, normals = space.nodes[touchable], compute_vertex_normals(space.nodes, triangles[:, :3])[touchable]
 
@@ -300,7 +300,7 @@ def build_tool_contact(
         return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, normals, reach, touch.march)
 
     def clear(pose: np.ndarray) -> np.ndarray:
-        """Where tools (B, tools, 4, 4) came from."""
+        """Return the poses from which tools (B, tools, 4, 4) approach."""
         begin = [came_from(number, one.tobytes()) for case in pose for number, one in enumerate(case)]
         return np.reshape(begin, pose.shape)
 
@@ -333,7 +333,7 @@ def build_tool_contact(
 
 
 def _sampled(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Device) -> tuple[Surface, int]:
-    """Surface triangles with sample points at most `fine` [m] apart, and the most rows of points in a triangle."""
+    """Return surface triangles with sample points at most `fine` [m] apart, and the maximum rows per triangle."""
     corners = nodes[triangles[:, :3]]
     pieces = np.ceil(compute_edge_lengths(corners).max(axis=1) / fine).astype(np.int32)
     out = Surface()
@@ -347,7 +347,7 @@ def _sampled(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Devi
 def _begun(
     last: np.ndarray | None, anew: np.ndarray | None, clear: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
 ) -> np.ndarray:
-    """Where ways to poses (B, tools, 4, 4) begin: where tools were last, clear of the body who was nowhere, or anew."""
+    """Return path starts for poses (B, tools, 4, 4): the last poses; contact-free ones without history or if `anew`."""
     begin = pose.copy() if last is None else last.copy()
     new = np.ones(len(pose), bool) if last is None else np.zeros(len(pose), bool) if anew is None else anew
     begin[new] = clear(pose[new])
@@ -355,7 +355,7 @@ def _begun(
 
 
 def _reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """How far (n,) [m] each of a surface's own nodes, ascending, is at most from the points that are nearest to it."""
+    """Return the maximum distance (n,) [m] from each surface node, ascending, to the points nearest to it."""
     numbers, table = np.unique(triangles, return_inverse=True)
     out = np.zeros(len(numbers))
     np.maximum.at(

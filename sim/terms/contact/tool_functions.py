@@ -1,4 +1,4 @@
-"""What contact is at a surface triangle and a tool: its forces, its curvature, and how far it lets the triangle go."""
+"""Warp functions for contact of a surface triangle and a tool: forces, tangent stiffness and step bounds."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -9,18 +9,18 @@ import warp as wp
 from ...runtime.device import Device
 from .barrier import barrier, barrier_curvature, barrier_slope
 
-# A step takes no point farther than this share of its distance from the middle of a tool.
+# Maximum motion of a point per step, as a fraction of its distance from the tool's core.
 ROOM_KEPT = 0.8
-# Curved triangles reach farther from their centre than their nodes do.
+# Bound of a curved triangle's extent relative to its nodes' distance from the centre.
 BULGE = 1.5
-# From one point of a row to the next it is so many times what the nodes are from the middle of their corners, over the
-# pieces: the shape functions' slopes, summed.
+# Distance between neighbouring points of a row, at most, times pieces / largest node distance from the corners'
+# centroid: the sum of the shape functions' slopes.
 STEEP = {3: 4.0 / 3.0, 6: 28.0 / 3.0}
 
 
 @wp.struct
 class Tools:
-    """T tools in b columns: cores as `tools.Core`, and how they stand: rotations and places."""
+    """T tools in b load cases: cores as `tools.Core`, and their rotations and origins."""
 
     centre: wp.array(dtype=wp.vec3d)
     half: wp.array(dtype=wp.vec3d)
@@ -31,7 +31,7 @@ class Tools:
 
 @wp.struct
 class Surface:
-    """Surface triangles: their nodes' places at rest and numbers, areas, and into how many parts an edge is cut."""
+    """Surface triangles: undeformed node positions, node numbers, subdivisions of an edge, and areas."""
 
     rest: wp.array(dtype=wp.vec3d)
     table: wp.array2d(dtype=wp.int32)
@@ -41,7 +41,7 @@ class Surface:
 
 @wp.struct
 class Scale:
-    """How wide the barrier is [m], and how stiff [Pa/m]."""
+    """Width [m] and stiffness [Pa/m] of the barrier."""
 
     gap: wp.float64
     stiffness: wp.float64
@@ -58,9 +58,9 @@ class ToolDistance:
 
 @wp.func
 def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
-    """As a core sees a point: d = |v| - r, v from its nearest point to p; n = v / |v|; dn = (M - n (x) n) / |v|.
+    """Return distance d = |v| - r to a core, v from its nearest point to p; n = v / |v|; dn = (M - n (x) n) / |v|.
 
-    M keeps the components in which p lies beyond the core.
+    M selects the components in which p lies outside the core.
     """
     one, zero = wp.float64(1.0), wp.float64(0.0)
     v, beyond = wp.vec3d(), wp.vec3d()
@@ -70,7 +70,7 @@ def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
     length = wp.length(v)
     out = ToolDistance()
     out.distance = length - radius
-    out.normal = wp.vec3d(zero, zero, -one)  # on the core itself: away from the shaft
+    out.normal = wp.vec3d(zero, zero, -one)  # on the core itself: opposite to the shaft
     if length > zero:
         out.normal = v / length
         out.bend = (wp.diag(beyond) - wp.outer(out.normal, out.normal)) / length
@@ -79,7 +79,7 @@ def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
 
 @wp.func
 def clear(room: wp.float64, pace: wp.float64, most: int) -> int:
-    """How many points on, 1 to `most`, the next is that may lack room: from one to the next it shrinks by a pace."""
+    """Return the offset, 1 to `most`, of the next point that may touch if `room` shrinks by `pace` per point."""
     out = wp.int32(1)
     if room > pace:
         out = wp.int32(wp.min(room / pace, wp.float64(most)))
@@ -88,7 +88,7 @@ def clear(room: wp.float64, pace: wp.float64, most: int) -> int:
 
 @wp.func
 def curvature_at(touch: ToolDistance, gap: wp.float64, definite: int) -> wp.mat33d:
-    """b'' n (x) n + b' dn; the first alone, which is never negative, where `definite`."""
+    """Return b'' n (x) n + b' dn; if `definite`, only the first term, which is positive semi-definite."""
     out = barrier_curvature(touch.distance, gap) * wp.outer(touch.normal, touch.normal)
     if definite == 0:
         out += barrier_slope(touch.distance, gap) * touch.bend
@@ -97,11 +97,11 @@ def curvature_at(touch: ToolDistance, gap: wp.float64, definite: int) -> wp.mat3
 
 @dataclass(frozen=True)
 class ToolFunctions:
-    """Functions of Warp for triangles of one number of nodes, of which `forces` (size, 3) are a type.
+    """Warp functions for triangles with a fixed number of nodes; `forces` is their type (size, 3).
 
-    A triangle is looked at in the centres of pieces^2 equal parts, which lie in as many rows as there are pieces. What
-    says `_in_row` is the sum over one of these rows. It is asked and answered in the axes of a core (`seen`), and looks
-    at no point that is surely out of its reach.
+    A triangle is sampled at the centroids of pieces^2 congruent parts, in as many rows as pieces. Functions
+    `_in_row` sum over one row. They work in the axes of a core (`seen`), and skip
+    points that are certainly out of its range.
     """
 
     forces: Any
@@ -123,9 +123,9 @@ class ToolFunctions:
 
 @cache
 def build_functions(device: Device, size: int) -> ToolFunctions:
-    """Functions for surface triangles of `size` nodes, 3 or 6.
+    """Build functions for surface triangles of `size` nodes, 3 or 6.
 
-    Positions and distances are in double precision whatever the device's scalar: gaps are small beside bodies.
+    Positions and distances are in double precision on every device, since gaps are small compared with bodies.
     """
     scalar = device.scalar
     shares = wp.types.vector(length=size, dtype=wp.float64)
@@ -136,7 +136,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def shape_of(i: int, j: int, n: int) -> shares:
-        """Shape functions at the centre of the j-th part of the i-th row; odd parts are turned round."""
+        """Return shape functions at the centroid of the j-th part of the i-th row; odd parts are turned upside down."""
         third, turned = wp.float64(1.0) / wp.float64(3 * n), j % 2
         y = wp.float64(3 * i + 1 + turned) * third
         z = wp.float64(3 * (j // 2) + 1 + turned) * third
@@ -152,7 +152,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def motion_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
-        """How far a triangle's nodes go (size, 3)."""
+        """Return the displacements of a triangle's nodes (size, 3)."""
         out = forces()
         for a in range(size):
             for k in range(3):
@@ -161,7 +161,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def nodes_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
-        """Where they are (size, 3)."""
+        """Return the deformed positions of a triangle's nodes (size, 3)."""
         out = motion_of(surface, u, s, c)
         for a in range(size):
             for k in range(3):
@@ -170,7 +170,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def seen(at: forces, tools: Tools, k: int, c: int) -> forces:
-        """Return the same from the middle of a core, along its axes."""
+        """Return positions relative to a core's centre, along its axes."""
         R = tools.rotation[k, c]
         start = tools.origin[k, c] + R * tools.centre[k]
         out = forces()
@@ -180,19 +180,19 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def spread(surface: Surface, total: forces, s: int, c: int, out: wp.array2d(dtype=scalar)):
-        """f_a += total_a."""
+        """Add nodal forces of a triangle: f_a += total_a."""
         for a in range(size):
             for k in range(3):
                 wp.atomic_add(out, 3 * surface.table[s, a] + k, c, scalar(total[a, k]))
 
     @wp.func
     def weight_of(surface: Surface, scale: Scale, s: int) -> wp.float64:
-        """Stiffness times the area that each point of a triangle stands for [N/m]."""
+        """Return stiffness times the area per sample point of a triangle [N/m]."""
         return scale.stiffness * surface.area[s] / wp.float64(surface.pieces[s] * surface.pieces[s])
 
     @wp.func
     def reach_of(along: forces) -> wp.float64:
-        """How far a point of a triangle is from where there is nothing, at most: (size, 3) from there."""
+        """Return a bound of the norm over a triangle, from nodal vectors (size, 3)."""
         out = wp.float64(0.0)
         for a in range(size):
             out = wp.max(out, wp.length(along[a]))
@@ -200,7 +200,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def around(at: forces) -> forces:
-        """Nodes (size, 3) from the middle of their corners."""
+        """Return the nodes (size, 3) relative to the centroid of their corners."""
         middle, out = wp.vec3d(), at
         for a in range(3):
             middle += at[a] / wp.float64(3.0)
@@ -210,26 +210,26 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def pace_of(at: forces, n: int) -> wp.float64:
-        """How far one point of a row is from the next, at most.
+        """Return a bound of the distance between neighbouring points of a row.
 
-        Between them barycentric coordinates change by 1, 1 and 2 thirds of a piece.
+        Barycentric coordinates change by 1, 1 and 2 thirds of a piece between them.
         """
         return steep * reach_of(around(at)) / (bulge * wp.float64(n))
 
     @wp.func
     def least_distance(at: forces, times: wp.float64, half: wp.vec3d, radius: wp.float64) -> wp.float64:
-        """No point of a triangle so many times as large is nearer to a core."""
+        """Return a lower bound of a core's distance from a triangle scaled by `times` about its centroid."""
         arms = around(at)
         return touch_of(at[0] - arms[0], half, radius).distance - times * reach_of(arms)
 
     @wp.func
     def is_near(at: forces, reach: wp.float64, half: wp.vec3d, radius: wp.float64) -> bool:
-        """Whether any point of a triangle may be in a core's reach."""
+        """Return True if a point of the triangle may be within `reach` of a core."""
         return least_distance(at, wp.float64(1.0), half, radius) < reach
 
     @wp.func
     def energy_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
-        """Sum over points of b(d)."""
+        """Return the sum over points of a row of b(d)."""
         total, pace, most, j = wp.float64(0.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             d = touch_of(shape_of(i, j, n) * at, half, radius).distance
@@ -239,7 +239,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def force_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> forces:
-        """Sum over points of N_a b'(d) n."""
+        """Return the sum over points of a row of N_a b'(d) n."""
         total, pace, most, j = forces(), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             N = shape_of(i, j, n)
@@ -263,7 +263,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         c: int,
         out: wp.array3d(dtype=wp.float64),
     ):
-        """K_ab += sum over points of w k H N_a N_b between the nodes that have a place."""
+        """Add K_ab += sum over points of a row of w k H N_a N_b, between the nodes with `place` >= 0."""
         n, half, radius = surface.pieces[s], tools.half[k], tools.radius[k]
         total, felt, pace, most, j = blocks(), wp.bool(False), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
@@ -295,7 +295,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def share_in_row(at: forces, along: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64) -> wp.float64:
-        """Return the share of a motion, at most 1, after which no point is as far as the middle of a core."""
+        """Return the fraction of a motion, at most 1, that takes no point as far as the centre of a core."""
         out, pace, most, j = wp.float64(1.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         farthest = reach_of(along)
         while j < most:

@@ -1,4 +1,4 @@
-"""The loops of contact over surface triangles."""
+"""Warp kernels of tool contact over surface triangles."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +12,7 @@ from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools, build_funct
 
 @dataclass(frozen=True)
 class ToolKernels:
-    """Loops over (triangle, column) for triangles of one number of nodes."""
+    """Kernels over (triangle, load case) for triangles with a fixed number of nodes."""
 
     add_energy: wp.Kernel
     add_gradient: wp.Kernel
@@ -27,7 +27,7 @@ class ToolKernels:
 
 @cache
 def build_kernels(device: Device, size: int) -> ToolKernels:
-    """Kernels for surface triangles of `size` nodes, 3 or 6. Each launches over (triangle, column)."""
+    """Build kernels for surface triangles of `size` nodes, 3 or 6. Each launches over (triangle, column)."""
     scalar, mat = device.scalar, device.matrix
     here, kept = build_functions(device, size), wp.constant(wp.float64(ROOM_KEPT))
     stretch = wp.constant(wp.float64(1.0 if size == 6 else BULGE))
@@ -52,7 +52,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """E += sum over points of w k b(d)."""
+        """Add the energy: E += sum over points of w k b(d)."""
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
@@ -72,7 +72,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """g_a += sum over points of w k b'(d) n N_a."""
+        """Add the gradient: g_a += sum over points of w k b'(d) n N_a."""
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
@@ -94,7 +94,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """f_a += sum over points of w k H N_a sum over nodes of N_b p_b."""
+        """Add the tangent stiffness times p: f_a += sum over points of w k H N_a sum over nodes of N_b p_b."""
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
@@ -121,7 +121,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """K_aa += sum over points of w k H N_a^2."""
+        """Add the diagonal blocks: K_aa += sum over points of w k H N_a^2."""
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
@@ -154,7 +154,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """K_ab += sum over points of w k H N_a N_b, of each column, between the nodes that have a place in it."""
+        """Add the tangent stiffness: K_ab += sum over points of w k H N_a N_b, between the nodes with `place` >= 0."""
         s, c = wp.tid()
         at = nodes_of(surface, u, s, c)
         for k in range(tools.radius.shape[0]):
@@ -172,7 +172,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """Force and moment about each tool's origin, as the tool exerts them: sums of -w k b'(d) n and its moments."""
+        """Add force and moment of each tool about its origin: sums of -w k b'(d) n and of its moments."""
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
@@ -203,7 +203,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array(dtype=scalar),
     ):
-        """t <= kept (d + r) / |dx|: no point goes as far as the middle of a tool, and out at its other side."""
+        """Bound t <= kept (d + r) / |dx|: no point moves as far as the centre of a tool, and through it."""
         s, c = wp.tid()
         at, n, along = nodes_of(surface, u, s, c), surface.pieces[s], motion_of(surface, du, s, c)
         for k in range(tools.radius.shape[0]):
@@ -220,7 +220,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """How far each tool is from the surface at least, which may stretch."""
+        """Compute a lower bound of each tool's distance from the surface, which may be curved or stretched."""
         s, c = wp.tid()
         at = nodes_of(surface, u, s, c)
         for k in range(tools.radius.shape[0]):
@@ -234,7 +234,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """Least signed distance from the points of the surface to each core, where it is negative."""
+        """Compute the minimum signed distance from surface points to each core, if negative."""
         s, c = wp.tid()
         at, n = nodes_of(surface, u, s, c), surface.pieces[s]
         for k in range(tools.radius.shape[0]):

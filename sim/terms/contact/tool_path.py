@@ -1,4 +1,4 @@
-"""How rigid tools get from one pose to another, and where one comes from that has not touched yet."""
+"""Paths of rigid tools between poses, and contact-free start poses."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from ...tools import Core, Tool, compute_distances, compute_extent, list_cores
 
 @dataclass(frozen=True)
 class ContactSampling:
-    """How finely a surface is looked at under tools, and how these come there.
+    """Sampling of a surface under tools, and step limits of tool paths.
 
     Parameters
     ----------
     sag
-        Surfaces are looked at in points. Between them they are nearer to a tool by at most this share of the gap. It is
-        added to the tool's radius, so that no point of a surface is inside.
+        Maximum decrease of a tool's distance between sample points of the surface, as a fraction of the gap. It is
+        added to the tool's radius, so that no point of the surface is inside.
     stretch
-        Triangles may be stretched so many times before that may fail.
+        Maximum stretch of triangles for which this bound holds.
     stride
-        A step moves no point of a tool farther into tissue than this share of its radius: none comes out at its other
-        side.
+        Maximum motion of a tool into tissue per step, as a fraction of its radius, so that it cannot pass
+        through.
     march
-        Most steps of a tool's way through the air, each as far as nothing can be touched.
+        Maximum steps of a tool's approach through air, each as long as the clearance.
     kept
-        Poses of which it is kept where their tools came from: a solver asks again and again.
+        Number of poses whose approach is cached, since a solver requests them repeatedly.
     """
 
     sag: float = 0.25
@@ -39,24 +39,24 @@ class ContactSampling:
 
 
 TOUCH = ContactSampling()
-"""Contact with tools as it is unless another is given."""
+"""Default sampling of tool contact."""
 
 
 @dataclass(frozen=True, eq=False)
 class ToolPath:
-    """B load cases' tools on their way: T_world_tool (B, tools, 4, 4) at its beginning and at its end."""
+    """Tool paths of B load cases: T_world_tool (B, tools, 4, 4) at the beginning and at the end."""
 
     begin: np.ndarray
     end: np.ndarray
 
     def at(self, share: np.ndarray) -> np.ndarray:
-        """Poses (B, tools, 4, 4) after shares (B,) of the way: straight, turning evenly (spherical interpolation)."""
+        """Return poses (B, tools, 4, 4) at path fractions (B,), with spherical interpolation of rotations."""
         count, tools = self.end.shape[:2]
         share = np.repeat(share, tools)
         before, after = self.begin.reshape(-1, 4, 4), self.end.reshape(-1, 4, 4)
         turn = Rotation.from_matrix(before[:, :3, :3].swapaxes(1, 2) @ after[:, :3, :3]).as_rotvec()
         out = after.copy()
-        on_the_way = share != 1.0  # the end is reached to the last digit
+        on_the_way = share != 1.0  # the end pose is exact
         partly = Rotation.from_rotvec(share[:, None] * turn).as_matrix()
         out[on_the_way, :3, :3] = (before[:, :3, :3] @ partly)[on_the_way]
         moved = before[:, :3, 3] + share[:, None] * (after[:, :3, 3] - before[:, :3, 3])
@@ -64,7 +64,7 @@ class ToolPath:
         return out.reshape(count, tools, 4, 4)
 
     def travel(self, tools: tuple[Tool, ...]) -> np.ndarray:
-        """How far (B, tools) [m] the points of each tool go, at most."""
+        """Return the maximum motion (B, tools) [m] of any point of each tool."""
         before, after = self.begin[:, :, :3], self.end[:, :, :3]
         turn = (before[..., :3].swapaxes(2, 3) @ after[..., :3]).reshape(-1, 3, 3)
         angle = Rotation.from_matrix(turn).magnitude().reshape(self.end.shape[:2])
@@ -72,7 +72,7 @@ class ToolPath:
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
     def stride(self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = TOUCH) -> np.ndarray:
-        """The longest shares (B,), at most 1, of the way that tools may go at once that are `clear` (B, tools) [m]."""
+        """Return the path fraction (B,), at most 1, that tools with clearance `clear` (B, tools) [m] may move."""
         most = clear + touch.stride * np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
@@ -85,12 +85,12 @@ def approach(
     reach: np.ndarray,
     march: int = ContactSampling.march,
 ) -> np.ndarray:
-    """Pose (4, 4) just clear of a surface from which a tool comes straight to `pose` (4, 4).
+    """Return the pose (4, 4), just clear of a surface, from which a tool moves straight to `pose` (4, 4).
 
-    The way is along its shaft, or along the surface's outward normal where that is less than half as long. An
-    instrument that lies flat in tissue was not pushed in from the side. A tool that is clear at `pose` comes from
-    there. The surface has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `reach` (n,) [m] round
-    each vertex. The tool is followed through the air in `march` steps at most.
+    The direction is along its shaft, or along the surface's outward normal if that path is less than half as long: an
+    instrument that lies flat in tissue was not inserted sideways. A tool that is clear at `pose` starts
+    there. The surface has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `reach` (n,) [m] around
+    each vertex. The approach through air takes `march` steps at most.
     """
     cores, R = list_cores(tool), pose[:3, :3]
     along_shaft = _cleared(tool, pose, R, cores, points, reach, march)
@@ -114,7 +114,7 @@ def _cleared(
     reach: np.ndarray,
     march: int,
 ) -> np.ndarray:
-    """Pose as of `approach`, along the third column of R (3, 3); `cores` in the axes of R contain the tool."""
+    """Return the pose as `approach`, along the third column of R (3, 3); `cores` in the axes of R contain the tool."""
     out, local = pose.copy(), (points - pose[:3, 3]) @ R
     back, room = max(_above(core, local, reach) for core in cores), 0.0
     for _ in range(march):
@@ -125,7 +125,7 @@ def _cleared(
 
 
 def _above(core: Core, local: np.ndarray, reach: np.ndarray) -> float:
-    """How far [m] a core must go up its axis z to be above all of a surface that it meets on its way down."""
+    """Return the distance [m] by which a core must rise along its axis z to be above any surface on its way down."""
     aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
     highest = (local[:, 2] + reach)[aside <= core.radius + reach].max(initial=-np.inf)
     return max(0.0, float(highest - (core.centre[2] - core.half[2] - core.radius)))

@@ -1,1 +1,1 @@
-"""One file per tissue law."""
+"""Material laws, one per file."""

@@ -1,4 +1,4 @@
-"""What the solver asks of a tissue law, as checks that anybody can run on a law of their own."""
+"""Conformance checks of a material law against the requirements of the solver, also for user-defined laws."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from ...runtime.device import Device, Precision, find_device, forward_kernel
 
 @dataclass(frozen=True)
 class TestStrains:
-    """The strains at which a law is checked.
+    """Strains at which a law is checked.
 
     Parameters
     ----------
     count
-        Random displacement gradients.
+        Number of random displacement gradients.
     large, small, single
-        Their standard deviation at large strain, at small, and in single precision.
+        Their standard deviation at large strain, at small strain, and in single precision.
     step, short_step
-        A step of central differences: of the energy, and of the stress.
+        Step of central differences of the energy, and of the stress.
     """
 
     count: int = 60
@@ -45,18 +45,18 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Evaluator:
-    """A law's Warp functions on arrays of displacement gradients; `of` is the tissue unless another is given."""
+    """Warp functions of a law on arrays of displacement gradients; `of` is the default tissue."""
 
     device: Device
     kernel: wp.Kernel
     of: Tissue
 
     def __call__(self, H: np.ndarray, D: np.ndarray | None = None, of: Tissue | None = None) -> Evaluated:
-        """At gradients H (n, 3, 3), along changes D (n, 3, 3) of them."""
+        """Evaluate at gradients H (n, 3, 3), with increments D (n, 3, 3)."""
         return self.at(H, D, (of or self.of).coefficients)
 
     def at(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
-        """Return the same with other coefficients."""
+        """Evaluate with other coefficients."""
         count, device = len(H), self.device
         energy = device.zeros(count)
         stress, change = (wp.zeros(count, dtype=device.matrix, device=device.name) for _ in range(2))
@@ -68,7 +68,7 @@ class Evaluator:
 
 @cache
 def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
-    """Return the functions of a tissue's law on the CPU."""
+    """Build the evaluator of a tissue's law on the CPU."""
     device = find_device("cpu", precision)
     scalar, mat = device.scalar, device.matrix
     constants = wp.types.vector(len(of.coefficients), scalar)
@@ -84,7 +84,7 @@ def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
         stress: wp.array(dtype=mat),
         change: wp.array(dtype=mat),
     ):
-        """psi, P and dP."""
+        """Evaluate psi, P and dP."""
         i = wp.tid()
         energy[i] = density(H[i], c)
         stress[i] = stress_of(H[i], c)
@@ -95,7 +95,7 @@ def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
 
 @dataclass(frozen=True)
 class Finding:
-    """One check of a law: how far it is off, relative to what it is compared with, and how far it may be."""
+    """Result of one check: relative error, and its limit."""
 
     name: str
     error: float
@@ -103,26 +103,26 @@ class Finding:
 
     @property
     def kept(self) -> bool:
-        """Whether it is within its limit; an error that is no number is not."""
+        """True if the error is within its limit; False for NaN."""
         return self.error <= self.limit
 
     def __str__(self) -> str:
-        return f"{self.name}: off by {self.error:.1e}, at most {self.limit:.0e} allowed"
+        return f"{self.name}: relative error {self.error:.1e}, limit {self.limit:.0e}"
 
 
 def check_tissue(
     tissue: Tissue, small_strain: bool = False, strains: TestStrains = TestStrains()
 ) -> tuple[Finding, ...]:
-    """Hold a tissue's law to what the solver asks of it, at random strains on the CPU; a few seconds to compile.
+    """Check a tissue's law against the solver's requirements at random strains on the CPU; compiling takes seconds.
 
-    `small_strain`: the law is for small rotations only, as Hooke's, and need not turn with the tissue.
+    `small_strain`: the law is for small rotations only, as Hooke's, and need not be objective.
 
     Raises
     ------
     InputError
-        Every check that the law does not pass, with its figures.
+        With every failed check and its error.
     """
-    with np.errstate(invalid="ignore"):  # of two infinities: no number, and no check is passed by it
+    with np.errstate(invalid="ignore"):  # infinity - infinity is NaN, which fails the check
         found = tuple(_findings(tissue, small_strain, strains))
     broken = [str(finding) for finding in found if not finding.kept]
     if broken:
@@ -134,12 +134,14 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
     count, step = strains.count, strains.short_step
     mu, lam = tissue.lame
     if not (mu > 0.0 and 3.0 * lam + 2.0 * mu > 0.0 and np.isfinite([mu, lam]).all()):
-        raise InputError(f"the law {tissue.law} has the Lamé constants {mu}, {lam} Pa: no tissue is at rest with them.")
+        raise InputError(
+            f"the law {tissue.law} has the Lamé constants {mu}, {lam} Pa: the undeformed state would be unstable."
+        )
     given, again = np.array(tissue.coefficients), np.array(tissue.coefficients_at(mu, lam))
     if given.shape != again.shape:
         raise InputError(
-            f"the law {tissue.law} has {len(given)} coefficients, but {len(again)} at other Lamé constants: "
-            "give as many."
+            f"the law {tissue.law} has {len(given)} coefficients, but {len(again)} at other Lamé parameters: "
+            "must be equal."
         )
     yield Finding("coefficients_at its own Lamé constants are its coefficients", _off(again, given), 1e-12)
     double, random = build_evaluator(tissue, "float64"), np.random.default_rng(3)
@@ -184,7 +186,7 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
     if positive:
         inverted = double(np.diag([-2.0, 0.0, 0.0])[None]).energy[0]
         yield Finding(
-            "infinite energy where J < 0, which needs_positive_volume promises", float(inverted < np.inf), 0.0
+            "infinite energy where J < 0, which needs_positive_volume requires", float(inverted < np.inf), 0.0
         )
     single = build_evaluator(tissue, "float32")
     strained = random.normal(0.0, strains.single, (count, 3, 3)).astype(np.float32).astype(np.float64)
@@ -192,7 +194,7 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
 
 
 def compute_hooke_stress(H: np.ndarray, mu: float, lam: float) -> np.ndarray:
-    """Hooke's stress (n, 3, 3) [Pa] at displacement gradients (n, 3, 3), of Lamé's constants [Pa]."""
+    """Return Hooke's stress (n, 3, 3) [Pa] at displacement gradients (n, 3, 3), with Lamé parameters [Pa]."""
     trace = np.trace(H, axis1=1, axis2=2)[:, None, None]
     return mu * (H + H.transpose(0, 2, 1)) + lam * trace * np.eye(3)
 
@@ -202,5 +204,5 @@ def _largest(values: np.ndarray) -> float:
 
 
 def _off(found: np.ndarray, wanted: np.ndarray) -> float:
-    """Return the largest difference, relative to the largest of what is wanted."""
+    """Return the largest difference, relative to the largest reference value."""
     return _largest(found - wanted) / max(_largest(wanted), np.finfo(float).tiny)

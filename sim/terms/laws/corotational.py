@@ -1,9 +1,9 @@
-"""Corotational law: Hooke's law in the frame of the rotation nearest to F.
+"""Corotational law: Hooke's law in the coordinates of the rotation nearest to F.
 
     psi = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2, F = R S
 
 Sifakis, Barbic 2012, "FEM Simulation of 3D Deformable Solids", SIGGRAPH course, section 3.4. R is a rotation for
-inverted elements too: the least singular value carries the sign.
+inverted elements too: the smallest singular value carries the sign.
 """
 
 from typing import Any
@@ -21,9 +21,9 @@ def axial(A: Any):
 
 @wp.func
 def spin(S: Any, A: Any):
-    """w with (tr S I - S) w = axial A: the rotation R exp([w]x) that follows a change R A of F = R S.
+    """Return w with (tr S I - S) w = axial A: the rotation R exp([w]x) that follows a change R A of F = R S.
 
-    Zero where the stretch S determines no rotation (two principal stretches cancel).
+    It is zero where the stretch S determines no rotation (two principal stretches cancel).
     """
     tiny = type(S[0, 0])(1.0e-6)
     G = wp.trace(S) * wp.identity(n=3, dtype=type(tiny)) - S
@@ -35,16 +35,16 @@ def spin(S: Any, A: Any):
 
 @wp.func
 def cross_matrix(w: Any):
-    """[w]x."""
+    """Return the cross product matrix [w]x."""
     zero = type(w[0])(0.0)
     return wp.matrix_from_rows(wp.vector(zero, -w[2], w[1]), wp.vector(w[2], zero, -w[0]), wp.vector(-w[1], w[0], zero))
 
 
 @wp.func
 def rotation_excess(H: Any):
-    """Q = R - I for the rotation R nearest to F = I + H: Warp's approximate singular values, then Newton steps.
+    """Return Q = R - I for the rotation R nearest to F = I + H: approximate singular values of Warp, then Newton steps.
 
-    With a unit quaternion (v, w), Q = 2 w [v]x + 2 [v]x^2: where R is near I, nothing cancels.
+    With a unit quaternion (v, w), Q = 2 w [v]x + 2 [v]x^2, without cancellation for R near I.
     """
     one = type(H[0, 0])(1.0)
     two = type(one)(2.0)
@@ -72,20 +72,20 @@ def rotation_excess(H: Any):
 
 @wp.func
 def excess_of(turn: Any):
-    """R - I of a unit quaternion."""
+    """Return R - I of a unit quaternion."""
     X = cross_matrix(wp.vector(turn[0], turn[1], turn[2]))
     return type(turn[0])(2.0) * (turn[3] * X + X * X)
 
 
 @wp.func
 def strain_of(H: Any, Q: Any):
-    """R^T F - I from H = F - I and Q = R - I."""
+    """Return R^T F - I from H = F - I and Q = R - I."""
     return H + wp.transpose(Q) + wp.transpose(Q) * H
 
 
 @wp.func
 def energy(H: Any, c: Any):
-    """psi [Pa] = mu |S - I|^2 + lambda/2 tr(S - I)^2."""
+    """Return the energy density psi [Pa] = mu |S - I|^2 + lambda/2 tr(S - I)^2."""
     mu, lam = c[0], c[1]
     strain = strain_of(H, rotation_excess(H))
     t = wp.trace(strain)
@@ -94,7 +94,7 @@ def energy(H: Any, c: Any):
 
 @wp.func
 def stress(H: Any, c: Any):
-    """P [Pa] = 2 mu (F - R) + lambda tr(S - I) R."""
+    """Return the stress P [Pa] = 2 mu (F - R) + lambda tr(S - I) R."""
     mu, lam = c[0], c[1]
     Q = rotation_excess(H)
     t = wp.trace(strain_of(H, Q))
@@ -103,7 +103,7 @@ def stress(H: Any, c: Any):
 
 @wp.func
 def stress_change(H: Any, D: Any, c: Any):
-    """dP [Pa] for dF = D: 2 mu D + lambda tr(R^T D) R + (lambda tr(S - I) - 2 mu) dR.
+    """Return dP [Pa] for dF = D: 2 mu D + lambda tr(R^T D) R + (lambda tr(S - I) - 2 mu) dR.
 
     dR = R [w]x with (tr S I - S) w = axial(R^T D): Barbic 2012, "Exact corotational linear FEM stiffness matrix".
     """

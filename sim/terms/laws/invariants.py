@@ -1,6 +1,6 @@
-"""What isotropic laws share: invariants of F = I + H, written in H so that nothing cancels at small strain.
+"""Invariants of F = I + H for isotropic laws, written in H to avoid cancellation at small strain.
 
-Shakeri et al. 2024, "Stable numerics for finite-strain elasticity": with F formed first, single precision stalls
+Shakeri et al. 2024, "Stable numerics for finite-strain elasticity": if F is formed first, single precision stalls
 near 3e-4 of the load; from H it reaches 1e-5.
 """
 
@@ -11,26 +11,26 @@ import warp as wp
 
 @wp.func
 def cofactor(A: Any):
-    """cof A, the derivative of det A: its rows are cross products of A's rows."""
+    """Return the cofactor matrix cof A, the derivative of det A; its rows are cross products of A's rows."""
     return wp.matrix_from_rows(wp.cross(A[1], A[2]), wp.cross(A[2], A[0]), wp.cross(A[0], A[1]))
 
 
 @wp.func
 def second_order_volume(H: Any):
-    """J - 1 - tr H = tr cof H + det H."""
+    """Return J - 1 - tr H = tr cof H + det H, the volume change beyond first order."""
     C = cofactor(H)
     return wp.trace(C) + wp.dot(H[0], C[0])
 
 
 @wp.func
 def volume_change(H: Any):
-    """j = J - 1 = det(I + H) - 1."""
+    """Return the volume change j = J - 1 = det(I + H) - 1."""
     return wp.trace(H) + second_order_volume(H)
 
 
 @wp.func
 def log_one_plus(j: Any):
-    """ln(1 + j), exact in the last digits for small j too (Kahan's quotient)."""
+    """Return ln(1 + j), accurate to round-off for small j too (Kahan's quotient)."""
     J = type(j)(1.0) + j
     change = J - type(j)(1.0)
     if change == type(j)(0.0):
@@ -40,14 +40,14 @@ def log_one_plus(j: Any):
 
 @wp.func
 def cofactor_excess(H: Any):
-    """cof(I + H) - I = tr H I - H^T + cof H."""
+    """Return cof(I + H) - I = tr H I - H^T + cof H."""
     t = wp.trace(H)
     return t * wp.identity(n=3, dtype=type(t)) - wp.transpose(H) + cofactor(H)
 
 
 @wp.func
 def cofactor_change(F: Any, D: Any):
-    """Return derivative of cof F in the direction D."""
+    """Return the derivative of cof F in the direction D."""
     return wp.matrix_from_rows(
         wp.cross(D[1], F[2]) + wp.cross(F[1], D[2]),
         wp.cross(D[2], F[0]) + wp.cross(F[2], D[0]),
@@ -57,13 +57,13 @@ def cofactor_change(F: Any, D: Any):
 
 @wp.func
 def green_strain(H: Any):
-    """E = (H + H^T + H^T H) / 2."""
+    """Return Green's strain E = (H + H^T + H^T H) / 2."""
     return (H + wp.transpose(H) + wp.transpose(H) * H) / type(H[0, 0])(2.0)
 
 
 @wp.func
 def exp_less_one(t: Any):
-    """exp(t) - 1 = 2 sinh(t/2) exp(t/2); far below zero the first of these is too large for its number."""
+    """Return exp(t) - 1 = 2 sinh(t/2) exp(t/2); for t < -1 evaluated directly, as sinh would overflow."""
     if t < type(t)(-1.0):
         return wp.exp(t) - type(t)(1.0)
     half = t / type(t)(2.0)

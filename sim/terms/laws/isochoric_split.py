@@ -1,4 +1,4 @@
-"""How a law parts shape, which relaxes, from volume, which does not; and the strain that its overstress works on."""
+"""Split of a law into a deviatoric part, which relaxes, and a volumetric part, for viscoelasticity."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -13,31 +13,31 @@ from .law import Law
 
 @wp.func
 def isochoric(H: Any):
-    """Fb - I = J^(-1/3) (I + H) - I, exact at small strain."""
+    """Return the isochoric part Fb - I = J^(-1/3) (I + H) - I, accurate at small strain."""
     k = exp_less_one(-log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
     return H + k * (wp.identity(n=3, dtype=type(k)) + H)
 
 
 @wp.func
 def dilated(H: Any):
-    """J^(1/3) I - I."""
+    """Return the volumetric part J^(1/3) I - I."""
     k = exp_less_one(log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
     return k * wp.identity(n=3, dtype=type(k))
 
 
 @wp.func
 def inverse_transpose(H: Any):
-    """(I + H)^-T."""
+    """Return the inverse transpose (I + H)^-T."""
     J = type(H[0, 0])(1.0) + volume_change(H)
     return (wp.identity(n=3, dtype=type(J)) + cofactor_excess(H)) / J
 
 
 @dataclass(frozen=True)
 class LawSplit:
-    """Of a law with coefficients k, at a displacement gradient H and along a change D of it.
+    """Warp functions of a split law with coefficients k, at a displacement gradient H with an increment D.
 
-    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain that a stress A [Pa] works on. stress and
-    stress_change(H, D, ...): its derivatives. overstress(H, k) -> S [Pa]: on that strain, the stress of shape.
+    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain conjugate to a stress A [Pa]. stress and
+    stress_change(H, D, ...): its derivatives. overstress(H, k) -> S [Pa]: deviatoric stress, conjugate to E.
     """
 
     energy: wp.Function
@@ -48,19 +48,19 @@ class LawSplit:
 
 
 def split_of(law: Law, device: Device) -> LawSplit:
-    """As the law itself has it, or by the isochoric part of F."""
+    """Return the law's own split if it has one, else the split by the isochoric part of F."""
     return build_isochoric_split(law, device) if law.of_shape is None else build_own_split(law, law.of_shape, device)
 
 
 @cache
 def build_isochoric_split(law: Law, device: Device) -> LawSplit:
-    """Shape is psi(F) - psi(J^(1/3) I), and E = (Fb^T Fb - I) / 2 with Fb = J^(-1/3) F."""
+    """Build the split with deviatoric part psi(F) - psi(J^(1/3) I) and E = (Fb^T Fb - I) / 2, Fb = J^(-1/3) F."""
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
 
     @wp.func
     def energy(H: mat, k: Any, less: scalar, A: mat):
-        """psi(F) + less (psi(F) - psi(J^(1/3) I)) + (Cb - I) : A / 2; +inf where J <= 0."""
+        """Return psi(F) + less (psi(F) - psi(J^(1/3) I)) + (Cb - I) : A / 2; +inf where J <= 0."""
         if volume_change(H) <= scalar(-1.0):
             return scalar(wp.inf)
         own = own_energy(H, k)
@@ -68,7 +68,7 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
     @wp.func
     def stress(H: mat, k: Any, less: scalar, A: mat):
-        """(1 + less) P(F) - less p J^(1/3) F^-T + J^(-1/3) (Q - (Q : F) F^-T / 3), p I = P(J^(1/3) I), Q = Fb A."""
+        """Return (1+less) P(F) - less p J^(1/3) F^-T + J^(-1/3) (Q - (Q:F) F^-T / 3), p I = P(J^(1/3) I), Q = Fb A."""
         F, Q, G, V = wp.identity(n=3, dtype=scalar) + H, A + isochoric(H) * A, inverse_transpose(H), dilated(H)
         wide = scalar(1.0) + V[0, 0]
         p = own_stress(V, k)[0, 0]
@@ -77,7 +77,7 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
     @wp.func
     def stress_change(H: mat, D: mat, k: Any, less: scalar, A: mat):
-        """dP for dF = D: the derivative of `stress`, factor by factor."""
+        """Return dP for dF = D, the derivative of `stress` by the product rule."""
         three = scalar(3.0)
         identity = wp.identity(n=3, dtype=scalar)
         F, V, G = identity + H, dilated(H), inverse_transpose(H)
@@ -96,7 +96,7 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
     @wp.func
     def overstress(H: mat, k: Any):
-        """S = Fb^-1 dev(P F^T) Fb^-T = J^(1/3) Fb^-1 (P - (P : Fb) Fb^-T / 3)."""
+        """Return S = Fb^-1 dev(P F^T) Fb^-T = J^(1/3) Fb^-1 (P - (P : Fb) Fb^-T / 3)."""
         Hb, P = isochoric(H), own_stress(H, k)
         identity = wp.identity(n=3, dtype=scalar)
         G, wide = identity + cofactor_excess(Hb), scalar(1.0) + dilated(H)[0, 0]
@@ -107,32 +107,32 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
 @cache
 def build_own_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit:
-    """Shape is the law itself with its coefficients `of_shape`, and E = (F^T F - I) / 2.
+    """Build the split whose deviatoric part is the law with coefficients `of_shape`, and E = (F^T F - I) / 2.
 
-    The potential is infinite nowhere that the law is not; the overstress is where J is exactly 0. Tissue that has
-    relaxed to its end obeys the law itself, its shear modulus less and its bulk modulus as it was.
+    The potential is finite wherever the law's is; the overstress is infinite at J = 0. Fully relaxed tissue
+    follows the same law with a smaller shear modulus and the same bulk modulus.
     """
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
 
     @wp.func
     def energy(H: mat, k: Any, less: scalar, A: mat):
-        """psi + less psi_shape + (C - I) : A / 2."""
+        """Return psi + less psi_shape + (C - I) : A / 2."""
         return own_energy(H, k) + less * own_energy(H, of_shape(k)) + wp.ddot(green_strain(H), A)
 
     @wp.func
     def stress(H: mat, k: Any, less: scalar, A: mat):
-        """P + less P_shape + F A."""
+        """Return the stress P + less P_shape + F A."""
         return own_stress(H, k) + less * own_stress(H, of_shape(k)) + A + H * A
 
     @wp.func
     def stress_change(H: mat, D: mat, k: Any, less: scalar, A: mat):
-        """dP + less dP_shape + D A."""
+        """Return the stress increment dP + less dP_shape + D A."""
         return own_change(H, D, k) + less * own_change(H, D, of_shape(k)) + D * A
 
     @wp.func
     def overstress(H: mat, k: Any):
-        """S = F^-1 P_shape."""
+        """Return the overstress S = F^-1 P_shape."""
         return wp.transpose(inverse_transpose(H)) * own_stress(H, of_shape(k))
 
     return LawSplit(energy, stress, stress_change, overstress, False)

@@ -1,4 +1,4 @@
-"""What a hyperelastic law is: three Warp functions of the displacement gradient."""
+"""Interface of hyperelastic laws: three Warp functions of the displacement gradient."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import warp as wp
 
 @dataclass(frozen=True)
 class Law:
-    """An isotropic hyperelastic law in the displacement gradient H = F - I, with coefficients c (k,).
+    """Isotropic hyperelastic law in the displacement gradient H = F - I, with coefficients c (k,).
 
     energy(H, c) -> psi [Pa]; stress(H, c) -> P (3, 3) [Pa]; stress_change(H, D, c) -> dP (3, 3) [Pa] for dF = D.
-    All are generic in the scalar type; c is Lamé's (mu, lambda) [Pa] unless the law says otherwise.
-    `needs_positive_volume`: the law is infinite where det F <= 0, so steps are bounded. `at_rest`(c) -> c: of numbers
-    that vary from point to point and from case to case, those of a body at rest; None: none do. `of_shape`(c) -> c: the
-    law without its bulk modulus, where the rest is a law of J alone that is finite everywhere; None: it is not.
+    All are generic in the scalar type; c is Lamé's (mu, lambda) [Pa] unless the law defines others.
+    `needs_positive_volume`: psi is infinite if det F <= 0, so steps are bounded. `at_rest`(c) -> c: coefficients
+    that vary between points and load cases, reset to the undeformed state; None: none vary. `of_shape`(c) -> c: the
+    law without bulk modulus, if the remainder depends on J only and is finite everywhere; None: not available.
     """
 
     name: str

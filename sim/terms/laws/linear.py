@@ -1,4 +1,4 @@
-"""Hooke's law on the small strain tensor: the first-order answer, for small rotations only.
+"""Hooke's law on the small strain tensor, for small rotations only.
 
 psi = mu eps : eps + lambda/2 (tr eps)^2, eps = (H + H^T)/2
 """
@@ -12,20 +12,20 @@ from .law import Law
 
 @wp.func
 def stress(H: Any, c: Any):
-    """P [Pa] = mu (H + H^T) + lambda tr H I."""
+    """Return the stress P [Pa] = mu (H + H^T) + lambda tr H I."""
     mu, lam = c[0], c[1]
     return mu * (H + wp.transpose(H)) + lam * wp.trace(H) * wp.identity(n=3, dtype=type(mu))
 
 
 @wp.func
 def energy(H: Any, c: Any):
-    """psi [Pa] = P : H / 2."""
+    """Return the energy density psi [Pa] = P : H / 2."""
     return wp.ddot(stress(H, c), H) / type(c[0])(2.0)
 
 
 @wp.func
 def stress_change(H: Any, D: Any, c: Any):
-    """dP [Pa] for dF = D."""
+    """Return dP [Pa] for dF = D."""
     return stress(D, c)
 
 

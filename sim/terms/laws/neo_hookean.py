@@ -15,7 +15,7 @@ from .law import Law
 
 @wp.func
 def log_volume_excess(j: Any):
-    """j - ln(1 + j), by the series of ln(1 + j) = 2 artanh s, s = j / (2 + j), where the difference would cancel."""
+    """Return j - ln(1 + j); for small j by the series ln(1 + j) = 2 artanh s, s = j / (2 + j), against cancellation."""
     one = type(j)(1.0)
     if wp.abs(j) > type(j)(0.1):
         return j - wp.log(one + j)
@@ -27,7 +27,7 @@ def log_volume_excess(j: Any):
 
 @wp.func
 def energy(H: Any, c: Any):
-    """psi [Pa] = mu (|H|^2 / 2 + tr H - ln J) + lambda/2 (ln J)^2; +inf where J <= 0."""
+    """Return psi [Pa] = mu (|H|^2 / 2 + tr H - ln J) + lambda/2 (ln J)^2; +inf where J <= 0."""
     mu, lam = c[0], c[1]
     half = type(mu)(0.5)
     j = volume_change(H)
@@ -39,7 +39,7 @@ def energy(H: Any, c: Any):
 
 @wp.func
 def stress(H: Any, c: Any):
-    """First Piola-Kirchhoff stress P [Pa] = mu F + (lambda ln J - mu) F^-T, sorted by powers of H."""
+    """Return the first Piola-Kirchhoff stress P [Pa] = mu F + (lambda ln J - mu) F^-T, by powers of H."""
     mu, lam = c[0], c[1]
     identity = wp.identity(n=3, dtype=type(mu))
     j = volume_change(H)
@@ -51,7 +51,7 @@ def stress(H: Any, c: Any):
 
 @wp.func
 def stress_change(H: Any, D: Any, c: Any):
-    """dP [Pa] for dF = D: mu D + (lambda ln J - mu) d(F^-T) + lambda (F^-T : D) F^-T."""
+    """Return dP [Pa] for dF = D: mu D + (lambda ln J - mu) d(F^-T) + lambda (F^-T : D) F^-T."""
     mu, lam = c[0], c[1]
     identity = wp.identity(n=3, dtype=type(mu))
     j = volume_change(H)

@@ -3,8 +3,8 @@
     psi = sum_i c_i / m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3) + K/2 (ln J)^2,  l_k = J^(-1/3) lambda_k
 
 Ogden 1972, Proc. R. Soc. Lond. A 326:565-584, in the uncoupled form of FEBio's theory manual. All is written in the
-eigenvalues e_k of Green's strain, lambda_k^2 = 1 + 2 e_k, and the logarithms y_k = ln l_k, which sum to zero. Nothing
-cancels at small strain, and equal stretches are no special case. Coefficients: (K, c_1, m_1, c_2, m_2, ...).
+eigenvalues e_k of Green's strain, lambda_k^2 = 1 + 2 e_k, and the logarithms y_k = ln l_k, which sum to zero: no
+cancellation at small strain, and equal stretches are not a special case. Coefficients: (K, c_1, m_1, c_2, m_2, ...).
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ from .spectral import principal_axes
 
 @wp.func
 def log_stretches(H: Any, e: Any, N: Any):
-    """ln lambda_k = log1p(2 e_k) / 2; where crushed, ln |F n_k|, of which 1 + 2 e_k keeps fewer digits."""
+    """Return ln lambda_k = log1p(2 e_k) / 2; under strong compression ln |F n_k|, as 1 + 2 e_k loses digits."""
     one, two = type(e[0])(1.0), type(e[0])(2.0)
     x = type(e)()
     for k in range(3):
@@ -33,21 +33,21 @@ def log_stretches(H: Any, e: Any, N: Any):
 
 @wp.func
 def squares(x: Any):
-    """lambda_k^2 = exp(2 x_k)."""
+    """Return the squared stretches lambda_k^2 = exp(2 x_k)."""
     two = type(x[0])(2.0)
     return wp.vector(wp.exp(two * x[0]), wp.exp(two * x[1]), wp.exp(two * x[2]))
 
 
 @wp.func
 def isochoric(x: Any):
-    """y_k = ln l_k: x less its mean."""
+    """Return the isochoric part y_k = ln l_k = x_k - mean x."""
     mean = (x[0] + x[1] + x[2]) / type(x[0])(3.0)
     return x - wp.vector(mean, mean, mean)
 
 
 @wp.func
 def exp_excess(t: Any):
-    """exp(t) - 1 - t, by its series where the difference would cancel."""
+    """Return exp(t) - 1 - t; for small t by its series, against cancellation."""
     one = type(t)(1.0)
     if wp.abs(t) > one:
         return wp.exp(t) - one - t
@@ -59,7 +59,7 @@ def exp_excess(t: Any):
 
 @wp.func
 def sinh_ratio(z: Any):
-    """sinh(z) / z."""
+    """Return sinh(z) / z."""
     if z == type(z)(0.0):
         return type(z)(1.0)
     return wp.sinh(z) / z
@@ -67,7 +67,7 @@ def sinh_ratio(z: Any):
 
 @wp.func
 def kirchhoff(H: Any, y: Any, c: Any):
-    """Principal Kirchhoff stresses t_k [Pa] = a_k - mean a + K ln J, with a_k = sum_i c_i / m_i l_k^m_i."""
+    """Return principal Kirchhoff stresses t_k [Pa] = a_k - mean a + K ln J, with a_k = sum_i c_i / m_i l_k^m_i."""
     a = type(y)()
     for i in range(len(c) // 2):
         for k in range(3):
@@ -78,7 +78,7 @@ def kirchhoff(H: Any, y: Any, c: Any):
 
 @wp.func
 def energy(H: Any, c: Any):
-    """psi [Pa] = sum_i c_i / m_i^2 sum_k (exp(m_i y_k) - 1 - m_i y_k) + K/2 (ln J)^2; +inf where J <= 0."""
+    """Return psi [Pa] = sum_i c_i / m_i^2 sum_k (exp(m_i y_k) - 1 - m_i y_k) + K/2 (ln J)^2; +inf where J <= 0."""
     j = volume_change(H)
     if j <= -type(j)(1.0):
         return type(j)(wp.inf)
@@ -96,7 +96,7 @@ def energy(H: Any, c: Any):
 
 @wp.func
 def stress(H: Any, c: Any):
-    """P [Pa] = F S, with S = sum_k t_k / lambda_k^2 n_k (x) n_k."""
+    """Return the stress P [Pa] = F S, with S = sum_k t_k / lambda_k^2 n_k (x) n_k."""
     e, N = principal_axes(green_strain(H))
     x = log_stretches(H, e, N)
     t = kirchhoff(H, isochoric(x), c)
@@ -106,10 +106,10 @@ def stress(H: Any, c: Any):
 
 @wp.func
 def stiffness_between(k: int, l: int, e: Any, y: Any, c: Any):
-    """b_kl [Pa] = sum_i c_i exp(m_i (y_k + y_l) / 2) sinh(m_i d / 2) / (m_i d / 2) x d / tanh d.
+    """Return b_kl [Pa] = sum_i c_i exp(m_i (y_k + y_l) / 2) sinh(m_i d / 2) / (m_i d / 2) x d / tanh d.
 
-    The divided difference of the a of `kirchhoff` over the eigenvalues e, times the mean of the squared stretches. With
-    tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), it is exact where stretches meet too.
+    This is the divided difference of a in `kirchhoff` over the eigenvalues e, times the mean squared stretch. With
+    tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), it is accurate for equal stretches too.
     """
     one, two = type(c[0])(1.0), type(c[0])(2.0)
     tanh = wp.abs(e[k] - e[l]) / (one + e[k] + e[l])
@@ -127,9 +127,9 @@ def stiffness_between(k: int, l: int, e: Any, y: Any, c: Any):
 
 @wp.func
 def stress_change(H: Any, D: Any, c: Any):
-    """dP [Pa] for dF = D: D S + F dS, dS in the principal frame by the change G = sym(F^T D) of strain there.
+    """Return dP [Pa] for dF = D: D S + F dS, dS in principal axes from the strain increment G = sym(F^T D) there.
 
-    lambda_k^2 lambda_l^2 dS_kl = (b_kl - t_k - t_l) G_kl, and to each lambda_k^2 dS_kk comes the sum over l of
+    lambda_k^2 lambda_l^2 dS_kl = (b_kl - t_k - t_l) G_kl, and each lambda_k^2 dS_kk has in addition the sum over l of
     (K + tr b / 9 - (b_kk + b_ll) / 3) G_ll / lambda_l^2.
     """
     one, two, three = type(c[0])(1.0), type(c[0])(2.0), type(c[0])(3.0)

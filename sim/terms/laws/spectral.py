@@ -1,7 +1,7 @@
-"""Eigenvalues and eigenvectors of symmetric 3 x 3 matrices, exact to the last digits in either precision.
+"""Eigenvalues and eigenvectors of symmetric 3 x 3 matrices, accurate to round-off in either precision.
 
-Jacobi's cyclic rotations: Golub, Van Loan 2013, "Matrix Computations", section 8.5. Warp's `eig3` is off by 1e-3 of the
-matrix in single precision where eigenvalues are close.
+Cyclic Jacobi rotations: Golub, Van Loan 2013, "Matrix Computations", section 8.5. Warp's `eig3` has a relative
+error of 1e-3 in single precision if eigenvalues are close.
 """
 
 from typing import Any
@@ -11,13 +11,13 @@ import warp as wp
 
 @wp.func
 def principal_axes(A: Any):
-    """Eigenvalues e (3,) in no order, and N (3, 3) whose rows are the eigenvectors: A = N^T diag(e) N."""
+    """Return eigenvalues e (3,), unsorted, and N (3, 3) whose rows are the eigenvectors: A = N^T diag(e) N."""
     zero, one, two = type(A[0, 0])(0.0), type(A[0, 0])(1.0), type(A[0, 0])(2.0)
     e = wp.get_diag(A)
-    off = wp.vector(A[1, 2], A[2, 0], A[0, 1])  # each by the axis that its rotation turns about
+    off = wp.vector(A[1, 2], A[2, 0], A[0, 1])  # off-diagonal entries, indexed by the rotation axis
     N = wp.identity(n=3, dtype=type(zero))
     for _ in range(8):
-        # Converged when what is off the diagonal vanishes beside what is on it.
+        # Converged if the off-diagonal entries are below the round-off of the diagonal ones.
         size = wp.abs(e[0]) + wp.abs(e[1]) + wp.abs(e[2])
         if size + (wp.abs(off[0]) + wp.abs(off[1]) + wp.abs(off[2])) == size:
             break

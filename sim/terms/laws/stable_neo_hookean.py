@@ -1,7 +1,7 @@
-"""Stable neo-Hookean law: finite for every deformation, inverted elements included.
+"""Stable neo-Hookean law, finite for every deformation including inversion.
 
 Smith, de Goes, Kim 2018, "Stable Neo-Hookean Flesh Simulation", ACM Trans. Graph. 37(2), without the logarithm and
-with Lamé's constants re-mapped so that the law meets Hooke's at small strain:
+with Lamé's constants re-mapped so that the law agrees with Hooke's at small strain:
 
     psi = mu/2 (I1 - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2
 """
@@ -16,7 +16,7 @@ from .law import Law
 
 @wp.func
 def energy(H: Any, c: Any):
-    """psi [Pa] = mu (|H|^2 / 2 - (j - tr H)) + (lambda + mu)/2 j^2, with j = J - 1."""
+    """Return psi [Pa] = mu (|H|^2 / 2 - (j - tr H)) + (lambda + mu)/2 j^2, with j = J - 1."""
     mu, lam = c[0], c[1]
     j = volume_change(H)
     half = type(mu)(0.5)
@@ -25,7 +25,7 @@ def energy(H: Any, c: Any):
 
 @wp.func
 def stress(H: Any, c: Any):
-    """First Piola-Kirchhoff stress P [Pa] = mu (F - cof F) + (lambda + mu) j cof F, sorted by powers of H."""
+    """Return the first Piola-Kirchhoff stress P [Pa] = mu (F - cof F) + (lambda + mu) j cof F, by powers of H."""
     mu, lam = c[0], c[1]
     pressure = (lam + mu) * volume_change(H)
     normal = pressure - mu
@@ -35,7 +35,7 @@ def stress(H: Any, c: Any):
 
 @wp.func
 def stress_change(H: Any, D: Any, c: Any):
-    """dP [Pa] for dF = D: mu (D - dcof) + (lambda + mu) ((cof F : D) cof F + j dcof)."""
+    """Return dP [Pa] for dF = D: mu (D - dcof) + (lambda + mu) ((cof F : D) cof F + j dcof)."""
     mu, lam = c[0], c[1]
     identity = wp.identity(n=3, dtype=type(mu))
     cof = identity + cofactor_excess(H)
@@ -45,7 +45,7 @@ def stress_change(H: Any, D: Any, c: Any):
 
 @wp.func
 def of_shape(c: Any):
-    """Lame's constants of bulk modulus 0: the rest of psi is K/2 (J - 1)^2, K = lambda + 2/3 mu."""
+    """Return Lamé constants with bulk modulus 0: the remainder of psi is K/2 (J - 1)^2, K = lambda + 2/3 mu."""
     k = c
     k[1] = -type(c[0])(2.0) / type(c[0])(3.0) * c[0]
     return k
