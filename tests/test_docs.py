@@ -84,7 +84,7 @@ def test_every_source_is_a_page_and_every_example_too(pages):
 
 def test_who_wants_to_contribute_finds_how(site, pages):
     assert "generated/contributing.html" in pages["develop"].links
-    assert "Where things go" in (site / "generated/contributing.html").read_text()
+    assert "Structure" in (site / "generated/contributing.html").read_text()
 
 
 def test_no_page_loads_anything_from_elsewhere(site, pages):
