@@ -16,7 +16,10 @@ from style_rules import (
 from test_house import DOCS, HOUSE, PACKAGED
 
 TESTS = sorted((HOUSE / "tests").glob("test_*.py"))
-PAGES = [HOUSE / "README.md", *(path for path in DOCS if path.parent.name not in {"notes", "decisions"})]
+PAGES = [
+    *(HOUSE / name for name in ("README.md", "CONTRIBUTING.md")),
+    *(path for path in DOCS if path.parent.name not in {"notes", "decisions"}),
+]
 LONGEST_TEST_NAME = 60
 
 
@@ -38,23 +41,23 @@ def test_banned_words(kind, most):
 
 
 def test_headings_of_pages_are_nouns_or_imperatives():
-    check([f"{path.name}: {it}" for path in PAGES for it in find_headings(path.read_text()) if not begins_well(it)], 70)
+    check([f"{path.name}: {it}" for path in PAGES for it in find_headings(path.read_text()) if not begins_well(it)], 0)
 
 
 def test_banned_words_on_pages():
     pages = {path: re.sub(r"^```.*?^```", "", path.read_text(), flags=re.M | re.S) for path in PAGES}
-    check([f"{path.name}: {word}" for path, text in pages.items() for word in find_banned(text)], 303)
+    check([f"{path.name}: {word}" for path, text in pages.items() for word in find_banned(text)], 0)
 
 
 def test_user_pages_tell_no_history():
-    check([f"{path.name}: {word}" for path in PAGES for word in HISTORY.findall(path.read_text())], 5)
+    check([f"{path.name}: {word}" for path in PAGES for word in HISTORY.findall(path.read_text())], 0)
 
 
 def test_user_pages_are_short():
     """At most 3,000 words a page and 220 kB in all."""
-    pages = PAGES[1:]
-    check([path.name for path in pages if len(path.read_text().split()) > 3000], 1)
-    assert sum(path.stat().st_size for path in pages) <= 290_000
+    pages = PAGES[2:]
+    check([path.name for path in pages if len(path.read_text().split()) > 3000], 0)
+    assert sum(path.stat().st_size for path in pages) <= 220_000
 
 
 def test_class_names_are_unique():

@@ -8,6 +8,7 @@ from pathlib import Path
 from array_tables import dataset_table, episode_table
 from command_pages import command_pages
 from example_scripts import copy_scripts
+from plan_keys import plan_table
 from public_names import reference_pages
 from sphinx.application import Sphinx
 
@@ -38,6 +39,7 @@ def _make(app: Sphinx) -> None:
         **command_pages(),
         "dataset-arrays.txt": dataset_table(),
         "episode-arrays.txt": episode_table(),
+        "plan-keys.txt": plan_table(),
         "changes.md": (source.parent / "CHANGELOG.md").read_text().replace("](docs/", "](../"),
         "contributing.md": (source.parent / "CONTRIBUTING.md").read_text().replace("](docs/", "](../"),
         **reference_pages(),

@@ -35,7 +35,7 @@ ROUNDING = 1e-6
 LIMIT = 5e-3
 UNKNOWN = "scan position, tissue motion unknown: do not rely on it"
 # # Motion during the readout of a rolling shutter: share of it that is the overlay's error, and factor to the error of
-# # a tool's tip, which is far from its cube: measured in docs/overlay.md, "A rolling shutter".
+# # a tool's tip, which is far from its cube: measured in docs/notes/overlay_experiments.md, "Rolling shutter".
 SKEW, LEVER = 0.5, 2.0
 # # Decay of a hand's maximum speed within a second.
 CALMS = 0.1
