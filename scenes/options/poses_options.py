@@ -22,7 +22,7 @@ AUTO = "auto"
 
 def add_poses(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    group = parser.add_argument_group("poses of another tracker, with a clock of its own; docs/external_tracker.md says more")
+    group = parser.add_argument_group("poses of an external tracker with its own clock; see docs/external_tracker.md")
     group.add_argument(
         "--poses", type=Path, nargs=2, metavar=("TOOL.csv", "PATIENT.csv"),
         help="poses of the tool and of the patient's reference in the tracker's frame, as `sulcus track` writes them",
