@@ -352,9 +352,9 @@ def test_a_wide_window_has_its_controls_in_two_columns(page):
 
 
 def test_the_line_over_the_picture_comes_and_goes(page):
-    page.status("solving ... 3 s")
+    page.show_status("solving ... 3 s")
     assert wait_for(lambda: "<span>solving ... 3 s</span>" in page.line.content)
-    page.status("")
+    page.show_status("")
     assert wait_for(lambda: page.line.content == "")
 
 
@@ -380,9 +380,9 @@ def test_a_note_is_there_while_it_has_words(page):
 
 
 def test_the_button_says_whether_it_plays(page):
-    page.plays(False)
+    page.show_playback(False)
     assert wait_for(lambda: page.button.label == "Play")
-    page.plays(True)
+    page.show_playback(True)
     assert wait_for(lambda: page.button.label == "Pause")
 
 

@@ -96,11 +96,11 @@ def test_windows_show_what_cameras_with_lenses_see(pair, geometry):
     points = TARGET + 5e-3 * np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
     pixels, disparity = geometry.place(points)
     there = pixels - np.stack([disparity, np.zeros_like(disparity)], axis=1)
-    assert np.allclose(geometry.points(pixels, disparity), points, atol=1e-9)
+    assert np.allclose(geometry.compute_points(pixels, disparity), points, atol=1e-9)
     assert np.abs(disparity).max() > 2.0 and geometry.size == 180
     assert np.allclose(geometry.place(TARGET[None])[0], 89.5) and abs(geometry.place(TARGET[None])[1][0]) < 1e-9
     for eye, where, number in zip(pair, (pixels, there), (0, 1), strict=True):
-        shown = [geometry.windows(each, each)[number] for each in (columns, rows)]
+        shown = [geometry.rectify(each, each)[number] for each in (columns, rows)]
         near = np.round(where).astype(int)
         found = np.stack([each[near[:, 1], near[:, 0]] for each in shown], axis=1)
         step = (where - near) * eye.K[0, 0] / geometry.focal
@@ -136,7 +136,7 @@ def test_glare_is_left_out(pair, geometry, pictures):
         for column, row in random.integers((100, 60), (220, 180), (20, 2)).tolist():
             picture[row - 1 : row + 2, column - 1 : column + 2] = 255
     pixels, view = grid(geometry.size), compute_stereo_view(geometry, *lit)
-    white = [window.min(axis=2) > 250 for window in geometry.windows(*lit)]
+    white = [window.min(axis=2) > 250 for window in geometry.rectify(*lit)]
     assert white[0].any() and view.hidden[white[0]].all() and view.hidden_right[white[1]].all()
     found = triangulate_cloud(view, pixels)
     assert 0.3 * len(pixels) < len(found.which) < 0.9 * len(pixels)
@@ -153,7 +153,7 @@ def test_what_a_tool_hides_in_either_eye_is_no_point(geometry, pictures, view):
     disparity = geometry.place(found.points)[1]
     at = [pixels[found.which], pixels[found.which] - np.stack([disparity, np.zeros_like(disparity)], axis=1)]
     assert len(found.which) > 20 and len(found.which) < 0.6 * len(triangulate_cloud(view, pixels).which)
-    for mask, place in zip(geometry.windows(left.astype(np.uint8), right.astype(np.uint8)), at, strict=True):
+    for mask, place in zip(geometry.rectify(left.astype(np.uint8), right.astype(np.uint8)), at, strict=True):
         column, row = place.round().astype(int).T
         assert mask.any() and not mask[row, column].any()
 

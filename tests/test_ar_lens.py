@@ -52,9 +52,9 @@ def points_in_view() -> np.ndarray:
 @each_lens
 def test_a_lens_bends_as_opencvs_and_is_inverted_to_its_reach(lens):
     where = places(lens)
-    assert len(where) > 1000 and np.abs(lens.bent(where) - by_opencv(lens, where)).max() < 1e-9
-    assert np.abs(lens.straight(lens.bent(where)) - where).max() < 1e-9
-    assert lens.straight(np.zeros((3, 4, 2))).shape == (3, 4, 2) and not lens.straight(np.zeros(2)).any()
+    assert len(where) > 1000 and np.abs(lens.distort(where) - by_opencv(lens, where)).max() < 1e-9
+    assert np.abs(lens.undistort(lens.distort(where)) - where).max() < 1e-9
+    assert lens.undistort(np.zeros((3, 4, 2))).shape == (3, 4, 2) and not lens.undistort(np.zeros(2)).any()
 
 
 def test_a_lens_that_folds_back_sees_nothing_beyond():
@@ -76,7 +76,7 @@ def test_no_two_places_come_to_one(lens):
     angles = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
     ways = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     radii = np.linspace(0.0, min(0.999 * lens.reach, 5.0), 500)[:, None, None]
-    assert ((np.diff(lens.bent(radii * ways), axis=0) * ways).sum(axis=-1) > 0.0).all()
+    assert ((np.diff(lens.distort(radii * ways), axis=0) * ways).sum(axis=-1) > 0.0).all()
 
 
 def test_a_lens_that_cannot_be_is_refused():

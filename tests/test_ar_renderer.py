@@ -157,13 +157,13 @@ def test_rows_shared_by_threads_give_the_same_depths():
 @pytest.mark.parametrize(
     ("attempt", "reason"),
     [
-        (lambda it: it.picture(camera(), [ball().vertices[1:]]), "vertices"),
-        (lambda it: it.pictures(ball().vertices, [camera()]), "vertices"),
-        (lambda it: it.pictures(np.full((1, *ball().vertices.shape), np.nan), [camera()]), "finite"),
-        (lambda it: it.pictures(wp.zeros((1, 4), dtype=wp.vec3d, device="cpu"), [camera()]), "vec3d"),
-        (lambda it: it.pictures(np.stack([ball().vertices] * 3), [camera()] * 2), "cameras"),
-        (lambda it: it.pictures(np.stack([ball().vertices] * 2), [camera(), camera(width=80)]), "sizes"),
-        (lambda it: it.pictures(np.stack([ball().vertices] * 2), [camera(width=40000, height=40000)]), "too many"),
+        (lambda it: it.render(camera(), [ball().vertices[1:]]), "vertices"),
+        (lambda it: it.render_batch(ball().vertices, [camera()]), "vertices"),
+        (lambda it: it.render_batch(np.full((1, *ball().vertices.shape), np.nan), [camera()]), "finite"),
+        (lambda it: it.render_batch(wp.zeros((1, 4), dtype=wp.vec3d, device="cpu"), [camera()]), "vec3d"),
+        (lambda it: it.render_batch(np.stack([ball().vertices] * 3), [camera()] * 2), "cameras"),
+        (lambda it: it.render_batch(np.stack([ball().vertices] * 2), [camera(), camera(width=80)]), "sizes"),
+        (lambda it: it.render_batch(np.stack([ball().vertices] * 2), [camera(width=40000, height=40000)]), "too many"),
     ],
 )
 def test_what_cannot_be_drawn_together_is_refused(attempt, reason):

@@ -59,7 +59,7 @@ class TestSite:
         assert np.allclose(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) == pytest.approx(1.0)
         nodes = site.anatomy.mesh.nodes
         assert (nodes.mean(axis=0) - site.origin) @ site.axis > 0.015
-        assert np.allclose(site.contact(0.0, 0.0, 0.0).point, site.origin, atol=1e-9)
+        assert np.allclose(site.find_contact(0.0, 0.0, 0.0).point, site.origin, atol=1e-9)
 
     def test_the_circle_of_its_clearance_is_open_and_no_larger_one(self, site):
         angle = np.linspace(0.0, 2.0 * np.pi, 721)
@@ -74,7 +74,7 @@ class TestSite:
 
     def test_a_contact_is_a_material_point(self, site):
         nodes = site.anatomy.mesh.nodes
-        contact = site.contact(0.006, -0.004, 0.007)
+        contact = site.find_contact(0.006, -0.004, 0.007)
         assert contact.weights.sum() == pytest.approx(1.0) and contact.weights.min() >= 0.0
         assert np.allclose(contact.carried(nodes), contact.point)
         turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
@@ -85,15 +85,15 @@ class TestSite:
 
     def test_the_tool_stays_inside_the_opening(self, site):
         for x, y in ((0.1, 0.0), (-0.03, 0.03), (0.0, -0.02)):
-            point = site.contact(x, y, 0.007).point[None]
+            point = site.find_contact(x, y, 0.007).point[None]
             assert open_patch(site.anatomy).compute_edge_distance(point)[0] > 0.007 * 0.999
-            assert site.across(point)[0] > 0.95 * site.reach(0.007)
-        assert np.allclose(site.contact(0.1, 0.1, 1.0).point, site.origin, atol=1e-9)
+            assert site.across(point)[0] > 0.95 * site.compute_reach(0.007)
+        assert np.allclose(site.find_contact(0.1, 0.1, 1.0).point, site.origin, atol=1e-9)
 
     def test_direction_tilts_as_asked(self, site):
-        assert np.allclose(site.direction(Touch()), site.axis)
+        assert np.allclose(site.compute_direction(Touch()), site.axis)
         for tilt, aside in (((0.5, 0.0), site.right), ((0.0, 0.5), site.up)):
-            way = site.direction(Touch(tilt=tilt))
+            way = site.compute_direction(Touch(tilt=tilt))
             assert np.linalg.norm(way) == pytest.approx(1.0)
             assert np.arctan2(way @ aside, way @ site.axis) == pytest.approx(0.5)
 

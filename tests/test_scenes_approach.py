@@ -63,7 +63,7 @@ def test_the_tool_enters_there_and_pushes_along_it(site, tmp_path, right, up, ti
     approach = approach_of(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
     touch = approach.follow(press(0.3))(2.0)
     assert np.linalg.norm(site.nearest(site.origin + touch.x * site.right + touch.y * site.up).point - entry) < 1e-4
-    np.testing.assert_allclose(site.direction(touch), way, atol=1e-9)
+    np.testing.assert_allclose(site.compute_direction(touch), way, atol=1e-9)
     assert touch.force == pytest.approx(0.3)
     aside = approach.follow(lambda time: Touch(2e-3, 1e-3, tilt=(0.2, 0.0)))(0.0)
     assert aside.x == pytest.approx(touch.x + 2e-3) and aside.y == pytest.approx(touch.y + 1e-3)
@@ -106,7 +106,7 @@ def test_a_shaft_lies_along_a_line_and_the_ball_stays(site, tmp_path, tilt):
 def test_what_misses_the_opening_is_refused(site, tmp_path):
     _, _, line = planned(site, 0.0, 0.0, (0.0, 0.0))
     beside = line + 60e-3 * site.right
-    oblique = site.origin + np.outer([-40e-3, 40e-3], site.direction(Touch(tilt=(1.3, 0.0))))
+    oblique = site.origin + np.outer([-40e-3, 40e-3], site.compute_direction(Touch(tilt=(1.3, 0.0))))
     for points, kind, reason in (
         (beside, "Line", r"passes \d\d mm from the open cortex\. Open the skull where it enters: --opening-at"),
         (oblique, "Line", "runs at 74 degrees to the opening's axis, and 60 is the most"),

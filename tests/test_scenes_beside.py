@@ -12,7 +12,7 @@ from scenes.script.uncertainty import TumourError
 
 
 def test_the_chart_and_the_slices_are_of_the_frame_that_is_shown(theatre):
-    player = theatre.player("linear", short())
+    player = theatre.build_player("linear", short())
     frame = player.draw(3, 0.1, Touch(force=0.25))
     read = sample_of(replace(frame, distance=12e-3, distance_error=np.inf), player.scene, 5.0)
     assert read.values == pytest.approx((12.0, 0.25)) and read.errors == (None, 0.0) and read.time == 5.0
@@ -23,7 +23,7 @@ def test_the_chart_and_the_slices_are_of_the_frame_that_is_shown(theatre):
     doubtful = render_slices(replace(frame, tumour_error=TumourError(4e-3), doubt="why"), player, TUMOUR_MIDDLE)
     green = [np.count_nonzero(each[..., 1] > each[..., 0] + 10.0) for each in (known, middle, doubtful)]
     assert green[0] > 1.5 * green[1] > 0 == green[2]
-    still = theatre.player("fem", sinking())
+    still = theatre.build_player("fem", sinking())
     assert [line.name for line in list_lines(still.scene)] == ["tumour moved"]
     moved = sample_of(replace(frame, moved=3e-3, tumour_error=TumourError(4e-3)), still.scene, 0.0)
     assert moved.values == (3.0,) and moved.errors == (4.0,)

@@ -83,7 +83,7 @@ class Loop:
     def __init__(self, demo):
         self.demo, self.failed = demo, []
         self.thread = threading.Thread(target=self.play)
-        self.plays = demo.browser.plays
+        self.plays = demo.browser.show_playback
 
     def play(self):
         try:
@@ -121,7 +121,7 @@ def ask_for_frame_12(demo, gated, page, steps):
 
 
 def test_intermediate_frames_show_and_slider_stays(demo, gated, monkeypatch):
-    said, begun = [], demo.busy.on
+    said, begun = [], demo.busy.begin_work
     monkeypatch.setattr(demo.busy, "on", lambda what: said.append(what) or begun(what))
     with Loop(demo) as page:
         gated.let(1)

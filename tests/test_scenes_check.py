@@ -55,7 +55,7 @@ def play(request, theatre):
 
 @pytest.fixture(scope="module")
 def frames(play):
-    return list(play.frames(every=30))
+    return list(play.play_frames(every=30))
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def truth(theatre, play, frames):
 
 
 def broken(play, frames, truth, camera=None):
-    figures = measure(play, play.camera_at if camera is None else lambda time: camera, frames, truth)
+    figures = measure(play, play.get_camera if camera is None else lambda time: camera, frames, truth)
     return set(figures.find_violations(Bounds())), figures
 
 
@@ -91,8 +91,8 @@ def test_every_bound_has_its_sentence():
 
 def test_what_passes_the_skull_is_reported(play, frames, truth):
     leaky = replace(truth, leaked=np.linspace(0.0, 0.35, len(truth)))
-    assert measure(play, play.camera_at, frames, leaky).leaked == 0.35
-    assert measure(play, play.camera_at, frames, truth).leaked == truth.leaked.max() < 1e-5
+    assert measure(play, play.get_camera, frames, leaky).leaked == 0.35
+    assert measure(play, play.get_camera, frames, truth).leaked == truth.leaked.max() < 1e-5
 
 
 @by_each
@@ -106,7 +106,7 @@ def test_what_was_not_perturbed_passes(play, frames, truth):
 def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):
     """A frame whose picture was drawn from other positions, by another camera, or with another tip."""
     stage, at = play.stage, frame.tip if tip is None else tip
-    tumour, rest = (stage.tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
+    tumour, rest = (stage.build_tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
     gauge = measure_gauge(at, tumour)
     if tip is None:
         gauge = replace(gauge, read=frame.distance)
@@ -137,7 +137,7 @@ class TestThePictureItself:
         return sentences, figures
 
     def test_drawn_again_as_it_was_it_passes(self, play, frames, truth):
-        again = drawn(play, frames[2], play.positions(frames[2].deformation))
+        again = drawn(play, frames[2], play.compute_positions(frames[2].deformation))
         assert not self.pixels(play, frames, truth, again)[0]
 
     def test_of_the_undeformed_tumour_it_fails(self, play, frames, truth):
@@ -148,19 +148,19 @@ class TestThePictureItself:
     def test_with_the_answer_a_millimetre_away_it_fails(self, play, frames, truth):
         """Picture and answer agree, and both differ from the finite elements."""
         away = shifted(frames[2], 1e-3 * play.site.right)
-        sentences, figures = self.pixels(play, frames, truth, drawn(play, away, play.positions(away.deformation)))
+        sentences, figures = self.pixels(play, frames, truth, drawn(play, away, play.compute_positions(away.deformation)))
         assert about(sentences, "outline") and figures.drawn > 2.0
 
     def test_of_an_earlier_frame_it_fails(self, play, frames, truth):
         late = replace(frames[2], shown=frames[1].shown)
         assert about(self.pixels(play, frames, truth, late)[0], "does not show its frame number")
-        wrong = drawn(play, frames[2], play.positions(frames[0].deformation))
+        wrong = drawn(play, frames[2], play.compute_positions(frames[0].deformation))
         assert about(self.pixels(play, frames, truth, wrong)[0], "outline")
 
     @pytest.mark.parametrize("off", [(3.0, 0.0), (0.0, 8.0), (60.0, 40.0)])
     def test_shifted_it_fails(self, play, frames, truth, off):
         camera = compute_error(play.camera, *off)
-        wrong = drawn(play, frames[2], play.positions(frames[2].deformation), camera)
+        wrong = drawn(play, frames[2], play.compute_positions(frames[2].deformation), camera)
         sentences, figures = self.pixels(play, frames, truth, wrong)
         assert about(sentences, "outline") and figures.drawn > 2.0
 
@@ -175,18 +175,18 @@ class TestThePictureItself:
 
     def test_with_another_number_it_fails(self, play, frames, truth):
         deep = frames[2].tip + 0.4e-3 * play.site.axis
-        wrong = drawn(play, frames[2], play.positions(frames[2].deformation), tip=deep)
+        wrong = drawn(play, frames[2], play.compute_positions(frames[2].deformation), tip=deep)
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not show its frame number")
 
     def test_with_a_number_ten_times_too_large_it_fails(self, play, frames, truth, monkeypatch):
         monkeypatch.setattr(
             "ar.overlay.gauge.format_millimetres", lambda length, error=None: format_millimetres(10.0 * length, error)
         )
-        wrong = drawn(play, frames[2], play.positions(frames[2].deformation))
+        wrong = drawn(play, frames[2], play.compute_positions(frames[2].deformation))
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not show its frame number")
 
     def test_with_another_frame_s_number_it_fails(self, play, frames, truth):
-        wrong = drawn(play, replace(frames[2], number=59), play.positions(frames[2].deformation))
+        wrong = drawn(play, replace(frames[2], number=59), play.compute_positions(frames[2].deformation))
         assert about(self.pixels(play, frames, truth, replace(wrong, number=60))[0], "does not show its frame number")
 
 

@@ -75,7 +75,7 @@ def build_tool_frame(size=(640, 360), style="window"):
 
 def broken(frame, play):
     """What is wrong with a frame, if the model's own answer is the truth."""
-    found = measure(play, play.camera_at, [frame], frame.deformation)
+    found = measure(play, play.get_camera, [frame], frame.deformation)
     return [sentence for sentence in found.find_violations(Bounds()) if "does not say its" not in sentence]
 
 
@@ -91,7 +91,7 @@ def test_every_style_passes_the_checks(style):
 def again(frame, play, opening, gauge=None, style="window"):
     """The frame's picture, drawn again from the same answer."""
     stage = play.stage
-    tumour, rest = (stage.tumour(at) for at in (play.positions(frame.deformation), play.site.anatomy.mesh.nodes))
+    tumour, rest = (stage.build_tumour(at) for at in (play.compute_positions(frame.deformation), play.site.anatomy.mesh.nodes))
     if gauge is None:
         gauge = replace(measure_gauge(frame.tip, tumour), read=frame.distance, error=frame.tumour_error.bound)
     band = frame.tumour_error.bound or 0.0

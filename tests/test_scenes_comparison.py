@@ -96,7 +96,7 @@ class TestVerdict:
 def test_a_verdict_is_the_error_in_millimetres(theatre):
     """Of a model whose answer is 0.2 mm off everywhere, and of the finite elements' own distance."""
     scene = short()
-    whole = Player(Stage(scene, theatre.site), theatre.fem(scene, LIVE))
+    whole = Player(Stage(scene, theatre.site), theatre.build_fem(scene, LIVE))
     loads = whole.build_loads(3)
     answer = whole.compute_deformation(loads)
 

@@ -52,7 +52,7 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
     assert truth.number == demo.wish.number
     nodes = theatre.anatomy.tumour_nodes
     scene = demo.stage.scene
-    loads = scene.loads(theatre.site, scene.path(scene.times[truth.number]), scene.times[truth.number])
+    loads = scene.build_loads(theatre.site, scene.path(scene.times[truth.number]), scene.times[truth.number])
     assert np.array_equal(loads.causes[0].force, truth.loads.causes[0].force)
     off = theatre.models["linear"].deform(loads, at=nodes).displacement[0] - truth.deformation.at(nodes).displacement[0]
     assert f"mean {1e3 * np.linalg.norm(off, axis=1).mean():.3f}" in text
@@ -178,7 +178,7 @@ def test_the_scene_changes_without_a_new_server(demo):
     demo.wish.set(scene="press")
     assert wait_for(lambda: demo.run(0.5) and "force 0." in report(demo))
     assert demo.stage.scene is demo.first and page.inputs["scene"].value == "press"
-    assert demo.wish.deformer == demo.theatre.usual(demo.first) != "fem"  # its own, not that of the scene before
+    assert demo.wish.deformer == demo.theatre.select_default(demo.first) != "fem"  # its own, not that of the scene before
 
 
 def test_unplayable_scene_is_reported_and_old_one_stays(demo):
@@ -200,16 +200,16 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
         return answer(model, loads, start, at)
 
     moment = PageState()
-    demo.answer(moment)
+    demo.update_page(moment)
     before = moment.picture
     monkeypatch.setattr(Learned, "deform", counted)
     demo.wish.set(style="contour")
-    demo.answer(moment)
+    demo.update_page(moment)
     assert before is not None and (moment.picture != before).any() and asked == []
     before = moment.picture
     for path, moves in (("orbit", True), ("stays", False)):
         demo.wish.set(path=path)
-        demo.answer(moment)
+        demo.update_page(moment)
         assert (moment.picture != before).any() == moves and asked == []
 
 
@@ -223,7 +223,7 @@ def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
 
     monkeypatch.setattr(Learned, "deform", slow)
     demo.wish.set(plays=False)
-    demo.wish.hand(force=0.2)
+    demo.wish.take_over(force=0.2)
     demo.run(0.2)
     assert said[0].startswith("computing the deformation for the manual tool, 0.20 N (trained model linear)")
     assert said[-1] == ""

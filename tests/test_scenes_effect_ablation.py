@@ -73,9 +73,9 @@ def test_bytes_are_the_same_in_every_run(small_theatre):
 def counted(theatre, scene, every):
     """Bytes that a scene keeps, counted again: numbers of each array, and the size of a number."""
     before = list_device_arrays()  # held: the number of an array that goes may be that of a new one
-    fem, last = replace(theatre, models={}).fem(scene, scene.accuracy, live=True), None
+    fem, last = replace(theatre, models={}).build_fem(scene, scene.accuracy, live=True), None
     for time in scene.times[::every].tolist():
-        last = fem.deform(scene.loads(theatre.site, scene.path(time), time), start=last)
+        last = fem.deform(scene.build_loads(theatre.site, scene.path(time), time), start=last)
     known = {id(array) for array in before}
     new = [array for array in list_device_arrays() if id(array) not in known]
     return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in new)

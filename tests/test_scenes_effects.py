@@ -140,7 +140,7 @@ class TestSwitches:
         scene, nodes = demo.stage.scene, theatre.anatomy.tumour_nodes
         plain, less = replace(theatre, models={}), remove_effect(scene, Gravity())
         one, other = (
-            plain.fem(each, TRAIN)
+            plain.build_fem(each, TRAIN)
             .deform(each.build_loads(theatre.site, each.path(5 / 30), 5 / 30))
             .at(nodes)
             .displacement[0]
@@ -174,7 +174,7 @@ class TestBrainShift:
     def test_the_brain_sinks_as_far_as_in_patients(self, coarse):
         """Cortex 6.1 +- 3.4 mm in 61 patients; 5.1, and the tumour 3.5, over 1,000 computed cases."""
         theatre, anatomy, scene = coarse, coarse.anatomy, find_scene("brain_shift")
-        fem, cortex = theatre.fem(scene, scene.accuracy), np.unique(anatomy.open_surface)
+        fem, cortex = theatre.build_fem(scene, scene.accuracy), np.unique(anatomy.open_surface)
         lying = {time: scene.build_loads(theatre.site, scene.path(time), time) for time in (0.0, 1.5, 3.0, 6.0)}
         answer = fem.deform(stacked([lying[time] for time in (0.0, 1.5, 3.0)]))
         moved = 1e3 * np.linalg.norm(answer.displacement, axis=2)
@@ -199,7 +199,7 @@ class TestBrainShift:
 
     def test_its_border_stays_hidden(self, coarse):
         """The cortex that moves out from under the bone is drawn too: nothing is seen through the hole beside it."""
-        playing = coarse.player("fem", small("brain_shift"))
+        playing = coarse.build_player("fem", small("brain_shift"))
         still, sunk = (playing.draw(0, time, Touch()) for time in (0.0, 3.0))
         seen = still.picture.segmentation == CORTEX
         inside = seen & ~(sunk.picture.segmentation == CORTEX)

@@ -173,7 +173,7 @@ def tips(follower, elsewhere, truth):
     """How far off the tool's tip is in the scan [m], and deviations, where it is known."""
     out = []
     for row, time in enumerate(truth.times):
-        beside = elsewhere.beside(time)
+        beside = elsewhere.find_tool(time)
         if beside is not None:
             there = follower.registration.T_patient_scan @ [*truth.T_scan_tool[row][:3, 3], 1.0]
             place, spread = beside.point(follower.tool.T_cube_tool[:3, 3])
@@ -363,18 +363,18 @@ def test_calibration_error_in_band_unless_reference_absorbs_it(follower, stage, 
     for step in deviations * rng.normal(size=(100, 9)):
         # What another camera would have seen, and what this one makes of it.
         focal, principal = (np.array(each) for each in (follower.calibration.focal, follower.calibration.principal))
-        lens = Lens(*(np.ravel(follower.calibration.camera(np.eye(4)).distortion)[:5] + step[4:]))
+        lens = Lens(*(np.ravel(follower.calibration.build_camera(np.eye(4)).distortion)[:5] + step[4:]))
         other = replace(
             follower.calibration, focal=(*(focal + step[:2]),), principal=(*(principal + step[2:4]),), lens=lens
         )
-        pixels = other.camera(reference).project(corners)[0]
+        pixels = other.build_camera(reference).project(corners)[0]
         tumour = np.linalg.inv(reference) @ [
             *known.camera.to_camera_frame(stage.tumour_at_rest.vertices.mean(axis=0)[None])[0],
             1.0,
         ]
-        camera = follower.calibration.camera(np.eye(4))
+        camera = follower.calibration.build_camera(np.eye(4))
         fitted = fit(camera, corners, pixels, reference)
-        apart = camera.project((fitted @ tumour)[None, :3])[0] - other.camera(reference).project(tumour[None, :3])[0]
+        apart = camera.project((fitted @ tumour)[None, :3])[0] - other.build_camera(reference).project(tumour[None, :3])[0]
         off.append(apart[0] * (fitted @ tumour)[2] / focal)
     assert known.parts["camera"] == pytest.approx(
         2.448 * np.linalg.svd(np.cov(np.transpose(off)))[1][0] ** 0.5, rel=0.25

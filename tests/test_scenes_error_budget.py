@@ -37,7 +37,7 @@ DEVIATES = np.random.default_rng(5).normal(size=100)
 
 def sideways(camera, target, time):
     """A camera that moves along its rows."""
-    return camera.moved(np.array([SPEED * time, 0.0, 0.0]))
+    return camera.move(np.array([SPEED * time, 0.0, 0.0]))
 
 
 @pytest.fixture(scope="module")

@@ -60,7 +60,7 @@ class TestScenes:
         asked(theatre, short(), *WORDS)
         assert capsys.readouterr().err == ""
         with pytest.raises(InputError, match=r"E 0\.5 kPa.*, and here it is .*\(necrosis\): neo-hookean, E 0\.4 kPa"):
-            theatre.deformer("series-gp", scene)
+            theatre.build_deformer("series-gp", scene)
         assert theatre.list_rejections(short())["series-gp"] is not None  # as the scene has it, without a command
 
     def test_of_another_brain_have_it_as_many_times_as_stiff(self, theatre):

@@ -38,11 +38,11 @@ def test_many_answered_together_are_as_each_alone():
     site = setting.site
     tips = [site.origin + 1e-3 * depth * site.axis for depth in (-3.0, 0.5, 2.0, 4.0)]
     asked = [TissueRequest(PALPATE.tool.compute_pose(tip, site.axis, site.right)) for tip in tips]
-    together = replace(setting.answers, together=True).answer(asked)
+    together = replace(setting.answers, together=True).compute_responses(asked)
     for one, each in zip(setting.answers.compute_responses(asked), together, strict=True):
         assert np.allclose(one.force, each.force, atol=1e-4) and np.allclose(one.motion, each.motion, atol=1e-5)
     unbound = replace(setting.answers, model=replace(setting.answers.model, bounds=None, bound=7e-4))
-    assert unbound.answer(asked[2:3])[0].error == 7e-4  # loads without a bound have the model's
+    assert unbound.compute_responses(asked[2:3])[0].error == 7e-4  # loads without a bound have the model's
 
 
 def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):

@@ -72,8 +72,8 @@ def test_the_outline_in_the_pixels_is_where_the_tumour_is(shown, truth, calibrat
         if not each.known.relied:
             assert np.count_nonzero(find_ink(each.colour, INK)) < 5  # nothing looks as if it were known
             continue
-        row = truth.at(each.known.time)
-        camera, pose = calibration.camera(truth.T_camera_scan[row]), truth.T_scan_tool[row]
+        row = truth.find_image(each.known.time)
+        camera, pose = calibration.build_camera(truth.T_camera_scan[row]), truth.T_scan_tool[row]
         true = stage.tumour_at_rest.vertices + truth.displacement[row]
         mask = compute_silhouette(camera, true, stage.tumour_at_rest.triangles)
         covered = compute_silhouette(camera, vertices @ pose[:3, :3].T + pose[:3, 3], triangles)
@@ -83,8 +83,8 @@ def test_the_outline_in_the_pixels_is_where_the_tumour_is(shown, truth, calibrat
 def test_under_the_drape_that_a_film_has_nothing_shines_through(shown, truth, calibration, stage, follower):
     each, known = next(islice(pictures(), 6, None)).picture, shown[6].known
     painted = Painter(stage, follower.tool).paint(each.colour, known).colour
-    camera, tumour = calibration.camera(truth.T_camera_scan[6]), stage.tumour(known.motion.positions)
-    seen = stage.picture(camera, known.motion.positions, None).segmentation
+    camera, tumour = calibration.build_camera(truth.T_camera_scan[6]), stage.build_tumour(known.motion.positions)
+    seen = stage.render(camera, known.motion.positions, None).segmentation
     mask = compute_silhouette(camera, tumour.vertices, tumour.triangles)
     under, through = (
         compute_changed_share(each.colour, painted, mask & (seen == ground)) for ground in (DRAPE, CORTEX)
@@ -127,7 +127,7 @@ def test_a_film_that_plays_as_a_camera_loses_what_comes_too_fast():
 
 
 def test_layers_of_a_real_picture_are_where_the_box_is(calibration):
-    camera = calibration.camera(np.eye(4))
+    camera = calibration.build_camera(np.eye(4))
     corners = 0.02 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     near, far = (Layer(str(n), n, corners + [0.0, 0.0, z], np.array([[0, 1, 2]])) for n, z in ((1, 0.3), (2, 0.4)))
     colour = np.random.default_rng(0).integers(0, 256, (720, 960, 3), np.uint8)

@@ -28,7 +28,7 @@ class TestDigestOfLoads:
 
 def test_the_page_reads_what_the_frame_holds(theatre):
     """Distance, motion, force and milliseconds, and whose error is how large, each as a person reads it."""
-    player = theatre.player("linear", short())
+    player = theatre.build_player("linear", short())
     seconds = {"deform": 12.3e-3, "render": 4.5e-3, "overlay": 0.7e-3}
     known = {
         "distance": 12.34e-3,

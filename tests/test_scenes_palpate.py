@@ -108,7 +108,7 @@ class TestPalpate:
         plain = replace(untrained(anatomy, scene), bound=1e-4, force=force)
         model = replace(plain, envelope=replace(plain.envelope, force=(1e-6, 2e-3)))
         both = replace(theatre, models={"contact": model})
-        assert both.names(scene) == ("contact", "guarded", "fem")
+        assert both.list_deformers(scene) == ("contact", "guarded", "fem")
         play, by_model = player(both, scene, "guarded"), 0
         frames = list(play.play_frames(10))
         for frame, solved in zip(frames, palpated, strict=True):
@@ -160,8 +160,8 @@ class TestPalpate:
 
     def test_learnt_models_of_pushes_do_not_know_it(self, theatre):
         with pytest.raises(InputError, match="palpate"):
-            theatre.deformer("linear", small("palpate"))
-        assert theatre.names(small("palpate")) == ("fem",)
+            theatre.build_deformer("linear", small("palpate"))
+        assert theatre.list_deformers(small("palpate")) == ("fem",)
 
 
 def test_a_moved_tool_needs_a_hand():
@@ -171,7 +171,7 @@ def test_a_moved_tool_needs_a_hand():
 
 def test_a_tool_in_the_air_touches_nothing(theatre):
     scene = small("palpate")
-    fem = theatre.fem(scene, scene.accuracy)
+    fem = theatre.build_fem(scene, scene.accuracy)
     loads = scene.build_loads(theatre.site, Touch(depth=-1e-3), 0.0)
     np.testing.assert_array_equal(fem.deform(loads).displacement, 0.0)
     assert Held() in fem.effects

@@ -25,7 +25,7 @@ from surrogate.model.learned import Learned
 
 def heights(play, frame, points):
     """Signed distance (n,) [m] of points from the deformed open cortex, positive outside."""
-    surface = trimesh.Trimesh(play.positions(frame.deformation), play.site.anatomy.open_surface, process=False)
+    surface = trimesh.Trimesh(play.compute_positions(frame.deformation), play.site.anatomy.open_surface, process=False)
     nearest, distance, triangle = trimesh.proximity.closest_point_naive(surface, points)
     side = np.einsum("ni,ni->n", points - nearest, surface.face_normals[triangle])
     return np.where(side >= 0.0, distance, -distance)
@@ -40,7 +40,7 @@ def test_the_pressing_tip_rests_on_the_deformed_surface(play):
     """Its ball touches, and no point of the tissue is inside it."""
     touch, radius = play.scene.path(1.7), play.scene.tool.radius
     frame = play.draw(51, 1.7, touch)
-    rest = play.scene.contact(play.site, touch).point
+    rest = play.scene.find_contact(play.site, touch).point
     assert (frame.tip - rest) @ play.site.axis > 1e-3  # it has gone in with the tissue
     middle = frame.pose[:3, :3] @ [0.0, 0.0, radius] + frame.pose[:3, 3]
     assert np.linalg.norm(middle - frame.tip) == pytest.approx(radius)
@@ -54,7 +54,7 @@ def test_a_place_under_the_bone_is_refused_said_and_shown(play, way):
     frame = play.draw(0, 0.0, Touch(way * 0.1, way * 0.1, force=0.1))
     assert frame.remark.startswith("the bone's edge stops the tool ") and frame.remark.endswith(" mm short")
     assert says(frame.shown, frame.remark)
-    assert play.site.across(frame.tip[None])[0] <= play.site.reach(radius) + CARRIED
+    assert play.site.across(frame.tip[None])[0] <= play.site.compute_reach(radius) + CARRIED
     inside = play.draw(0, 0.0, Touch(force=0.1))
     assert inside.remark == "" and not says(inside.shown, frame.remark)
 
@@ -158,7 +158,7 @@ def test_the_overlay_lies_where_the_tumour_is(play):
 
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     changed = (frame.shown != frame.picture.colour).any(axis=2)
-    corners = play.positions(frame.deformation)[play.site.anatomy.tumour_nodes]
+    corners = play.compute_positions(frame.deformation)[play.site.anatomy.tumour_nodes]
     column, row = np.rint(project_cv2(play.camera, corners)).astype(int).T
     seen = frame.picture.segmentation[row, column] == CORTEX
     assert seen.sum() > 4 and changed[row, column][seen].mean() > 0.97
@@ -185,7 +185,7 @@ def test_frame_computes_rest_and_nearest_point_once(play, monkeypatch):
 
 def test_the_distance_is_that_from_tip_to_tumour(play):
     frame = play.draw(51, 1.7, play.scene.path(1.7))
-    corners = play.positions(frame.deformation)[play.site.anatomy.tumour_surface]
+    corners = play.compute_positions(frame.deformation)[play.site.anatomy.tumour_surface]
     share = np.random.default_rng(0).dirichlet(np.ones(3), 2000)
     samples = np.einsum("nc,scx->snx", share, corners).reshape(-1, 3)
     least = np.linalg.norm(samples - frame.tip, axis=1).min()

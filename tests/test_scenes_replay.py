@@ -151,7 +151,7 @@ def test_jumps_use_frames_where_brain_separates(theatre) -> None:
 @pytest.mark.parametrize("name", REMEMBERING)
 def test_frames_in_any_order_are_those_of_the_straight_run(theatre, name):
     """Of two visitors' sessions in turns, with one solver, a hand in between."""
-    player = theatre.player("fem", REMEMBERING[name])
+    player = theatre.build_player("fem", REMEMBERING[name])
     assert player.remembers
     run = straight(player)
     one, other = ReplaySession(player), ReplaySession(player)
@@ -165,9 +165,9 @@ def test_frames_in_any_order_are_those_of_the_straight_run(theatre, name):
 
 def test_what_went_before_counts(theatre):
     """Else nothing above would say anything: from rest, or from a later frame's shape, it is another answer."""
-    player = theatre.player("fem", REMEMBERING["tissue that relaxes under a blade"])
+    player = theatre.build_player("fem", REMEMBERING["tissue that relaxes under a blade"])
     run = straight(player)
-    alone = player.answer(player.loads(12))
+    alone = player.compute_deformation(player.build_loads(12))
     assert np.abs(alone.reaction - run[12].reaction)[0, 0, 2] > 0.015 * np.abs(run[12].reaction[0, 0, 2])
 
 
@@ -176,10 +176,10 @@ def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
 
     It stays where it is in a frame that begins within the tolerance.
     """
-    player = theatre.player("fem", REMEMBERING["tissue that relaxes under a blade"])
+    player = theatre.build_player("fem", REMEMBERING["tissue that relaxes under a blade"])
     session = ReplaySession(player)
     run = answer(session, 12)
-    held, reads = player.touch(12), [np.linalg.norm(run.reaction[0, 0, :3])]
+    held, reads = player.get_touch(12), [np.linalg.norm(run.reaction[0, 0, :3])]
     for number in (12, 12, 3, 0, 9):
         found = answer(session, number, held)
         assert found.outcome[0].good
@@ -187,13 +187,13 @@ def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
     assert (np.diff(reads) <= 0.0).all() and reads[-1] < 0.97 * reads[0]
     once = replace(run, time=run.time - 1.0 / player.scene.frames_per_second)
     assert same(answer(ReplaySession(player), 12), run)
-    first = player.answer(player.loads(12, held), once)
+    first = player.compute_deformation(player.build_loads(12, held), once)
     assert np.linalg.norm(first.reaction[0, 0, :3]) == reads[1]
 
 
 def test_plain_statics_are_not_run_again(theatre, monkeypatch):
     """One solve a frame, from whatever was shown last."""
-    player = theatre.player("fem", hasty("press", path=press(0.2, rise=0.2, hold=0.1)))
+    player = theatre.build_player("fem", hasty("press", path=press(0.2, rise=0.2, hold=0.1)))
     asked: list[Deformation | None] = []
     solve = player.deformer.deform
     monkeypatch.setattr(player.deformer, "deform", lambda loads, start=None: asked.append(start) or solve(loads, start))
@@ -228,8 +228,8 @@ class TestPages:
 
     def test_two_pages_scrub_switch_and_play(self, theatre, pages, monkeypatch):
         scene = pages[0].stage.scene
-        full = straight(theatre.player("fem", scene))
-        less = straight(theatre.player("fem", remove_effect(scene, Gravity())))
+        full = straight(theatre.build_player("fem", scene))
+        less = straight(theatre.build_player("fem", remove_effect(scene, Gravity())))
         assert not same(full[6], less[6])
         shown: dict[Demo, list] = {page: [] for page in pages}
         owners = {page.browser: page for page in pages}
@@ -267,7 +267,7 @@ class TestPages:
 
 def test_the_referee_answers_the_straight_run_too(theatre):
     scene = REMEMBERING["tissue that relaxes under a blade"]
-    full = straight(theatre.player("fem", scene))
+    full = straight(theatre.build_player("fem", scene))
     referee = FemWorker(theatre, scene, threading.Lock())
     for number in (12, 3, 8):
         referee.ask(number, None)

@@ -27,7 +27,7 @@ class TestWish:
     @staticmethod
     def played(wish):
         """The frame that is shown next, of three."""
-        number = wish.now()[0]
+        number = wish.read_current()[0]
         wish.go_on(number, 3)
         return number
 
@@ -129,7 +129,7 @@ def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd
 
 def test_loads_without_fem_solution_are_left_out(theatre, scene, monkeypatch):
     refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
-    player = theatre.player("linear", scene)  # as quick to have, and asked the same way
+    player = theatre.build_player("linear", scene)  # as quick to have, and asked the same way
     monkeypatch.setattr(Theatre, "player", lambda *words: player)
     referee = FemWorker(theatre, scene, threading.Lock())
     referee.ask(7, None)

@@ -40,7 +40,7 @@ def play(theatre, scene):
 
 @pytest.fixture(scope="module")
 def frames(play):
-    return list(play.frames())
+    return list(play.play_frames())
 
 
 def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
@@ -58,19 +58,19 @@ def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
 
 def test_its_effects_and_causes_are_the_body_s(theatre, scene):
     assert [type(effect) for effect in scene.get_effects_on(theatre.anatomy)][-1] is Resection
-    loads = scene.loads(theatre.site, Touch(), 0.12)
+    loads = scene.build_loads(theatre.site, Touch(), 0.12)
     assert [type(cause) for cause in loads.causes] == [Posture, Resected]
     assert loads.of(Resected).done.tolist() == [2] and "resection: 2 steps done" in format_acting(
         loads, guess(np.zeros((1, 3, 3))), theatre.site.anatomy.mesh.nodes
     )
-    assert theatre.names(scene) == ("fem",)
+    assert theatre.list_deformers(scene) == ("fem",)
 
 
 def test_the_rest_of_the_tumour_is_drawn(play, frames):
     areas = []
     for frame in frames:
-        stage = play.stage.at(frame.loads)
-        layer = stage.tumour(play.positions(frame.deformation))
+        stage = play.stage.select_stage(frame.loads)
+        layer = stage.build_tumour(play.compute_positions(frame.deformation))
         areas.append(int(compute_silhouette(frame.camera, layer.vertices, layer.triangles).sum()))
         assert not stage.anatomy.orphaned[stage.tumour_vertices].any()
         assert frame.deformation.outcome[0].good and frame.moved >= 0.0
@@ -87,7 +87,7 @@ def test_the_corridor_is_seen_in_the_cortex(play, frames):
 
 
 def test_what_was_taken_stays_where_the_scan_has_it(play, frames):
-    gone = play.stage.at(frames[-1].loads).anatomy.orphaned
+    gone = play.stage.select_stage(frames[-1].loads).anatomy.orphaned
     moved = np.linalg.norm(frames[-1].deformation.displacement[0], axis=1)
     assert gone.any() and not moved[gone].any() and moved[~gone].max() > 1e-5
 
@@ -110,7 +110,7 @@ def test_the_page_shows_the_rest(theatre, scene):
         demo.wish.set(number=6)
         assert wait_for(lambda: demo.run(0.3) and "resection: 3 steps done" in demo.browser.shown[2])
         assert wait_for(lambda: len(demo.browser.meshes["tumour"].faces) < whole)
-        rest = demo.stage.select_stage(scene.loads(theatre.site, Touch(), 0.2)).build_tumour(theatre.anatomy.mesh.nodes)
+        rest = demo.stage.select_stage(scene.build_loads(theatre.site, Touch(), 0.2)).build_tumour(theatre.anatomy.mesh.nodes)
         assert np.array_equal(demo.browser.meshes["tumour"].faces, rest.triangles)
         assert wait_for(
             lambda: demo.run(0.2) and np.array_equal(demo.browser.meshes["finite elements"].faces, rest.triangles)

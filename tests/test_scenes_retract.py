@@ -29,9 +29,9 @@ class TestRetract:
         scene, site = small("retract"), theatre.site
         cause = scene.build_loads(site, touch, 0.0).of(Retracted)
         apart = compute_distances(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
-        upright = site.direction(touch) @ site.axis
+        upright = site.compute_direction(touch) @ site.axis
         assert apart.min() == pytest.approx(AIR * upright, abs=0.3e-3)
         moved = cause.pose[0].copy()
         moved[:3, 3] += cause.displacement[0]
         np.testing.assert_allclose(moved, scene.compute_pose(site, touch), atol=1e-15)
-        assert cause.displacement[0] == pytest.approx((AIR + touch.depth) * site.direction(touch))
+        assert cause.displacement[0] == pytest.approx((AIR + touch.depth) * site.compute_direction(touch))

@@ -33,7 +33,7 @@ from surrogate.training.train import train
 def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box, tmp_path, monkeypatch):
     """Fitted here to the training rows; in the file that the report reads, answers to the discs' loads are wild."""
     training, pushed, nodes = study.discs.train, study.pushed, study_box.tumour_nodes
-    truth = study.dataset.displacement(nodes)[study.dataset.good]
+    truth = study.dataset.read_displacement(nodes)[study.dataset.good]
     path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
     monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})

@@ -43,9 +43,9 @@ class TestScenes:
     def test_a_scene_s_name_covers_no_words_at_the_foot(self, theatre):
         scene = short()
         wide = replace(scene, viewpoint=replace(scene.viewpoint, width=480, height=360))
-        player = theatre.player("linear", wide)
+        player = theatre.build_player("linear", wide)
         foot, kept = render_thumbnail(player, "linear").colour[-40:], []
-        for frame in player.frames():
+        for frame in player.play_frames():
             words = frame.taken[-40:] > 0
             kept.append(words.any() and np.array_equal(foot[words], frame.shown[-40:][words]))
         assert any(kept)

@@ -162,10 +162,10 @@ def test_pyigtl_sends_and_hears(follower, registration, beside):
 
 def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registration, truth, beside, stage):
     picture = next(iter(read_video(FILM / "film.mp4", 30.0, colour=True))).colour
-    camera = follower.calibration.camera(truth.T_camera_scan[0])
+    camera = follower.calibration.build_camera(truth.T_camera_scan[0])
     placed = in_mm(registration.T_patient_scan @ np.linalg.inv(truth.T_camera_scan[0]))
     mask = compute_silhouette(camera, stage.tumour_at_rest.vertices, stage.tumour_at_rest.triangles)
-    tool = follower.tool.at(truth.T_scan_tool[0])
+    tool = follower.tool.build_surface(truth.T_scan_tool[0])
     rest = in_mm(registration.T_patient_scan @ truth.T_scan_tool[0] @ np.linalg.inv(follower.tool.T_cube_tool))
 
     async def scene():

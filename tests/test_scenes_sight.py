@@ -50,12 +50,12 @@ def scene():
 
 @pytest.fixture(scope="module")
 def play(theatre, scene):
-    return theatre.player("fem", scene)
+    return theatre.build_player("fem", scene)
 
 
 @pytest.fixture(scope="module")
 def frames(play):
-    return list(play.frames(every=40))
+    return list(play.play_frames(every=40))
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +65,14 @@ def truth(theatre, scene, frames):
 
 def test_what_the_tool_hides_is_not_seen_and_where_it_touches_is(still, play):
     observer, rest = still
-    held = play.tool(play.scene.tool, play.touch(40), rest)
+    held = play.place_tool(play.scene.tool, play.get_touch(40), rest)
     corners = np.asarray(play.scene.tool.mesh.vertices) @ held.pose[:3, :3].T + held.pose[:3, 3]
-    seen, all_seen = observer.seen(0, rest, corners), observer.seen(0, rest)
+    seen, all_seen = observer.observe(0, rest, corners), observer.observe(0, rest)
     assert 0 < len(all_seen.now) - len(seen.now) < 300 and len(seen.rest) == len(seen.now) == len(seen.sigmas)
     away = np.linalg.norm(seen.rest - held.tip, axis=1)
     assert away.min() > 3e-3 and len(seen.tips) == 1
     assert np.linalg.norm(seen.tips[0] - held.tip) < 3e-3
-    lifted = observer.seen(0, rest, corners - 4e-3 * play.site.axis)
+    lifted = observer.observe(0, rest, corners - 4e-3 * play.site.axis)
     assert not len(lifted.tips) and len(seen.now) < len(lifted.now)
 
 
@@ -84,7 +84,7 @@ def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
     for ink, least in ((TUMOUR_COLOUR, 200), (ELLIPSOID_COLOUR, 10), (TRUTH_COLOUR, 10)):
         assert np.count_nonzero(find_ink(frame.shown, compute_ink(ink))) >= least
     nodes = play.site.anatomy.tumour_nodes
-    believed, positions = play.believed(frame), play.positions(frame.deformation)
+    believed, positions = play.estimate_positions(frame), play.compute_positions(frame.deformation)
     assert not np.allclose(believed[nodes], positions[nodes], atol=1e-5)
     others = np.setdiff1d(np.arange(len(positions)), nodes)
     assert np.array_equal(believed[others], positions[others])  # the camera sees the true cortex
@@ -94,7 +94,7 @@ def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
 
 
 def test_the_checks_pass_and_tell_what_an_estimate_is_worth(play, frames, truth):
-    figures = measure(play, play.camera_at, frames, truth)
+    figures = measure(play, play.get_camera, frames, truth)
     assert figures.find_violations(Bounds(overlap=0.5, error=3e-3)) == []
     # One frame moves, and by nothing that the locator's dents are: 14 % of it are removed.
     assert figures.covered == 1.0 and 0.1 < figures.removed < 1.0 and figures.error_mm > 0.01
@@ -104,11 +104,11 @@ def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
     frame, others = frames[1], [frames[0], *frames[2:]]
 
     def sentences(wrong):
-        figures = measure(play, play.camera_at, [others[0], wrong, *others[1:]], truth)
+        figures = measure(play, play.get_camera, [others[0], wrong, *others[1:]], truth)
         return " ".join(figures.find_violations(Bounds(overlap=0.0, error=1.0, covered=1.0)))
 
     plain = replace(play, stage=replace(play.stage, observer=None))
-    undrawn = plain.drawn(frame.number, frame.touch, frame.loads, frame.deformation, 0.1)
+    undrawn = plain.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, 0.1)
     assert "the drawn outline" in sentences(replace(undrawn, estimate=frame.estimate))
     astray = replace(frame.estimate, middle=frame.estimate.middle + 0.01)
     for wrong in (astray, replace(frame.estimate, location=None)):  # one that is refused has no ellipsoid
@@ -122,7 +122,7 @@ def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
 
 def test_an_ellipsoid_holds_what_its_covariance_says(frames):
     found = frames[1].estimate
-    closed, root = found.ellipsoid(), np.linalg.cholesky(found.location.centroid_covariance)
+    closed, root = found.build_ellipsoid(), np.linalg.cholesky(found.location.centroid_covariance)
     at, way = found.middle + found.motion, np.array([0.6, 0.0, 0.8])
     assert is_within_surface(closed, at + 2.7 * root @ way) and not is_within_surface(closed, at + 2.85 * root @ way)
     assert replace(found, true=found.motion + 2.79 * root @ way).held  # chi-square of three, 95 %: 2.795
@@ -141,9 +141,9 @@ def test_where_nothing_moves_that_is_said(play, frames):
 @pytest.fixture(scope="module")
 def refused(theatre, scene):
     """A frame whose points are off by far more than they say."""
-    play = theatre.player("fem", scene)
+    play = theatre.build_player("fem", scene)
     stage = replace(play.stage, observer=Wild(play.stage.observer))
-    return replace(play, stage=stage), replace(play, stage=stage).draw(40, 4 / 3, play.touch(40))
+    return replace(play, stage=stage), replace(play, stage=stage).draw(40, 4 / 3, play.get_touch(40))
 
 
 class Wild:
@@ -154,7 +154,7 @@ class Wild:
 
     def estimate(self, number, positions, tool=None):
         wild = replace(self.observer, sight=replace(self.observer.sight, white=8e-3, smooth=1e-4))
-        sigma = replace(wild.seen(number, positions, tool), sigma=None)
+        sigma = replace(wild.observe(number, positions, tool), sigma=None)
         return _estimated(replace(wild), sigma, positions)
 
 
@@ -167,9 +167,9 @@ def _estimated(observer, seen, positions):
 def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     play, frame = refused
     found, said = frame.estimate, []
-    assert frame.doubt == REFUSED and found.ellipsoid() is None and not found.held and frame.remark == ""
+    assert frame.doubt == REFUSED and found.build_ellipsoid() is None and not found.held and frame.remark == ""
     nodes = play.site.anatomy.tumour_nodes
-    assert np.array_equal(play.believed(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
+    assert np.array_equal(play.estimate_positions(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
     assert not find_ink(frame.shown, compute_ink(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
     assert np.count_nonzero(find_ink(frame.shown, compute_ink(TRUTH_COLOUR))) > 10
     monkeypatch.setattr(
@@ -230,7 +230,7 @@ def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
     flat = {"times": times, "worst": (3e-3, 3e-3), "middle": (2e-3, 2e-3), "moved": (1e-3, 1e-3)}
     known = Uncertainty("it", "", 9, 0, **flat, parts={"E": (1e-3, 1e-3)})
     knowing = replace(play, uncertainty=known)
-    both = knowing.drawn(frame.number, frame.touch, frame.loads, frame.deformation, 0.1).tumour_error
+    both = knowing.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, 0.1).tumour_error
     assert both.prior == pytest.approx(3e-3) and both.bound == both.observed == frame.estimate.worst
 
 
@@ -260,7 +260,7 @@ def test_locator_of_other_regions_is_rejected(theatre, scene):
     other = replace(theatre)
     other.__dict__["locator"] = replace(theatre.locator, regions=(Region(PART_LABELS["oedema"], 0.5),))
     with pytest.raises(InputError, match=r"another stiffness of region 3 \(oedema\) than the scene\."):
-        other.stage(scene)
+        other.build_stage(scene)
 
 
 def test_no_trained_model_is_the_truth(scene):

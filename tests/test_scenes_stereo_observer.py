@@ -52,12 +52,12 @@ def moved(observer, rest):
 
 @pytest.fixture(scope="module")
 def shot(observer, moved):
-    return observer.shot(30, moved)
+    return observer.render_pair(30, moved)
 
 
 @pytest.fixture(scope="module")
 def seen(observer, shot):
-    return observer.seen(shot, NONE)
+    return observer.observe(shot, NONE)
 
 
 def truly(observer, moved, points):
@@ -82,7 +82,7 @@ def test_one_seed_gives_the_same_pictures_and_another_others(observer, moved, sh
     same, other = again.render_pair(30, moved), observer_of(replace(EXACT, seed=1)).render_pair(30, moved)
     for one, two, three in zip(shot.pictures, same.pictures, other.pictures, strict=True):
         assert np.array_equal(one, two) and np.abs(one.astype(float) - three).mean() > 2.0
-    assert not np.array_equal(observer.shot(31, moved).pictures[0], shot.pictures[0])
+    assert not np.array_equal(observer.render_pair(31, moved).pictures[0], shot.pictures[0])
     assert shot.pictures[1].mean() < 0.93 * shot.pictures[0].mean()
 
 
@@ -103,10 +103,10 @@ def test_a_tracked_microscope_is_off_as_a_whole(observer, shot, seen):
 def test_a_tool_hides_points_and_moves_none(observer, moved, seen):
     site, scene = observer.stage.site, observer.stage.scene
     inward, tip = site.axis, site.origin + 3e-3 * site.right - 2e-3 * site.axis
-    corners = observer.stage.corners(scene.tool.pose(tip, inward, site.right))
-    found = observer.seen(observer.shot(30, moved, corners), NONE)
+    corners = observer.stage.compute_corners(scene.tool.compute_pose(tip, inward, site.right))
+    found = observer.observe(observer.render_pair(30, moved, corners), NONE)
     assert 20 < len(found.now) < len(seen.now)
-    left = observer.shot(30, moved, corners).cameras[0]
+    left = observer.render_pair(30, moved, corners).cameras[0]
     hidden = compute_silhouette(left, corners, np.asarray(scene.tool.mesh.faces))
     column, row_ = left.project(found.now)[0].round().astype(int).T
     assert hidden.any() and not hidden[row_, column].any()
@@ -133,7 +133,7 @@ def test_a_cortex_without_a_scan_has_vessels_to_follow(observer):
 class TestRefusals:
     def refusal(self, observer, shot):
         with pytest.raises(InputError) as refused:
-            observer.seen(shot, NONE)
+            observer.observe(shot, NONE)
         return str(refused.value)
 
     def test_an_eye_that_is_dark(self, observer, shot):
@@ -141,7 +141,7 @@ class TestRefusals:
         assert "the right eye sees nothing" in self.refusal(observer, dark)
 
     def test_a_cortex_that_moved_farther_than_is_searched(self, observer, rest):
-        far = observer.shot(30, rest + 12e-3 * observer.stage.site.right)
+        far = observer.render_pair(30, rest + 12e-3 * observer.stage.site.right)
         assert "begin with a new scan" in self.refusal(observer, far)
 
     def test_swapped_eyes(self, observer, shot, rest):

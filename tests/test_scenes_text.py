@@ -62,7 +62,7 @@ class TestTrust:
 
     def test_undeformed_brain_has_no_motion_and_no_error_of_it(self, theatre):
         scene = small(path=press(0.2), duration=1.0)
-        player = Player(theatre.stage(scene), theatre.deformer("linear", scene))
+        player = Player(theatre.build_stage(scene), theatre.build_deformer("linear", scene))
         frames = [player.draw(0, time, player.scene.path(time)) for time in (0.0, 0.9)]
         said = [report(frame, player.stage, "linear", "", (), 2) for frame in frames]
         assert "tumour moved" not in said[0] and "Nothing moves the tumour" in said[0]
@@ -102,8 +102,8 @@ class TestWords:
         assert plan_words(("First <this>.", "Then that.")) == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
         assert plan_words(()) == "" == plan_words(plan_of(theatre.models["linear"]))
         scene = small("resection")
-        assert plan_of(theatre.fem(scene, scene.accuracy)) == ()
-        assert plan_of(theatre.fem(short(), LIVE)) == theatre.fem(short(), LIVE).plan.explain()
+        assert plan_of(theatre.build_fem(scene, scene.accuracy)) == ()
+        assert plan_of(theatre.build_fem(short(), LIVE)) == theatre.build_fem(short(), LIVE).plan.explain()
 
     def test_the_side_is_the_patient_s(self, theatre):
         site = theatre.site

@@ -198,13 +198,13 @@ class TestStored:
     def test_it_is_of_this_scene_tissue_element_and_brain_alone(self, theatre):
         scene = short()
         knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
-        assert knowing.uncertainty(scene) is not None
+        assert knowing.estimate_uncertainty(scene) is not None
         others = (
             scene.replace_tissue(replace(BRAIN, young=4000.0), None), scene.replace_tissue(None, "p1"),
             replace(scene, name="else"),
             replace(scene, path=lambda time: Touch(force=0.1)), replace(scene, effects=scene.effects[:-1]),
         )  # fmt: skip
-        assert [knowing.uncertainty(other) for other in others] == [None] * 5
+        assert [knowing.estimate_uncertainty(other) for other in others] == [None] * 5
 
     def test_error_interpolates_between_moments_plus_model(self, theatre):
         found = stated(short(), theatre)
@@ -276,7 +276,7 @@ class TestSaid:
         scene = short()
         wide = replace(scene, viewpoint=replace(scene.viewpoint, width=640, height=480))
         knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
-        player = knowing.player("linear", wide)
+        player = knowing.build_player("linear", wide)
         drawn_with = []
         from scenes.play.player import composite
 
@@ -292,7 +292,7 @@ class TestSaid:
         assert all(has_text(frame.shown, line, FINE) for line in frame.head)
         # The panel of figures begins under them.
         assert all(has_text(add_cost_label(frame, "linear"), line, FINE) for line in frame.head)
-        narrow = knowing.player("linear", scene).draw(3, 0.1, scene.path(0.1))
+        narrow = knowing.build_player("linear", scene).draw(3, 0.1, scene.path(0.1))
         assert narrow.shown.shape == (240, 320, 3)
         assert list(narrow.head) == format_errors(narrow.model_error, narrow.tumour_error, True, brief=True)
         moved = wrap_line(f"moved {format_millimetres(narrow.moved, narrow.tumour_error.moved)}", NARROW * 320)
@@ -301,7 +301,7 @@ class TestSaid:
 
     def test_in_a_hand_and_of_a_doubtful_answer_it_is_not_known(self, theatre):
         scene = short()
-        player = replace(theatre, uncertainties={scene.name: stated(scene, theatre)}).player("linear", scene)
+        player = replace(theatre, uncertainties={scene.name: stated(scene, theatre)}).build_player("linear", scene)
         held, doubtful = (player.draw(3, 0.1, Touch(force=force)) for force in (0.2, 0.6))
         assert held.tumour_error == doubtful.tumour_error == NOT_KNOWN
         assert held.model_error is not None and doubtful.model_error is None and doubtful.doubt

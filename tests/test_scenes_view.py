@@ -11,7 +11,7 @@ def test_the_3d_view_follows(demo, theatre):
     demo.wish.set(plays=False, number=30)
     assert demo.run(1.0) >= 1
     tumour = np.asarray(demo.browser.meshes["tumour"].vertices)
-    rest = demo.stage.tumour(theatre.anatomy.mesh.nodes).vertices
+    rest = demo.stage.build_tumour(theatre.anatomy.mesh.nodes).vertices
     assert wait_for(lambda: np.linalg.norm(demo.browser.meshes["tumour"].vertices - rest, axis=1).max() > 5e-4)
     meshes = demo.browser.meshes
     assert wait_for(
@@ -32,7 +32,7 @@ def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
     monkeypatch.setattr(demo.browser, "tint", lambda name, colour: tints.append(colour))
     asked = []
     monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
-    demo.wish.hand(x=0.004, force=0.25)
+    demo.wish.take_over(x=0.004, force=0.25)
     demo.run(0.5)
     assert wait_for(lambda: "force 0.25 N" in report(demo))
     said = demo.browser.shown[2]

@@ -25,13 +25,13 @@ class TestLearnt:
         why = find_rejection(model, (*short().effects, Gravity()))
         assert why is not None and "not under Gravity" in why
         with pytest.raises(InputError, match=r"svr does not know the scene sinking.*but Gravity. Choose one of fem"):
-            theatre.player("svr", sinking())
+            theatre.build_player("svr", sinking())
         # No force at all: it has nothing to say of that either.
-        assert "here is none" in (find_rejection(model, EFFECTS) or "") and theatre.names(
+        assert "here is none" in (find_rejection(model, EFFECTS) or "") and theatre.list_deformers(
             replace(short(), effects=EFFECTS)
         ) == ("fem",)
-        assert theatre.names(short()) == ("linear", "svr", "guarded", "fem") and theatre.names(sinking()) == ("fem",)
-        assert theatre.best(sinking()) == "fem"
+        assert theatre.list_deformers(short()) == ("linear", "svr", "guarded", "fem") and theatre.list_deformers(sinking()) == ("fem",)
+        assert theatre.select_best(sinking()) == "fem"
 
     def test_it_refuses_causes_that_it_does_not_know(self, theatre):
         model, scene = theatre.models["linear"], sinking()
@@ -66,9 +66,9 @@ class TestLearnt:
     def test_models_beside_an_anatomy_do_not_change_its_physics(self, theatre):
         training = {"element": "p1", "tissue": to_tissue_json(Material("neo-hookean", 9000.0, 0.3))}
         other = replace(theatre, models={"linear": replace(theatre.models["linear"], training=training)})
-        assert other.fem(short(), LIVE).description == "finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
+        assert other.build_fem(short(), LIVE).description == "finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
         for scene in (short(), sinking()):
-            found, alone = (each.fem(scene, LIVE) for each in (other, replace(theatre, models={})))
+            found, alone = (each.build_fem(scene, LIVE) for each in (other, replace(theatre, models={})))
             assert (found.space.element, found.effects) == (alone.space.element, alone.effects)
 
     @pytest.mark.parametrize(
@@ -81,11 +81,11 @@ class TestLearnt:
     def test_a_model_of_another_body_is_refused(self, theatre, training, reason):
         model = replace(theatre.models["linear"], training=training)
         other = replace(theatre, models={"linear": model})
-        assert other.names(short()) == ("fem",)
+        assert other.list_deformers(short()) == ("fem",)
         with pytest.raises(InputError, match=reason):
-            other.deformer("linear", short())
+            other.build_deformer("linear", short())
         tissue, element = (Material("neo-hookean", 9000.0, 0.3), None) if "tissue" in training else (None, "p1")
-        assert other.deformer("linear", short().replace_tissue(tissue, element)) is model
+        assert other.build_deformer("linear", short().replace_tissue(tissue, element)) is model
 
     def test_another_tissue_goes_on_relaxing(self):
         scene = find_scene("retract").replace_tissue(Material("neo-hookean", 9000.0, 0.3), "p2")

@@ -59,7 +59,7 @@ def test_likeness_uses_patch_size_not_point_count(body, evidence):
     """The same patch twice as wide is as far off for few points as for many; a patch of half the area is smaller."""
     wide = replace(evidence, at=2.0 * evidence.at)
     few, many = (
-        compute_likeness(wide.rows(np.arange(n))) - compute_likeness(evidence.rows(np.arange(n))) for n in (60, 180)
+        compute_likeness(wide.select(np.arange(n))) - compute_likeness(evidence.select(np.arange(n))) for n in (60, 180)
     )
     assert few == pytest.approx(many) and few[2] > 1.0 and few[[0, 1, 3]] == pytest.approx(np.zeros(3))
     still, sizes = np.zeros_like(body.mesh.nodes), []
@@ -83,7 +83,7 @@ def test_patch_trials_give_covariance_growth(evidence):
 
 def test_a_cloud_is_like_no_named_points(evidence):
     """One row a point, as clouds have, and three."""
-    cloud = evidence.rows(np.arange(0, 180, 3))
+    cloud = evidence.select(np.arange(0, 180, 3))
     assert np.array_equal(compute_likeness(cloud)[1:3], compute_likeness(evidence)[1:3])
     assert compute_likeness(cloud)[3] > 100.0 + compute_likeness(evidence)[3]
     named, unnamed = (

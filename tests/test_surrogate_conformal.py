@@ -38,7 +38,7 @@ def bound():
 
 def test_fresh_loads_are_covered_in_every_class(bound):
     features, force, error = drawn(20000, 2)
-    stated = bound.of(features, force, lying(len(force)))
+    stated = bound.evaluate(features, force, lying(len(force)))
     covered = error <= stated
     for level, row in zip(LEVELS, covered, strict=True):
         assert abs(row.mean() - level) < 0.01
@@ -51,11 +51,11 @@ def test_fresh_loads_are_covered_in_every_class(bound):
 
 def test_outside_it_grows(bound):
     features, force, _ = drawn(10, 3)
-    inside, outside = (bound.of(features, force, lying(10, beyond=excess)) for excess in (0.0, 1.0))
+    inside, outside = (bound.evaluate(features, force, lying(10, beyond=excess)) for excess in (0.0, 1.0))
     assert (outside > 2.0 * inside).all()
     near = replace(bound, growth=np.array(500.0), near=np.array(1e-3))  # its first millimetre does not count
-    assert near.of(features, force, lying(10, 3e-3)) == pytest.approx(2.0 * inside)
-    assert near.of(features, force, lying(10, 0.9e-3)) == pytest.approx(inside)
+    assert near.evaluate(features, force, lying(10, 3e-3)) == pytest.approx(2.0 * inside)
+    assert near.evaluate(features, force, lying(10, 0.9e-3)) == pytest.approx(inside)
 
 
 def far_and_near(growth, seed, near=400, far=300):

@@ -110,12 +110,12 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, p
     some = np.flatnonzero(data.good)[:90]
     loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
     nodes = (expansion.tumour, expansion.cortex)
-    bases = expansion.bases(Examples(loads, *(data.displacement(at)[some] for at in nodes)), ADDED, COARSE)
+    bases = expansion.build_bases(Examples(loads, *(data.read_displacement(at)[some] for at in nodes)), ADDED, COARSE)
     fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     places = np.array([0, 17, 60, 120, 198])
     point = np.repeat(add_edge_midpoints(patch)[1][places], 3, axis=0)
     units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
-    predicted = expansion.on(bases, np.zeros(len(expansion.places), bool))
+    predicted = expansion.build_series(bases, np.zeros(len(expansion.places), bool))
     for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact, strict=True):
         wanted = fem.series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
         for terms in SPANS[len(exact) :]:
@@ -132,12 +132,12 @@ def test_two_series_orders_are_exact_for_any_tool(expansion, box):
     assert 10 < inside.sum() < 40
     exact = fem.series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
     size = split_forces(loads)[0][:, None, None]
-    found = [size * part.response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
+    found = [size * part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
     for order, (motion, limit) in enumerate(zip(found, (1e-3, 3e-2), strict=True)):
         off = np.linalg.norm(motion.reshape(40, -1) - exact[:, order], axis=1) / np.linalg.norm(exact[:, order], axis=1)
         assert off[inside].max() < limit
-    many = [part.response(ENCODERS[part.encoder](expansion.patch, replaced(loads, 3))) for part in expansion.exact[0]]
-    some = [part.response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
+    many = [part.compute_response(ENCODERS[part.encoder](expansion.patch, replaced(loads, 3))) for part in expansion.exact[0]]
+    some = [part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
     for few, more in zip(some, many, strict=True):  # more than are answered at once
         np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
 
@@ -191,7 +191,7 @@ def test_held_out_discs_are_unknown_to_series(trained, data, expansion, tmp_path
     rows = np.flatnonzero(data.good)[~split.train]
     wild = read_dataset(poisoned(data.path, tmp_path / "wild.h5", rows)[0])
     again = Expansion(wild, "cpu")
-    inside = split.covers(again.places)
+    inside = split.is_covered(again.places)
     assert 0 < inside.sum() < len(inside)
     again.tabulated.table[inside] = np.random.default_rng(0).normal(size=again.tabulated.table[inside].shape)
     before, after = (train(each.data, EXPANDED, split=split, expansion=each) for each in (expansion, again))
@@ -211,8 +211,8 @@ def test_every_solve_is_counted(trained, data):
     """
     linear, series, learnt = (row.solves for row in trained.scores)
     loads_given, units = int(trained.split.train.sum()), len(data.unit_good)
-    outside = int((~trained.split.covers(add_edge_midpoints(open_patch(data.anatomy))[1])).sum())
-    inside = 3 * int(trained.split.covers(open_patch(data.anatomy).points).sum())
+    outside = int((~trained.split.is_covered(add_edge_midpoints(open_patch(data.anatomy))[1])).sum())
+    inside = 3 * int(trained.split.is_covered(open_patch(data.anatomy).points).sum())
     assert (linear.loads, linear.units, linear.series, linear.inside) == (loads_given, units, 0, inside) and inside
     assert series == learnt and (series.loads, series.units, series.inside) == (loads_given, units, inside)
     assert series.series == outside * 19 and series.total == loads_given + units + outside * 19
@@ -226,7 +226,7 @@ def test_every_solve_is_counted(trained, data):
 
 def test_the_cortex_moves_as_the_finite_elements_say(trained, data, box, patch):
     cortex = np.setdiff1d(patch.nodes, box.tumour_nodes)
-    truth = data.displacement(cortex)
+    truth = data.read_displacement(cortex)
     miss = {name: np.linalg.norm(model.deform(data.loads, at=cortex).displacement - truth, axis=2).mean()
             for name, model in trained.models.items()}  # fmt: skip
     assert miss["series"] < 0.7 * miss["linear"] and miss["series-gp"] < 0.7 * miss["linear"]

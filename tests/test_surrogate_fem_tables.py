@@ -62,7 +62,7 @@ def test_the_ball_enters_no_facet_and_pulls_nothing(box, pressed):
     """
     contact, loads = pressed[0], draw_poses("palpation", box, 30, 2)
     X = features(box, loads)
-    force = contact.force(X)
+    force = contact.compute_nodal_forces(X)
     moved = contact.points + (force @ contact.compliance.astype(np.float64).T).reshape(len(X), -1, 3)
     middle = X[:, :3] + (X[:, 6] - X[:, 7])[:, None] * X[:, 3:6]
     arm, force = moved - middle[:, None], force.reshape(moved.shape)
@@ -94,7 +94,7 @@ def test_it_answers_as_finite_elements_of_linear_tissue_do(box, pressed):
         off = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
         assert off.mean() < 0.03
         assert off.max() < 0.06
-    bears = contact.force(X).reshape(len(X), -1, 3).sum(axis=1)
+    bears = contact.compute_nodal_forces(X).reshape(len(X), -1, 3).sum(axis=1)
     reads = truth.reaction[:, 0, :3]
     assert (np.linalg.norm(bears - reads, axis=1) < 0.05 * np.linalg.norm(reads, axis=1)).all()
 
@@ -104,7 +104,7 @@ def test_bone_under_the_ball_bears_nothing(box, pressed):
     contact, rim = pressed[0], open_patch(box).points
     middle, pose = 0.5 * (rim.min(axis=0) + rim.max(axis=0)), np.tile(np.eye(4), (8, 1, 1, 1))
     pose[:, 0, :3, 3] = middle + np.linspace([0.0, 0.0, -4e-3], [1.25 * (rim[:, 0].max() - middle[0]), 0.0, -4e-3], 8)
-    force = contact.force(features(box, Loads((Touching(pose),)))).reshape(8, -1, 3)
+    force = contact.compute_nodal_forces(features(box, Loads((Touching(pose),)))).reshape(8, -1, 3)
     stiff = np.einsum("nini->n", contact.compliance.reshape(force.shape[1], 3, -1, 3)) == 0.0
     assert stiff.any() and np.abs(force[-2:]).max() > 0.0
     assert np.linalg.norm(force.sum(axis=1), axis=1).max() < 20.0
@@ -114,7 +114,7 @@ def test_how_stiff_tissue_is_does_not_matter(box, pressed):
     soft = pressed[0]
     stiff = condense_contact(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
     X = features(box, draw_poses("palpation", box, 10, 3))
-    force, more = soft.force(X), stiff.compute_nodal_forces(X)
+    force, more = soft.compute_nodal_forces(X), stiff.compute_nodal_forces(X)
     np.testing.assert_allclose(2.5 * force, more, atol=1e-3 * np.abs(more).max())
     moved, again = force @ soft.compliance.T, more @ stiff.compliance.T
     np.testing.assert_allclose(moved, again, atol=2e-6)
@@ -244,8 +244,8 @@ def test_without_reactions_the_force_is_not_answered(tmp_path, data, box):
         del file["answers/reaction"]
         file["answers/checksum"][:] = compute_row_checksums(rows)
     read = read_dataset(older)
-    assert read.read_reaction() is None and data.reaction() is not None
-    np.testing.assert_array_equal(read.read_displacement(box.tumour_nodes), data.displacement(box.tumour_nodes))
+    assert read.read_reaction() is None and data.read_reaction() is not None
+    np.testing.assert_array_equal(read.read_displacement(box.tumour_nodes), data.read_displacement(box.tumour_nodes))
     found = train(read, ["contact"])
     assert found.force == {}
     answer = found.models["contact"].deform(draw_poses("palpation", box, 2, 1))

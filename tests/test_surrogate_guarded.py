@@ -22,7 +22,7 @@ from surrogate.model.store import load, save
 
 @pytest.fixture(scope="module")
 def guarded(theatre):
-    return theatre.deformer(GUARDED, small())
+    return theatre.build_deformer(GUARDED, small())
 
 
 @pytest.fixture(scope="module")
@@ -63,14 +63,14 @@ def test_each_load_is_judged_by_its_own_bound(guarded, loads, predicted, solved)
     bounds = np.linspace(1e-4, 6e-4, len(loads))
     bounds[2] = np.nan
     marked = replace(predicted, bound=np.stack([bounds, bounds]), outcome=(Outcome.PREDICTED,) * len(loads))
-    assert replace(guarded, limit=3.5e-4, model=replace(guarded.model, bound=1.0)).unsure(marked).tolist() == [
+    assert replace(guarded, limit=3.5e-4, model=replace(guarded.model, bound=1.0)).find_unreliable(marked).tolist() == [
         False, False, True, True, True, True,
     ]  # fmt: skip
     far = replace(marked, outcome=(Outcome.EXTRAPOLATED,) * len(loads))
-    assert replace(guarded, limit=1.0).unsure(far).all()
+    assert replace(guarded, limit=1.0).find_unreliable(far).all()
     nodes, limit = guarded.model.nodes[5:2:-1], float(np.sort(predicted.bound[0])[2]) + 1e-9
     some = replace(guarded, limit=limit)
-    handed = some.unsure(predicted)
+    handed = some.find_unreliable(predicted)
     assert 0 < handed.sum() < len(loads)
     answer = some.deform(loads, at=nodes)
     expected = np.where(handed[:, None, None], solved.at(nodes).displacement, predicted.at(nodes).displacement)
@@ -102,7 +102,7 @@ def test_a_frame_says_who_answered(theatre, limit):
     by_model = find_first_model(play.deformer, frame.deformation) is not None
     assert by_model == (limit == 1.0) == (frame.model_error is not None) == (frame.distance_error is not None)
     assert ("finite elements themselves" in " ".join(frame.head) or "FEM itself" in " ".join(frame.head)) != by_model
-    moved = player(theatre, small(), "fem" if not by_model else theatre.best(small())).draw(0, 0.0, Touch(force=0.1))
+    moved = player(theatre, small(), "fem" if not by_model else theatre.select_best(small())).draw(0, 0.0, Touch(force=0.1))
     assert frame.moved == pytest.approx(moved.moved, abs=1e-9)
 
 
@@ -118,8 +118,8 @@ def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
 
 def test_the_limit_is_the_user_s(theatre):
     strict = replace(theatre, limit=5e-5)
-    assert strict.deformer(GUARDED, small()).limit == 5e-5 and theatre.deformer(GUARDED, small()).limit == LIMIT
-    assert "where its error may exceed 0.05 mm" in strict.described(GUARDED, small())
+    assert strict.build_deformer(GUARDED, small()).limit == 5e-5 and theatre.build_deformer(GUARDED, small()).limit == LIMIT
+    assert "where its error may exceed 0.05 mm" in strict.describe_deformer(GUARDED, small())
     parser = argparse.ArgumentParser()
     add_theatre(parser)
     asked = parser.parse_args(["--guard", "0.05", "--device", "cpu"])
@@ -131,7 +131,7 @@ def test_the_limit_is_the_user_s(theatre):
 
 
 def test_scene_model_is_named_with_description(theatre):
-    assert GUARDED in theatre.names(small()) and "where its error may exceed 0.2 mm" in theatre.described(
+    assert GUARDED in theatre.list_deformers(small()) and "where its error may exceed 0.2 mm" in theatre.describe_deformer(
         GUARDED, small()
     )
 
@@ -163,8 +163,8 @@ def test_fem_share_matches_held_out_errors(theatre):
     assert (many.limit, many.solved) == (0.1e-3, 1.0)
     (_, model), *_ = theatre.models.items()
     some = replace(theatre, models={"series-gp": replace(model, left_out=middle)})
-    assert some.deformer(GUARDED, small()).limit == 0.05e-3
-    assert replace(some, limit=1e-3).deformer(GUARDED, small()).limit == 1e-3
+    assert some.build_deformer(GUARDED, small()).limit == 0.05e-3
+    assert replace(some, limit=1e-3).build_deformer(GUARDED, small()).limit == 1e-3
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_default_deformer_is_model_alone_where_valid(theatre, mean, bound, who):
     (_, model), *_ = theatre.models.items()
     stated = None if mean is None else LeftOut(mean, 0.001, None, 0.3)
     some = replace(theatre, models={"series-gp": replace(model, bound=bound, left_out=stated)})
-    assert some.usual(small()) == who and some.best(small()) == "series-gp"
+    assert some.select_default(small()) == who and some.select_best(small()) == "series-gp"
     said = describe_error(some.models["series-gp"])
     assert said.endswith(": scenes play it guarded" if who == GUARDED else ": it may answer alone")
 
@@ -199,4 +199,4 @@ def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):
 
 def test_where_no_model_knows_the_scene_the_reason_is_said(theatre):
     with pytest.raises(InputError, match=r"could ask knows the scene retract: .*Retraction\. Choose fem\."):
-        theatre.deformer(GUARDED, small("retract"))
+        theatre.build_deformer(GUARDED, small("retract"))

@@ -131,7 +131,7 @@ def test_no_answer_that_calibrates_reaches_a_model(trained, data, tmp_path):
 
 def test_what_is_used_was_trained_on_the_discs_too(trained, scored, data):
     held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
-    truth = data.displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
+    truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
     for name in ("ann", "svr", "gp", "residual"):
         both = (trained.models[name], scored.models[name])
         used, judged = (compute_point_errors(model, held_out, truth, data.anatomy.tumour_nodes) for model in both)
@@ -157,7 +157,7 @@ def test_bounds_are_calibrated_on_untrained_loads(trained, data, fresh, pretende
 def test_held_out_coverage_is_reported(trained, scored, data):
     """Recomputed: the scored model, bounds from the loads that are apart and outside every disc."""
     good = data.loads.rows(np.flatnonzero(data.good))
-    truth = data.displacement(data.anatomy.tumour_nodes)[data.good]
+    truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good]
     place = np.linalg.norm(good.of(Pushed).point[:, None] - trained.split.centres, axis=2).min(axis=1)
     apart = np.arange(len(good)) >= len(good) - trained.calibrated
     beside = np.flatnonzero(apart & (place > trained.split.radius))
@@ -211,7 +211,7 @@ def test_scores_are_the_errors_of_the_held_out_loads(trained, scored, data, box)
     name, model = "linear", scored.models["linear"]
     row = next(row for row in trained.scores if row.name == name)
     held_out = np.flatnonzero(data.good)[trained.split.test]
-    truth = data.displacement(box.tumour_nodes)[held_out].astype(float)
+    truth = data.read_displacement(box.tumour_nodes)[held_out].astype(float)
     miss, motion = [], []
     for number, load_case in enumerate(held_out):
         answer = model.deform(data.loads.rows(np.array([load_case]))).at(box.tumour_nodes).displacement[0]
@@ -252,7 +252,7 @@ def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh
     size = np.linalg.norm(fresh.of(Pushed).force, axis=1)
     within = fresh.rows((size >= model.envelope.force[0]) & (size <= model.envelope.force[1]))
     wanted = model.deform(within, at=box.tumour_nodes).displacement
-    assert np.allclose(model.motion(model.asked(within), box.tumour_nodes), wanted, atol=1e-5 * np.abs(wanted).max())
+    assert np.allclose(model.predict_motion(model.to_input(within), box.tumour_nodes), wanted, atol=1e-5 * np.abs(wanted).max())
 
 
 def test_outside_the_training_range_is_said(trained, box):

@@ -44,12 +44,12 @@ def test_nothing_of_held_out_loads_reaches_an_envelope(trained, scored, data):
 
 def test_unit_responses_inside_the_discs_are_given_and_counted(trained, data, box):
     """Linear tissue is known everywhere: the table answers weak loads in the discs exactly, and the row says so."""
-    inside = int(trained.split.covers(open_patch(box).points).sum())
+    inside = int(trained.split.is_covered(open_patch(box).points).sum())
     assert inside and trained.scores[0].solves.inside == 3 * inside
     model = train(data, ["linear"], split=trained.split).models["linear"]
     patch = open_patch(box)
     unit = data.compute_unit_response(box.tumour_nodes).reshape(len(patch.points), 3, -1, 3)
-    for node in np.flatnonzero(trained.split.covers(patch.points))[:3]:
+    for node in np.flatnonzero(trained.split.is_covered(patch.points))[:3]:
         force = np.zeros(3 * len(patch.points))
         force[3 * node + 2] = 1.0
         found = model.parts[0].compute_response(force[None])[0]

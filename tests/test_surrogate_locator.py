@@ -100,7 +100,7 @@ def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):
 
 def test_small_locator_agrees_with_full_one(locator, body, truth, tmp_path):
     """Points with names, a cloud, and tips; read from its file, which is much smaller on a body with more inside."""
-    save_locator(tmp_path / "small.npz", locator.small())
+    save_locator(tmp_path / "small.npz", locator.restrict())
     small = load_locator(tmp_path / "small.npz", body)
     nodes = small.prior.nodes
     assert len(nodes) < len(body.mesh.nodes) == len(locator.prior.shape[0])
@@ -112,20 +112,20 @@ def test_small_locator_agrees_with_full_one(locator, body, truth, tmp_path):
             ours, whole = small.locate(each), locator.locate(each)
             assert ours.centroid == pytest.approx(whole.centroid, abs=1e-6)
             assert ours.p95 == pytest.approx(whole.p95, rel=1e-3)
-            assert ours.compute_motion(nodes) == pytest.approx(whole.at(nodes), abs=1e-6)
+            assert ours.compute_motion(nodes) == pytest.approx(whole.compute_motion(nodes), abs=1e-6)
             assert ours.compute_covariance(body.tumour_nodes) == pytest.approx(
-                whole.covariance(body.tumour_nodes), rel=1e-3
+                whole.compute_covariance(body.tumour_nodes), rel=1e-3
             )
             assert ours.causes == pytest.approx(whole.causes, abs=1e-3)
 
 
 def test_a_small_locator_refuses_what_it_does_not_know(locator, body, truth):
-    small = locator.small()
+    small = locator.restrict()
     seen = observed(body, truth[0][0])
     other = np.setdiff1d(np.arange(len(body.mesh.nodes)), small.prior.nodes)
     for asked in (other[:1], np.append(body.tumour_nodes, other[-1])):
         with pytest.raises(InputError, match="this locator knows"):
-            small.locate(seen).at(asked)
+            small.locate(seen).compute_motion(asked)
     with pytest.raises(InputError, match="this locator knows"):
         small.prior.restrict(other)
     deep = replace(seen, rest=seen.rest - [0.0, 0.0, 11e-3], now=seen.now - [0.0, 0.0, 11e-3])
@@ -158,7 +158,7 @@ def test_locator_files_round_trip_and_reject_foreign(locator, body, tmp_path):
         save_locator(tmp_path / "wild.npz", Locator(spoilt, locator.tried))
         with pytest.raises(InputError, match="do not fit"):
             load_locator(tmp_path / "wild.npz", body)
-    small = locator.small().prior
+    small = locator.restrict().prior
     for nodes in (small.nodes[::-1], small.nodes[1:], small.nodes + len(body.mesh.nodes), small.nodes + 0.5):
         save_locator(tmp_path / "wild.npz", Locator(replace(small, nodes=nodes), locator.tried))
         with pytest.raises(InputError, match="do not fit"):
@@ -175,7 +175,7 @@ def test_most_tumour_motion_is_found_within_ellipsoids(locator, body, truth):
         left, all_of_it = left + np.linalg.norm(off), all_of_it + np.linalg.norm(middle)
         held.append(off @ np.linalg.solve(found.centroid_covariance, off) < 7.815)
         assert np.linalg.eigvalsh(found.centroid_covariance).min() > 0.0
-        covariance = found.covariance(body.tumour_nodes)
+        covariance = found.compute_covariance(body.tumour_nodes)
         assert covariance.shape == (len(body.tumour_nodes), 3, 3) and np.linalg.eigvalsh(covariance).min() > 0.0
         assert sum(found.causes.values()) == pytest.approx(float(not found.within_errors)) and found.calibrated
     assert left < 0.35 * all_of_it and np.mean(held) > 0.85

@@ -70,7 +70,7 @@ def seen_unknowns(prior, evidence):
 
 def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
     evidence = seen(prior, np.zeros((len(prior.anatomy.mesh.nodes), 3)))
-    found = np.hstack([prior.seen(*evidence.weights), evidence.rigid * evidence.rigid_scale])
+    found = np.hstack([prior.project_shapes(*evidence.weights), evidence.rigid * evidence.rigid_scale])
     assert found == pytest.approx(seen_unknowns(prior, evidence), abs=1e-9)
 
 

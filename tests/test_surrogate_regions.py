@@ -64,7 +64,7 @@ def test_who_knows_a_stiff_region_finds_the_tumour_better(body, locators):
         for one in motion[:6] * (3e-3 / compute_surface_motion(body, motion[:6]))[:, None, None]:
             seen = Observation(body.mesh.nodes[nodes] + one[nodes], body.mesh.nodes[nodes], rigid=0.0)
             truth = one[body.tumour_nodes]
-            off.append([np.linalg.norm(each.locate(seen).at(body.tumour_nodes) - truth) for each in locators])
+            off.append([np.linalg.norm(each.locate(seen).compute_motion(body.tumour_nodes) - truth) for each in locators])
     knowing, other = np.median(off, axis=0)
     assert knowing < 0.7 * other, (knowing, other)
 
@@ -90,7 +90,7 @@ def test_a_file_keeps_the_regions_and_an_older_one_has_none(body, locators, tmp_
     for name, locator in (("knows.npz", knowing), ("not.npz", other)):
         save_locator(tmp_path / name, locator)
         assert load_locator(tmp_path / name, body).regions == locator.regions
-    assert knowing.regions == (STIFF,) and knowing.small().regions == (STIFF,) and other.regions == ()
+    assert knowing.regions == (STIFF,) and knowing.restrict().regions == (STIFF,) and other.regions == ()
 
 
 def test_fit_finds_tumour_stiffness_for_any_locator(locators):

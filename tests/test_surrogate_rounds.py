@@ -43,7 +43,7 @@ def test_settled_round_starts_from_the_last_result(prior, monkeypatch, named, lo
     found, near = rounds.match_and_update(prior, seen, free=True)
     assert found is results[-1] and 2 <= len(results) <= rounds.ROUNDS + 1
     np.testing.assert_array_equal(near, np.arange(count))  # without the one that is off the cortex
-    every = prior.at(np.arange(len(body.mesh.nodes)))
+    every = prior.restrict_shapes(np.arange(len(body.mesh.nodes)))
     for result, (points, motion, bias) in zip(results, starts, strict=False):
         np.testing.assert_array_equal(points, near)
         np.testing.assert_allclose(motion[cortex], np.tensordot(result.weight, every[:, cortex], 1), atol=1e-12)

@@ -125,7 +125,7 @@ def test_the_bound_holds_as_often_as_it_says(model, fresh):
     # Of 200 loads that calibrate and 300 that judge the share scatters by 0.02.
     assert 0.89 <= found.held[0] <= 0.99 and found.held[1] >= found.held[0]
     # It follows the load: bounds of one size would be the 95th percentile for all.
-    predicted = model.distance(fresh[0])
+    predicted = model.predict_distance(fresh[0])
     error = np.abs(predicted.value - fresh[1])
     assert np.median(predicted.bound[0]) < 0.7 * np.quantile(error, 0.95)
 
@@ -138,7 +138,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
 
     def seen(some):
         return collect_missed(
-            model, open_patch(model.anatomy), model.asked(some.loads), compute_distance_errors(model, some)
+            model, open_patch(model.anatomy), model.to_input(some.loads), compute_distance_errors(model, some)
         )
 
     kept, later = known(1500, 21), known(1000, 22)
@@ -150,7 +150,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
 def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
     """Recomputed: the scored model, a bound from the loads that are apart and outside every disc."""
     good, split = data.loads.rows(np.flatnonzero(data.good)), trained.split
-    distance = gauge.distances(good, data.displacement(gauge.nodes)[data.good], gauge.nodes)
+    distance = gauge.distances(good, data.read_displacement(gauge.nodes)[data.good], gauge.nodes)
     place = np.linalg.norm(get_only_pushes(good).point[:, None] - split.centres, axis=2).min(axis=1)
     beside = np.flatnonzero((np.arange(len(good)) >= len(good) - trained.calibrated) & (place > split.radius))
     scored = train(data, ["linear"], split=split).models["linear"]
@@ -172,26 +172,26 @@ def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
 
 
 def test_the_correction_brings_distances_nearer(model, fresh):
-    plain = replace(model, tip=None).distance(fresh[0])
+    plain = replace(model, tip=None).predict_distance(fresh[0])
     assert np.isnan(plain.bound).all()
-    off, left = (np.abs(predicted.value - fresh[1]).mean() for predicted in (plain, model.distance(fresh[0])))
+    off, left = (np.abs(predicted.value - fresh[1]).mean() for predicted in (plain, model.predict_distance(fresh[0])))
     assert left < 0.5 * off
 
 
 def test_no_push_gives_zero_and_far_bound_is_wide(model, fresh):
     loads = fresh[0].rows(slice(0, 20))
-    idle = model.distance(loads.scaled(0.0))
+    idle = model.predict_distance(loads.scaled(0.0))
     still = np.zeros((20, len(model.nodes), 3))
     assert np.array_equal(idle.value, build_tip_gauge(model.anatomy).distances(loads, still, model.nodes))
     assert (idle.bound == 0.0).all()
-    strong = model.distance(loads.scaled(2.5))
-    assert (strong.bound[0] > 2.0 * model.distance(loads).bound[0]).all() and (strong.value >= 0.0).all()
+    strong = model.predict_distance(loads.scaled(2.5))
+    assert (strong.bound[0] > 2.0 * model.predict_distance(loads).bound[0]).all() and (strong.value >= 0.0).all()
 
 
 def test_an_answer_at_hand_is_taken(model, fresh):
     loads = fresh[0].rows(slice(0, 3))
     answer = model.deform(loads, at=build_tip_gauge(model.anatomy).nodes)
-    given, asked = model.distance(loads, answer), model.distance(loads)
+    given, asked = model.predict_distance(loads, answer), model.predict_distance(loads)
     assert given.value == pytest.approx(asked.value, abs=1e-9) and np.array_equal(given.bound, asked.bound)
 
 
@@ -202,7 +202,7 @@ def test_the_store_keeps_it(model, fresh, tmp_path):
         save(tmp_path / "model.pkl", {"whole": model})
     models = load(tmp_path / "m.npz", model.anatomy)
     for found, expected in ((models["whole"], model), (models["bare"], bare)):
-        one, other = found.predict_distance(fresh[0]), expected.distance(fresh[0])
+        one, other = found.predict_distance(fresh[0]), expected.predict_distance(fresh[0])
         assert np.array_equal(one.value, other.value) and np.array_equal(one.bound, other.bound, equal_nan=True)
     assert models["bare"].tip is None and models["none"].tip == TipModel()
 
@@ -223,7 +223,7 @@ def test_shipped_models_bound_strong_press_distance():
 def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender, gauge, fresh):
     loads, tool = fresh[0].rows(slice(2, 3)), Probe()
     answer, truth = model.deform(loads), pretender.deform(loads)
-    predicted = model.distance(loads)
+    predicted = model.predict_distance(loads)
     apart = gauge.distances(loads, answer.displacement, answer.nodes)[0]
     assert read_tip_distance(model, loads, answer, tool, apart) == TipDistance(
         predicted.value[0], predicted.bound[0, 0]
@@ -234,7 +234,7 @@ def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender,
     assert read_tip_distance(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(
         predicted.value[0] + 2e-3
     )
-    plain = replace(model, tip=None).distance(loads).value[0]
+    plain = replace(model, tip=None).predict_distance(loads).value[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
     assert read_tip_distance(model, loads, outside, tool, apart) == TipDistance(predicted.value[0], None)
     assert read_tip_distance(replace(model, tip=None), loads, answer, tool, apart) == TipDistance(plain, None)

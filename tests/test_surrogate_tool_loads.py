@@ -39,7 +39,7 @@ def test_tools_stay_in_their_ranges(box, patch, name):
 def test_points_directions_and_forces_are_uniform(box, patch):
     loads = pushes("bipolar", box, 4000, 0)
     inner = np.linalg.norm(loads.point[:, :2], axis=1) < 10e-3
-    allowed = patch.covered(np.zeros((1, 3)), 10e-3) * patch.areas.sum()
+    allowed = patch.compute_covered(np.zeros((1, 3)), 10e-3) * patch.areas.sum()
     pressable = patch.areas.sum() - 0.85e-3 * np.linalg.norm(patch.rim[:, 1] - patch.rim[:, 0], axis=1).sum()
     assert inner.mean() == pytest.approx(allowed / pressable, rel=0.12)
     loads = pushes("palpation", box, 4000, 0)
@@ -119,7 +119,7 @@ def test_spread_points_are_far_from_each_other():
 
 
 def test_covered_share_is_that_of_discs(box, patch):
-    assert patch.covered(np.zeros((1, 3)), 12e-3) == pytest.approx(np.pi * 12e-3**2 / patch.areas.sum(), rel=0.03)
+    assert patch.compute_covered(np.zeros((1, 3)), 12e-3) == pytest.approx(np.pi * 12e-3**2 / patch.areas.sum(), rel=0.03)
 
 
 @pytest.mark.parametrize("name", TOOLS)
