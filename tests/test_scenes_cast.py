@@ -49,7 +49,7 @@ class Gated:
 def gated(monkeypatch):
     """The only finite elements, whoever asks for some."""
     made = Gated(AtRest(make_box(cells=(6, 6, 4), spacing=12e-3)))
-    monkeypatch.setattr(Theatre, "player", lambda theatre, name, scene: Player(theatre.stage(scene), made))
+    monkeypatch.setattr(Theatre, "build_player", lambda theatre, name, scene: Player(theatre.stage(scene), made))
     yield made
     made.let(10_000)
 
@@ -122,7 +122,7 @@ def ask_for_frame_12(demo, gated, page, steps):
 
 def test_intermediate_frames_show_and_slider_stays(demo, gated, monkeypatch):
     said, begun = [], demo.busy.begin_work
-    monkeypatch.setattr(demo.busy, "on", lambda what: said.append(what) or begun(what))
+    monkeypatch.setattr(demo.busy, "begin_work", lambda what: said.append(what) or begun(what))
     with Loop(demo) as page:
         gated.let(1)
         assert wait_for(lambda: shows(page, 0))
@@ -219,10 +219,10 @@ def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
         assert prepared.wait(30.0)
         return player(theatre, name, scene)
 
-    monkeypatch.setattr(Theatre, "player", slow)
+    monkeypatch.setattr(Theatre, "build_player", slow)
     gated.let(1)
     demo = opened(Theatre(gated.anatomy, None, {}, "cpu"), ordered())
-    monkeypatch.setattr(demo.busy, "on", said.append)
+    monkeypatch.setattr(demo.busy, "begin_work", said.append)
     demo.wish.set(plays=False)
     with Loop(demo) as page:
         assert wait_for(lambda: "undeformed body, as in the scan" in page.shown[2])
@@ -242,7 +242,7 @@ def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
         assert prepared.wait(30.0)
         return player(theatre, name, scene)
 
-    monkeypatch.setattr(Theatre, "player", slow)
+    monkeypatch.setattr(Theatre, "build_player", slow)
     with Loop(demo):
         assert wait_for(lambda: made == ["retract"])
         for name in ("slide", "draw", "palpate", "press"):
@@ -257,7 +257,7 @@ def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
 def test_a_question_that_is_taken_back_is_not_prepared_for(gated, monkeypatch):
     made = []
     player = Theatre.build_player
-    monkeypatch.setattr(Theatre, "player", lambda *words: made.append(words) or player(*words))
+    monkeypatch.setattr(Theatre, "build_player", lambda *words: made.append(words) or player(*words))
     theatre, turn = Theatre(gated.anatomy, None, {}, "cpu"), threading.Lock()
     gated.let(2)
     with turn:
@@ -282,7 +282,7 @@ class TestFailures:
         def refusing(theatre, name, scene):
             raise InputError("the body is not held.")
 
-        monkeypatch.setattr(Theatre, "player", refusing)
+        monkeypatch.setattr(Theatre, "build_player", refusing)
         demo = opened(theatre, ordered())
         with pytest.raises(InputError, match="the body is not held"):
             demo.run(30.0)

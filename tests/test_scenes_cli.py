@@ -39,8 +39,8 @@ def test_page_opens_during_compilation_then_plays(name, box, tmp_path, monkeypat
         done.append("compiled")
 
     monkeypatch.setattr("ar.overlay.composite.load_kernels", slow)
-    monkeypatch.setattr(Busy, "on", lambda busy, what: done.append(what) or opened.set())
-    monkeypatch.setattr(SceneSolvers, "predicted", lambda *words: done.append("answered") or predicted(*words))
+    monkeypatch.setattr(Busy, "begin_work", lambda busy, what: done.append(what) or opened.set())
+    monkeypatch.setattr(SceneSolvers, "predict", lambda *words: done.append("answered") or predicted(*words))
     monkeypatch.setattr(Demo, "run", lambda page, seconds: done.append("plays"))
     path = put(theatre_of(box), tmp_path / "box.vtu")
     assert main(["demo", "--anatomy", str(path), "--deformer", name, "--port", str(free_port())]) == 0

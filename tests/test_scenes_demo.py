@@ -215,7 +215,7 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
 
 def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
     answer, said = Learned.deform, []
-    monkeypatch.setattr(demo.browser, "status", said.append)
+    monkeypatch.setattr(demo.browser, "show_status", said.append)
 
     def slow(model, loads, start=None, at=None):
         time.sleep(0.8)

@@ -25,7 +25,7 @@ def test_each_frame_is_drawn_once_in_order_and_sent(box, monkeypatch):
         sent.append((code, words))
         put_sight(page, code, words)
 
-    monkeypatch.setattr(Player, "drawn", seen)
+    monkeypatch.setattr(Player, "draw_frame", seen)
     monkeypatch.setattr(Browser, "put_sight", heard)
     player = theatre_of(box).build_player("linear", short())
     found = list(frames_of(player, 4))
@@ -49,7 +49,7 @@ def test_a_batch_is_of_so_many_frames_and_cameras(box, monkeypatch):
         asked.append((vertices, cameras))
         return pictures(renderer, vertices, cameras)
 
-    monkeypatch.setattr(Renderer, "pictures", heard)
+    monkeypatch.setattr(Renderer, "render_batch", heard)
     assert batch_rate(theatre_of(box).build_player("linear", short()), 3, 0.01) > 0.0
     vertices, cameras = asked[-1]
     assert len(asked) >= 2 and len({vertex.tobytes() for vertex in vertices}) > 1

@@ -102,7 +102,7 @@ def refuse(monkeypatch, refused, error):
             raise error
         return loads(player, number, touch)
 
-    monkeypatch.setattr(Player, "loads", refusing)
+    monkeypatch.setattr(Player, "build_loads", refusing)
 
 
 def test_rejected_load_is_shown_on_the_page(running, monkeypatch):
@@ -130,7 +130,7 @@ def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd
 def test_loads_without_fem_solution_are_left_out(theatre, scene, monkeypatch):
     refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
     player = theatre.build_player("linear", scene)  # as quick to have, and asked the same way
-    monkeypatch.setattr(Theatre, "player", lambda *words: player)
+    monkeypatch.setattr(Theatre, "build_player", lambda *words: player)
     referee = FemWorker(theatre, scene, threading.Lock())
     referee.ask(7, None)
     assert wait_for(lambda: str(referee.failure) == "7 is refused.")
