@@ -107,7 +107,7 @@ class TestTool:
         probe, tip = Probe(), np.array([0.01, 0.02, 0.03])
         inward, aside = np.array([0.0, 0.6, -0.8]), np.array([1.0, 0.0, 0.0])
         for lean in (0.0, 0.4, 0.75):
-            T = replace(probe, lean=lean).compute_pose(tip, inward, aside)
+            T = replace(probe, lean=lean).pose(tip, inward, aside)
             assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3)) and np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
             at = np.asarray(probe.mesh.vertices) @ T[:3, :3].T + T[:3, 3]
             assert ((at - tip) @ inward).max() == pytest.approx(0.0, abs=1e-4)

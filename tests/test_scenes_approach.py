@@ -93,7 +93,7 @@ def test_a_shaft_lies_along_a_line_and_the_ball_stays(site, tmp_path, tilt):
     entry, way, line = planned(site, 4e-3, 2e-3, tilt)
     approach = approach_of(read_markup(marked(tmp_path, line)), site)
     held, plain = approach.align_tool(PALPATION), PALPATION
-    turned, usual = (tool.compute_pose(entry, site.axis, site.right) for tool in (held, plain))
+    turned, usual = (tool.pose(entry, site.axis, site.right) for tool in (held, plain))
     np.testing.assert_allclose(turned[:3, 2], -way, atol=1e-9)
     np.testing.assert_allclose(turned[:3, :3].T @ turned[:3, :3], np.eye(3), atol=1e-12)
     assert np.linalg.det(turned[:3, :3]) == pytest.approx(1.0)

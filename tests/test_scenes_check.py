@@ -148,7 +148,9 @@ class TestThePictureItself:
     def test_with_the_answer_a_millimetre_away_it_fails(self, play, frames, truth):
         """Picture and answer agree, and both differ from the finite elements."""
         away = shifted(frames[2], 1e-3 * play.site.right)
-        sentences, figures = self.pixels(play, frames, truth, drawn(play, away, play.compute_positions(away.deformation)))
+        sentences, figures = self.pixels(
+            play, frames, truth, drawn(play, away, play.compute_positions(away.deformation))
+        )
         assert about(sentences, "outline") and figures.drawn > 2.0
 
     def test_of_an_earlier_frame_it_fails(self, play, frames, truth):

@@ -91,7 +91,9 @@ def test_every_style_passes_the_checks(style):
 def again(frame, play, opening, gauge=None, style="window"):
     """The frame's picture, drawn again from the same answer."""
     stage = play.stage
-    tumour, rest = (stage.build_tumour(at) for at in (play.compute_positions(frame.deformation), play.site.anatomy.mesh.nodes))
+    tumour, rest = (
+        stage.build_tumour(at) for at in (play.compute_positions(frame.deformation), play.site.anatomy.mesh.nodes)
+    )
     if gauge is None:
         gauge = replace(measure_gauge(frame.tip, tumour), read=frame.distance, error=frame.tumour_error.bound)
     band = frame.tumour_error.bound or 0.0

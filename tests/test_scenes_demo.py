@@ -178,7 +178,9 @@ def test_the_scene_changes_without_a_new_server(demo):
     demo.wish.set(scene="press")
     assert wait_for(lambda: demo.run(0.5) and "force 0." in report(demo))
     assert demo.stage.scene is demo.first and page.inputs["scene"].value == "press"
-    assert demo.wish.deformer == demo.theatre.select_default(demo.first) != "fem"  # its own, not that of the scene before
+    assert (
+        demo.wish.deformer == demo.theatre.select_default(demo.first) != "fem"
+    )  # its own, not that of the scene before
 
 
 def test_unplayable_scene_is_reported_and_old_one_stays(demo):

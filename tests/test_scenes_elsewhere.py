@@ -374,7 +374,9 @@ def test_calibration_error_in_band_unless_reference_absorbs_it(follower, stage, 
         ]
         camera = follower.calibration.build_camera(np.eye(4))
         fitted = fit(camera, corners, pixels, reference)
-        apart = camera.project((fitted @ tumour)[None, :3])[0] - other.build_camera(reference).project(tumour[None, :3])[0]
+        apart = (
+            camera.project((fitted @ tumour)[None, :3])[0] - other.build_camera(reference).project(tumour[None, :3])[0]
+        )
         off.append(apart[0] * (fitted @ tumour)[2] / focal)
     assert known.parts["camera"] == pytest.approx(
         2.448 * np.linalg.svd(np.cov(np.transpose(off)))[1][0] ** 0.5, rel=0.25

@@ -27,7 +27,7 @@ def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):
         return solved[-1]
 
     fem = SimpleNamespace(deform=deform, remains=setting.answers.fem.remains)
-    pose = DEBULK.tool.compute_pose(setting.site.origin, setting.site.axis, setting.site.right)
+    pose = DEBULK.tool.pose(setting.site.origin, setting.site.axis, setting.site.right)
     for fluid, good in ((1.0, True), (0.95, False)):
         answers = CutElements(setting.site, fem, setting.answers.ball)
         assert answers.compute_responses([TissueRequest(pose, fluid=fluid, done=1)])[0].good == good

@@ -16,9 +16,7 @@ from sim.material import MATERIALS
 def test_the_model_has_the_force_of_the_finite_elements():
     """By pose, at 3 mm: its force within 25 %, the tumour's nodes within a quarter of their motion."""
     site = open_setting(PALPATE, "template", "model", "cpu", SIZE).site
-    poses = [
-        PALPATE.tool.compute_pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (-2e-3, 3e-3)
-    ]
+    poses = [PALPATE.tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (-2e-3, 3e-3)]
     found = []
     for physics in ("model", "fem"):
         answers, last = open_setting(PALPATE, "template", physics, "cpu", SIZE).answers, None
@@ -37,7 +35,7 @@ def test_many_answered_together_are_as_each_alone():
     setting = open_setting(PALPATE, "template", "model", "cpu", SIZE)
     site = setting.site
     tips = [site.origin + 1e-3 * depth * site.axis for depth in (-3.0, 0.5, 2.0, 4.0)]
-    asked = [TissueRequest(PALPATE.tool.compute_pose(tip, site.axis, site.right)) for tip in tips]
+    asked = [TissueRequest(PALPATE.tool.pose(tip, site.axis, site.right)) for tip in tips]
     together = replace(setting.answers, together=True).compute_responses(asked)
     for one, each in zip(setting.answers.compute_responses(asked), together, strict=True):
         assert np.allclose(one.force, each.force, atol=1e-4) and np.allclose(one.motion, each.motion, atol=1e-5)
@@ -51,7 +49,7 @@ def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):
     for depth in (1e-3, DEBULK.tool.radius + 1e-3):  # its middle above a flat top, and below it
         tip = site.origin + 0.012 * site.right + depth * site.axis  # beside the corridor
         (touched,) = setting.answers.compute_responses(
-            [TissueRequest(DEBULK.tool.compute_pose(tip, site.axis, site.right), done=1)]
+            [TissueRequest(DEBULK.tool.pose(tip, site.axis, site.right), done=1)]
         )
         force = float(ball.compute_force(np.array(depth)))
         assert touched.force @ site.axis == pytest.approx(force, rel=1e-6)
@@ -64,7 +62,7 @@ def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):
 def test_a_pose_that_the_model_refuses_ends_an_episode():
     setting = open_setting(RETRACT, "template", "model", "cpu", SIZE)
     site, tool = setting.site, RETRACT.tool
-    poses = [tool.compute_pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (2e-3, 40e-3)]
+    poses = [tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (2e-3, 40e-3)]
     (first,) = setting.answers.compute_responses([TissueRequest(poses[0])])
     (second,) = setting.answers.compute_responses([TissueRequest(poses[1], first)])
     assert first.good and not second.good and second.error == np.inf

@@ -10,7 +10,7 @@ from scenes.warp.moment import Played
 
 
 def test_warp_bound_is_that_of_the_frame_in_time(box, monkeypatch):
-    grows = SimpleNamespace(at=lambda time: SimpleNamespace(prior=1e-3 * (1.0 + time)))
+    grows = SimpleNamespace(evaluate=lambda time: SimpleNamespace(prior=1e-3 * (1.0 + time)))
     monkeypatch.setattr(Theatre, "estimate_uncertainty", lambda theatre, scene: grows)
     scene = small()
     found = Played(theatre_of(box), scene).list_moments([0, 12, len(scene.times) - 1])

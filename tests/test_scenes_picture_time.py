@@ -46,7 +46,9 @@ def off(placed, time):
 def at(heard, time, now=None, stamped=True):
     middle = camera(0.0)[:3, :3] @ TUMOUR + 1e-3 * camera(0.0)[:3, 3]
     stamp = to_stamp(BEGUN + time) if stamped else 0
-    return place_camera(heard.list_transforms(heard.names.camera), time if now is None else now, stamp, middle, heard.stale)
+    return place_camera(
+        heard.list_transforms(heard.names.camera), time if now is None else now, stamp, middle, heard.stale
+    )
 
 
 def test_interpolated_pose_reports_remaining_error():

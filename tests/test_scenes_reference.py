@@ -95,7 +95,7 @@ def test_the_truth_of_a_frame_knows_what_went_before() -> None:
 
 
 def test_whoever_waits_for_the_truth_sees_it_go_by(pretender):
-    theatre = SimpleNamespace(fem=lambda scene, accuracy, batch: pretender)
+    theatre = SimpleNamespace(build_fem=lambda scene, accuracy, batch: pretender)
     loads = [push(np.array([0.001 * k, 0.0, 0.0]), np.array([0.0, 0.0, -0.1]), 6e-3) for k in range(20)]
     heard = []
     found = solve_reference_frames(theatre, None, loads, heard.append)

@@ -110,7 +110,9 @@ def test_the_page_shows_the_rest(theatre, scene):
         demo.wish.set(number=6)
         assert wait_for(lambda: demo.run(0.3) and "resection: 3 steps done" in demo.browser.shown[2])
         assert wait_for(lambda: len(demo.browser.meshes["tumour"].faces) < whole)
-        rest = demo.stage.select_stage(scene.build_loads(theatre.site, Touch(), 0.2)).build_tumour(theatre.anatomy.mesh.nodes)
+        rest = demo.stage.select_stage(scene.build_loads(theatre.site, Touch(), 0.2)).build_tumour(
+            theatre.anatomy.mesh.nodes
+        )
         assert np.array_equal(demo.browser.meshes["tumour"].faces, rest.triangles)
         assert wait_for(
             lambda: demo.run(0.2) and np.array_equal(demo.browser.meshes["finite elements"].faces, rest.triangles)

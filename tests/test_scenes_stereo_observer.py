@@ -103,7 +103,7 @@ def test_a_tracked_microscope_is_off_as_a_whole(observer, shot, seen):
 def test_a_tool_hides_points_and_moves_none(observer, moved, seen):
     site, scene = observer.stage.site, observer.stage.scene
     inward, tip = site.axis, site.origin + 3e-3 * site.right - 2e-3 * site.axis
-    corners = observer.stage.compute_corners(scene.tool.compute_pose(tip, inward, site.right))
+    corners = observer.stage.compute_corners(scene.tool.pose(tip, inward, site.right))
     found = observer.observe(observer.render_pair(30, moved, corners), NONE)
     assert 20 < len(found.now) < len(seen.now)
     left = observer.render_pair(30, moved, corners).cameras[0]

@@ -39,7 +39,7 @@ def test_episode_is_over_after_goals_in_a_row_or_a_bad_answer(shares, ends):
         return [Touched(np.zeros((len(nodes), 3)), nodes, force, 0.0, good=share != "x")]
 
     task = replace(PALPATE, aside=1.0, held=3)
-    setting = replace(environment.setting, task=task, answers=SimpleNamespace(answer=answer))
+    setting = replace(environment.setting, task=task, answers=SimpleNamespace(compute_responses=answer))
     environment.setting = environment.episode.setting = setting
     environment.reset(seed=3)
     over = [environment.step(0.0 * DOWN) for _ in shares]

@@ -52,8 +52,8 @@ class Hasty:
     def __init__(self, theatre, failing):
         self.theatre, self.failing, self.starts, self.site = theatre, failing, [], theatre.site
 
-    def fem(self, *asked, **named):
-        self.solver = self.theatre.fem(*asked, **named)
+    def build_fem(self, *asked, **named):
+        self.solver = self.theatre.build_fem(*asked, **named)
         return self
 
     def deform(self, loads, start=None):

@@ -78,7 +78,9 @@ def seen(monkeypatch, name, size, touch=None, number=51, style="window"):
 def lined(play, frame):
     """(H, W) bool: pixels of the outlines, of the arrow between their middles, and of the line from the tip."""
     lines = np.zeros(frame.picture.segmentation.shape, np.uint8)
-    rest, now = (play.stage.build_tumour(at) for at in (play.site.anatomy.mesh.nodes, play.compute_positions(frame.deformation)))
+    rest, now = (
+        play.stage.build_tumour(at) for at in (play.site.anatomy.mesh.nodes, play.compute_positions(frame.deformation))
+    )
     for tumour in (rest, now):
         mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles)
         cv2.polylines(lines, find_outlines(mask), True, (1,), 2)

@@ -30,7 +30,9 @@ class TestLearnt:
         assert "here is none" in (find_rejection(model, EFFECTS) or "") and theatre.list_deformers(
             replace(short(), effects=EFFECTS)
         ) == ("fem",)
-        assert theatre.list_deformers(short()) == ("linear", "svr", "guarded", "fem") and theatre.list_deformers(sinking()) == ("fem",)
+        assert theatre.list_deformers(short()) == ("linear", "svr", "guarded", "fem") and theatre.list_deformers(
+            sinking()
+        ) == ("fem",)
         assert theatre.select_best(sinking()) == "fem"
 
     def test_it_refuses_causes_that_it_does_not_know(self, theatre):

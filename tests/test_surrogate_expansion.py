@@ -132,11 +132,16 @@ def test_two_series_orders_are_exact_for_any_tool(expansion, box):
     assert 10 < inside.sum() < 40
     exact = fem.series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
     size = split_forces(loads)[0][:, None, None]
-    found = [size * part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
+    found = [
+        size * part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]
+    ]
     for order, (motion, limit) in enumerate(zip(found, (1e-3, 3e-2), strict=True)):
         off = np.linalg.norm(motion.reshape(40, -1) - exact[:, order], axis=1) / np.linalg.norm(exact[:, order], axis=1)
         assert off[inside].max() < limit
-    many = [part.compute_response(ENCODERS[part.encoder](expansion.patch, replaced(loads, 3))) for part in expansion.exact[0]]
+    many = [
+        part.compute_response(ENCODERS[part.encoder](expansion.patch, replaced(loads, 3)))
+        for part in expansion.exact[0]
+    ]
     some = [part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
     for few, more in zip(some, many, strict=True):  # more than are answered at once
         np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)

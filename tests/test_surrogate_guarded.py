@@ -102,7 +102,9 @@ def test_a_frame_says_who_answered(theatre, limit):
     by_model = find_first_model(play.deformer, frame.deformation) is not None
     assert by_model == (limit == 1.0) == (frame.model_error is not None) == (frame.distance_error is not None)
     assert ("finite elements themselves" in " ".join(frame.head) or "FEM itself" in " ".join(frame.head)) != by_model
-    moved = player(theatre, small(), "fem" if not by_model else theatre.select_best(small())).draw(0, 0.0, Touch(force=0.1))
+    moved = player(theatre, small(), "fem" if not by_model else theatre.select_best(small())).draw(
+        0, 0.0, Touch(force=0.1)
+    )
     assert frame.moved == pytest.approx(moved.moved, abs=1e-9)
 
 
@@ -118,7 +120,10 @@ def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
 
 def test_the_limit_is_the_user_s(theatre):
     strict = replace(theatre, limit=5e-5)
-    assert strict.build_deformer(GUARDED, small()).limit == 5e-5 and theatre.build_deformer(GUARDED, small()).limit == LIMIT
+    assert (
+        strict.build_deformer(GUARDED, small()).limit == 5e-5
+        and theatre.build_deformer(GUARDED, small()).limit == LIMIT
+    )
     assert "where its error may exceed 0.05 mm" in strict.describe_deformer(GUARDED, small())
     parser = argparse.ArgumentParser()
     add_theatre(parser)
@@ -131,9 +136,9 @@ def test_the_limit_is_the_user_s(theatre):
 
 
 def test_scene_model_is_named_with_description(theatre):
-    assert GUARDED in theatre.list_deformers(small()) and "where its error may exceed 0.2 mm" in theatre.describe_deformer(
-        GUARDED, small()
-    )
+    assert GUARDED in theatre.list_deformers(
+        small()
+    ) and "where its error may exceed 0.2 mm" in theatre.describe_deformer(GUARDED, small())
 
 
 def test_held_out_errors_count_fem_solutions_as_exact():

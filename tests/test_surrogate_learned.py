@@ -252,7 +252,9 @@ def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh
     size = np.linalg.norm(fresh.of(Pushed).force, axis=1)
     within = fresh.rows((size >= model.envelope.force[0]) & (size <= model.envelope.force[1]))
     wanted = model.deform(within, at=box.tumour_nodes).displacement
-    assert np.allclose(model.predict_motion(model.to_input(within), box.tumour_nodes), wanted, atol=1e-5 * np.abs(wanted).max())
+    assert np.allclose(
+        model.predict_motion(model.to_input(within), box.tumour_nodes), wanted, atol=1e-5 * np.abs(wanted).max()
+    )
 
 
 def test_outside_the_training_range_is_said(trained, box):

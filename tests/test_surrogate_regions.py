@@ -64,7 +64,9 @@ def test_who_knows_a_stiff_region_finds_the_tumour_better(body, locators):
         for one in motion[:6] * (3e-3 / compute_surface_motion(body, motion[:6]))[:, None, None]:
             seen = Observation(body.mesh.nodes[nodes] + one[nodes], body.mesh.nodes[nodes], rigid=0.0)
             truth = one[body.tumour_nodes]
-            off.append([np.linalg.norm(each.locate(seen).compute_motion(body.tumour_nodes) - truth) for each in locators])
+            off.append(
+                [np.linalg.norm(each.locate(seen).compute_motion(body.tumour_nodes) - truth) for each in locators]
+            )
     knowing, other = np.median(off, axis=0)
     assert knowing < 0.7 * other, (knowing, other)
 

@@ -160,7 +160,9 @@ def test_answers_follow_from_the_ones_before(model, box):
     alone = model.deform(Loads(loads.causes, np.full(3, 9.0)))
     np.testing.assert_allclose(answer.displacement, alone.displacement, atol=1e-9)
     apart = model.predict_distance(Loads(loads.causes, np.full(3, 9.0)), answer)
-    np.testing.assert_allclose(apart.value, model.predict_distance(Loads(loads.causes, np.full(3, 9.0))).value, atol=1e-9)
+    np.testing.assert_allclose(
+        apart.value, model.predict_distance(Loads(loads.causes, np.full(3, 9.0))).value, atol=1e-9
+    )
     up = touching.pose.copy()
     up[:, 0, 2, 3] += 0.05
     lifted = model.deform(Loads((Touching(up),), np.full(3, 9.1)), answer)

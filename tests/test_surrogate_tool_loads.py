@@ -119,7 +119,9 @@ def test_spread_points_are_far_from_each_other():
 
 
 def test_covered_share_is_that_of_discs(box, patch):
-    assert patch.compute_covered(np.zeros((1, 3)), 12e-3) == pytest.approx(np.pi * 12e-3**2 / patch.areas.sum(), rel=0.03)
+    assert patch.compute_covered(np.zeros((1, 3)), 12e-3) == pytest.approx(
+        np.pi * 12e-3**2 / patch.areas.sum(), rel=0.03
+    )
 
 
 @pytest.mark.parametrize("name", TOOLS)

@@ -48,7 +48,7 @@ class Moved:
         corners = np.arange(2 * points)[:, None] + np.arange(3)
         self._mesh = SentMesh.from_triangles(corners % points)
 
-    def answer(
+    def compute_result(
         self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
     ) -> PoseResult:
         """The pose's shift, as the motion of a brain that is known."""
@@ -58,24 +58,24 @@ class Moved:
         motion = BrainMotion(self._points + body.T[:3, 3], True)
         return PoseResult(body.stamp, TrackingResult(moment, TumourState.GOOD, "", NOT_SEEN, motion))
 
-    def camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
+    def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
         """No camera is listened to."""
         return "no camera"
 
-    def scan(self, stamp: int) -> bytes:
+    def build_scan(self, stamp: int) -> bytes:
         """The points where they were."""
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * self._points, self._mesh), stamp)
 
-    def messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
+    def build_messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """The surface."""
         body = encode_polydata(1e3 * answer.known.motion.positions, self._mesh)
         return (pack_message("POLYDATA", "TumourNow", body, answer.stamp),)
 
-    def status(self, answer: PoseResult, refused: str) -> bytes:
+    def build_status(self, answer: PoseResult, refused: str) -> bytes:
         """What is known."""
         return pack_message("STATUS", "Sulcus", encode_status(Code.OK, answer.known.words), answer.stamp)
 
-    def placed(self, names: list[str], at: np.ndarray) -> SentPlaces:
+    def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """No places are followed."""
         raise BadMessageError("no places are followed")
 

@@ -49,7 +49,7 @@ def build_tool_frame(site: Site) -> np.ndarray:
 
 def lay_tool(site: Site, tool: Instrument, tip: np.ndarray) -> RobotTool:
     """Return a tool in its first posture, its lowest point at `tip` (3,) [m]."""
-    turned = tool.compute_pose(tip, site.axis, site.right)[:3, :3]
+    turned = tool.pose(tip, site.axis, site.right)[:3, :3]
     return RobotTool(tip - compute_lever(tool) * site.axis, turned)
 
 
@@ -66,7 +66,7 @@ def move_tool(
     along = float((place - site.origin) @ site.axis) + compute_lever(tool)
     place = place + (np.clip(along, -HIGHEST, deepest) - along) * site.axis
     turned = Rotation.from_rotvec(frame @ twist[3:]).as_matrix() @ hand.turned
-    first = tool.compute_pose(site.origin, site.axis, site.right)[:3, 2]
+    first = tool.pose(site.origin, site.axis, site.right)[:3, 2]
     if turned[:, 2] @ first < np.cos(tilt):
         turned = hand.turned
     return RobotTool(place, np.asarray(turned))

@@ -32,7 +32,7 @@ def build_page_bodies(stage: Stage) -> list[SceneSurface]:
         middle = tumour.vertices.mean(axis=0)
         bodies.append(SceneSurface("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
     if tool is not None:
-        pose = tool.compute_pose(site.origin - 0.02 * site.axis, site.axis, site.right)
+        pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
         at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
         bodies.append(SceneSurface("tool", at, tool.mesh.faces, TOOL_COLOUR))
     return bodies

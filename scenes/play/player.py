@@ -347,7 +347,7 @@ class Player:
         if isinstance(tool, Probe):
             tip = find_resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
         tip = tip - compute_lift(touch.force) * inward
-        pose = tool.compute_pose(tip, inward, self.site.right)
+        pose = tool.pose(tip, inward, self.site.right)
         return HeldTool(tip, pose, beyond)
 
 

@@ -51,7 +51,7 @@ def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     tip = find_rested_tip(site, pushed.point[worst], there, radius)
     tool = Probe(radius)
     stage = Stage(replace(find_scene("press"), viewpoint=VIEW, tool=tool), site, scan)
-    picture = stage.render(camera, there, tool.compute_pose(tip, site.axis, site.right))
+    picture = stage.render(camera, there, tool.pose(tip, site.axis, site.right))
     shown = composite(picture, camera, stage.build_tumour(predicted), style="window", cover=Cover((TOOL,))).colour
     reference = stage.build_tumour(there)
     draw_dashes(

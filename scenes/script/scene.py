@@ -210,7 +210,7 @@ class Scene:
     def compute_pose(self, site: Site, touch: Touch) -> np.ndarray:
         """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""
         assert self.tool is not None
-        return self.tool.compute_pose(self.compute_tip(site, touch), site.axis, site.right)
+        return self.tool.pose(self.compute_tip(site, touch), site.axis, site.right)
 
     def build_loads(self, site: Site, touch: Touch, time: float) -> Loads:
         """Build one load case: the cause of every effect that has one; without causes, only time advances."""

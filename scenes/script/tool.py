@@ -62,7 +62,7 @@ class Instrument(Protocol):
         """Contact shape, for `ToolContact`."""
         ...
 
-    def compute_pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
+    def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """T_world_tool (4, 4) as it touches `tip` (3,) [m] from outside; inward, aside: unit vectors (3,)."""
         ...
 
@@ -106,7 +106,7 @@ class Probe:
         """Contact shape."""
         return Ball(self.radius)
 
-    def compute_pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
+    def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """T_world_tool (4, 4): the ball touches `tip` (3,) [m] from outside; the shaft leans towards `aside` (3,).
 
         `turn` turns that from `aside` towards `aside` x `inward`; these are unit vectors (3,). The ball turns about its
@@ -162,7 +162,7 @@ class Blade:
         arm.apply_translation([0.0, 0.5 * self.length - self.edge, 0.5 * self.arm])
         return blade + arm
 
-    def compute_pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
+    def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """T_world_tool (4, 4): the middle of its face at `tip` (3,) [m], facing `inward` (3,), wide along `aside`."""
         T = np.eye(4)
         T[:3, :3] = np.column_stack([aside, np.cross(-inward, aside), -inward])
