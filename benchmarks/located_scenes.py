@@ -18,18 +18,18 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.play.deformers import Theatre, open_theatre
+from scenes.play.deformers import PatientSetup, open_theatre
 from scenes.play.observer import Observer, TumourEstimate
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import get_template_path
-from scenes.script.sight import Sight
+from scenes.script.sight import PointObservation
 
 MOMENTS, COUNTS = 5, (30, 100, 300)
-ERRORS = {"none": Sight(white=2e-5, smooth=2e-5, shift=0.0, turn=0.0), "of sag": Sight()}
+ERRORS = {"none": PointObservation(white=2e-5, smooth=2e-5, shift=0.0, turn=0.0), "of sag": PointObservation()}
 """An error of 0.02 mm is none: an observation cannot state less than it can mean."""
 
 
-def estimates(theatre: Theatre, name: str, sights: int) -> dict[str, list[TumourEstimate]]:
+def estimates(theatre: PatientSetup, name: str, sights: int) -> dict[str, list[TumourEstimate]]:
     """What is answered of a scene, by the errors of what is seen."""
     scene = find_scene(name)
     player, last, found = theatre.build_player("fem", scene), None, {error: [] for error in ERRORS}

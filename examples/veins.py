@@ -149,7 +149,7 @@ class VeinsTerm:
 
     def __init__(self, veins: Veins, device: Device):
         self._device, self._kernels = device, build_kernels(device)
-        self._nodes = device.array(np.array(veins.vertices, np.int32), wp.int32)
+        self._nodes = device.upload(np.array(veins.vertices, np.int32), wp.int32)
         self._numbers = [self._nodes, device.scalar(veins.stiffness), device.scalar(veins.slack)]
         self._at: wp.array | None = None
 

@@ -4,15 +4,15 @@ from .episodes.episode import collect
 from .episodes.exports.card import write_card
 from .episodes.reading.torch_dataset import EpisodeDataset
 from .episodes.reading.windows import Episodes, read_episodes
-from .play.deformers import Theatre, open_theatre
+from .play.deformers import PatientSetup, open_theatre
 from .play.player import Frame, Player
 from .script.camera_paths import Focus, HandHeld, Microscope, Orbit
 from .script.debulking import Debulking
-from .script.head_posture import Lying
+from .script.head_posture import HeadPose
 from .script.scene import Bounds, Scene, find_scene
 from .script.shipped_files import get_template_path
-from .script.sight import Sight, StereoSight
-from .script.site import Site, build_site
+from .script.sight import PointObservation, StereoObservation
+from .script.site import CraniotomyFrame, build_craniotomy_frame
 from .script.tool import Blade, Instrument, Probe
 from .script.tool_paths import Touch, draw, keep_idle, lay, palpate, press, slide, stroke_cortex
 from .script.viewpoint import Viewpoint
@@ -21,26 +21,26 @@ from .tracked.calibration_file import read_calibration, write_calibration
 __all__ = [
     "Blade",
     "Bounds",
+    "CraniotomyFrame",
     "Debulking",
     "EpisodeDataset",
     "Episodes",
     "Focus",
     "Frame",
     "HandHeld",
+    "HeadPose",
     "Instrument",
-    "Lying",
     "Microscope",
     "Orbit",
+    "PatientSetup",
     "Player",
+    "PointObservation",
     "Probe",
     "Scene",
-    "Sight",
-    "Site",
-    "StereoSight",
-    "Theatre",
+    "StereoObservation",
     "Touch",
     "Viewpoint",
-    "build_site",
+    "build_craniotomy_frame",
     "collect",
     "draw",
     "find_scene",

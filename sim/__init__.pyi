@@ -2,13 +2,13 @@
 
 from .accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
 from .anatomy import Anatomy
-from .bodies.label_volume import volume_subject
+from .bodies.label_volume import build_volume_subject
 from .bodies.meshfile import MeshFile, read_anatomy, read_mesh, write_anatomy, write_mesh
 from .bodies.open_cortex import OpenCortex, Place, open_cortex
-from .bodies.refine import refined
+from .bodies.refine import refine
 from .bodies.subject import MeshPlan, Subject, make_anatomy
-from .bodies.template import Lobed, Tumour, template_subject
-from .contact_pressure import pressure
+from .bodies.template import Lobed, Tumour, build_template_subject
+from .contact_pressure import compute_pressure
 from .deformation import Cost, Deformation, Deformer, Outcome
 from .discretisation.body import Body
 from .discretisation.term import Cases, Term
@@ -25,7 +25,7 @@ from .effects import (
     ToolContact,
     ToolDisplacement,
     ToolForce,
-    pushed_effects,
+    build_push_effects,
 )
 from .errors import InputError
 from .fem import Fem
@@ -41,14 +41,14 @@ from .loads import (
     Resected,
     Retracted,
     Touching,
-    posture,
+    build_posture,
     push,
-    stacked,
+    stack,
 )
 from .material import BRAIN, MATERIALS, Material, Ogden, Tissue
-from .resected_fem import finite_elements
+from .resected_fem import build_fem
 from .skulls import Bonded, SkullContact, Slide
-from .tearing import Torn, torn
+from .tearing import DebondedSolution, solve_with_debonding
 from .terms.laws.conformance import check_tissue
 from .terms.laws.law import Law
 from .tools import Ball, Capsule, Core, OwnTool, Spatula
@@ -69,6 +69,7 @@ __all__ = [
     "Cases",
     "Core",
     "Cost",
+    "DebondedSolution",
     "Deformation",
     "Deformer",
     "Displaced",
@@ -112,24 +113,23 @@ __all__ = [
     "ToolContact",
     "ToolDisplacement",
     "ToolForce",
-    "Torn",
     "Touching",
     "Tumour",
+    "build_fem",
+    "build_posture",
+    "build_push_effects",
+    "build_template_subject",
+    "build_volume_subject",
     "check_tissue",
-    "finite_elements",
+    "compute_pressure",
     "make_anatomy",
     "open_cortex",
-    "posture",
-    "pressure",
     "push",
-    "pushed_effects",
     "read_anatomy",
     "read_mesh",
-    "refined",
-    "stacked",
-    "template_subject",
-    "torn",
-    "volume_subject",
+    "refine",
+    "solve_with_debonding",
+    "stack",
     "write_anatomy",
     "write_mesh",
 ]

@@ -33,7 +33,7 @@ def describe_region(label: int) -> str:
 
 def describe_missing_region(mesh: TetMesh, label: int) -> str:
     """Return a message that a mesh lacks a region, with the regions it has; empty if it has it."""
-    if mesh.within(label).any():
+    if mesh.mark_elements(label).any():
         return ""
     has = ", ".join(map(describe_region, np.unique(mesh.region).tolist()))
     return f"the mesh has no {describe_region(label)}. It has {has}."
@@ -85,7 +85,7 @@ class Anatomy:
         orphaned[self.mesh.table] = False
         return orphaned
 
-    def without(self, elements: np.ndarray) -> Anatomy:
+    def remove_elements(self, elements: np.ndarray) -> Anatomy:
         """Return the body without the tetrahedra `elements` (n,), with the same vertex numbers.
 
         New surfaces are free. Vertices that lose their last tetrahedron are fixed, and neither slide nor are touchable.
@@ -120,12 +120,12 @@ class Anatomy:
     @cached_property
     def in_tumour(self) -> np.ndarray:
         """Mask (T,) of tetrahedra of the tumour, including necrosis."""
-        return self.mesh.within(*TUMOUR_LABELS)
+        return self.mesh.mark_elements(*TUMOUR_LABELS)
 
     @cached_property
     def tumour_nodes(self) -> np.ndarray:
         """Sorted vertex numbers (n,) of the tumour."""
-        return self.mesh.nodes_of(*TUMOUR_LABELS)
+        return self.mesh.find_nodes(*TUMOUR_LABELS)
 
     @cached_property
     def tumour_surface(self) -> np.ndarray:

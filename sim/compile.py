@@ -147,7 +147,7 @@ def compile_problem(
                 )
     check_held(anatomy.mesh, held, normal)
     _check_names((*terms, *barriers), own)
-    constraint = Constraint(space.held(held), space.sliding(normal, held), device)
+    constraint = Constraint(space.extend_held(held), space.extend_normals(normal, held), device)
     elastic = all(term.constant for term in own)
     return Problem(
         (*terms, *own, *barriers), constraint, device, partial(_impose, space, skin), tuple(barriers), elastic
@@ -208,14 +208,14 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
 
 
 def _impose(space: Discretisation, skin: ContactSurface, loads: Loads) -> Imposed:
-    prescribed, displaced = loads.of(Prescribed), loads.of(Displaced)
+    prescribed, displaced = loads.get(Prescribed), loads.get(Displaced)
     value = None
     if prescribed is not None:
         check_field("Prescribed.displacement", prescribed.displacement, len(space.mesh.nodes))
         value = space.interpolate_field(prescribed.displacement).reshape(len(loads), 3 * space.count).T
     if displaced is None:
         return Imposed(value)
-    weight = skin.press(displaced.point, displaced.footprint).rows(space.count)
+    weight = skin.press(displaced.point, displaced.footprint).to_matrix(space.count)
     return Imposed(value, weight.toarray().T, displaced.displacement.T)
 
 
@@ -262,7 +262,7 @@ def _loaded(problem: Problem) -> LocalProblem:
     from .terms.dead_force import DeadForce, Forces
 
     device = problem.device
-    load, nodes = DeadForce("load", lambda _: None, device), device.array(np.arange(problem.rows // 3), wp.int32)
+    load, nodes = DeadForce("load", lambda _: None, device), device.upload(np.arange(problem.rows // 3), wp.int32)
     problem = replace(problem, terms=(*problem.terms, load))
     return LocalProblem(problem, lambda force: load.take(None if force is None else Forces(nodes, force)))
 
@@ -285,12 +285,12 @@ def _elasticity(
     absent = set() if pulsation is None else set(pulsation.regions or ()) - set(labels)
     if absent:
         raise InputError(f"Pulsation is given for region {min(absent)}, but the mesh has the regions {labels}.")
-    unknown = sorted(set(effect.regions) - set(effect.on(labels).regions))
+    unknown = sorted(set(effect.regions) - set(effect.restrict(labels).regions))
     if unknown:
         raise InputError(f"a law is given for {describe_region(unknown[0])}, but the mesh has the regions {labels}.")
     materials: dict[int, Tissue] = {}
     for label in labels:
-        material = effect.of(label)
+        material = effect.get_law(label)
         if material is None:
             raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
         materials[label] = material
@@ -306,9 +306,9 @@ def _elasticity(
             chosen &= within
         if not chosen.any():
             continue
-        for part in space.parts(chosen):
+        for part in space.split_elements(chosen):
             which = np.searchsorted(list(obeying), mesh.region[part.elements.owner])
-            elements = part.elements if nodes is None else part.elements.on(nodes)
+            elements = part.elements if nodes is None else part.elements.restrict(nodes)
             swelling = None if pulsation is None else (pulsation, swell[part.elements.owner])
             terms.append(_obeying(list(obeying.values()), which, elements, part.carries, device, swelling))
     return terms
@@ -342,5 +342,5 @@ def _obeying(
     if swelling is not None and swelling[1].any():
         from .terms.swelling import Swelling
 
-        sources.append(Swelling(swelling[0].swelling, swelling[1], device))
+        sources.append(Swelling(swelling[0].compute_swelling, swelling[1], device))
     return ElasticityTerm(name, law, elements, coefficients, lame, device, sources)

@@ -12,7 +12,7 @@ from .geometry.surface import compute_vertex_areas
 from .loads import Loads
 
 
-def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
+def compute_pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
     """Return the mean contact pressure (B, V) [Pa] of tools and separable skull at each vertex: nodal force / area.
 
     The area is a third of each adjacent deformed surface triangle; interior vertices have neither force nor area.
@@ -37,8 +37,8 @@ def pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
     device, surface = fem.problem.device, fem.space.surface
     with fem.lock:
         fem.problem.begin(Cases(loads, answer.time, answer.memory, share=np.zeros(len(answer))))
-        u = device.array(answer.displacement.reshape(-1, 3 * count).T)
-        gradient = device.zeros(*u.shape)
+        u = device.upload(answer.displacement.reshape(-1, 3 * count).T)
+        gradient = device.allocate(*u.shape)
         for term in fem.problem.barriers:
             term.add_gradient(u, gradient)
     force = np.linalg.norm(gradient.numpy().T.reshape(answer.displacement.shape), axis=2)

@@ -143,7 +143,7 @@ class Deformation:
     def __len__(self) -> int:
         return len(self.displacement)
 
-    def rows(self, index: np.ndarray) -> Deformation:
+    def select(self, index: np.ndarray) -> Deformation:
         """Return a subset (k,) of the load cases; the cost stays that of all."""
         return replace(
             self,
@@ -159,7 +159,7 @@ class Deformation:
             warm={name: value[index] for name, value in self.warm.items()},
         )
 
-    def at(self, nodes: np.ndarray) -> Deformation:
+    def restrict(self, nodes: np.ndarray) -> Deformation:
         """Return the result at some mesh vertices `nodes` (n,).
 
         Raises

@@ -46,11 +46,11 @@ class Elasticity:
             if tissue is not None:
                 check_described(tissue)
 
-    def of(self, label: int) -> Tissue | None:
+    def get_law(self, label: int) -> Tissue | None:
         """Return the law of a region, or None."""
         return self.regions.get(label, self.regions.get(_around(label), self.default))
 
-    def on(self, labels: Iterable[int]) -> Elasticity:
+    def restrict(self, labels: Iterable[int]) -> Elasticity:
         """Return the effect for a body with these regions, without laws of others."""
         obeyed = {each for label in labels for each in (label, _around(label))}
         return replace(self, regions={label: law for label, law in self.regions.items() if label in obeyed})
@@ -267,7 +267,7 @@ class Pulsation:
         if self.regions is not None and not self.regions:
             raise InputError("Pulsation has no regions: name some, give None for all, or remove the effect.")
 
-    def swelling(self, times: np.ndarray) -> np.ndarray:
+    def compute_swelling(self, times: np.ndarray) -> np.ndarray:
         """Return the relative volume change (B,) at times (B,) [s]."""
         waves = (self.cardiac, self.respiratory)
         return sum((wave.amplitude * np.sin(2.0 * np.pi * wave.frequency * times) for wave in waves), np.zeros(()))
@@ -365,7 +365,7 @@ SKULLS = {"bonded": Bonded(), "slide": Slide(), "contact": SkullContact()}
 """Skull models by name; the first is recommended, the others are its frictionless limits."""
 
 
-def pushed_effects(anatomy: Anatomy, tissue: Tissue | Elasticity, skull: str = "bonded") -> tuple[Effect, ...]:
+def build_push_effects(anatomy: Anatomy, tissue: Tissue | Elasticity, skull: str = "bonded") -> tuple[Effect, ...]:
     """Return the effects for a pushing tool on a body of this tissue, with one of `SKULLS` if there is a skull."""
     made = tissue if isinstance(tissue, Elasticity) else Elasticity(tissue)
     covered = (SKULLS[skull],) if anatomy.slide_normal.any() else ()

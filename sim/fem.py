@@ -162,9 +162,9 @@ class Fem:
         check_causes(self.effects, loads)
         at = None if at is None else self._vertices(at)
         if start is not None and self.following is not None:
-            answer = self.following.answer(loads, start, lambda: self.guess(loads, start))
+            answer = self.following.solve_frame(loads, start, lambda: self.guess(loads, start))
             if answer is not None:
-                return answer if at is None else answer.at(at)
+                return answer if at is None else answer.restrict(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self.strategy.held)
         last = None if start is None else self.guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads)))
@@ -176,9 +176,9 @@ class Fem:
         parts = []
         for step, rows in batches:
             guess = None if last is None else last[:, rows]
-            parts.append(self._solve(self._strategy_at(step), cases.rows(rows), guess, at))
+            parts.append(self._solve(self._strategy_at(step), cases.select(rows), guess, at))
         answer = _joined(parts)
-        return answer.rows(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
+        return answer.select(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
     def _strategy_at(self, step: float) -> Strategy | NoMotionStep:
         """Return the strategy with a preconditioner for a time step [s]; an infinite step is static."""
@@ -227,10 +227,10 @@ class Fem:
         """
         self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.memory))
-        return measure_residual(self.problem, self.problem.device.array(self.guess(loads, answer)))
+        return measure_residual(self.problem, self.problem.device.upload(self.guess(loads, answer)))
 
     @lock_method
-    def reading(self, nodes: np.ndarray, modes: np.ndarray) -> SeriesReading:
+    def build_reading(self, nodes: np.ndarray, modes: np.ndarray) -> SeriesReading:
         """Return the projection of the motion of vertices `nodes` (n,) on modes (r, n, 3), an argument of `series`.
 
         Raises
@@ -245,13 +245,13 @@ class Fem:
         for some in self._batches(len(modes)):
             force = np.zeros((self.problem.rows, len(modes[some])))
             force[rows] = modes[some].reshape(-1, len(rows)).T
-            on_device = device.array(force)
+            on_device = device.upload(force)
             self.problem.constraint.project(on_device)
-            answers[some] = self._resting.answer(on_device).numpy().T
+            answers[some] = self._resting.solve(on_device).numpy().T
         return SeriesReading(answers, device)
 
     @lock_method
-    def series(self, loads: Loads, orders: int, reading: SeriesReading, sizes: int = 1) -> np.ndarray:
+    def compute_series(self, loads: Loads, orders: int, reading: SeriesReading, sizes: int = 1) -> np.ndarray:
         """Return the power series (G, terms, r) of a projection of the solution in the magnitudes of the loads.
 
         Each `sizes` successive loads form one group of G. For a group whose loads, scaled by s_1 ... s_m, act
@@ -283,10 +283,10 @@ class Fem:
         # BLAS threads wait for each other, very long if other processes use their cores.
         with limit_to_one_thread():
             for first in range(0, len(found), max(groups, 1)):
-                some = loads.rows(slice(first * sizes, (first + groups) * sizes))
+                some = loads.select(slice(first * sizes, (first + groups) * sizes))
                 self.problem.begin(Cases(some, np.zeros(len(some))))
-                forces = expand_taylor(self.problem, self._resting.answer, len(some), sizes, edge, orders)
-                read = [reading.of(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
+                forces = expand_taylor(self.problem, self._resting.solve, len(some), sizes, edge, orders)
+                read = [reading.read(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
                 found[first : first + groups] = np.concatenate(read, axis=1)
         return found
 
@@ -294,9 +294,9 @@ class Fem:
         """Return a given solution as columns (3N, B) [m] over the nodes of the element."""
         vertices = len(self._anatomy.mesh.nodes)
         check_start(start, len(loads), vertices)
-        full = self.space.interpolate_field(start.at(np.arange(vertices)).displacement)
+        full = self.space.interpolate_field(start.restrict(np.arange(vertices)).displacement)
         if len(self.space.edges) and MIDDLES in start.memory:
-            full[:, vertices:] += Cases(loads, start.time, start.memory).past(MIDDLES, (len(self.space.edges), 3))
+            full[:, vertices:] += Cases(loads, start.time, start.memory).get_past(MIDDLES, (len(self.space.edges), 3))
         return full.reshape(len(loads), self.problem.rows).T
 
     def _solve(
@@ -321,10 +321,10 @@ class Fem:
         solved = time.perf_counter()
         self.problem.begin(replace(cases, share=found.gone, anew=found.anew))
         memory = dict(self.problem.end(found.u))
-        displaced = cases.loads.of(Displaced) is not None
+        displaced = cases.loads.get(Displaced) is not None
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
         on_footprint = self.problem.constraint.compute_footprint_force(held) if displaced else None
-        touching = [term.reaction(found.u) for term in self.problem.barriers]
+        touching = [term.compute_reaction(found.u) for term in self.problem.barriers]
         reaction = np.concatenate([self._reaction(cases.loads, on_footprint), *touching], axis=1)
         nodes = np.arange(len(self._anatomy.mesh.nodes)) if at is None else at
         if at is None and len(self.space.edges):
@@ -333,11 +333,11 @@ class Fem:
             memory[MIDDLES] = whole[:, len(nodes) :] - self.space.interpolate_field(displacement)[:, len(nodes) :]
         else:
             displacement = unstack_columns(self.problem.device, found.u, nodes)
-        fields = self._diagnostics.fields(found.u, held)
+        fields = self._diagnostics.compute_fields(found.u, held)
         return Deformation(
             displacement=displacement,
             nodes=nodes,
-            outcome=tuple(self._diagnostics.outcomes(found.outcome, found.inverted, fields["strained"])),
+            outcome=tuple(self._diagnostics.mark_outcomes(found.outcome, found.inverted, fields["strained"])),
             iterations=found.iterations,
             residual=found.residual,
             time=cases.loads.times,
@@ -359,7 +359,7 @@ class Fem:
                 force = cause.force if isinstance(cause, Pushed) else on_footprint
                 assert force is not None
                 force = force if isinstance(cause, Pushed) else force.T
-                arm = self._skin.press(cause.point, cause.footprint).centres() - cause.point
+                arm = self._skin.press(cause.point, cause.footprint).compute_centres() - cause.point
                 rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
         return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))
 

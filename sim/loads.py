@@ -174,7 +174,7 @@ class Loads:
         assert self.time is not None
         return self.time
 
-    def of(self, kind: type[C]) -> C | None:
+    def get(self, kind: type[C]) -> C | None:
         """Return the cause of a type, or None.
 
         Raises
@@ -182,28 +182,28 @@ class Loads:
         InputError
             Several causes of that type.
         """
-        found = self.every(kind)
+        found = self.get_all(kind)
         if len(found) > 1:
             raise InputError(f"the loads have {len(found)} causes {kind.__name__}, but one is supported: give one.")
         return found[0] if found else None
 
-    def every(self, kind: type[C]) -> tuple[C, ...]:
+    def get_all(self, kind: type[C]) -> tuple[C, ...]:
         """Return all causes of a type."""
         return tuple(cause for cause in self.causes if isinstance(cause, kind))
 
-    def without_kind(self, kind: type[Cause]) -> Loads:
+    def drop(self, kind: type[Cause]) -> Loads:
         """Return the loads without causes of a type."""
         return Loads(tuple(cause for cause in self.causes if not isinstance(cause, kind)), self.times)
 
-    def only(self, kind: type[C]) -> C | None:
+    def get_only(self, kind: type[C]) -> C | None:
         """Return the only cause if it is of a type, else None."""
-        return self.of(kind) if len(self.causes) == 1 else None
+        return self.get(kind) if len(self.causes) == 1 else None
 
-    def rows(self, index: slice | np.ndarray) -> Loads:
+    def select(self, index: slice | np.ndarray) -> Loads:
         """Return a subset of the load cases."""
         return Loads(tuple(select_rows(cause, index) for cause in self.causes), self.times[index])
 
-    def scaled(self, fraction: float | np.ndarray) -> Loads:
+    def scale(self, fraction: float | np.ndarray) -> Loads:
         """Return the loads with all magnitudes multiplied by `fraction`, a scalar or (B,)."""
 
         def grown(cause: Cause) -> Any:
@@ -222,7 +222,7 @@ def select_rows(cause: C, index: slice | np.ndarray) -> C:
     return replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
 
 
-def stacked(parts: Sequence[Loads]) -> Loads:
+def stack(parts: Sequence[Loads]) -> Loads:
     """Concatenate the load cases of several loads.
 
     Raises
@@ -268,7 +268,7 @@ def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) ->
     return Loads((Pushed(**rows),))
 
 
-def posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads:
+def build_posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads:
     """Return loads for the full change of weight since the scan: direction (3,) or (B, 3), csf_level () or (B,) [m].
 
     Raises

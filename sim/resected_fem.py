@@ -60,7 +60,7 @@ class OperatedFem:
         """Anatomy of the whole body."""
         return self._bodies[0].anatomy
 
-    def remains(self, done: int) -> RemainingBody:
+    def get_remains(self, done: int) -> RemainingBody:
         """Return the body that remains after `done` steps."""
         return self._bodies[done]
 
@@ -83,15 +83,15 @@ class OperatedFem:
         order, parts, stages = [], [], []
         for stage, stays in sorted(set(zip(done.tolist(), same.tolist(), strict=True))) or [(most, False)]:
             rows = np.flatnonzero((done == stage) & (same == stays))
-            begun = None if start is None else self._begun(start.rows(rows), stage, stays)
-            answer = self._solver(stage).deform(loads.without_kind(Resected).rows(rows), begun, at)
+            begun = None if start is None else self._begun(start.select(rows), stage, stays)
+            answer = self._solver(stage).deform(loads.drop(Resected).select(rows), begun, at)
             order.append(rows)
             stages.append(stage)
             parts.append(self._ended(answer, stage))
-        return self._together(parts, stages).rows(np.argsort(np.concatenate(order))) if len(parts) > 1 else parts[0]
+        return self._together(parts, stages).select(np.argsort(np.concatenate(order))) if len(parts) > 1 else parts[0]
 
     def _done(self, loads: Loads) -> np.ndarray:
-        cause = loads.of(Resected)
+        cause = loads.get(Resected)
         return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
 
     def _begun(self, start: Deformation, stage: int, stays: bool) -> Deformation:
@@ -164,7 +164,7 @@ def _found(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
     return order[np.searchsorted(known, asked, sorter=order)]
 
 
-def finite_elements(
+def build_fem(
     anatomy: Anatomy,
     effects: Iterable[Effect],
     accuracy: Accuracy = TRAIN,
@@ -202,6 +202,6 @@ def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effec
         if isinstance(effect, Pulsation) and effect.regions is not None:
             left = tuple(label for label in effect.regions if label not in gone)
             return replace(effect, regions=left) if left else None
-        return effect.on(present | set(effect.regions) - gone) if isinstance(effect, Elasticity) else effect
+        return effect.restrict(present | set(effect.regions) - gone) if isinstance(effect, Elasticity) else effect
 
     return tuple(effect for effect in map(kept, effects) if effect is not None)

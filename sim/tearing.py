@@ -46,7 +46,7 @@ TEARING = Tearing()
 
 
 @dataclass(frozen=True, eq=False)
-class Torn:
+class DebondedSolution:
     """Solution of one load with no bond above its strength.
 
     Parameters
@@ -68,7 +68,7 @@ class Torn:
     rested: bool
 
 
-def torn(
+def solve_with_debonding(
     anatomy: Anatomy,
     effects: Sequence[Effect],
     loads: Loads,
@@ -76,7 +76,7 @@ def torn(
     device: str = "auto",
     element: str | None = None,
     tearing: Tearing = TEARING,
-) -> Torn:
+) -> DebondedSolution:
     """Solve one load with debonding: an active set iteration over bonded, sliding and separated vertices.
 
     Bonds above their strength fail, sliding vertices under tension separate, and vertices that would penetrate slide.
@@ -135,14 +135,16 @@ def torn(
         bonded, sliding = holding, pressed
     most = share[bonded].max(initial=0.0)
     off = covered & ~bonded & ~sliding
-    return Torn(replace(last, bond=np.array([most])), np.flatnonzero(sliding), np.flatnonzero(off), rounds, rested)
+    return DebondedSolution(
+        replace(last, bond=np.array([most])), np.flatnonzero(sliding), np.flatnonzero(off), rounds, rested
+    )
 
 
 def _reaction(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
     """Return the gradient of the energy, the reaction forces (3N, 1) [N]."""
     problem = fem.problem
     problem.begin(Cases(loads, answer.time, answer.memory))
-    return problem.gradient(problem.device.array(fem.guess(loads, answer)))
+    return problem.gradient(problem.device.upload(fem.guess(loads, answer)))
 
 
 def _shares(
@@ -156,7 +158,7 @@ def _shares(
     bond = Bond(skull, body, fem.space, fem.problem.device, around)
     own = bond.nodes < len(bonded)
     out = np.zeros(len(bonded))
-    out[bond.nodes[own]] = bond.shares(force)[own, 0]
+    out[bond.nodes[own]] = bond.compute_shares(force)[own, 0]
     return out
 
 

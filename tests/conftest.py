@@ -112,7 +112,7 @@ class Pretender:
             loads.times,
             np.zeros((len(loads), 0, 6)),
         )
-        return answer if at is None else answer.at(at)
+        return answer if at is None else answer.restrict(at)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -259,9 +259,9 @@ def study_rows(study):
 
 @pytest.fixture(scope="module")
 def site(box):
-    from scenes.script.site import build_site
+    from scenes.script.site import build_craniotomy_frame
 
-    return build_site(box)
+    return build_craniotomy_frame(box)
 
 
 @pytest.fixture(scope="module")
@@ -291,11 +291,11 @@ def play(request, theatre):
 @pytest.fixture(scope="module")
 def still(box):
     """An observer and the body at rest, with errors as they are by default, and many points."""
-    from scenes.play.deformers import Theatre
+    from scenes.play.deformers import PatientSetup
     from scenes.play.observer import Observer
-    from scenes.script.sight import Sight
+    from scenes.script.sight import PointObservation
 
-    return Observer(Theatre(box, None, {}, "cpu").site, None, Sight(points=400)), box.mesh.nodes
+    return Observer(PatientSetup(box, None, {}, "cpu").site, None, PointObservation(points=400)), box.mesh.nodes
 
 
 @pytest.fixture(scope="session")

@@ -60,9 +60,9 @@ class Mortal(Pretender):
     mark: Path = Path()
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        pushed = loads.of(Pushed)
+        pushed = loads.get(Pushed)
         if self.loads is not None and pushed is not None and not self.mark.exists():
-            mine = self.loads.of(Pushed)
+            mine = self.loads.get(Pushed)
             if mine is not None and (pushed.point == mine.point[self.number]).all(axis=1).any():
                 time.sleep(1.0)  # others finish what they have
                 self.mark.touch()

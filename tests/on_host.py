@@ -25,6 +25,6 @@ class Found:
 
 def equilibrium_of(problem: Problem, descent: Descent, start: np.ndarray, accuracy: Accuracy) -> Found:
     """`find_equilibrium` from a start (3N, B) on the host."""
-    found = find_equilibrium(problem, descent, problem.device.array(start), accuracy)
+    found = find_equilibrium(problem, descent, problem.device.upload(start), accuracy)
     rest = {item.name: getattr(found, item.name) for item in fields(Equilibrium) if item.name != "u"}
     return Found(found.u.numpy(), **rest)

@@ -75,7 +75,7 @@ def descent_of(
 def equilibria(problem: Problem, total: np.ndarray = TOTAL) -> np.ndarray:
     """By L-BFGS on the whole."""
     problem.begin(Cases(loads_of(total), np.zeros(len(total))))
-    start = problem.device.zeros(problem.rows, len(total))
+    start = problem.device.allocate(problem.rows, len(total))
     found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(len(total), FINE), 2000)
     assert (found.status == DONE).all()
     return found.u.numpy().copy()

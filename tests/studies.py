@@ -12,7 +12,7 @@ from scenes.report.reference import solve_beyond, solve_reference
 from scenes.report.row import ReportRow
 from scenes.report.study import ReportStudy
 from sim.accuracy import TRAIN
-from sim.effects import NodalForce, pushed_effects
+from sim.effects import NodalForce, build_push_effects
 from sim.fem import Fem
 from sim.material import Material, to_tissue_json
 from surrogate.data.simulate import simulate
@@ -28,7 +28,7 @@ def nothing(count):
 
 def study_of(folder, box, count):
     """`count` loads on a box, and what the reference answers, in a folder."""
-    fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
+    fem = Fem(box, (*build_push_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     said = {"tissue": to_tissue_json(TISSUE), "element": "p1", "preset": "palpation"}
     simulate(folder / "data.h5", fem, draw("palpation", box, count, 0), said)
     study = ReportStudy(folder / "data.h5", folder, "cpu", loads=2, beyond=QUICK[2], timed=30)

@@ -128,7 +128,7 @@ def relaxing(law: str, element: str = "p1", *effects: object) -> Example:
     """A viscoelastic law amid its memory; the first case is a body at rest so far, at once."""
     space = discretise(MESH, element)
     tissues = replace(tissue(law), prony=SERIES)
-    part = space.parts(np.ones(len(MESH.tets), bool))[0]
+    part = space.split_elements(np.ones(len(MESH.tets), bool))[0]
     points = part.elements.weight.size
     name = f"viscoelasticity {law}" + ("" if part.carries == "whole" else f" of {part.carries}")
     past = 50.0 * np.random.default_rng(14).normal(size=(3, points, 18)) * np.array([0.0, 1.0, 1.0])[:, None, None]

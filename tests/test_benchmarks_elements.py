@@ -15,7 +15,7 @@ from benchmarks.studies.elements import Press, Row, limits, rows
 from benchmarks.studies.robustness import SETS, Record, Trial, records, shares, tallies
 from scenes.analysis import measurement
 from sim.bodies.meshfile import write_anatomy
-from sim.bodies.refine import refined
+from sim.bodies.refine import refine
 from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.material import Material
@@ -46,7 +46,7 @@ def test_soft_tissue_locks_linear_elements_alone():
     anatomy = make_box(cells=(6, 6, 4), spacing=12e-3, tumour=12e-3, opening=45e-3)
     press = Press(law="linear", force=0.02, footprint=12e-3)
     found = list(rows([anatomy], ["p1", "smoothed"], [0.495], press, "cpu"))
-    found += rows([anatomy, refined(anatomy)], ["p2"], [0.495], press, "cpu")
+    found += rows([anatomy, refine(anatomy)], ["p2"], [0.495], press, "cpu")
     assert all(row.good for row in found)
     limit = limits(found)[0.495]
     share = {row.element: row.motion / limit for row in reversed(found)}

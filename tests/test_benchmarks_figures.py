@@ -14,7 +14,7 @@ from benchmarks.figures.figure_readings import LIVE, STAGES
 from benchmarks.figures.figures import FIGURES, NAMED, SHORTCUTS, words_of
 from benchmarks.peers import comparison as peers
 from benchmarks.studies import elements, frame, live, robustness, scaling, shortcuts, skull_models, stages, throughput
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 from surrogate.data.tool_loads import PRESETS
 
 HOUSE = Path(__file__).parents[1]
@@ -63,7 +63,8 @@ def test_every_number_is_a_field_of_its_bench():
     assert presets and set(presets) <= {*PRESETS, *robustness.SETS}
     stated = [step for it in FIGURES for r in it.readings for step in r.place if "shortcut" in str(step)]
     done = [
-        {"shortcut": work.shortcut, "work": work.name} for work in shortcuts.works(build_site(make_box()), 1, False)
+        {"shortcut": work.shortcut, "work": work.name}
+        for work in shortcuts.works(build_craniotomy_frame(make_box()), 1, False)
     ]
     assert len(stated) == 2 * len(SHORTCUTS) + 2 and not [pair for pair in stated if pair not in done]
 

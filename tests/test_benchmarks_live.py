@@ -12,7 +12,7 @@ from benchmarks.studies import live
 from benchmarks.studies.live import RIDES, WARM_UP, Frame, Ride, errors, frames_of, loads_of, tally
 from scenes.analysis.budget import PROMISED
 from scenes.script.scene import find_scene
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 from scenes.script.tool_paths import stroke_cortex
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
@@ -24,7 +24,7 @@ SCENE = replace(find_scene("press"), effects=(Elasticity(), Held(), ToolForce())
 
 @pytest.fixture(scope="module")
 def site():
-    return build_site(make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3))
+    return build_craniotomy_frame(make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3))
 
 
 def test_wandering_path_has_one_speed_within_circle():
@@ -45,7 +45,7 @@ def test_wandering_path_has_one_speed_within_circle():
 def test_the_tool_presses_where_it_moves(site):
     found = loads_of(RIDES[0], SCENE, site, 20)
     assert len(found) == WARM_UP + 20
-    pushed = [load.of(Pushed) for load in found]
+    pushed = [load.get(Pushed) for load in found]
     assert all(np.linalg.norm(one.force) == pytest.approx(0.25) for one in pushed)
     steps = np.linalg.norm(np.diff([one.point[0] for one in pushed], axis=0), axis=1)
     assert np.median(steps) == pytest.approx(20e-3 / 30.0, rel=0.01)
@@ -59,7 +59,7 @@ def test_frames_start_from_last_and_first_do_not_count(site, pretender):
             starts.append(start)
             return pretender.deform(loads)
 
-    loads = loads_of(RIDES[0], SCENE, build_site(pretender.anatomy), 3)
+    loads = loads_of(RIDES[0], SCENE, build_craniotomy_frame(pretender.anatomy), 3)
     frames = list(frames_of(Watched(), loads))
     assert [frame.loads for frame in frames] == loads[WARM_UP:]
     assert starts[0] is None and all(start is not None for start in starts[1:])
@@ -79,7 +79,7 @@ def test_an_error_is_seen(site):
 
 
 def test_the_tally_counts_what_happened(site, pretender):
-    load = loads_of(RIDES[0], SCENE, build_site(pretender.anatomy), 1)[-1]
+    load = loads_of(RIDES[0], SCENE, build_craniotomy_frame(pretender.anatomy), 1)[-1]
     answer = pretender.deform(load)
     frames = [Frame(load, answer, 1e-3 * number) for number in range(1, 101)]
     item = tally(RIDES[0], frames, np.array([1e-5, 3e-5]))

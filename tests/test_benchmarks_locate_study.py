@@ -29,7 +29,7 @@ from benchmarks.studies.locate_twins import CAUSES, Twin, drawn, effects_of, loa
 from sim.accuracy import REFERENCE
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.open_cortex import open_cortex
-from sim.bodies.refine import refined
+from sim.bodies.refine import refine
 from sim.effects import Bonded, Elasticity, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
@@ -282,7 +282,7 @@ def test_twins_have_their_own_tissue_and_only_their_cause(body):
             assert mu == pytest.approx(670.0 * draw.stiffness * times) and law.terms[0][1] == -19.0
             assert lam / (2.0 * (lam + mu)) == pytest.approx(0.49)
         loads = loads_of(body, draw)
-        pushed, posture = loads.of(Pushed), loads.of(Posture)
+        pushed, posture = loads.get(Pushed), loads.get(Posture)
         assert pushed.force.any() == ("tool" in draw.cause)
         assert (loads.times[0] != 0.0) == (draw.cause == "swelling")
         height = -body.mesh.nodes @ posture.direction[0]
@@ -294,7 +294,7 @@ def test_a_twin_is_an_equilibrium_of_its_loads(body):
     """A tool that pushes moves the open cortex along its push, and the tumour less."""
     draw = replace(drawn(0, 0), skull="slide", stiffness=1.0)
     motion = solved(body, draw, "cpu", "p1")
-    pushed = loads_of(body, draw).of(Pushed)
+    pushed = loads_of(body, draw).get(Pushed)
     near = np.linalg.norm(body.mesh.nodes - pushed.point[0], axis=1).argmin()
     assert motion[near] @ pushed.force[0] > 0.7 * np.linalg.norm(motion[near]) * np.linalg.norm(pushed.force[0])
     deep = np.linalg.norm(motion[body.tumour_nodes], axis=1).mean()
@@ -302,7 +302,7 @@ def test_a_twin_is_an_equilibrium_of_its_loads(body):
 
 
 def test_twins_are_stored_and_read_at_body_vertices(body, tmp_path, monkeypatch):
-    finer, made = refined(body), []
+    finer, made = refine(body), []
 
     def linear(anatomy, draw, device, element):
         made.append(draw.number)

@@ -131,7 +131,7 @@ def test_the_network_tells_noise_from_signal():
 
 
 def test_features_are_those_of_the_paper(box):
-    loads = draw("seed", box, 20, 3).of(Pushed)
+    loads = draw("seed", box, 20, 3).get(Pushed)
     nodes = published_nodes(box)
     X = thirteen(*sites_of(box, nodes), loads)
     assert X.shape == (len(nodes), 20, 13)

@@ -11,10 +11,10 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.studies import shortcuts
 from benchmarks.studies.shortcuts import Row, Work, measure, works
-from scenes.script.site import Site, build_site
+from scenes.script.site import CraniotomyFrame, build_craniotomy_frame
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.fem import Fem
 from sim.material import BRAIN
 from sim.strategy.plan import SolverStep
@@ -22,18 +22,18 @@ from surrogate.data.tool_loads import draw
 
 
 @pytest.fixture(scope="module")
-def site(box: Anatomy) -> Site:
-    return build_site(box)
+def site(box: Anatomy) -> CraniotomyFrame:
+    return build_craniotomy_frame(box)
 
 
-def some(site: Site, **more) -> Work:
+def some(site: CraniotomyFrame, **more) -> Work:
     loads = draw("palpation", site.anatomy, 3, 0)
-    single = [loads.rows(np.array([row])) for row in range(3)]
-    effects = pushed_effects(site.anatomy, BRAIN)
+    single = [loads.select(np.array([row])) for row in range(3)]
+    effects = build_push_effects(site.anatomy, BRAIN)
     return replace(Work("a", "b", SolverStep.LBFGS, single, effects, TRAIN, "p1"), **more)
 
 
-def test_with_and_without_are_timed_in_turn(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_and_without_are_timed_in_turn(site: CraniotomyFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, solve = [], Fem.deform
 
     def heard(fem: Fem, loads, start=None):
@@ -49,7 +49,7 @@ def test_with_and_without_are_timed_in_turn(site: Site, monkeypatch: pytest.Monk
     assert row.ratio == pytest.approx(row.median_without / row.median) and row.total >= row.median > 0.0
 
 
-def test_frames_follow_and_what_is_warm_is_dropped(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_follow_and_what_is_warm_is_dropped(site: CraniotomyFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     starts, solve = [], Fem.deform
 
     def heard(fem: Fem, loads, start=None):
@@ -63,11 +63,11 @@ def test_frames_follow_and_what_is_warm_is_dropped(site: Site, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("step", [SolverStep.FRAME, SolverStep.CONTACT, SolverStep.CLAMPED, SolverStep.STRAINED])
-def test_a_shortcut_that_is_not_taken_has_no_row(site: Site, step: SolverStep) -> None:
+def test_a_shortcut_that_is_not_taken_has_no_row(site: CraniotomyFrame, step: SolverStep) -> None:
     assert measure(some(site, step=step), site, "cpu") is None
 
 
-def test_every_step_but_newton_is_some_work(site: Site) -> None:
+def test_every_step_but_newton_is_some_work(site: CraniotomyFrame) -> None:
     found = list(works(site, 2, False))
     assert {work.step for work in found} == {None, *SolverStep} - {SolverStep.NEWTON}
     assert all(len(work.loads) == 3 for work in found)

@@ -13,9 +13,9 @@ from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
+from sim.bodies.template import Tumour, build_template_subject
 from sim.deformation import Outcome
-from sim.effects import Bonded, Slide, pushed_effects
+from sim.effects import Bonded, Slide, build_push_effects
 from sim.fem import Fem
 from sim.material import Material
 from sim.tearing import Tearing
@@ -44,7 +44,7 @@ def test_the_bench_measures_what_it_says(brain, capsys):
     assert bonded["leaked"] == 0.0 and 0.01 < slide["leaked"] < 0.5
     assert 0.0 < bonded["bond"] < 3.0 and slide["bond"] is None
     tissue = Material("neo-hookean", 3000.0, 0.49)
-    answer = Fem(anatomy, pushed_effects(anatomy, tissue), TRAIN, "cpu").deform(draw("palpation", anatomy, 2, 0))
+    answer = Fem(anatomy, build_push_effects(anatomy, tissue), TRAIN, "cpu").deform(draw("palpation", anatomy, 2, 0))
     mesh = anatomy.mesh
     inside = mesh.region == TUMOUR_LABEL
     share = mesh.volumes[inside] / mesh.volumes[inside].sum()
@@ -72,9 +72,9 @@ def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkey
 
 def test_skull_rows_under_strained_loads_count_them(brain):
     _, anatomy = brain
-    loads = draw("palpation", anatomy, 3, 0).rows(slice(2, 3)).scaled(np.full(1, 4.0))
+    loads = draw("palpation", anatomy, 3, 0).select(slice(2, 3)).scale(np.full(1, 4.0))
     tissue = Material("neo-hookean", 3000.0, 0.45)
-    limited = Fem(anatomy, pushed_effects(anatomy, tissue), TRAIN, "cpu").deform(loads)
+    limited = Fem(anatomy, build_push_effects(anatomy, tissue), TRAIN, "cpu").deform(loads)
     assert limited.outcome[0] in (Outcome.OVERSTRAINED, Outcome.INVERTED)
     (row,) = rows([anatomy], ["bonded"], [0.45], loads, "cpu")
     assert row.failed == 0 and row.bond == pytest.approx(limited.bond[0], rel=1e-3)
@@ -90,7 +90,9 @@ def test_what_cannot_be_measured_is_a_sentence(brain, capsys, words, reason):
 
 def test_what_is_learnt_of_a_skull_is_of_that_skull(tmp_path):
     """From the command to the finite elements that a learner asks: they slide where the data did."""
-    write_anatomy(tmp_path / "brain.vtu", make_anatomy(template_subject(Tumour()), MeshPlan(2000, craniotomy=0.03)))
+    write_anatomy(
+        tmp_path / "brain.vtu", make_anatomy(build_template_subject(Tumour()), MeshPlan(2000, craniotomy=0.03))
+    )
     for skull, effect in (("slide", Slide()), ("bonded", Bonded())):
         out = tmp_path / f"{skull}.h5"
         words = ["--count", "2", "--skull", skull, "--element", "p1", "--tolerance", "1e-3", "--device", "cpu"]

@@ -9,9 +9,9 @@ from theatres import PUSHING, on_template, small, template_theatre
 
 from ar.optics.camera import project_cv2
 from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clip_surface
-from scenes.script.head_posture import Lying
+from scenes.script.head_posture import HeadPose
 from scenes.script.scene import SCENES, find_scene
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 from scenes.script.tool import Probe
 from scenes.script.tool_paths import AIR, Touch, compute_lift
 from scenes.script.viewpoint import UNDER, Viewpoint
@@ -27,7 +27,7 @@ def template():
 
 @pytest.fixture(scope="module", params=["box", "template"])
 def site(request, box, template):
-    return build_site(box) if request.param == "box" else template.site
+    return build_craniotomy_frame(box) if request.param == "box" else template.site
 
 
 def sampled(path, times):
@@ -41,7 +41,7 @@ def test_built_in_scenes_say_what_they_are_and_begin_as_the_scan(name, template)
     assert scene.name == name and len(scene.title.split()) > 5
     times = scene.times
     assert times[0] == 0.0 and times[-1] == pytest.approx(scene.duration) and np.allclose(np.diff(times), 1 / 30)
-    assert scene.path(0.0).force == 0.0 and scene.lying(0.0) == Lying()
+    assert scene.path(0.0).force == 0.0 and scene.lying(0.0) == HeadPose()
     loads = scene.build_loads(template.site, scene.path(0.0), 0.0)
     check_causes(scene.get_effects_on(template.anatomy), loads)
 
@@ -99,7 +99,7 @@ class TestSite:
 
     def test_a_body_without_opening_is_refused(self, box):
         with pytest.raises(InputError, match="no open cortex"):
-            build_site(replace(box, craniotomy=np.zeros(len(box.mesh.nodes), bool)))
+            build_craniotomy_frame(replace(box, craniotomy=np.zeros(len(box.mesh.nodes), bool)))
 
 
 class TestTool:

@@ -39,7 +39,7 @@ class TestAdapting:
         after = build_debulked_study(study)
         model = train(after.dataset, ["linear"], split=after.discs).models["linear"]
         test = np.flatnonzero(after.discs.test)
-        guess = model.deform(after.converged.rows(test), at=after.anatomy.tumour_nodes).displacement
+        guess = model.deform(after.converged.select(test), at=after.anatomy.tumour_nodes).displacement
         wanted = 1e3 * np.linalg.norm(guess - after.answers[test], axis=2).mean()
         assert row.adapted.mm.mean == pytest.approx(wanted, rel=1e-6)
         assert row.adapt > read_simulation_seconds(study) > 0.0

@@ -36,7 +36,7 @@ def test_the_template_with_its_intensities_round_trip(tmp_path, capsys):
     # Three millimetres under the opened cortex there is grey matter to be seen.
     nodes = anatomy.mesh.nodes[anatomy.craniotomy]
     inward = anatomy.mesh.nodes.mean(axis=0) - nodes
-    grey = read_intensity(to_intensity_path(out)).at(
+    grey = read_intensity(to_intensity_path(out)).interpolate(
         nodes + 3e-3 * inward / np.linalg.norm(inward, axis=1, keepdims=True)
     )
     assert 0.3 < grey.mean() < 0.95 and grey.std() > 0.02
@@ -51,7 +51,7 @@ def test_a_users_volume_with_and_without_intensities(brain, capsys):
     code, text, noted = run(capsys, *words, "--t1", brain / "t1.nii.gz")
     assert code == 0 and "intensities to" in text and "ask for more nodes" not in noted
     grey = read_intensity(to_intensity_path(out))
-    left, right = grey.at(np.array([[0.010, 0.0, 0.03], [0.030, 0.0, 0.03]]))
+    left, right = grey.interpolate(np.array([[0.010, 0.0, 0.03], [0.030, 0.0, 0.03]]))
     assert right > left + 0.05
     code, text, _ = run(capsys, *words, "--force")
     assert code == 0 and "intensities" not in text

@@ -15,13 +15,13 @@ from theatres import short
 
 from scenes.cli import main
 from scenes.options.placement_options import add_opening_arguments, get_trajectory_option, to_opening_options
-from scenes.play.deformers import Theatre
+from scenes.play.deformers import PatientSetup
 from scenes.script.approach import Approach, approach_of
 from scenes.script.scene import PALPATION, find_scene
-from scenes.script.site import Site, build_site
+from scenes.script.site import CraniotomyFrame, build_craniotomy_frame
 from scenes.script.tool import Blade
 from scenes.script.tool_paths import Touch, keep_idle, press
-from sim.bodies.label_volume import volume_subject
+from sim.bodies.label_volume import build_volume_subject
 from sim.bodies.markups import read_markup
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.subject import make_anatomy
@@ -34,7 +34,7 @@ def site(tmp_path_factory):
     """A curved cortex, open over a tumour to the right and above."""
     affine, places = grid()
     path = nifti(tmp_path_factory.mktemp("approach") / "a.nii", head(places), affine)
-    return build_site(make_anatomy(volume_subject(path, (1,), (3,)), PLAN))
+    return build_craniotomy_frame(make_anatomy(build_volume_subject(path, (1,), (3,)), PLAN))
 
 
 def marked(folder: Path, points: np.ndarray, kind: str = "Line") -> Path:
@@ -47,10 +47,10 @@ def marked(folder: Path, points: np.ndarray, kind: str = "Line") -> Path:
 
 
 def planned(
-    site: Site, right: float, up: float, tilt: tuple[float, float]
+    site: CraniotomyFrame, right: float, up: float, tilt: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A point of the cortex, a direction, and a line through it from 40 mm outside to 30 mm inside."""
-    entry = site.nearest(site.origin + right * site.right + up * site.up).point
+    entry = site.find_nearest(site.origin + right * site.right + up * site.up).point
     way = site.compute_direction(Touch(tilt=tilt))
     return entry, way, entry + np.outer([-40e-3, 30e-3], way)
 
@@ -135,11 +135,11 @@ def test_commands_play_scenes_along_it(site, tmp_path, capsys):
         words = parser.parse_args(
             ["--trajectory", str(marked(tmp_path, line))], argparse.Namespace(program="sulcus demo")
         )
-        return build_requested_scene(words, name, Theatre(site.anatomy, None, {}, "cpu"))
+        return build_requested_scene(words, name, PatientSetup(site.anatomy, None, {}, "cpu"))
 
     entry, way, line = planned(site, 6e-3, 4e-3, (0.3, 0.1))
     scene = asked("press", line)
-    pushed = scene.build_loads(site, scene.path(2.0), 2.0).of(Pushed)
+    pushed = scene.build_loads(site, scene.path(2.0), 2.0).get(Pushed)
     assert scene.tool == replace(PALPATION, lean=scene.tool.lean, turn=scene.tool.turn) != PALPATION
     assert pushed is not None and np.linalg.norm(pushed.point[0] - entry) < 1e-4
     np.testing.assert_allclose(pushed.force[0] / np.linalg.norm(pushed.force[0]), way, atol=1e-9)

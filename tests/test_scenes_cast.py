@@ -12,7 +12,7 @@ from visitor import Visitor, free_port, wait_for
 
 from scenes.page.demo import Demo
 from scenes.page.referee import FemWorker
-from scenes.play.deformers import AtRest, Theatre
+from scenes.play.deformers import AtRest, PatientSetup
 from scenes.play.player import Player
 from scenes.script.scene import Viewpoint, find_scene
 from scenes.script.tool_paths import lay
@@ -49,7 +49,7 @@ class Gated:
 def gated(monkeypatch):
     """The only finite elements, whoever asks for some."""
     made = Gated(AtRest(make_box(cells=(6, 6, 4), spacing=12e-3)))
-    monkeypatch.setattr(Theatre, "build_player", lambda theatre, name, scene: Player(theatre.stage(scene), made))
+    monkeypatch.setattr(PatientSetup, "build_player", lambda theatre, name, scene: Player(theatre.stage(scene), made))
     yield made
     made.let(10_000)
 
@@ -66,7 +66,7 @@ def opened(theatre, scene, deformer="fem"):
 
 @pytest.fixture
 def demo(gated):
-    demo = opened(Theatre(gated.anatomy, None, {}, "cpu"), ordered())
+    demo = opened(PatientSetup(gated.anatomy, None, {}, "cpu"), ordered())
     demo.wish.set(plays=False)
     yield demo
     gated.let(10_000)
@@ -213,15 +213,15 @@ def test_the_overlay_changes_while_a_solve_is_waited_for(demo, gated):
 
 def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
     prepared, said = threading.Event(), []
-    player = Theatre.build_player
+    player = PatientSetup.build_player
 
     def slow(theatre, name, scene):
         assert prepared.wait(30.0)
         return player(theatre, name, scene)
 
-    monkeypatch.setattr(Theatre, "build_player", slow)
+    monkeypatch.setattr(PatientSetup, "build_player", slow)
     gated.let(1)
-    demo = opened(Theatre(gated.anatomy, None, {}, "cpu"), ordered())
+    demo = opened(PatientSetup(gated.anatomy, None, {}, "cpu"), ordered())
     monkeypatch.setattr(demo.busy, "begin_work", said.append)
     demo.wish.set(plays=False)
     with Loop(demo) as page:
@@ -235,14 +235,14 @@ def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
 def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
     """A visitor leafs through the scenes while the first is prepared."""
     prepared, made = threading.Event(), []
-    player = Theatre.build_player
+    player = PatientSetup.build_player
 
     def slow(theatre, name, scene):
         made.append(scene.name)
         assert prepared.wait(30.0)
         return player(theatre, name, scene)
 
-    monkeypatch.setattr(Theatre, "build_player", slow)
+    monkeypatch.setattr(PatientSetup, "build_player", slow)
     with Loop(demo):
         assert wait_for(lambda: made == ["retract"])
         for name in ("slide", "draw", "palpate", "press"):
@@ -256,9 +256,9 @@ def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
 
 def test_a_question_that_is_taken_back_is_not_prepared_for(gated, monkeypatch):
     made = []
-    player = Theatre.build_player
-    monkeypatch.setattr(Theatre, "build_player", lambda *words: made.append(words) or player(*words))
-    theatre, turn = Theatre(gated.anatomy, None, {}, "cpu"), threading.Lock()
+    player = PatientSetup.build_player
+    monkeypatch.setattr(PatientSetup, "build_player", lambda *words: made.append(words) or player(*words))
+    theatre, turn = PatientSetup(gated.anatomy, None, {}, "cpu"), threading.Lock()
     gated.let(2)
     with turn:
         referee = FemWorker(theatre, ordered(), turn)
@@ -276,13 +276,13 @@ class TestFailures:
     @pytest.fixture
     def theatre(self, gated):
         gated.let(10_000)
-        return Theatre(gated.anatomy, None, {}, "cpu")
+        return PatientSetup(gated.anatomy, None, {}, "cpu")
 
     def test_a_first_scene_without_finite_elements_ends_the_run(self, theatre, monkeypatch):
         def refusing(theatre, name, scene):
             raise InputError("the body is not held.")
 
-        monkeypatch.setattr(Theatre, "build_player", refusing)
+        monkeypatch.setattr(PatientSetup, "build_player", refusing)
         demo = opened(theatre, ordered())
         with pytest.raises(InputError, match="the body is not held"):
             demo.run(30.0)

@@ -14,7 +14,7 @@ from visitor import Visitor, free_port, wait_for
 from scenes.episodes.episode import UNITS, collect
 from scenes.page.demo import Demo
 from scenes.play.checks import measure
-from scenes.play.deformers import Theatre
+from scenes.play.deformers import PatientSetup
 from scenes.play.effect_ablation import remove_effect
 from scenes.play.frame_text import format_acting
 from scenes.play.reference import solve_reference_frames
@@ -27,7 +27,7 @@ from sim.accuracy import TRAIN
 from sim.deformation import guess
 from sim.effects import Elasticity, Gravity, Held, Slide, ToolForce
 from sim.errors import InputError
-from sim.loads import Loads, Posture, Pushed, posture, stacked
+from sim.loads import Loads, Posture, Pushed, build_posture, stack
 
 EFFECTS = (Elasticity(), Held(), Slide())
 STILL = guess(np.zeros((1, 3, 3)))
@@ -68,7 +68,7 @@ class TestCauses:
         )
         assert "the tool does not push" in idle and "force" not in idle
         assert format_acting(Loads((), np.zeros(1)), STILL, height) == ""
-        lying = posture(np.array([-3.0, 0.0, 4.0]), -0.012)
+        lying = build_posture(np.array([-3.0, 0.0, 4.0]), -0.012)
         way = "gravity pulls to the crown (0.80) and the left (0.60), fluid up to "
         assert format_acting(lying, STILL, height) == way + "62 % of the brain's height"
 
@@ -167,7 +167,7 @@ class TestSwitches:
 @pytest.fixture(scope="module")
 def coarse():
     """The brain that ships, on fewer nodes."""
-    return Theatre(coarse_brain(), None, {}, "cpu")
+    return PatientSetup(coarse_brain(), None, {}, "cpu")
 
 
 class TestBrainShift:
@@ -176,7 +176,7 @@ class TestBrainShift:
         theatre, anatomy, scene = coarse, coarse.anatomy, find_scene("brain_shift")
         fem, cortex = theatre.build_fem(scene, scene.accuracy), np.unique(anatomy.open_surface)
         lying = {time: scene.build_loads(theatre.site, scene.path(time), time) for time in (0.0, 1.5, 3.0, 6.0)}
-        answer = fem.deform(stacked([lying[time] for time in (0.0, 1.5, 3.0)]))
+        answer = fem.deform(stack([lying[time] for time in (0.0, 1.5, 3.0)]))
         moved = 1e3 * np.linalg.norm(answer.displacement, axis=2)
         shift, tumour = moved[:, cortex].mean(axis=1), moved[:, anatomy.tumour_nodes].mean(axis=1)
         assert all(outcome.good for outcome in answer.outcome) and not answer.displacement[0].any()
@@ -193,7 +193,7 @@ class TestBrainShift:
         site, held = theatre.site, replace(scene, effects=(Elasticity(), Held()))
         moved = theatre.anatomy.mesh.nodes + 8e-3 * site.right
         drawn, true = (Stage(each, site).build_visible(moved).vertices for each in (scene, held))
-        beyond = site.across(true) - HOLE * site.clearance
+        beyond = site.compute_axis_distance(true) - HOLE * site.clearance
         low = (drawn - true) @ site.axis
         assert (low[beyond < 0.0] == 0.0).all() and (low[beyond > 2e-3] > 5e-3).all() and (beyond > 2e-3).sum() > 20
 

@@ -11,7 +11,7 @@ import warp as wp
 from conftest import make_box
 
 from scenes.script.scene import SCENES, find_scene
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, guess
@@ -51,13 +51,13 @@ def posed(name: str) -> tuple[Anatomy, tuple[Effect, ...], Loads, Deformation]:
     """The body, what acts without mass, the load that stays, and what the body starts from, at rest."""
     scene, time = find_scene(name), TAKEN[name]
     effects = scene.get_effects_on(BODY)
-    site = build_site(BODY)
+    site = build_craniotomy_frame(BODY)
     loads = scene.build_loads(site, scene.path(time), time)
     body, start = BODY, guess(np.zeros((1, len(BODY.mesh.nodes), 3)))
     if scene.surgery is not None:  # as it was before the last cut
         stages, done = list_remaining_bodies(BODY, effects), scene.surgery.count_done(time)
         effects = (*(effect for effect in effects if not isinstance(effect, Held | Resection)), Held())
-        loads, body = loads.without_kind(Resected), stages[done].anatomy
+        loads, body = loads.drop(Resected), stages[done].anatomy
         before = Fem(stages[done - 1].anatomy, effects, TIGHT, "cpu", element="p1").deform(loads)
         start = guess(np.where(body.orphaned[:, None], 0.0, before.displacement))
     if any(isinstance(effect, Pulsation) for effect in effects):
@@ -83,7 +83,7 @@ def potential(fem: Fem, loads: Loads, answer: Deformation) -> float:
     out = wp.zeros(1, dtype=wp.float64, device="cpu")
     for term in fem.problem.terms:
         if term.name != "inertia":
-            term.energy(fem.problem.device.array(answer.displacement.reshape(-1, 1)), out)
+            term.energy(fem.problem.device.upload(answer.displacement.reshape(-1, 1)), out)
     stored = float(out.numpy()[0])
     tissue = next(effect.default for effect in fem.effects if isinstance(effect, Elasticity))
     assert tissue is not None

@@ -21,7 +21,7 @@ from scenes.analysis.error_budget import (
 )
 from scenes.analysis.tracking_errors import change_calibration, sample_usual_covariance
 from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 from scenes.script.uncertainty import SURROGATE
 from scenes.tracked.filming import USUAL, VIEW, place_reference
 from sim.errors import InputError
@@ -42,7 +42,7 @@ def sideways(camera, target, time):
 
 @pytest.fixture(scope="module")
 def filmed(box):
-    site, rng = build_site(box), np.random.default_rng(0)
+    site, rng = build_craniotomy_frame(box), np.random.default_rng(0)
     ball = rng.normal(size=(60, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     rest = site.origin + 0.015 * site.axis + 5e-3 * ball

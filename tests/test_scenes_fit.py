@@ -96,7 +96,7 @@ def test_a_row_counts_what_was_right(body):
     one = patient(tools, 0, 0, 2, 3)
     assert one == patient(tools, 0, 0, 2, 3) != patient(tools, 0, 1, 2, 3)
     loads = loads_of(body, tools, one)
-    pushed = loads.of(Pushed)
+    pushed = loads.get(Pushed)
     assert pushed is not None and (np.linalg.norm(pushed.force, axis=1) > 0.0).tolist() == [
         True,
         True,

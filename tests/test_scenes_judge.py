@@ -10,10 +10,10 @@ from conftest import make_box
 from programs import simulated
 from theatres import small, theatre_of
 
-from scenes.play.deformers import Theatre, open_theatre
+from scenes.play.deformers import PatientSetup, open_theatre
 from scenes.play.reference import solve_reference_frames
 from scenes.script.scene import Scene
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
@@ -33,7 +33,7 @@ def body() -> Anatomy:
     return make_box(cells=(6, 6, 4), spacing=12e-3, tumour=14e-3)
 
 
-def physics(theatre: Theatre, scene: Scene) -> tuple[str, Tissue | None]:
+def physics(theatre: PatientSetup, scene: Scene) -> tuple[str, Tissue | None]:
     """Element and default tissue of a theatre's finite elements."""
     fem = theatre.build_deformer("fem", scene)
     assert isinstance(fem, Fem)
@@ -58,7 +58,7 @@ def test_models_are_judged_with_what_they_were_trained_on(box, body, tmp_path) -
         "guarded",
         "fem",
     )
-    loads = [scene.build_loads(build_site(box), scene.path(1.0), 1.0)]
+    loads = [scene.build_loads(build_craniotomy_frame(box), scene.path(1.0), 1.0)]
     others = tuple(effect for effect in scene.effects if not isinstance(effect, Elasticity))
     right = Fem(box, (Elasticity(STIFF), *others), TRAIN, "cpu", element="smoothed").deform(loads[0])
     found = solve_reference_frames(theatre, scene, loads)

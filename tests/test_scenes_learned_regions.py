@@ -67,19 +67,21 @@ class TestScenes:
         for scene in (asked(theatre, short(), "--young", "2100", "--poisson", "0.45"), find_scene("brain_shift")):
             found = asked(theatre, scene).elasticity
             assert found.default == Material(BRAIN.law, 2100.0, 0.45)
-            assert found.of(NECROSIS_LABEL) == Material(BRAIN.law, 350.0, 0.45)
+            assert found.get_law(NECROSIS_LABEL) == Material(BRAIN.law, 350.0, 0.45)
         minutes = asked(theatre, short(), "--material", "minutes").elasticity
-        assert minutes.of(NECROSIS_LABEL) == minutes.default  # Ogden's constants are no Young's modulus
+        assert minutes.get_law(NECROSIS_LABEL) == minutes.default  # Ogden's constants are no Young's modulus
 
     def test_that_relax_do_so_in_every_region(self, theatre):
         found = asked(theatre, find_scene("retract")).elasticity
         assert found.default == RELAXING
-        assert found.of(NECROSIS_LABEL) == replace(SOFT, prony=RELAXING.prony)
+        assert found.get_law(NECROSIS_LABEL) == replace(SOFT, prony=RELAXING.prony)
 
     def test_keep_what_they_say_themselves(self, theatre):
         own = find_scene("sag").elasticity
         found = asked(theatre, find_scene("sag")).elasticity
-        assert found.of(TUMOUR_LABEL) == own.of(TUMOUR_LABEL) != STIFF and found.of(NECROSIS_LABEL) != own.of(5)
+        assert found.get_law(TUMOUR_LABEL) == own.get_law(TUMOUR_LABEL) != STIFF and found.get_law(
+            NECROSIS_LABEL
+        ) != own.get_law(5)
 
     def test_of_a_region_that_is_not_there_are_refused(self, theatre):
         for word in ("oedema:2000", "3:2000", "-1:5"):
@@ -91,12 +93,12 @@ class TestScenes:
         assert get_tissue(scene) == BRAIN
         draw = PatientSample(stiffness=2.0, poisson=0.45, ratio=3.0, skull=0.5, tip=(0.0, 0.0, 0.0), mesh=0.0)
         found = apply_sample(scene, draw).elasticity
-        assert found.of(TUMOUR_LABEL) == replace(BRAIN, young=6.0 * BRAIN.young, poisson=0.45)
-        assert found.of(NECROSIS_LABEL) == replace(BRAIN, young=1000.0, poisson=0.45)
+        assert found.get_law(TUMOUR_LABEL) == replace(BRAIN, young=6.0 * BRAIN.young, poisson=0.45)
+        assert found.get_law(NECROSIS_LABEL) == replace(BRAIN, young=1000.0, poisson=0.45)
         stated = apply_sample(
             scene.replace_regions({TUMOUR_LABEL: STIFF}), draw
         ).elasticity  # three times as stiff, as such
-        assert stated.of(TUMOUR_LABEL) == replace(BRAIN, young=18.0 * BRAIN.young, poisson=0.45)
-        assert stated.of(NECROSIS_LABEL) == found.of(NECROSIS_LABEL) and stated.default == found.default
+        assert stated.get_law(TUMOUR_LABEL) == replace(BRAIN, young=18.0 * BRAIN.young, poisson=0.45)
+        assert stated.get_law(NECROSIS_LABEL) == found.get_law(NECROSIS_LABEL) and stated.default == found.default
         with pytest.raises(InputError, match=r"the scene .* has another tissue: ogden"):
             get_tissue(small().replace_regions({TUMOUR_LABEL: MATERIALS["minutes"].tissue}))

@@ -13,7 +13,7 @@ from witness import slippery
 
 from scenes.play.effect_ablation import list_device_arrays, remove_effect
 from scenes.script.scene import SCENES, Scene, find_scene
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 from sim.compile import compile_problem
 from sim.discretisation.footprint import ContactSurface
 from sim.discretisation.space import discretise
@@ -25,7 +25,7 @@ from sim.runtime.device import find_device
 pytestmark = pytest.mark.usefixtures("ours_alone")
 
 BODY = slippery(make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3))
-SITE = build_site(BODY)
+SITE = build_craniotomy_frame(BODY)
 
 # One scene for each set of effects: others keep the same.
 DISTINCT = {frozenset(type(effect) for effect in find_scene(name).effects): name for name in SCENES}.values()
@@ -58,9 +58,9 @@ def kept(scene: Scene) -> dict[str, int]:
     effects = tuple(effect for effect in scene.get_effects_on(BODY) if not isinstance(effect, Resection))
     device, space = find_device("cpu", "float32"), discretise(BODY.mesh, scene.element)
     skin, time = ContactSurface(space.nodes, space.surface, device), 0.45 * scene.duration
-    loads = scene.build_loads(SITE, scene.path(time), time).without_kind(Resected)
-    u, out = device.zeros(3 * space.count, 1), device.zeros(3 * space.count, 1)
-    flags = device.array(np.zeros(1), wp.int32)
+    loads = scene.build_loads(SITE, scene.path(time), time).drop(Resected)
+    u, out = device.allocate(3 * space.count, 1), device.allocate(3 * space.count, 1)
+    flags = device.upload(np.zeros(1), wp.int32)
     before = {id(array) for array in list_device_arrays()}
     problem = compile_problem(effects, BODY, device, space, skin)
     problem.begin(Cases(loads, np.zeros(1)))

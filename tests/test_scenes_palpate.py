@@ -20,7 +20,7 @@ from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, Slide, ToolContact
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Touching, stacked
+from sim.loads import Touching, stack
 from sim.material import Material
 from sim.tools import Ball, compute_distances
 from surrogate.data.cortex_patch import open_patch
@@ -117,14 +117,14 @@ class TestPalpate:
             assert trained == (model.deform(frame.loads).outcome[0] is Outcome.PREDICTED)
             expected = model.deform(frame.loads) if trained else solved.deformation
             nodes = anatomy.tumour_nodes
-            theirs = expected.at(nodes).displacement
-            assert frame.deformation.at(nodes).displacement == pytest.approx(theirs, abs=1e-5)
+            theirs = expected.restrict(nodes).displacement
+            assert frame.deformation.restrict(nodes).displacement == pytest.approx(theirs, abs=1e-5)
             if force is not None:
                 assert frame.deformation.reaction == pytest.approx(expected.reaction, abs=2e-3)
         assert 2 < by_model < len(frames) - 2
-        batch = play.deformer.deform(stacked([frame.loads for frame in frames]), at=nodes)
+        batch = play.deformer.deform(stack([frame.loads for frame in frames]), at=nodes)
         for row, (frame, solved) in enumerate(zip(frames, palpated, strict=True)):
-            theirs = frame.deformation.at(nodes).displacement[0]
+            theirs = frame.deformation.restrict(nodes).displacement[0]
             assert batch.displacement[row] == pytest.approx(theirs, abs=1e-5)
             known = batch.outcome[row] is Outcome.PREDICTED
             assert np.isnan(batch.reaction_bound).all() and batch.reaction.shape == (len(frames), force is not None, 6)
@@ -155,7 +155,7 @@ class TestPalpate:
             answer = drawn.draw(frame.number, frame.time, frame.touch).deformation
             for nodes, most in ((anatomy.tumour_nodes, 0.2), (open_patch(anatomy).nodes, 0.25)):
                 theirs = frame.deformation.at(nodes).displacement
-                off = np.linalg.norm(answer.at(nodes).displacement - theirs)
+                off = np.linalg.norm(answer.restrict(nodes).displacement - theirs)
                 assert off < most * np.linalg.norm(theirs)
 
     def test_learnt_models_of_pushes_do_not_know_it(self, theatre):

@@ -7,11 +7,11 @@ import pytest
 import trimesh
 
 from scenes.report.picture import find_rested_tip
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 
 
 def test_report_image_tool_rests_without_piercing(box):
-    site, radius = build_site(box), 5e-3
+    site, radius = build_craniotomy_frame(box), 5e-3
     nodes = box.mesh.nodes.copy()
     top = site.find_contact(0.0, 0.0, radius).point
     away = np.linalg.norm(nodes - top, axis=1)

@@ -10,7 +10,7 @@ from balls import ball
 
 from scenes.cli import main
 from scenes.options.placement_options import place_craniotomy
-from sim.bodies.label_volume import volume_subject
+from sim.bodies.label_volume import build_volume_subject
 from sim.errors import InputError
 from sim.runtime.journal import open_journal as opened_journal
 
@@ -27,7 +27,7 @@ def two_foci(folder):
 
 def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
     two_foci(tmp_path)
-    subject = volume_subject(tmp_path / "labels.nii.gz", (1,), (2,))
+    subject = build_volume_subject(tmp_path / "labels.nii.gz", (1,), (2,))
     large, small = subject.pieces
     assert large.volume > 3.0 * small.volume and large.centre[0] > 0.0 > small.centre[0]
     asked = dict.fromkeys(("opening_at", "opening_over"))

@@ -15,7 +15,7 @@ from scenes.episodes.scripted import sample_episode
 from scenes.play.deformers import open_theatre
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
-from sim.effects import Elasticity, pushed_effects
+from sim.effects import Elasticity, build_push_effects
 from sim.errors import InputError
 from sim.material import BRAIN, Material
 from sim.runtime.device import find_device
@@ -181,9 +181,9 @@ def test_a_model_knows_what_the_tumour_is_made_of():
     theatre = open_theatre()
     model = theatre.models["series-gp"]
     other = replace(model, training={**model.training, **describe_tissue_source(tissue)})
-    here = pushed_effects(theatre.anatomy, tissue)
+    here = build_push_effects(theatre.anatomy, tissue)
     assert find_rejection(other, here) is None
     assert "region 2" in (find_rejection(model, here) or "") and find_rejection(
-        other, pushed_effects(theatre.anatomy, BRAIN)
+        other, build_push_effects(theatre.anatomy, BRAIN)
     )
     assert "region 2" in other.source

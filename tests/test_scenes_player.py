@@ -65,7 +65,7 @@ def test_tissue_pressed_into_bone_is_not_reliable(theatre):
     reach = play.site.compute_reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
     assert frame.doubt == IN_BONE and all(says(frame.shown, part, compute_ink(WARNING)) for part in IN_BONE.split(": "))
-    assert play.site.across(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
+    assert play.site.compute_axis_distance(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
 
 
 def test_lighter_touch_rests_higher_and_idle_tool_above(play):
@@ -202,7 +202,7 @@ def test_learnt_and_finite_elements_are_interchangeable(theatre):
     """The same scene, the same call: the answers agree to a fraction of the motion."""
     nodes = theatre.anatomy.tumour_nodes
     fem, learnt = (
-        player(theatre, small(), name).draw(51, 1.7, Touch(force=0.2)).deformation.at(nodes).displacement
+        player(theatre, small(), name).draw(51, 1.7, Touch(force=0.2)).deformation.restrict(nodes).displacement
         for name in ("fem", "linear")
     )
     assert np.linalg.norm(fem, axis=2).mean() > 3e-4

@@ -17,7 +17,7 @@ class TestPulsation:
         scene = replace(small("pulsation"), duration=3.0)
         frames = list(player(theatre, scene, "fem").play_frames(3))
         reads = np.array([-frame.deformation.reaction[0, 0, 2] for frame in frames if frame.time >= 1.0])
-        swells = Pulsation().swelling(np.array([frame.time for frame in frames if frame.time >= 1.0]))
+        swells = Pulsation().compute_swelling(np.array([frame.time for frame in frames if frame.time >= 1.0]))
         assert np.corrcoef(reads, swells)[0, 1] > 0.95
         assert reads.max() > 1.05 * reads.min() > 0.0
 

@@ -15,7 +15,7 @@ from scenes.report.study import ReportStudy
 from sim.accuracy import TRAIN
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
-from sim.effects import Elasticity, pushed_effects
+from sim.effects import Elasticity, build_push_effects
 from sim.fem import Fem
 from sim.material import BRAIN, Material
 from surrogate.data.answer_rows import read_tissue_statement
@@ -43,7 +43,7 @@ class TestData:
     def test_are_of_the_regions_tissue_and_state_it(self, data):
         found = read_dataset(data)
         assert read_tissue_statement(found.provenance) == TISSUE
-        truth = Fem(found.anatomy, pushed_effects(found.anatomy, TISSUE), TRAIN, "cpu", element="p1").deform(
+        truth = Fem(found.anatomy, build_push_effects(found.anatomy, TISSUE), TRAIN, "cpu", element="p1").deform(
             found.loads
         )
         stored = found.read_displacement(np.arange(len(found.anatomy.mesh.nodes)))
@@ -53,8 +53,8 @@ class TestData:
         study = ReportStudy(data, data.parent)
         assert study.tissue == TISSUE
         linear = tissue_of_law(study.tissue, "linear")
-        assert linear.of(NECROSIS_LABEL) == Material("linear", 500.0, BRAIN.poisson)
-        whole = study.anatomy.without(np.flatnonzero(study.anatomy.mesh.within(NECROSIS_LABEL)))
+        assert linear.get_law(NECROSIS_LABEL) == Material("linear", 500.0, BRAIN.poisson)
+        whole = study.anatomy.remove_elements(np.flatnonzero(study.anatomy.mesh.mark_elements(NECROSIS_LABEL)))
         assert study.get_tissue_on(whole) == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})
 
     def test_are_trained_on_with_it(self, data):

@@ -17,7 +17,7 @@ from scenes.page.demo import Demo
 from scenes.page.referee import FemWorker
 from scenes.page.requests import HAND, SCRIPT
 from scenes.page.view import move_bodies
-from scenes.play.deformers import AtRest, Theatre
+from scenes.play.deformers import AtRest, PatientSetup
 from scenes.play.effect_ablation import remove_effect
 from scenes.play.player import Frame, Player
 from scenes.play.replay import IN_ORDER, FrameCache, ReplayOrder, ReplaySession, plan_replay_order
@@ -35,9 +35,9 @@ ASKED = (0, 1, 5, 4, 12, 0, 7, 7, 3)
 
 
 @pytest.fixture(scope="module")
-def theatre() -> Theatre:
+def theatre() -> PatientSetup:
     """A coarse box: a frame takes milliseconds."""
-    return Theatre(make_box(cells=(6, 6, 4), spacing=12e-3), None, {}, "cpu")
+    return PatientSetup(make_box(cells=(6, 6, 4), spacing=12e-3), None, {}, "cpu")
 
 
 def hasty(name: str, **values: object) -> Scene:
@@ -140,7 +140,7 @@ def test_jumps_use_frames_where_brain_separates(theatre) -> None:
 
     def course(name: str, anatomy: Anatomy, **values: object) -> ReplayOrder | None:
         scene = replace(find_scene(name), **values)
-        return plan_replay_order(Player(Theatre(anatomy, None, {}, "cpu").build_stage(scene), AtRest(anatomy)))
+        return plan_replay_order(Player(PatientSetup(anatomy, None, {}, "cpu").build_stage(scene), AtRest(anatomy)))
 
     assert course("brain_shift", sliding) == ReplayOrder(6, back=True, kept=64)
     assert course("brain_shift", sliding, frames_per_second=10.0) == ReplayOrder(2, back=True, kept=64)

@@ -15,7 +15,7 @@ from scenes.report.finite_elements import HALVED, OWN, FemVariant, describe_diff
 from scenes.report.page import Section, write_report
 from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow
 from sim.accuracy import REFERENCE, TRAIN
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.fem import Fem
 from surrogate.data.dataset import read_dataset
 from surrogate.data.splits import leave_sectors_out
@@ -40,15 +40,18 @@ def test_numbers_are_those_recomputed_by_hand(study, page, study_box):
         lines = list(csv.DictReader(file))
     assert [line["name"] for line in lines] == [row["name"] for row in stored]
     assert [row["name"] for row in stored] == [spec.name for spec in SPECS]
-    effects = pushed_effects(study_box, TISSUE)
+    effects = build_push_effects(study_box, TISSUE)
     truth = (
         Fem(study_box, effects, REFERENCE, "cpu", element="p2")
         .deform(study.played)
-        .at(study_box.tumour_nodes)
+        .restrict(study_box.tumour_nodes)
         .displacement
     )
     answer = (
-        Fem(study_box, effects, TRAIN, "cpu", element="p1").deform(study.played).at(study_box.tumour_nodes).displacement
+        Fem(study_box, effects, TRAIN, "cpu", element="p1")
+        .deform(study.played)
+        .restrict(study_box.tumour_nodes)
+        .displacement
     )
     wanted = figures_by_hand(np.linalg.norm(answer - truth, axis=2), truth)
     names = ("mean", "p95", "largest")  # of so few loads no percentile of a thousand is reported
@@ -61,7 +64,7 @@ def test_numbers_are_those_recomputed_by_hand(study, page, study_box):
         test = split.test
         model = train(data, ["linear"], split=split).models["linear"]
         truth = data.read_displacement(study_box.tumour_nodes)[test]
-        guess = model.deform(data.loads.rows(np.flatnonzero(test)), at=study_box.tumour_nodes).displacement
+        guess = model.deform(data.loads.select(np.flatnonzero(test)), at=study_box.tumour_nodes).displacement
         wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
         held = stored[2]["own_fem"][name]
         assert np.allclose([held[kind][each] for kind in ("mm", "percent") for each in names], wanted, rtol=1e-5)

@@ -11,7 +11,7 @@ from visitor import Visitor, report, wait_for
 from scenes.page.demo import READING
 from scenes.page.referee import FemWorker
 from scenes.page.requests import HAND, SCRIPT, Requests, describe_holder
-from scenes.play.deformers import Theatre
+from scenes.play.deformers import PatientSetup
 from scenes.play.player import Player
 from scenes.script.tool_paths import Touch
 from sim.errors import InputError
@@ -130,7 +130,7 @@ def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd
 def test_loads_without_fem_solution_are_left_out(theatre, scene, monkeypatch):
     refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
     player = theatre.build_player("linear", scene)  # as quick to have, and asked the same way
-    monkeypatch.setattr(Theatre, "build_player", lambda *words: player)
+    monkeypatch.setattr(PatientSetup, "build_player", lambda *words: player)
     referee = FemWorker(theatre, scene, threading.Lock())
     referee.ask(7, None)
     assert wait_for(lambda: str(referee.failure) == "7 is refused.")

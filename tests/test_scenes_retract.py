@@ -27,7 +27,7 @@ class TestRetract:
     @pytest.mark.parametrize("touch", [Touch(depth=-AIR), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)])
     def test_blade_is_laid_clear_of_tissue_then_moved(self, theatre, touch):
         scene, site = small("retract"), theatre.site
-        cause = scene.build_loads(site, touch, 0.0).of(Retracted)
+        cause = scene.build_loads(site, touch, 0.0).get(Retracted)
         apart = compute_distances(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
         upright = site.compute_direction(touch) @ site.axis
         assert apart.min() == pytest.approx(AIR * upright, abs=0.3e-3)

@@ -55,7 +55,7 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box,
     assert row.loads == training.sum()
     # Of loads that point into the sectors, by a model of those that do not.
     data, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
-    asked = data.loads.rows(np.flatnonzero(data.good)[sectors.test])
+    asked = data.loads.select(np.flatnonzero(data.good)[sectors.test])
     guess = train(data, ["svr"], split=sectors).models["svr"].deform(asked, at=nodes).displacement
     wanted = 1e3 * np.linalg.norm(guess - data.read_displacement(nodes)[data.good][sectors.test], axis=2)
     mm = row.own_fem["sectors"].mm

@@ -10,7 +10,7 @@ import trimesh
 from theatres import put, theatre_of
 
 from scenes.cli import main
-from scenes.play.deformers import Theatre
+from scenes.play.deformers import PatientSetup
 from scenes.play.stage import TOOL
 from scenes.script.scene import find_scene
 from sim.bodies.meshfile import read_anatomy, write_anatomy
@@ -90,7 +90,7 @@ def test_custom_tool_uses_its_own_mesh_and_shape(folder, monkeypatch, capsys):
     look.export(folder / "sucker.stl")
     scene = find_scene("held.py")
     assert np.ptp(scene.tool.mesh.vertices, axis=0) == pytest.approx([0.03, 0.004, 0.05], abs=1e-6)
-    box = Theatre(read_anatomy("box.vtu"), None, {}, "cpu")
+    box = PatientSetup(read_anatomy("box.vtu"), None, {}, "cpu")
     frames = list(box.build_player("fem", scene).play_frames(every=15))
     assert all(frame.deformation.outcome[0].good for frame in frames)
     assert np.abs(frames[-1].deformation.displacement).max() > 1e-3

@@ -116,7 +116,7 @@ def test_a_stiff_tumour_lies_in_the_same_brain(found, anatomy, now, times):
     default, changed = (
         Fem(anatomy, (Elasticity(brain, regions), *rest), TIGHT, "cpu", element="p1")
         .deform(draw("palpation", anatomy, 4, 0))
-        .at(anatomy.tumour_nodes)
+        .restrict(anatomy.tumour_nodes)
         .displacement
         for regions in ({}, {TUMOUR_LABEL: tumour})
     )
@@ -162,10 +162,10 @@ def test_a_change_has_the_percentiles_that_it_says():
 
 def test_tools_are_off_by_what_is_asked(anatomy):
     loads, patch = draw("palpation", anatomy, 5, 1), open_patch(anatomy)
-    drawn = loads.of(Pushed)
+    drawn = loads.get(Pushed)
     size = np.linalg.norm(drawn.force, axis=1)
-    turned = apply_aim(loads, Aim(turn=0.2), patch).of(Pushed)
-    shifted = apply_aim(loads, Aim(shift=1e-3), patch).of(Pushed)
+    turned = apply_aim(loads, Aim(turn=0.2), patch).get(Pushed)
+    shifted = apply_aim(loads, Aim(shift=1e-3), patch).get(Pushed)
     assert (len(turned.force), len(shifted.force)) == (10, 20)
     np.testing.assert_allclose(np.linalg.norm(turned.force, axis=1), np.tile(size, 2))
     cosine = np.einsum("bi,bi->b", turned.force, np.tile(drawn.force, (2, 1))) / np.tile(size, 2) ** 2
@@ -182,7 +182,7 @@ def test_tools_are_off_by_what_is_asked(anatomy):
 def test_a_known_motion_is_the_footprints_mean(box, pretender):
     loads = draw("palpation", box, 2, 0)
     answer = pretender.deform(loads)
-    moved, pushed = match_motion(box, loads, answer).of(Displaced), loads.of(Pushed)
+    moved, pushed = match_motion(box, loads, answer).get(Displaced), loads.get(Pushed)
     weight = compute_footprint_weights(box.mesh.nodes, box.mesh.surface, pushed.point, pushed.footprint)
     for row in range(2):
         np.testing.assert_allclose(moved.displacement[row], (weight[[row]] @ answer.displacement[row])[0])

@@ -75,7 +75,7 @@ def test_a_body_has_the_tissue_of_its_models(stiff):
     assert isinstance(setting.answers, PressedModel) and setting.scene.elasticity == STIFF
     assert setting.answers.ball.tissue == BRAIN  # which lies over the tumour
     exact = open_setting(DEBULK, str(stiff), "auto", "cpu", SIZE)  # drained brain: as many times as stiff
-    assert exact.scene.elasticity.of(TUMOUR_LABEL) == replace(MATERIALS["drained"].tissue, young=6300.0)
+    assert exact.scene.elasticity.get_law(TUMOUR_LABEL) == replace(MATERIALS["drained"].tissue, young=6300.0)
 
 
 def test_a_ball_presses_what_lies_at_the_cortex(stiff, box, tmp_path):
@@ -86,7 +86,7 @@ def test_a_ball_presses_what_lies_at_the_cortex(stiff, box, tmp_path):
     }
     path = put(replace(theatre_of(box), anatomy=shallow, models=models), tmp_path / "shallow.vtu")
     setting = open_setting(PALPATE, str(path), "fem", "cpu", SIZE)
-    assert setting.answers.ball.tissue == STIFF.of(TUMOUR_LABEL)
+    assert setting.answers.ball.tissue == STIFF.get_law(TUMOUR_LABEL)
 
 
 def test_a_model_that_may_not_answer_is_named_with_the_reason(stiff):

@@ -13,7 +13,7 @@ from ar.overlay.outlines import compute_ink, find_ink, has_text
 from scenes.cli import main
 from scenes.page.text import describe_estimate, format_page_legend, report
 from scenes.play.checks import is_within_surface, list_objections, measure
-from scenes.play.deformers import Theatre, open_theatre
+from scenes.play.deformers import PatientSetup, open_theatre
 from scenes.play.observer import ELLIPSOID_COLOUR
 from scenes.play.player import REFUSED
 from scenes.play.reference import solve_reference_frames
@@ -21,7 +21,7 @@ from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.shipped_files import get_template_path
-from scenes.script.sight import Sight
+from scenes.script.sight import PointObservation
 from scenes.script.tool_paths import press
 from scenes.script.uncertainty import TumourError, Uncertainty
 from sim.anatomy import PART_LABELS
@@ -32,14 +32,14 @@ from surrogate.locating.prior import compute_middle
 from surrogate.locating.regions import Region
 
 # Small errors, as a tumour in a box moves little.
-SIGHT = Sight(points=80, white=1e-4, smooth=1e-4, shift=1e-4, turn=0.0)
+SIGHT = PointObservation(points=80, white=1e-4, smooth=1e-4, shift=1e-4, turn=0.0)
 
 
 @pytest.fixture(scope="module")
 def theatre(box, tmp_path_factory):
     path = tmp_path_factory.mktemp("sight") / "box.locator.npz"
     save_locator(path, locator_of(box, solved=True).restrict())
-    return Theatre(box, None, {}, "cpu", path)
+    return PatientSetup(box, None, {}, "cpu", path)
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +247,7 @@ def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
 
 def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
     with pytest.raises(InputError, match="sulcus locator"):
-        Theatre(box, None, {}, "cpu").build_stage(replace(short(), sight=SIGHT))
+        PatientSetup(box, None, {}, "cpu").build_stage(replace(short(), sight=SIGHT))
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["--anatomy", str(tmp_path / "box.vtu"), "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["render", "sag", *words]) == 2

@@ -7,7 +7,7 @@ from balls import ball
 from scenes.cli import main
 from scenes.play.stage import Stage
 from scenes.script.scene import SCENES, find_scene
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 from sim.bodies.meshfile import read_anatomy
 from sim.compile import check_causes
 from sim.geometry.closest_point import find_closest_points
@@ -26,7 +26,7 @@ def site(tmp_path_factory):
     words = ["--mask", folder / "labels.nii.gz", "--nodes", 2000, "--radius", 9, f"--opening-at={PLACE}"]
     words += [f"--tumour-at={PLACE.replace('-40', '-22')}", "--out", folder / "long.vtu"]
     assert main(["anatomy", *map(str, words)]) == 0
-    return build_site(read_anatomy(folder / "long.vtu"))
+    return build_craniotomy_frame(read_anatomy(folder / "long.vtu"))
 
 
 def test_craniotomy_axis_points_inwards_at_request(site):
@@ -46,7 +46,7 @@ def test_scenes_touch_open_cortex_of_another_head(name, site):
         loads = scene.build_loads(site, touch, float(time))
         left = stage.select_stage(loads).anatomy
         assert 0 < len(left.mesh.tets) <= len(site.anatomy.mesh.tets)
-        for pushed in loads.every(Pushed):
+        for pushed in loads.get_all(Pushed):
             away = np.linalg.norm(find_closest_points(pushed.point, cortex).point - pushed.point, axis=1)
             assert away.max() < 1e-9 and (pushed.force @ site.axis >= -1e-12).all()
         if scene.tool is None:

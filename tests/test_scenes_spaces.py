@@ -23,7 +23,7 @@ from ar.tracking.pose import Verdict
 from ar.tracking.registration import Registration
 from scenes.cli import main
 from scenes.episodes.episode import EpisodeRecording, collect
-from scenes.play.deformers import Theatre
+from scenes.play.deformers import PatientSetup
 from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.tracked.pose_file import TrackedRow, write_poses
@@ -159,7 +159,7 @@ def test_data_sets_and_registrations_name_their_spaces(folder, pretender):
 def test_an_episode_shows_the_tumour_where_it_says_it_is(folder, pretender):
     """Through the camera's matrices, the resting tumour falls on the middle of its mask in the first picture."""
     anatomy = read_anatomy(folder / "patient.vtu")
-    theatre = Theatre(anatomy, None, {}, "cpu")
+    theatre = PatientSetup(anatomy, None, {}, "cpu")
     play = Player(Stage(short(), theatre.site, None), replace(pretender, anatomy=anatomy))
     collect(
         folder / "press.h5", theatre, play, "fem", iter, recording=EpisodeRecording(None, overlay=False, dated=False)

@@ -14,18 +14,18 @@ from scenes.play.player import REFUSED, Player
 from scenes.play.stereo_observer import StereoObserver
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import get_template_path
-from scenes.script.sight import StereoSight
+from scenes.script.sight import StereoObservation
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points
 from surrogate.locating.locator_store import to_locator_path
 
-EXACT = StereoSight(shift=0.0, turn=0.0)
+EXACT = StereoObservation(shift=0.0, turn=0.0)
 MICROSCOPE = find_scene("microscope")
 NONE = np.zeros((0, 3))
 
 
-def observer_of(sight: StereoSight = EXACT) -> StereoObserver:
+def observer_of(sight: StereoObservation = EXACT) -> StereoObserver:
     """On few pixels."""
     theatre = replace(template_theatre(), locator_file=to_locator_path(get_template_path()))
     scene = replace(MICROSCOPE, viewpoint=replace(MICROSCOPE.viewpoint, width=400, height=300), sight=sight)
@@ -126,7 +126,7 @@ def test_a_cortex_without_a_scan_has_vessels_to_follow(observer):
     """A head without T1 gets the same vessels, on even tissue; before, it was bare and nothing was found on it."""
     bare = replace(observer, stage=replace(observer.stage, intensity=None))
     assert len(bare.first.rest) > 60
-    plain = replace(bare, stage=replace(bare.stage, scene=replace(MICROSCOPE, sight=StereoSight(vessels=False))))
+    plain = replace(bare, stage=replace(bare.stage, scene=replace(MICROSCOPE, sight=StereoObservation(vessels=False))))
     assert plain.stage.scan is None
 
 
@@ -178,7 +178,7 @@ class TestRefusals:
     def test_sights_that_cannot_be(self):
         for wrong in ({"darker": 1.0}, {"points": 5}, {"noise": -1.0}, {"seed": -1}):
             with pytest.raises(InputError):
-                StereoSight(**wrong)
+                StereoObservation(**wrong)
 
 
 def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):

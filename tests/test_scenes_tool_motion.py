@@ -8,11 +8,11 @@ from theatres import template_theatre
 import scenes.gym  # noqa: F401
 from scenes.gym.tasks import PALPATE
 from scenes.gym.tool_motion import HIGHEST, lay_tool, move_tool
-from scenes.script.site import build_site
+from scenes.script.site import build_craniotomy_frame
 
 
 def test_tool_leans_and_sinks_no_farther_than_it_may(box):
-    site, tool = build_site(box), PALPATE.tool
+    site, tool = build_craniotomy_frame(box), PALPATE.tool
     hand = lay_tool(site, tool, site.origin)
     for angle, turned in ((0.29, True), (0.31, False)):
         found = move_tool(hand, site, tool, np.array([0.0, 0.0, 0.0, 0.0, angle, 0.0]), 0.3, 5e-3)

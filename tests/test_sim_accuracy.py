@@ -7,7 +7,7 @@ from scenes.play.deformers import open_theatre
 from scenes.script.scene import find_scene
 from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.fem import Fem
-from sim.loads import stacked
+from sim.loads import stack
 
 # Largest distance over all nodes from the converged solution [m].
 PROMISED = {"live": (LIVE, 5e-5), "train": (TRAIN, 5e-6)}
@@ -18,7 +18,7 @@ def press():
     """Anatomy, effects and the loads of the press scene, while the force rises and while it falls."""
     scene, theatre = find_scene("press"), open_theatre()
     times = (0.3, 1.2, 2.6)
-    loads = stacked([scene.build_loads(theatre.site, scene.path(time), time) for time in times])
+    loads = stack([scene.build_loads(theatre.site, scene.path(time), time) for time in times])
     converged = Fem(theatre.anatomy, scene.effects, Accuracy(1e-7), "cpu", element="p1").deform(loads)
     assert all(outcome.good for outcome in converged.outcome)
     return theatre.anatomy, scene.effects, loads, converged.displacement

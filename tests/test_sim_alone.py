@@ -17,7 +17,7 @@ from sim.deformation import Deformation
 from sim.effects import Elasticity, Held, NodalForce, Resection, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, Resected, push
-from sim.resected_fem import finite_elements
+from sim.resected_fem import build_fem
 from sim.strategy.frame_sequence import Kept
 
 BODY = base_held(box((4, 4, 4), 0.1))
@@ -31,7 +31,7 @@ def pushes(thread: int) -> list[Loads]:
     """One thread's: single ones, and a batch in other forces."""
     force = np.array([[0.0, 0.05, -0.2], [0.1, 0.0, -0.4], [0.0, 0.0, 0.3]]) * (1.0 + 0.2 * thread)
     whole = push(PLACES[thread], force, 0.02)
-    return [whole.rows(slice(0, 1)), whole, whole.rows(slice(2, 3))]
+    return [whole.select(slice(0, 1)), whole, whole.select(slice(2, 3))]
 
 
 def same(one: Deformation, other: Deformation) -> None:
@@ -59,7 +59,7 @@ def test_finite_elements_shared_by_threads_answer_bit_for_bit(accuracy: Accuracy
 
     def work(thread: int) -> list[Deformation]:
         answers = [fem.deform(loads) for loads in pushes(thread)]
-        warm = [fem.deform(loads.scaled(1.1), start) for loads, start in zip(pushes(thread), answers, strict=True)]
+        warm = [fem.deform(loads.scale(1.1), start) for loads, start in zip(pushes(thread), answers, strict=True)]
         return answers + warm
 
     alone = [work(thread) for thread in range(THREADS)]
@@ -75,8 +75,8 @@ def test_residuals_and_series_shared_by_threads() -> None:
 
     def work(thread: int) -> list[np.ndarray]:
         loads = pushes(thread)[1]
-        found = fem.deform(loads.scaled(0.7))
-        series = fem.series(loads, 2, fem.reading(nodes, modes))
+        found = fem.deform(loads.scale(0.7))
+        series = fem.compute_series(loads, 2, fem.build_reading(nodes, modes))
         return [fem.residual(loads, found), series]
 
     alone = [work(thread) for thread in range(THREADS)]
@@ -87,7 +87,7 @@ def test_residuals_and_series_shared_by_threads() -> None:
 
 def test_a_body_that_is_cut_shared_by_threads() -> None:
     gone = np.flatnonzero((BODY.mesh.nodes[BODY.mesh.tets].mean(axis=1) > [0.0, 0.0, 0.075]).all(axis=1))[:9]
-    fem = finite_elements(BODY, (*EFFECTS, Resection((tuple(gone.tolist()),))), LIVE, "cpu")
+    fem = build_fem(BODY, (*EFFECTS, Resection((tuple(gone.tolist()),))), LIVE, "cpu")
 
     def work(thread: int) -> list[Deformation]:
         loads = pushes(thread)[1]

@@ -35,12 +35,12 @@ def test_refining_costs_few_iterations() -> None:
     count = []
     for cells in (4, 8):
         problem, preconditioner = built("p1", 0.45, (cells, cells, cells), settings=LEVELS)
-        free, device = problem.constraint.basis(), problem.device
+        free, device = problem.constraint.build_basis(), problem.device
         r = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 2))
-        problem.linearise(device.zeros(*r.shape), np.zeros(2, bool))
+        problem.linearise(device.allocate(*r.shape), np.zeros(2, bool))
         preconditioner.prepare(problem, 2)
         tolerance = 1e-6 * np.linalg.norm(r, axis=0)
-        count.append(solve_conjugate_gradients(problem, preconditioner, device.array(r), tolerance, 400).iterations)
+        count.append(solve_conjugate_gradients(problem, preconditioner, device.upload(r), tolerance, 400).iterations)
     assert count[1] <= 25
     assert count[1] <= count[0] + 8
 

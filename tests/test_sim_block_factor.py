@@ -37,7 +37,7 @@ def test_factor_and_solution_are_those_of_the_matrix(name: str) -> None:
     right = rng.normal(size=(count, size))
     whole = np.full((count, size + 4, size + 4), np.nan)
     whole[:, :size, :size] = np.triu(matrix)
-    a, x = device.array(whole), device.array(np.hstack([right, np.full((count, 4), np.nan)]))
+    a, x = device.upload(whole), device.upload(np.hstack([right, np.full((count, 4), np.nan)]))
     said = wp.zeros(count, dtype=wp.int32, device=device.name)
     launch(device, run, count, [a, x, size], [said])
     assert said.numpy().tolist() == [1, 0, 1]

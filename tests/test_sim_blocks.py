@@ -26,7 +26,7 @@ def test_block_scan_returns_sum_maximum_and_prefix(name: str) -> None:
 
     given = np.random.default_rng(0).integers(1, 100, (count, threads)).astype(float)
     out = wp.zeros((3, count, threads), dtype=wp.float64, device=device.name)
-    launch(device, run, count, [device.array(given)], [out])
+    launch(device, run, count, [device.upload(given)], [out])
     sums, most, passed = out.numpy()
     np.testing.assert_array_equal(sums, np.broadcast_to(given.sum(axis=1, keepdims=True), given.shape))
     np.testing.assert_array_equal(most, np.broadcast_to(given.max(axis=1, keepdims=True), given.shape))

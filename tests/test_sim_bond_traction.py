@@ -37,7 +37,7 @@ def test_its_share_is_the_mean_traction_over_the_strength(cube, element, total):
     traction = np.abs(total) / SIDE**2
     pull = traction[2] / 300.0 if total[2] > 0.0 else 0.0
     assert answer.bond[0] == pytest.approx(np.hypot(pull, np.hypot(*traction[:2]) / 200.0), rel=1e-6)
-    assert answer.rows(np.array([0])).bond[0] == answer.bond[0]
+    assert answer.select(np.array([0])).bond[0] == answer.bond[0]
 
 
 def test_it_holds_its_nodes(cube):

@@ -42,7 +42,7 @@ def test_finds_the_equilibrium() -> None:
     assert answer.outcome[0].good and moved > 5e-3
     np.testing.assert_allclose(answer.displacement, expected.displacement, atol=1e-5 * moved)
     fem.problem.begin(Cases(load, np.zeros(1)))
-    found = elimination.descend(fem.problem.device.zeros(fem.problem.rows, 1), np.array([1e-8]), 60)
+    found = elimination.descend(fem.problem.device.allocate(fem.problem.rows, 1), np.array([1e-8]), 60)
     assert found.status[0] == DONE and found.steps[0] > 0
     assert fem.problem.residual(found.u)[1][0] <= 1.01e-8 * fem.problem.residual(found.u)[2][0]
 
@@ -50,7 +50,7 @@ def test_finds_the_equilibrium() -> None:
 def test_what_it_does_not_bring_home_is_left_nearer_to_it() -> None:
     fem, elimination = fem_and_elimination()
     fem.problem.begin(Cases(pressed(0.6), np.zeros(1)))
-    start = fem.problem.device.zeros(fem.problem.rows, 1)
+    start = fem.problem.device.allocate(fem.problem.rows, 1)
     found = elimination.descend(start, np.array([1e-8]), 3)
     assert found.status[0] == LIVE and found.steps[0] == 3
     before, after = (fem.problem.residual(u)[1][0] for u in (start, found.u))
@@ -60,7 +60,7 @@ def test_what_it_does_not_bring_home_is_left_nearer_to_it() -> None:
 def test_what_is_hardly_strained_is_left_to_others() -> None:
     fem, elimination = fem_and_elimination()
     fem.problem.begin(Cases(pressed(1e-3), np.zeros(1)))
-    found = elimination.descend(fem.problem.device.zeros(fem.problem.rows, 1), np.array([1e-8]), 60)
+    found = elimination.descend(fem.problem.device.allocate(fem.problem.rows, 1), np.array([1e-8]), 60)
     assert found.status[0] == LIVE and found.steps[0] == 0 and not found.u.numpy().any()
     assert fem.deform(pressed(1e-3)).outcome[0].good
 
@@ -69,12 +69,12 @@ def test_a_part_is_settled_between_what_holds_its_rim() -> None:
     fem, _ = fem_and_elimination()
     problem, device = fem.problem, fem.problem.device
     problem.begin(Cases(pressed(0.6), np.zeros(1)))
-    u = device.array(1e-4 * np.random.default_rng(0).normal(size=(problem.rows, 1)))
+    u = device.upload(1e-4 * np.random.default_rng(0).normal(size=(problem.rows, 1)))
     problem.constraint.project(u)
     chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.08
     constant, _ = compute_constant_gradients(problem, u)
     part = ClampedPart(problem, EFFECTS, fem.space, chosen, constant, u)
-    settled = part.settled(u, 1e-9)
+    settled = part.settle(u, 1e-9)
     inside = np.setdiff1d(part.nodes, fem.space.table[~chosen])
     moved = (settled.numpy() != u.numpy()).reshape(-1, 3).any(axis=1)
     assert len(inside) and set(np.flatnonzero(moved)) <= set(inside.tolist())
@@ -86,9 +86,9 @@ def test_a_part_is_settled_between_what_holds_its_rim() -> None:
 def test_the_assembled_curvature_is_the_one_that_multiplies(law: str) -> None:
     fem = Fem(BODY, (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
     problem, random = fem.problem, np.random.default_rng(0)
-    u, p = (problem.device.array(scale * random.normal(size=(problem.rows, 1))) for scale in (3e-4, 1.0))
+    u, p = (problem.device.upload(scale * random.normal(size=(problem.rows, 1))) for scale in (3e-4, 1.0))
     problem.linearise(u, np.zeros(1, bool))
-    expected = problem.device.zeros(problem.rows, 1)
+    expected = problem.device.allocate(problem.rows, 1)
     problem.add_curvature(p, expected)
     found = sum(term.curvature() @ p.numpy() for term in problem.terms if isinstance(term, ElasticityTerm))
     np.testing.assert_allclose(found, expected.numpy(), atol=1e-10 * np.abs(expected.numpy()).max())
@@ -113,8 +113,8 @@ def test_a_part_whose_forces_are_not_finite_stays_as_it_is() -> None:
     fem = Fem(BODY, (Elasticity(tissue("neo-hookean")), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
     problem = fem.problem
     problem.begin(Cases(pressed(0.6), np.zeros(1)))
-    rest = problem.device.zeros(problem.rows, 1)
-    folded = problem.device.array(-2.0 * fem.space.nodes.reshape(-1, 1) * (fem.space.nodes[:, 2:] > 0.0).repeat(3, 0))
+    rest = problem.device.allocate(problem.rows, 1)
+    folded = problem.device.upload(-2.0 * fem.space.nodes.reshape(-1, 1) * (fem.space.nodes[:, 2:] > 0.0).repeat(3, 0))
     chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.04
     part = ClampedPart(problem, fem.effects, fem.space, chosen, compute_constant_gradients(problem, rest)[0], rest)
-    np.testing.assert_array_equal(part.settled(folded, 1e-9).numpy(), folded.numpy())
+    np.testing.assert_array_equal(part.settle(folded, 1e-9).numpy(), folded.numpy())

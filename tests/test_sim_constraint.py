@@ -48,7 +48,7 @@ def constraint(device: Device, footprint: bool, columns: int = 3) -> Constraint:
 
 
 def projected(of: Constraint, device: Device, v: np.ndarray) -> np.ndarray:
-    array = device.array(v)
+    array = device.upload(v)
     of.project(array)
     return array.numpy()
 
@@ -85,25 +85,25 @@ class TestProjection:
     def test_closing_the_gap_meets_the_constraints(self, device: Device, footprint: bool) -> None:
         of = constraint(device, footprint)
         u = RNG.normal(size=(3 * COUNT, 3))
-        gap, size = of.close_gap(device.array(u))
+        gap, size = of.close_gap(device.upload(u))
         np.testing.assert_array_equal(size, np.abs(gap.numpy()).max(axis=0))
-        _, left = of.close_gap(device.array(u + gap.numpy()))
+        _, left = of.close_gap(device.upload(u + gap.numpy()))
         assert left.max() < 1e-12 * size.max()
         # The least such motion: nothing in it is free.
         np.testing.assert_allclose(projected(of, device, gap.numpy()), 0.0, atol=1e-11)
 
     def test_keeping_columns_keeps_values_weights_and_targets(self, device: Device, footprint: bool) -> None:
         of, u = constraint(device, footprint), RNG.normal(size=(3 * COUNT, 3))
-        gap = of.close_gap(device.array(u))[0].numpy()
+        gap = of.close_gap(device.upload(u))[0].numpy()
         free = projected(of, device, u)
         of.keep(np.array([2, 0]))
-        np.testing.assert_array_equal(of.close_gap(device.array(u[:, [2, 0]]))[0].numpy(), gap[:, [2, 0]])
+        np.testing.assert_array_equal(of.close_gap(device.upload(u[:, [2, 0]]))[0].numpy(), gap[:, [2, 0]])
         np.testing.assert_array_equal(projected(of, device, u[:, [2, 0]]), free[:, [2, 0]])
 
 
 def test_basis_spans_what_the_projection_leaves(device: Device) -> None:
     of = constraint(device, False, columns=1)
-    basis = of.basis().toarray()
+    basis = of.build_basis().toarray()
     np.testing.assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-12)
     v = RNG.normal(size=(3 * COUNT, 1))
     np.testing.assert_allclose(basis @ (basis.T @ v), projected(of, device, v), atol=1e-12)

@@ -22,7 +22,7 @@ from sim.local_solvers.contact_descent import ContactDescent
 from sim.local_solvers.contact_forces import ContactCompliance, ForceLimits, allocate_scratch, solve_contact_forces
 from sim.local_solvers.contact_preconditioner import ContactPreconditioner
 from sim.material import Material
-from sim.minimisers.compact_lbfgs import CurvaturePairs, PairsOfColumns, build_empty_history
+from sim.minimisers.compact_lbfgs import BatchHistory, CurvaturePairs, build_empty_history
 from sim.minimisers.lbfgs_kernels import PAIRS
 from sim.runtime.device import Device
 from sim.strategy.plan import SolverStep
@@ -99,7 +99,9 @@ def learnt_pairs(count: int) -> tuple[CurvaturePairs, np.ndarray, np.ndarray]:
 def test_pairs_are_those_of_bfgs(count: int) -> None:
     pairs, begun, expected = learnt_pairs(count)
     force = np.random.default_rng(6).normal(size=len(begun))
-    np.testing.assert_allclose(begun @ force + pairs.motion(pairs.weights(force)), expected @ force, rtol=1e-8)
+    np.testing.assert_allclose(
+        begun @ force + pairs.compute_motion(pairs.compute_weights(force)), expected @ force, rtol=1e-8
+    )
 
 
 def test_each_column_learns_and_forgets_by_itself() -> None:
@@ -107,7 +109,7 @@ def test_each_column_learns_and_forgets_by_itself() -> None:
     rng, size = np.random.default_rng(5), 30
     stiffness, change = (matrix @ matrix.T for matrix in rng.normal(size=(2, size, size)))
     begun = np.linalg.inv(stiffness + size * np.eye(size))
-    pairs, known = PairsOfColumns(Device("cpu", "float64"), size, 4), [[] for _ in range(4)]
+    pairs, known = BatchHistory(Device("cpu", "float64"), size, 4), [[] for _ in range(4)]
     for turn in range(PAIRS + 3):
         columns = np.array([0, 1, 2, 3] if turn < 2 else [0, 2] if turn < PAIRS else [2])
         s = rng.normal(size=(size, len(columns)))
@@ -118,8 +120,8 @@ def test_each_column_learns_and_forgets_by_itself() -> None:
     pairs.forget(np.array([3]))
     pairs.keep(np.array([2, 1, 3]))
     force = rng.normal(size=(size, 3))
-    learnt = pairs.of(np.arange(3))
-    found = begun @ force + learnt.motion(learnt.weights(force))
+    learnt = pairs.get_history(np.arange(3))
+    found = begun @ force + learnt.compute_motion(learnt.compute_weights(force))
     for place, column in enumerate((2, 1, 3)):
         last = [] if column == 3 else known[column][-PAIRS:]
         steps, changes = (np.array([pair[i] for pair in last]).reshape(-1, size) for i in range(2))
@@ -137,12 +139,12 @@ def test_columns_are_what_the_preconditioner_does() -> None:
     force = force.reshape(-1, 2)
     whole = np.zeros((fem.problem.rows, 2))
     whole[soft.rows] = force
-    expected = soft.answered(whole)
+    expected = soft.apply(whole)
     size = np.abs(expected).max()
     np.testing.assert_allclose(soft.spread(force), expected, atol=1e-6 * size)
-    between = soft.between(np.isin(np.arange(len(nodes)), some))
+    between = soft.build_matrix(np.isin(np.arange(len(nodes)), some))
     np.testing.assert_allclose(between @ force, expected[soft.rows], atol=1e-6 * size)
-    np.testing.assert_allclose(soft.moved(force), expected[soft.rows], atol=1e-6 * size)
+    np.testing.assert_allclose(soft.compute_motion(force), expected[soft.rows], atol=1e-6 * size)
 
 
 def test_columns_are_bit_identical_in_any_order() -> None:
@@ -151,8 +153,8 @@ def test_columns_are_bit_identical_in_any_order() -> None:
     assert len(nodes) > 3 * Columns().block
     one, other = (Compliance(fem.problem, preconditioner, nodes) for _ in range(2))
     every = np.ones(len(nodes), bool)
-    other.between(np.arange(len(nodes)) == len(nodes) - 1)
-    np.testing.assert_array_equal(one.between(every), other.between(every))
+    other.build_matrix(np.arange(len(nodes)) == len(nodes) - 1)
+    np.testing.assert_array_equal(one.build_matrix(every), other.build_matrix(every))
 
 
 @pytest.mark.parametrize("definite", [False, True])
@@ -163,15 +165,15 @@ def test_the_reduced_barrier_is_the_whole_one(definite: bool) -> None:
     problem.begin(Cases(touching(DOWN), np.zeros(1)))
     rng = np.random.default_rng(2)
     u = 1e-4 * rng.normal(size=(problem.rows, 1))
-    rows, place = descent.compliance.rows[: 3 * len(nodes)], problem.device.array(u)
-    expected = problem.device.zeros(problem.rows, 1)
+    rows, place = descent.compliance.rows[: 3 * len(nodes)], problem.device.upload(u)
+    expected = problem.device.allocate(problem.rows, 1)
     term.add_gradient(place, expected)
-    barrier = term.reduced(np.zeros(1, int))
+    barrier = term.reduce(np.zeros(1, int))
     assert barrier is not None and np.abs(expected.numpy()).max() > 1e-3
     np.testing.assert_allclose(barrier.slope(u[rows]), expected.numpy()[rows], rtol=1e-9, atol=1e-12)
-    p, product = rng.normal(size=(problem.rows, 1)), problem.device.zeros(problem.rows, 1)
+    p, product = rng.normal(size=(problem.rows, 1)), problem.device.allocate(problem.rows, 1)
     problem.linearise(place, np.array([definite]))
-    term.add_curvature(problem.device.array(p), product)
+    term.add_curvature(problem.device.upload(p), product)
     every = np.arange(len(nodes))[:, None]
     matrix = barrier.curvature(u[rows], every, len(nodes), np.array([definite]))[0]
     np.testing.assert_allclose(matrix @ p[rows], product.numpy()[rows], rtol=1e-8, atol=1e-9 * np.abs(matrix).max())
@@ -182,10 +184,10 @@ def test_what_is_touched_is_known_to_the_preconditioner() -> None:
     fem, descent = parts()
     problem, preconditioner = fem.problem, fem.strategy.preconditioner
     problem.begin(Cases(touching(DOWN), np.zeros(1)))
-    problem.linearise(problem.device.zeros(problem.rows, 1), np.ones(1, bool))
+    problem.linearise(problem.device.allocate(problem.rows, 1), np.ones(1, bool))
     touched = ContactPreconditioner(preconditioner, descent.compliance, descent.barrier)
     touched.prepare(problem, 1)
-    r = problem.device.array(np.random.default_rng(3).normal(size=(problem.rows, 1)))
+    r = problem.device.upload(np.random.default_rng(3).normal(size=(problem.rows, 1)))
     problem.constraint.project(r)
 
     def missed(one: Preconditioner) -> float:
@@ -249,7 +251,7 @@ def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float, rough:
     device = replace(fem.problem.device, precision="float64")
     shallow = (at(0.031, 0.028, HEIGHT - 3e-4), at(0.02, 0.02, HEIGHT - 2e-4), at(0.0, 0.0, 0.2))
     fem.problem.begin(Cases(touching(*shallow), np.zeros(3)))
-    barrier = descent.barrier.reduced(np.arange(3))
+    barrier = descent.barrier.reduce(np.arange(3))
     assert barrier is not None
     here, known = np.zeros((3 * n, 3)), np.zeros((3 * n, 3))
     model, few = ContactCompliance(soft, device, partial(allocate_scratch, device)), ForceLimits(iterations=20)
@@ -257,7 +259,7 @@ def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float, rough:
         barrier, model, here, here + 1e-4, known, np.full(3, 1e-6), np.full(3, drag), few
     )
     assert found.all() and not force[:, 2].any()
-    between = soft.between(np.ones(n, bool))
+    between = soft.build_matrix(np.ones(n, bool))
     w = here + 1e-4 - 0.5 * (between + between.T) @ force
     slope, touched = barrier.slope(w), (barrier.slope(here) != 0.0).reshape(n, 3, 3).any(axis=1)
     for column in range(2):
@@ -279,7 +281,7 @@ def test_a_batch_of_which_one_case_is_slow_goes_on() -> None:
 
 def test_no_poses_no_answers() -> None:
     fem = solver(Accuracy(1e-6))
-    none = fem.deform(touching(DOWN).rows(np.zeros(0, int)))
+    none = fem.deform(touching(DOWN).select(np.zeros(0, int)))
     assert none.displacement.shape == (0, len(BODY.mesh.nodes), 3)
 
 

@@ -175,8 +175,8 @@ def test_no_force_on_tissue_pulls() -> None:
     fem = body((BLADE,))
     found = fem.deform(touching(BESIDE))
     term = fem.problem.barriers[0]
-    u = fem.problem.device.array(fem.guess(touching(BESIDE), found))
-    gradient = fem.problem.device.zeros(*u.shape)
+    u = fem.problem.device.upload(fem.guess(touching(BESIDE), found))
+    gradient = fem.problem.device.allocate(*u.shape)
     term.begin(Cases(touching(BESIDE), np.zeros(1)))
     term.add_gradient(u, gradient)
     force = -gradient.numpy().reshape(-1, 3)

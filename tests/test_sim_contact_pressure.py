@@ -8,7 +8,7 @@ from boxes import base_held, box
 from scipy.spatial.transform import Rotation
 
 from sim.accuracy import Accuracy
-from sim.contact_pressure import pressure
+from sim.contact_pressure import compute_pressure
 from sim.effects import Effect, Elasticity, Held, NodalForce, Retraction, ToolContact
 from sim.errors import InputError
 from sim.fem import Fem
@@ -37,7 +37,7 @@ def test_a_plate_presses_evenly_by_force_over_area(element: str) -> None:
     poses = np.stack([at(0.03, 0.03, HEIGHT - depth)[None] for depth in (1e-3, 3e-3)])
     loads = Loads((Touching(poses),))
     answer = fem.deform(loads)
-    found = pressure(fem, loads, answer)
+    found = compute_pressure(fem, loads, answer)
     inner = TOP & ((BLOCK.mesh.nodes[:, :2] > 1e-9) & (BLOCK.mesh.nodes[:, :2] < SIDE - 1e-9)).all(axis=1)
     squeezed = -answer.displacement[:, inner, 2].mean(axis=1) / HEIGHT
     np.testing.assert_allclose(found[:, inner], np.repeat(3000.0 * squeezed[:, None], inner.sum(), axis=1), rtol=1e-4)
@@ -50,7 +50,7 @@ def test_a_blade_presses_hardest_under_its_lower_end() -> None:
     laid, moved = at(0.03, 0.03, HEIGHT + 5e-3, tip=12.0), np.array([[0.0, 0.0, -8e-3]])
     loads = Loads((Retracted(laid[None], moved),))
     answer = fem.deform(loads)
-    found = pressure(fem, loads, answer)[0]
+    found = compute_pressure(fem, loads, answer)[0]
     assert answer.outcome[0].good
     along = BLOCK.mesh.nodes[:, 1] - 0.03
     ends = [found[TOP & (along * way > 4e-3)].max() for way in (-1.0, 1.0)]
@@ -60,7 +60,7 @@ def test_a_blade_presses_hardest_under_its_lower_end() -> None:
 def test_where_nothing_touches_it_presses_nowhere() -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu", element="p1")
     loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
-    assert not pressure(fem, loads, fem.deform(loads)).any()
+    assert not compute_pressure(fem, loads, fem.deform(loads)).any()
 
 
 def test_it_is_of_the_whole_answer_to_its_loads() -> None:
@@ -68,10 +68,10 @@ def test_it_is_of_the_whole_answer_to_its_loads() -> None:
     loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
     answer, none = fem.deform(loads), np.zeros(0, int)
     with pytest.raises(InputError, match="1 load cases at 2 vertices, the loads have 1, and the body 196"):
-        pressure(fem, loads, answer.at(np.arange(2)))
+        compute_pressure(fem, loads, answer.restrict(np.arange(2)))
     with pytest.raises(InputError, match="1 load cases at 196 vertices, the loads have 0"):
-        pressure(fem, loads.rows(none), answer)
-    assert pressure(fem, loads.rows(none), answer.rows(none)).shape == (0, 196)
+        compute_pressure(fem, loads.select(none), answer)
+    assert compute_pressure(fem, loads.select(none), answer.select(none)).shape == (0, 196)
 
 
 @pytest.mark.parametrize(
@@ -82,4 +82,4 @@ def test_what_has_no_pressure_is_a_sentence(effect: Effect, element: str, senten
     fem = Fem(BLOCK, (Elasticity(), Held(), effect), Accuracy(), "cpu", element=element)
     loads = Loads((), np.zeros(1))
     with pytest.raises(InputError, match=sentence):
-        pressure(fem, loads, fem.deform(loads))
+        compute_pressure(fem, loads, fem.deform(loads))

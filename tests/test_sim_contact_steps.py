@@ -46,7 +46,7 @@ def cases_at(number: int, memory: Mapping[str, Any]) -> Cases:
 
 def followed(fem: Fem, descent: ContactDescent, many: int) -> list[Descended]:
     """Along so much of the way, each from where the last one ended, with what is remembered of it."""
-    u, out, memory = fem.problem.device.zeros(fem.problem.rows, 1), [], {}
+    u, out, memory = fem.problem.device.allocate(fem.problem.rows, 1), [], {}
     for number in range(many):
         fem.problem.begin(cases_at(number, memory))
         out.append(descent.descend(u, np.full(1, TOLERANCE), 30))

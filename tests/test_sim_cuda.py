@@ -26,7 +26,7 @@ from sim.elements import ELEMENTS
 from sim.fem import Fem
 from sim.linalg.half_symv import add_product, list_tiles
 from sim.linalg.pcg import BlockJacobi
-from sim.loads import Displaced, Loads, Touching, posture, push
+from sim.loads import Displaced, Loads, Touching, build_posture, push
 from sim.material import Material
 from sim.strategy.frame_sequence import Kept
 from sim.tools import Ball, Spatula
@@ -77,7 +77,7 @@ def test_a_batch_of_postures(box, element, precision):
     """Levels between those of the box's nodes, and a tool beside them; the scan's posture among them."""
     accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
     down, top = np.array([0.3, 0.0, -1.0]), float(box.mesh.nodes[:, 2].max())
-    drained = posture(down, top - np.linspace(0.001, 0.04, 7))
+    drained = build_posture(down, top - np.linspace(0.001, 0.04, 7))
     loads = Loads((*pushes().causes, *drained.causes))
     effects = (Elasticity(), Held(), ToolForce(), Gravity())
     on_cpu, on_cuda = (Fem(box, effects, accuracy, name, element=element) for name in ("cpu", "cuda"))
@@ -85,7 +85,7 @@ def test_a_batch_of_postures(box, element, precision):
     assert all(outcome.good for outcome in found.outcome)
     off = np.abs(expected.displacement - found.displacement).max()
     assert off <= BOUND[precision] * np.abs(expected.displacement).max()
-    scan = posture(np.array(Gravity().direction), np.full(7, 1.0))
+    scan = build_posture(np.array(Gravity().direction), np.full(7, 1.0))
     assert not on_cuda.deform(scan, found).displacement.any()
 
 
@@ -171,7 +171,7 @@ def test_a_skull_that_lets_go(box, element, precision):
     body = replace(box, held=box.held & ~low[:, None], slide_normal=np.outer(low, [0.0, 0.0, -1.0]))
     effects = (Elasticity(Material("neo-hookean", 1000.0, 0.45)), Held(), Gravity((0.0, 1.0, 0.0)), SkullContact())
     way = np.array([[0.0, 0.0, -1.0], [0.0, 0.5, 1.0], [0.3, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    loads = posture(way, -1.0)
+    loads = build_posture(way, -1.0)
     on_cpu, on_cuda = (Fem(body, effects, accuracy, name, element=element).deform(loads) for name in ("cpu", "cuda"))
     assert all(outcome.good for outcome in on_cuda.outcome)
     size = np.abs(on_cpu.displacement).max()

@@ -31,7 +31,7 @@ def test_concurrent_kernel_is_compiled_once(monkeypatch: pytest.MonkeyPatch) -> 
         i = wp.tid()
         x[i] = x[i] + wp.float64(7.0)
 
-    outputs = [device.zeros(3) for _ in range(4)]
+    outputs = [device.allocate(3) for _ in range(4)]
     threads = [threading.Thread(target=device.launch, args=(add_seven, (3,), [], [out])) for out in outputs]
     for thread in threads:
         thread.start()

@@ -17,7 +17,7 @@ from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.bodies.subject import MeshPlan
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
@@ -95,11 +95,11 @@ def test_beyond_it_the_brain_moves_less(said, labels, subject):
     plain = add_boundary_conditions(mesh, subject.site, PLAN.craniotomy, PLAN.placement)
     assert said["septa_nodes"] == {"falx": walls.held.all(axis=1).sum() - plain.held.all(axis=1).sum()}
     assert not walls.slide_normal[walls.held.any(axis=1)].any() and not (walls.held.T & walls.craniotomy).any()
-    place = open_cortex(plain).nearest(open_cortex(plain).origin)
+    place = open_cortex(plain).find_nearest(open_cortex(plain).origin)
     loads = push(place.point, 0.2 * place.inward, footprint=8e-3)
     far, moved = mesh.nodes[:, 0] < 1e-3 * MIDDLE[0] - 8e-3, []
     for anatomy in (plain, walls):
-        fem = Fem(anatomy, pushed_effects(anatomy, BRAIN, "slide"), device="cpu", element="p1")
+        fem = Fem(anatomy, build_push_effects(anatomy, BRAIN, "slide"), device="cpu", element="p1")
         size = np.linalg.norm(fem.deform(loads).displacement[0], axis=1)
         moved.append((size[far].mean(), size[anatomy.tumour_nodes].mean()))
     (free, tumour), (less, kept) = moved

@@ -46,11 +46,11 @@ def swell(mesh: TetMesh, seed: int) -> np.ndarray:
 
 
 def energy(problem: Problem, u: np.ndarray) -> float:
-    return float(problem.energy(problem.device.array(u.reshape(-1, 1)))[0])
+    return float(problem.energy(problem.device.upload(u.reshape(-1, 1)))[0])
 
 
 def forces(problem: Problem, u: np.ndarray) -> np.ndarray:
-    return problem.gradient(problem.device.array(u.reshape(-1, 1))).numpy().reshape(-1, 3).astype(np.float64)
+    return problem.gradient(problem.device.upload(u.reshape(-1, 1))).numpy().reshape(-1, 3).astype(np.float64)
 
 
 @pytest.mark.parametrize("element", ELEMENTS)

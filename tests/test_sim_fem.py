@@ -95,7 +95,7 @@ def answered(name: str) -> Deformation:
 
 def loads(rows: slice | np.ndarray = slice(None), scale: float = 1.0, time: float = 0.0) -> Loads:
     whole = push(POINT, scale * FORCE, 0.02)
-    return replace(whole, time=np.full(len(whole), time) + 0.1 * np.arange(len(whole))).rows(rows)
+    return replace(whole, time=np.full(len(whole), time) + 0.1 * np.arange(len(whole))).select(rows)
 
 
 class TestEveryDeformer:
@@ -167,7 +167,7 @@ class TestEveryDeformer:
         some = deformer.deform(loads(), at=picked)
         np.testing.assert_array_equal(some.nodes, picked)
         np.testing.assert_allclose(some.displacement, answer.displacement[:, [5, 2, 11]], rtol=0.0, atol=1e-10)
-        np.testing.assert_array_equal(answer.at(picked).displacement, answer.displacement[:, [5, 2, 11]])
+        np.testing.assert_array_equal(answer.restrict(picked).displacement, answer.displacement[:, [5, 2, 11]])
         with pytest.raises(InputError, match=f"vertex {COUNT}"):
             deformer.deform(loads(), at=np.array([COUNT]))
 
@@ -277,7 +277,7 @@ def test_load_steps_rescue_what_newton_fails_on() -> None:
 def test_a_rescue_leaves_the_other_rows_alone() -> None:
     anatomy, asked = stubborn()
     effects = Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held()
-    value = asked.of(Prescribed)
+    value = asked.get(Prescribed)
     assert value is not None
     three = Loads((Prescribed(value.displacement * np.array([0.01, 1.0, 0.02])[:, None, None]),))
     body = Fem(anatomy, effects, Accuracy(1e-8, outer=8, limit_strain=False), "cpu", element="p1")
@@ -285,7 +285,7 @@ def test_a_rescue_leaves_the_other_rows_alone() -> None:
     assert found.outcome[0] is found.outcome[2] is Outcome.CONVERGED
     assert found.outcome[1] is Outcome.CONVERGED_IN_STEPS
     for row in range(3):
-        alone = body.deform(three.rows(np.array([row])))
+        alone = body.deform(three.select(np.array([row])))
         np.testing.assert_allclose(alone.displacement[0], found.displacement[row], atol=1e-8)
 
 

@@ -82,7 +82,7 @@ def test_last_press_is_kept_for_same_place_and_radius() -> None:
     nodes, triangles = sheet(300)
     skin = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
     for point, radius in ((POINT, RADIUS), (POINT, 0.5 * RADIUS), (-POINT, 0.5 * RADIUS), (POINT, RADIUS)):
-        found = skin.press(point[None], np.array([radius])).rows(len(nodes)).toarray()[0]
+        found = skin.press(point[None], np.array([radius])).to_matrix(len(nodes)).toarray()[0]
         np.testing.assert_allclose(found, weights(nodes, triangles, point, radius), atol=1e-15)
 
 
@@ -210,10 +210,10 @@ def test_the_nearest_point_is_found_in_any_chunk() -> None:
     assert len(triangles) > 8 * CHUNK
     above = nodes[triangles].mean(axis=1) + [0.0, 0.0, 1e-3]
     skin = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
-    found, distance = skin.nearest(above, np.full(len(above), 2e-3))
+    found, distance = skin.find_nearest(above, np.full(len(above), 2e-3))
     np.testing.assert_allclose(found, above * [1.0, 1.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(distance, 1e-3, rtol=1e-12)
-    assert np.isinf(skin.nearest(above, np.full(len(above), 0.9e-3))[1]).all()
+    assert np.isinf(skin.find_nearest(above, np.full(len(above), 0.9e-3))[1]).all()
 
 
 def test_finer_pieces_find_nearly_the_same_weights() -> None:
@@ -223,7 +223,7 @@ def test_finer_pieces_find_nearly_the_same_weights() -> None:
     coarse, fine = (
         ContactSurface(nodes, triangles, device, division=EdgeSubdivision(fineness=share))
         .press(point, radius)
-        .rows(len(nodes))
+        .to_matrix(len(nodes))
         for share in (0.12, 0.03)
     )
     assert 0.0 < np.abs((coarse - fine).toarray()).max() < 2e-3
@@ -235,7 +235,7 @@ def test_finer_pieces_find_nearly_the_same_weights() -> None:
 def test_the_centre_is_where_the_force_acts(mesh: tuple[np.ndarray, np.ndarray]) -> None:
     points, radii = np.array([POINT, [0.03, 0.0, 0.0]]), np.array([RADIUS, 0.007])
     pressed = ContactSurface(*mesh, find_device("cpu", "float64")).press(points, radii)
-    np.testing.assert_allclose(pressed.centres(), pressed.rows(len(mesh[0])) @ mesh[0], atol=1e-16)
+    np.testing.assert_allclose(pressed.compute_centres(), pressed.to_matrix(len(mesh[0])) @ mesh[0], atol=1e-16)
 
 
 def test_arrays_that_change_in_place_are_pressed_anew() -> None:
@@ -248,7 +248,7 @@ def test_arrays_that_change_in_place_are_pressed_anew() -> None:
     before = skin.press(points, radii)
     assert skin.press(points.copy(), radii) is before  # nothing is integrated twice
     points[0, 0] += 0.01
-    np.testing.assert_allclose(skin.press(points, radii).centres(), points, atol=2e-3 * RADIUS)
+    np.testing.assert_allclose(skin.press(points, radii).compute_centres(), points, atol=2e-3 * RADIUS)
 
 
 @pytest.mark.gpu
@@ -259,6 +259,6 @@ def test_a_graphics_card_gives_the_same_weights(mesh: tuple[np.ndarray, np.ndarr
     points = np.column_stack([rng.uniform(-0.03, 0.03, (200, 2)), rng.uniform(-3e-4, 3e-4, 200)])
     radii = rng.uniform(5e-4, 0.016, 200)
     here, there = (ContactSurface(*mesh, find_device(name, "float64")).press(points, radii) for name in ("cpu", "cuda"))
-    shares = (one.rows(len(mesh[0])).toarray() for one in (there, here))
+    shares = (one.to_matrix(len(mesh[0])).toarray() for one in (there, here))
     np.testing.assert_allclose(*shares, atol=1e-12)
-    np.testing.assert_allclose(there.centres(), here.centres(), atol=1e-14)
+    np.testing.assert_allclose(there.compute_centres(), here.compute_centres(), atol=1e-14)

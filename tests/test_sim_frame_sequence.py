@@ -14,7 +14,7 @@ from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads, push, stacked
+from sim.loads import Loads, push, stack
 from sim.minimisers.lbfgs import LEARNT
 from sim.strategy import frame_sequence
 from sim.strategy.captured_frame import FRAME_EVALUATIONS, CapturedFrame
@@ -102,7 +102,7 @@ def test_only_what_is_kept_leaves_the_device(fem, monkeypatch):
 def test_a_batch_between_frames_changes_nothing(fem):
     answers = ride(fem)
     other = ride(fem, 5)[-1]
-    fem.deform(stacked([pushed(x) for x in (0.0, 4e-3, 8e-3)]))
+    fem.deform(stack([pushed(x) for x in (0.0, 4e-3, 8e-3)]))
     assert same(fem.deform(pushed(7e-4 * 5), other), answers[-1])
 
 
@@ -110,7 +110,7 @@ def test_what_does_not_go_well_is_the_ladders(fem):
     last = ride(fem)[-1]
     with pytest.raises(InputError, match="does not touch the surface"):
         fem.deform(pushed(0.5), last)
-    lifted = fem.deform(pushed(4e-3, 0.0).scaled(np.zeros(1)), last)
+    lifted = fem.deform(pushed(4e-3, 0.0).scale(np.zeros(1)), last)
     assert not lifted.displacement.any() and not isinstance(lifted.warm, Kept)
     assert isinstance(fem.deform(pushed(4e-3), lifted).warm, Kept)
     vast = fem.deform(pushed(4e-3, 60.0), last)
@@ -130,7 +130,7 @@ def test_a_start_that_is_not_fit_is_the_ladders(fem):
 
 def test_a_start_may_name_its_vertices_in_any_order(fem):
     last = ride(fem)[-1]
-    turned = last.at(last.nodes[::-1].copy())
+    turned = last.restrict(last.nodes[::-1].copy())
     assert same(fem.deform(pushed(5e-3), last), fem.deform(pushed(5e-3), turned))
 
 

@@ -12,7 +12,7 @@ def test_on_a_sphere_they_are_arcs():
     radius = 0.06
     lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
     body = cut(build_whole(lattice), lambda points: np.linalg.norm(points, axis=1) - radius)
-    body = body.kept(body.inside)
+    body = body.select(body.inside)
     surface = find_single_faces(body.tets)
     source = radius * np.array([0.6, 0.0, 0.8])
     found = compute_geodesic_distances(body.nodes, surface, source, 0.08)

@@ -15,9 +15,21 @@ from sim.deformation import Deformation, guess
 from sim.effects import Elasticity, Held, Inertia, Resection, ToolForce
 from sim.errors import InputError
 from sim.fem import MIDDLES, Fem
-from sim.loads import Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Resected, Retracted, Touching, posture, push
+from sim.loads import (
+    Displaced,
+    Loads,
+    Nodal,
+    Posture,
+    Prescribed,
+    Pushed,
+    Resected,
+    Retracted,
+    Touching,
+    build_posture,
+    push,
+)
 from sim.minimisers.lbfgs import LEARNT
-from sim.resected_fem import finite_elements
+from sim.resected_fem import build_fem
 
 BODY = base_held(box((3, 3, 3), 0.1))
 EFFECTS = Elasticity(), Held(), ToolForce()
@@ -70,7 +82,7 @@ def test_arguments_of_push_and_posture_are_refused_by_name(wrong: str) -> None:
             push(**{"point": POINT, "force": FORCE, "footprint": 0.01, name: value})
     for name in ("direction", "csf_level"):
         with pytest.raises(InputError, match=rf"Posture\.{name} .*({reason}|shape)"):
-            posture(**{"direction": FORCE, "csf_level": 0.0, name: value})
+            build_posture(**{"direction": FORCE, "csf_level": 0.0, name: value})
 
 
 @pytest.mark.parametrize(
@@ -81,8 +93,8 @@ def test_arguments_of_push_and_posture_are_refused_by_name(wrong: str) -> None:
         (lambda: push(POINT, FORCE, np.full((1, 1), 0.01)), r"Pushed\.footprint has shape \(1, 1\)"),
         (lambda: push(POINT, FORCE, 7), r"a radius of 7 m: give positive radii in metres, .*7 mm are 0\.007"),
         (lambda: push(POINT, FORCE, 1e-12), r"a radius of 1e-12 m.* from 0\.0001 to 0\.1"),
-        (lambda: posture(np.ones((2, 3)), np.zeros(3)), "rows of direction 2, csf_level 3"),
-        (lambda: posture(np.array([1e-200, 0.0, 0.0]), 0.0), "row of zeros"),
+        (lambda: build_posture(np.ones((2, 3)), np.zeros(3)), "rows of direction 2, csf_level 3"),
+        (lambda: build_posture(np.array([1e-200, 0.0, 0.0]), 0.0), "row of zeros"),
         (lambda: Loads((5,)), r"int is no cause: choose from Pushed, "),  # pyright: ignore[reportArgumentType]
         (lambda: Loads(PUSH), r"Loads\.causes is Loads"),  # pyright: ignore[reportArgumentType]
         (lambda: Loads(PUSH.causes, "now"), r"Loads\.time has the type"),  # pyright: ignore[reportArgumentType]
@@ -102,7 +114,7 @@ def fem() -> Fem:
 
 @pytest.fixture(scope="module")
 def cut() -> Any:
-    return finite_elements(BODY, (*EFFECTS, Resection(((150, 151, 152),))), LIVE, "cpu")
+    return build_fem(BODY, (*EFFECTS, Resection(((150, 151, 152),))), LIVE, "cpu")
 
 
 VERTICES = [
@@ -126,10 +138,10 @@ def test_vertices_that_are_none(fem: Fem, cut: Any, at: Any, sentence: str) -> N
         with pytest.raises(InputError, match=sentence):
             body.deform(PUSH, at=at)
     with pytest.raises(InputError, match=sentence):
-        fem.reading(at, np.ones((1, 1, 3)))
+        fem.build_reading(at, np.ones((1, 1, 3)))
     answer = fem.deform(PUSH)
     with pytest.raises(InputError):
-        answer.at(at)
+        answer.restrict(at)
 
 
 @pytest.mark.parametrize("loads", [None, [PUSH], "push"])
@@ -146,14 +158,14 @@ def test_lists_of_vertices_will_do(fem: Fem, cut: Any) -> None:
         for at in some_lists:
             some = body.deform(PUSH, at=at)
             np.testing.assert_array_equal(some.displacement, whole.displacement[:, np.array(at, int)])
-            np.testing.assert_array_equal(whole.at(at).displacement, some.displacement)
+            np.testing.assert_array_equal(whole.restrict(at).displacement, some.displacement)
             assert some.displacement.shape == (1, len(at), 3)
         none: Any = []
-        assert body.deform(PUSH, at=none).displacement.shape == whole.at(none).displacement.shape == (1, 0, 3)
+        assert body.deform(PUSH, at=none).displacement.shape == whole.restrict(none).displacement.shape == (1, 0, 3)
     with pytest.raises(InputError, match="lacks vertex 3"):
-        fem.deform(PUSH, at=np.array([1])).at(np.array([3]))
+        fem.deform(PUSH, at=np.array([1])).restrict(np.array([3]))
     with pytest.raises(InputError, match="lacks vertex 3"):
-        fem.deform(PUSH, at=np.zeros(0, int)).at(np.array([3]))
+        fem.deform(PUSH, at=np.zeros(0, int)).restrict(np.array([3]))
 
 
 @pytest.mark.parametrize("batch", [0, -1, 1.5, True, "2", np.nan])
@@ -212,7 +224,7 @@ def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
             (good.displacement, "the start is a ndarray"),
             (guess(np.zeros((2, 64, 3))), r"shape \(2, 64, 3\): give every vertex of 1 load cases, \(1, 64, 3\)"),
             (guess(np.zeros((1, 8, 3))), r"shape \(1, 8, 3\)"),
-            (good.at(np.array([1, 2])), r"shape \(1, 2, 3\)"),
+            (good.restrict(np.array([1, 2])), r"shape \(1, 2, 3\)"),
             (replace(good, time=np.array([np.nan])), "the start's 'time' are no 1 rows of finite numbers"),
             (replace(good, time=np.zeros(3)), "the start's 'time'"),
             (spoilt(good, inertia=np.full((1, 64, 3), np.nan)), "the start's 'inertia'"),
@@ -233,12 +245,12 @@ def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_what_was_learnt_and_is_not_finite_is_forgotten(fem: Fem, value: float) -> None:
     first = fem.deform(PUSH)
-    start = fem.deform(PUSH.scaled(1.1), first)
+    start = fem.deform(PUSH.scale(1.1), first)
     assert start.warm["known"][0] > 0
     for name, rest in (("s", {"pushes", "before"}), ("before", {*LEARNT, "pushes"})):
-        found = fem.deform(PUSH.scaled(1.2), warmed(start, **{name: np.full_like(start.warm[name], value)}))
+        found = fem.deform(PUSH.scale(1.2), warmed(start, **{name: np.full_like(start.warm[name], value)}))
         left = {key: array for key, array in start.warm.items() if key in rest}
-        other = fem.deform(PUSH.scaled(1.2), replace(start, warm=left))
+        other = fem.deform(PUSH.scale(1.2), replace(start, warm=left))
         np.testing.assert_array_equal(found.displacement, other.displacement)
 
 
@@ -252,7 +264,7 @@ def test_mid_edge_nodes_of_another_body() -> None:
 
 def test_no_load_at_all_from_a_start_is_no_answer_at_all() -> None:
     body = Fem(BODY, (Elasticity(), Held(), ToolForce(), Inertia()), LIVE, "cpu", element="p1")
-    none = PUSH.rows(np.arange(0))
+    none = PUSH.select(np.arange(0))
     assert len(body.deform(none, guess(np.zeros((0, 64, 3))))) == 0
 
 

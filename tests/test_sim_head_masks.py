@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sim.bodies.head_masks import Sources, read_head_masks
-from sim.bodies.label_volume import build_masked_subject, volume_subject
+from sim.bodies.label_volume import build_masked_subject, build_volume_subject
 from sim.bodies.subject import MeshPlan, SubjectPart, make_anatomy
 from sim.bodies.volume import read_volume
 from sim.bodies.voxels import Voxels
@@ -101,7 +101,7 @@ def test_a_head_is_the_same_in_every_format(tmp_path, name, axes):
     affine, places = grid(AXES[axes])
     path = WRITERS[name](tmp_path / name, head(places), affine)
     named = ("Whole brain",), ("tumour",)
-    subject = volume_subject(path, *(named if name.endswith(".seg.nrrd") else ((1,), (3,))))
+    subject = build_volume_subject(path, *(named if name.endswith(".seg.nrrd") else ((1,), (3,))))
     assert subject.notes == ()
     within = head(places) > 0
     np.testing.assert_allclose(subject.cortex.min(axis=0), 1e-3 * places[within].min(axis=0), atol=1e-6)
@@ -201,11 +201,11 @@ def test_segments_are_called_by_their_names(tmp_path):
     affine, places = grid()
     path = seg_nrrd(tmp_path / "a.seg.nrrd", head(places), affine)
     with pytest.raises(InputError, match=r"has no label Tumor. Choose from Whole brain, Tumour\."):
-        volume_subject(path, ("Whole brain",), ("Tumor",))
+        build_volume_subject(path, ("Whole brain",), ("Tumor",))
     with pytest.raises(InputError, match="several segments have the label 1: name one of Tumour, Whole brain"):
-        volume_subject(path, (1,), ("Tumour",))
+        build_volume_subject(path, (1,), ("Tumour",))
     with pytest.raises(InputError, match="label Tumour is named by --brain and by --tumour"):
-        volume_subject(path, ("Whole brain", "tumour"), ("Tumour",))
+        build_volume_subject(path, ("Whole brain", "tumour"), ("Tumour",))
 
 
 def test_segments_of_one_name_need_numbers(tmp_path):
@@ -215,8 +215,8 @@ def test_segments_of_one_name_need_numbers(tmp_path):
     labels[(labels == 3) & (places[..., 0] > TUMOUR[0])] = 4
     path = nrrd(tmp_path / "a.seg.nrrd", labels, affine, more=named)
     with pytest.raises(InputError, match="several segments are called tumo\u00far: give its number, of 3, 4"):
-        volume_subject(path, ("Brain",), ("tumo\u00far",))  # composed or not, they are one name
-    assert volume_subject(path, ("Brain",), (3, 4)).notes == ()
+        build_volume_subject(path, ("Brain",), ("tumo\u00far",))  # composed or not, they are one name
+    assert build_volume_subject(path, ("Brain",), (3, 4)).notes == ()
 
 
 class TestSeveralFiles:

@@ -159,7 +159,7 @@ def test_tumour_is_drawn_in_mask_with_t1(masked, capsys):
     for one, border in ((own, 20.0), (large, 20.0 * factor)):
         across = np.arange(5.0, 40.0, 0.1)
         line = np.array([10.0 + across, *np.outer(one["opening"]["at_mm"][1:], np.ones(len(across)))]).T
-        grey = read_intensity(to_intensity_path(one["mesh"])).at(1e-3 * line)
+        grey = read_intensity(to_intensity_path(one["mesh"])).interpolate(1e-3 * line)
         assert np.ptp(grey) > 0.3 and across[np.searchsorted(grey, grey.mean())] == pytest.approx(border, abs=1.5)
 
 

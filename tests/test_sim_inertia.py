@@ -144,7 +144,7 @@ def test_energy_never_grows_under_loads_that_stay(step: float, poisson: float) -
 
     def total(answer: Deformation) -> float:
         velocity = answer.memory.get("inertia", np.zeros((1, 1, 3)))[0]
-        potential = still.energy(still.device.array(answer.displacement.reshape(-1, 1)))[0]
+        potential = still.energy(still.device.upload(answer.displacement.reshape(-1, 1)))[0]
         return float(potential + 0.5 * (mass[:, None] * velocity**2).sum())
 
     energies = [total(answer)]

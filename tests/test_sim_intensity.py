@@ -24,8 +24,8 @@ def places(index):
 
 def test_sampling_is_trilinear_in_metres_and_zero_outside():
     index = np.array([[3.25, 7.5, 11.75], [20.0, 30.0, 10.0], [38.9, 48.9, 28.9]])
-    np.testing.assert_allclose(ramp().at(places(index)), index @ [2.0, 1.0, 3.0] / 255.0, rtol=1e-6)
-    assert ramp().at(places([[-5.0, 0.0, 0.0]]))[0] == 0.0
+    np.testing.assert_allclose(ramp().interpolate(places(index)), index @ [2.0, 1.0, 3.0] / 255.0, rtol=1e-6)
+    assert ramp().interpolate(places([[-5.0, 0.0, 0.0]]))[0] == 0.0
 
 
 def brain():
@@ -36,7 +36,7 @@ def brain():
 
 def test_the_crop_keeps_the_place_and_fits_the_brain(tmp_path):
     points = places([[18.0, 22.0, 14.0], [22.0, 28.0, 16.0]])
-    crop = ramp().around(points, brain())
+    crop = ramp().crop(points, brain())
     assert crop.values.dtype == np.uint8 and np.prod(crop.values.shape) < 40 * 50 * 30
     path = to_intensity_path(tmp_path / "mesh.vtu")
     assert path.name == "mesh.t1.nii.gz"
@@ -45,9 +45,9 @@ def test_the_crop_keeps_the_place_and_fits_the_brain(tmp_path):
     np.testing.assert_array_equal(again.values, crop.values)
     np.testing.assert_allclose(again.affine, crop.affine, rtol=1e-6, atol=1e-9)
     # Grey levels go with the volume's own, and the brain's stay apart from black and from white.
-    after = again.at(points)
+    after = again.interpolate(points)
     assert 0.2 < after[0] < after[1] < 0.8
-    np.testing.assert_allclose(again.at(points.mean(axis=0)[None]), after.mean(), rtol=0.01)
+    np.testing.assert_allclose(again.interpolate(points.mean(axis=0)[None]), after.mean(), rtol=0.01)
     # Other programs read millimetres.
     np.testing.assert_allclose(nibabel.load(path).affine[:3], 1e3 * crop.affine[:3], rtol=1e-6, atol=1e-6)
     assert sorted(tmp_path.iterdir()) == [path]
@@ -56,7 +56,7 @@ def test_the_crop_keeps_the_place_and_fits_the_brain(tmp_path):
 def test_the_crop_reaches_15_mm_beyond_the_box_round_the_points():
     """Voxels of 1 mm: one point has 15 to each side, the two of a trilinear value, and no more; less at the border."""
     cube = Intensity(np.ones((60, 60, 60), np.float32), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
-    crop = cube.around(np.array([[0.0302, 0.0302, 0.0502]]), box((2, 2, 2), 0.059))
+    crop = cube.crop(np.array([[0.0302, 0.0302, 0.0502]]), box((2, 2, 2), 0.059))
     assert crop.values.shape == (32, 32, 25)
     np.testing.assert_allclose(crop.affine[:3, 3], [0.015, 0.015, 0.035], atol=1e-12)
 
@@ -91,9 +91,9 @@ def test_voxels_that_are_no_tissue_leave_the_others_as_they_are():
 
 def test_a_volume_elsewhere_or_without_numbers_is_refused(tmp_path):
     with pytest.raises(InputError, match="does not cover"):
-        ramp().around(places([[400.0, 0.0, 0.0]]), brain())
+        ramp().crop(places([[400.0, 0.0, 0.0]]), brain())
     with pytest.raises(InputError, match="no finite values in the brain"):
-        Intensity(np.full((40, 50, 30), np.nan), AFFINE).around(places([[20.0, 20.0, 10.0]]), brain())
+        Intensity(np.full((40, 50, 30), np.nan), AFFINE).crop(places([[20.0, 20.0, 10.0]]), brain())
     with pytest.raises(InputError, match="no such file"):
         read_intensity(tmp_path / "none.nii.gz")
     (tmp_path / "file").write_text("")

@@ -22,7 +22,7 @@ def core(points):
 def carved():
     lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
     body = cut(build_whole(lattice), ball)
-    body = body.kept(body.inside)
+    body = body.select(body.inside)
     return body, cut(body, core, pinned=body.surface)
 
 
@@ -58,7 +58,7 @@ def test_no_tetrahedron_crosses_the_interface(carved):
 def test_pinned_nodes_stay():
     lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
     body = cut(build_whole(lattice), ball)
-    body = body.kept(body.inside)
+    body = body.select(body.inside)
 
     def half(points):
         return points[:, 0] - 0.0013

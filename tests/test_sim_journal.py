@@ -43,9 +43,9 @@ def test_rows_of_a_run_are_read_but_for_one_that_a_kill_tore(tmp_path):
     assert run_of(path) == {"seed": "0"}
     path.write_bytes(path.read_bytes()[:-3])
     with open_journal(path, {"seed": "0"}) as journal:
-        assert journal.rows(Row) == ROWS[:2] and len(journal) == 2
+        assert journal.read_rows(Row) == ROWS[:2] and len(journal) == 2
         journal.append(ROWS[2])
-        assert journal.rows(Row) == ROWS
+        assert journal.read_rows(Row) == ROWS
     with pytest.raises(InputError, match="was begun with seed 0, but now seed is 1"), open_journal(path, {"seed": "1"}):
         pass
 

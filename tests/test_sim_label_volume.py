@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from scenes.cli import main
 from sim.anatomy import TUMOUR_LABEL
-from sim.bodies.label_volume import volume_subject
+from sim.bodies.label_volume import build_volume_subject
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.errors import InputError
 from sim.geometry.tetmesh import compute_dihedral_angles, compute_row_keys, find_single_faces
@@ -64,7 +64,7 @@ def labelled(path, axes, tumour=ball):
 @pytest.mark.parametrize("kind", AFFINES)
 def test_every_affine_gives_the_same_brain(tmp_path, kind):
     path, labels, affine = labelled(tmp_path / "labels.nii", AFFINES[kind])
-    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=3000))
+    anatomy = make_anatomy(build_volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=3000))
     mesh = anatomy.mesh
     assert abs(len(mesh.nodes) - 3000) <= 300
     assert compute_dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
@@ -91,7 +91,7 @@ def test_every_affine_gives_the_same_brain(tmp_path, kind):
 def test_the_skull_is_not_opened_from_below(tmp_path):
     low = MIDDLE - [0.0, 0.0, 0.024]
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], lambda points: ball(points, low))
-    subject = volume_subject(path, (1, 2), (3, 4))
+    subject = build_volume_subject(path, (1, 2), (3, 4))
     assert subject.site[2] >= low[2]
 
 
@@ -101,7 +101,7 @@ def test_the_skull_is_opened_over_cortex_that_can_be_reached(tmp_path):
     middle = MIDDLE + [0.012, 0.0, 0.012]
     fissure = (np.abs(places[..., 0] - MIDDLE[0] + 0.001) < 0.0025) & (places[..., 2] > MIDDLE[2])
     labels = np.where(ball(places, middle, 0.007), 3, ellipsoid(places) & ~fissure)
-    subject = volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3,))
+    subject = build_volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3,))
     nearest = subject.cortex[np.linalg.norm(subject.cortex - middle, axis=1).argmin()]
     assert np.linalg.norm((nearest - MIDDLE) / AXES) < 0.5 and not subject.notes
     assert np.linalg.norm((subject.site - MIDDLE) / AXES) > 0.85
@@ -120,7 +120,7 @@ def test_the_skull_is_opened_over_cortex_that_can_be_reached(tmp_path):
 def test_labels_that_cannot_be_used(tmp_path, brain, tumour, reason):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["thick slices"])
     with pytest.raises(InputError, match=reason):
-        volume_subject(path, brain, tumour)
+        build_volume_subject(path, brain, tumour)
 
 
 def test_unknown_labels_are_named_and_tumour_kept(tmp_path):
@@ -130,10 +130,10 @@ def test_unknown_labels_are_named_and_tumour_kept(tmp_path):
     labels[ball(places) | ball(places, MIDDLE - [0.018, 0.0, 0.014], 0.006)] = 3
     path = save(tmp_path / "l.nii", labels, affine)
     with pytest.raises(InputError, match=r"4\.\d+ of 5\.\d+ ml of the tumour lie outside the brain"):
-        volume_subject(path, (1,), (3,))
-    assert volume_subject(path, (1, 5), (3,)).notes == ()
+        build_volume_subject(path, (1,), (3,))
+    assert build_volume_subject(path, (1, 5), (3,)).notes == ()
     labels[ball(places, radius=0.004)] = 2
-    found = volume_subject(save(tmp_path / "l.nii", labels, affine), (1, 5), (3,))
+    found = build_volume_subject(save(tmp_path / "l.nii", labels, affine), (1, 5), (3,))
     assert found.notes[0] == "neither brain nor tumour: what is labelled 2" and "of holes" in found.notes[1]
 
 
@@ -146,7 +146,7 @@ def test_volumes_that_cannot_be_used(tmp_path):
         path = tmp_path / name
         nibabel.save(nibabel.Nifti1Image(values, used), path)
         with pytest.raises(InputError, match=reason):
-            volume_subject(path, (1,), (3,))
+            build_volume_subject(path, (1,), (3,))
 
     outside = labels.copy()
     outside[:3, :3, :3] = 3
@@ -185,7 +185,7 @@ def test_files_that_are_no_volumes(tmp_path):
         ("text.img", "unsupported file type; expected .nii"),
     ):
         with pytest.raises(InputError, match=reason) as caught:
-            volume_subject(tmp_path / name, (1,), (3,))
+            build_volume_subject(tmp_path / name, (1,), (3,))
         assert name in str(caught.value)
 
 
@@ -199,7 +199,7 @@ def test_forms_that_disagree_are_said_and_the_sform_is_taken(tmp_path, apart, sa
     image.set_qform(moved, 1)
     image.set_sform(affine, 1)
     nibabel.save(image, tmp_path / "l.nii")
-    subject = volume_subject(tmp_path / "l.nii", (1,), (3,))
+    subject = build_volume_subject(tmp_path / "l.nii", (1,), (3,))
     assert any("30 mm apart: the sform is taken" in note for note in subject.notes) == said
     assert np.linalg.norm(subject.interface.mean(axis=0) - TUMOUR) < 1e-3
 
@@ -210,16 +210,16 @@ def test_a_qform_without_rotation_does_not_spoil_a_good_sform(tmp_path):
     image.set_qform(affine, 1)
     image.header["quatern_b"] = 3.0
     nibabel.save(image, tmp_path / "l.nii")
-    assert volume_subject(tmp_path / "l.nii", (1,), (3,)).notes == ()
+    assert build_volume_subject(tmp_path / "l.nii", (1,), (3,)).notes == ()
 
 
 def test_a_brain_that_the_volume_cuts_is_said_to_be_cut(tmp_path):
     affine, places = grid(AFFINES["straight"])
     labels = np.where(ball(places), 3, ellipsoid(places))
-    whole = volume_subject(save(tmp_path / "whole.nii", labels, affine), (1,), (3,))
+    whole = build_volume_subject(save(tmp_path / "whole.nii", labels, affine), (1,), (3,))
     assert whole.notes == ()
     plane = labels.shape[2] // 2 + 18
-    cut = volume_subject(save(tmp_path / "cut.nii", labels[..., :plane], affine), (1,), (3,))
+    cut = build_volume_subject(save(tmp_path / "cut.nii", labels[..., :plane], affine), (1,), (3,))
     assert any(f"{(labels[..., plane - 1] > 0).sum()} voxels of the brain lie on" in note for note in cut.notes)
 
 
@@ -230,8 +230,8 @@ def test_a_file_in_other_units_holds_the_same_brain(tmp_path, unit, per_millimet
     image = nibabel.Nifti1Image(labels, np.diag([*[per_millimetre] * 3, 1.0]) @ affine)
     image.header.set_xyzt_units(unit)
     nibabel.save(image, tmp_path / "other.nii")
-    here = volume_subject(save(tmp_path / "mm.nii", labels, affine), (1,), (3,))
-    there = volume_subject(tmp_path / "other.nii", (1,), (3,))
+    here = build_volume_subject(save(tmp_path / "mm.nii", labels, affine), (1,), (3,))
+    there = build_volume_subject(tmp_path / "other.nii", (1,), (3,))
     assert there.tumour_volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.05)
     for name in ("site", "cortex", "interface", "tumour_volume"):
         np.testing.assert_allclose(getattr(there, name), getattr(here, name), rtol=1e-5, atol=1e-8)
@@ -248,9 +248,9 @@ def test_intensities_are_read_where_their_own_affine_says(tmp_path):
     grey[bright] = 100.0
     assert grey.shape != labels.shape
     nibabel.save(nibabel.Nifti1Image(grey, affine), tmp_path / "t1.nii")
-    subject = volume_subject(path, (1, 2), (3, 4), tmp_path / "t1.nii")
+    subject = build_volume_subject(path, (1, 2), (3, 4), tmp_path / "t1.nii")
     beside = places[bright] + 1e-3 * np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, -4.0, 0.0], [0.0, 0.0, 4.0]])
-    np.testing.assert_allclose(255.0 * subject.intensity.at(beside), [100.0, 20.0, 20.0, 20.0], rtol=1e-3)
+    np.testing.assert_allclose(255.0 * subject.intensity.interpolate(beside), [100.0, 20.0, 20.0, 20.0], rtol=1e-3)
 
 
 def with_plates(path, count):

@@ -43,27 +43,27 @@ def preconditioner(request: pytest.FixtureRequest, problem: Problem) -> Precondi
 def compute_right_hand_side(problem: Problem) -> np.ndarray:
     """Projected, one column much larger than the other."""
     r = FORCE.reshape(2, -1).T * [1.0, 1e-6]
-    array = problem.device.array(r)
+    array = problem.device.upload(r)
     problem.constraint.project(array)
     return array.numpy()
 
 
 def dense(problem: Problem, u: np.ndarray) -> np.ndarray:
     """Free curvature (n, n) at the first column of u, after linearising there."""
-    problem.linearise(problem.device.array(u), np.zeros(u.shape[1], bool))
+    problem.linearise(problem.device.upload(u), np.zeros(u.shape[1], bool))
     columns = []
     for row in FREE:
         p = np.zeros(u.shape)
         p[row] = 1.0
-        out = problem.device.zeros(*u.shape)
-        problem.add_curvature(problem.device.array(p), out)
+        out = problem.device.allocate(*u.shape)
+        problem.add_curvature(problem.device.upload(p), out)
         columns.append(out.numpy()[FREE, 0])
     return np.array(columns).T
 
 
 def solve(problem: Problem, preconditioner: Preconditioner, r: np.ndarray, tolerance: np.ndarray, most: int):
     preconditioner.prepare(problem, r.shape[1])
-    return solve_conjugate_gradients(problem, preconditioner, problem.device.array(r), tolerance, most)
+    return solve_conjugate_gradients(problem, preconditioner, problem.device.upload(r), tolerance, most)
 
 
 def test_solves_to_the_tolerance_column_by_column(problem: Problem, preconditioner: Preconditioner) -> None:
@@ -87,8 +87,8 @@ def test_needs_no_more_iterations_than_unknowns(problem: Problem, preconditioner
 
 def test_the_factor_inverts_the_rest_stiffness(problem: Problem) -> None:
     K, r = dense(problem, REST), compute_right_hand_side(problem)
-    out = problem.device.zeros(*r.shape)
-    build_rest_solver(problem).apply(problem.device.array(r), np.ones(2, bool), out)
+    out = problem.device.allocate(*r.shape)
+    build_rest_solver(problem).apply(problem.device.upload(r), np.ones(2, bool), out)
     np.testing.assert_allclose(out.numpy()[FREE], np.linalg.solve(K, r[FREE]), rtol=1e-9, atol=1e-18)
 
 
@@ -102,8 +102,8 @@ def test_negative_curvature_gives_a_descent_direction(problem: Problem, precondi
     assert ((x * r).sum(axis=0) > 0.0).all()
     # Steihaug: what was gathered lies where the model still curves upwards, or it is the first direction.
     curved = np.einsum("ic,ij,jc->c", x[FREE], K, x[FREE])
-    out = problem.device.zeros(*r.shape)
-    preconditioner.apply(problem.device.array(r), np.ones(2, bool), out)
+    out = problem.device.allocate(*r.shape)
+    preconditioner.apply(problem.device.upload(r), np.ones(2, bool), out)
     problem.constraint.project(out)
     first = np.abs(x - out.numpy()).max(axis=0) < 1e-12 * np.abs(x).max(axis=0)
     assert ((curved > 0.0) | first).all()
@@ -126,11 +126,11 @@ def test_nothing_to_solve_is_zero(problem: Problem, preconditioner: Precondition
 
 def downhill(problem: Problem, sign: np.ndarray) -> tuple[wp.array, Direction]:
     """At rest: minus the free gradient scaled to a motion of millimetres, times a sign per column."""
-    u = problem.device.zeros(ROWS, 2)
+    u = problem.device.allocate(ROWS, 2)
     g = problem.gradient(u)
     problem.constraint.project(g)
     d = -sign * g.numpy() * 1e-3 / np.abs(g.numpy()).max(axis=0)
-    return u, Direction(problem.device.array(d), np.abs((g.numpy() * d).sum(axis=0)), 0)
+    return u, Direction(problem.device.upload(d), np.abs((g.numpy() * d).sum(axis=0)), 0)
 
 
 def test_search_accepts_where_the_energy_falls(problem: Problem) -> None:
@@ -138,7 +138,7 @@ def test_search_accepts_where_the_energy_falls(problem: Problem) -> None:
     length = search(problem, u, direction)
     assert ((length > 0.0) & (length <= 1.0)).all()
     before = problem.energy(u)
-    moved = problem.device.array(length * direction.d.numpy())
+    moved = problem.device.upload(length * direction.d.numpy())
     assert (problem.energy(moved) < before).all()
 
 
@@ -167,8 +167,8 @@ def test_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -> None
         return np.sqrt(np.einsum("ic,ij,jc->c", x[FREE], rest, x[FREE]))
 
     def solution(at: np.ndarray, radius: np.ndarray | None):
-        problem.linearise(problem.device.array(at), np.zeros(2, bool))
-        return solve_conjugate_gradients(problem, solver, problem.device.array(r), tolerance, 400, radius)
+        problem.linearise(problem.device.upload(at), np.zeros(2, bool))
+        return solve_conjugate_gradients(problem, solver, problem.device.upload(r), tolerance, 400, radius)
 
     whole = solution(1e-2 * CRUSHED, None)
     np.testing.assert_allclose(whole.size, size(whole.x.numpy()), rtol=1e-9)
@@ -190,11 +190,11 @@ def test_search_lengthens_what_it_cut_too_much(problem: Problem) -> None:
     """Along a direction far too long it comes near the minimum, not to a tenth of a tenth of the way."""
     u, direction = downhill(problem, np.ones(2))
     far = 37.0 / search(problem, u, direction)
-    long = Direction(problem.device.array(far * direction.d.numpy()), far * direction.promised, 0)
+    long = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.promised, 0)
     length = search(problem, u, long)
 
     def slope(t: np.ndarray) -> np.ndarray:
-        g = problem.gradient(problem.device.array(t * long.d.numpy()))
+        g = problem.gradient(problem.device.upload(t * long.d.numpy()))
         problem.constraint.project(g)
         return (g.numpy() * long.d.numpy()).sum(axis=0)
 
@@ -206,5 +206,5 @@ def test_a_step_of_nothing_is_none(problem: Problem) -> None:
     u, direction = downhill(problem, np.ones(2))
     length = search(problem, u, direction)
     far = 1e10 * length
-    endless = Direction(problem.device.array(far * direction.d.numpy()), far * direction.promised, 0)
+    endless = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.promised, 0)
     assert not search(problem, u, endless).any()

@@ -12,7 +12,7 @@ from sim.accuracy import TRAIN
 from sim.effects import Elasticity, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads, Nodal, Prescribed, Pushed, push, stacked
+from sim.loads import Loads, Nodal, Prescribed, Pushed, push, stack
 
 COUNT = 27
 FORCE = np.array([[0.0, 0.0, -0.05], [0.02, -0.03, -0.3], [0.1, 0.0, -0.6], [0.0, 0.1, 0.2], [0.0, 0.0, -0.9]])
@@ -57,15 +57,15 @@ def test_a_whole_field_of_another_mesh_is_refused() -> None:
 
 def test_time_alone_is_a_load() -> None:
     later = Loads((), np.array([0.1, 0.2]))
-    both = stacked([later, later.rows(np.array([1])).scaled(0.5)])
+    both = stack([later, later.select(np.array([1])).scale(0.5)])
     np.testing.assert_array_equal(both.times, [0.1, 0.2, 0.2])
     body = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), NodalForce()], TRAIN, "cpu", element="p1")
     np.testing.assert_array_equal(body.deform(both).displacement, 0.0)
 
 
 def test_scaling_and_rows() -> None:
-    half = LOADS.scaled(0.5).of(Pushed)
-    each = LOADS.scaled(np.arange(5.0)).rows(np.array([3])).of(Pushed)
+    half = LOADS.scale(0.5).get(Pushed)
+    each = LOADS.scale(np.arange(5.0)).select(np.array([3])).get(Pushed)
     assert half is not None
     assert each is not None
     np.testing.assert_array_equal(half.force, 0.5 * FORCE)

@@ -55,7 +55,7 @@ def test_older_files_that_do_not_say_all_are_refused(tmp_path, system, row, reas
 
 
 def test_a_curve_is_smooth_through_its_points(tmp_path):
-    smooth = read_markup(markup(tmp_path / "c.mrk.json", curve(), "ClosedCurve")).curve()
+    smooth = read_markup(markup(tmp_path / "c.mrk.json", curve(), "ClosedCurve")).fit_curve()
     np.testing.assert_allclose(1e3 * np.linalg.norm(smooth, axis=1), RADIUS, atol=0.15)
     np.testing.assert_allclose((1e3 * smooth[:, 1] / 30.0) ** 2 + (1e3 * smooth[:, 0] / 18.0) ** 2, 1.0, atol=0.04)
 

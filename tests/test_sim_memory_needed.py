@@ -38,18 +38,18 @@ def test_gpu_memory_is_tables_inverse_and_loads() -> None:
 
 def test_gpu_overflow_is_rejected_with_fitting_batch() -> None:
     free = 2 * FIXED
-    fits = compute_needed(SPACE, CARD, 0, None, 10**6, free).demand()
+    fits = compute_needed(SPACE, CARD, 0, None, 10**6, free).check_fits()
     assert fits.peak <= 0.9 * free and fits.batch > 100
     assert f"{fits.batch} loads together: about" in str(fits) and "of cuda:0, 2 GiB free" in str(fits)
     with pytest.raises(InputError, match=r"343 nodes .smoothed., 9999 loads together: .*: a --batch") as refusal:
-        compute_needed(SPACE, CARD, 0, 9999, 9999, free).demand()
+        compute_needed(SPACE, CARD, 0, 9999, 9999, free).check_fits()
     found = re.search(r"--batch of (\d+) fits", str(refusal.value))
     assert found
-    compute_needed(SPACE, CARD, 0, int(found[1]), 9999, free).demand()
+    compute_needed(SPACE, CARD, 0, int(found[1]), 9999, free).check_fits()
     with pytest.raises(InputError, match="--batch"):
-        compute_needed(SPACE, CARD, 0, int(found[1]) + 1, 9999, free).demand()
+        compute_needed(SPACE, CARD, 0, int(found[1]) + 1, 9999, free).check_fits()
     with pytest.raises(InputError, match=r"one load at a time.* free: take a coarser mesh, or a larger machine"):
-        compute_needed(SPACE, CARD, 50_000, 1, 1, free).demand()
+        compute_needed(SPACE, CARD, 50_000, 1, 1, free).check_fits()
 
 
 def test_the_processor_is_asked_batch_by_batch() -> None:

@@ -51,12 +51,12 @@ def built(
 
 def matrices(problem: Problem, preconditioner: Preconditioner) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness and preconditioner (n, n) over the free motions, scaled to ones on the stiffness's diagonal."""
-    basis = problem.constraint.basis()
+    basis = problem.constraint.build_basis()
     K = (basis.T @ problem.rest_curvature() @ basis).toarray()
-    problem.linearise(problem.device.zeros(problem.rows, basis.shape[1]), np.zeros(basis.shape[1], bool))
+    problem.linearise(problem.device.allocate(problem.rows, basis.shape[1]), np.zeros(basis.shape[1], bool))
     preconditioner.prepare(problem, basis.shape[1])
-    out = problem.device.zeros(problem.rows, basis.shape[1])
-    preconditioner.apply(problem.device.array(basis.toarray()), np.ones(basis.shape[1], bool), out)
+    out = problem.device.allocate(problem.rows, basis.shape[1])
+    preconditioner.apply(problem.device.upload(basis.toarray()), np.ones(basis.shape[1], bool), out)
     scale = np.sqrt(np.diag(K))
     return K / np.outer(scale, scale), basis.T @ out.numpy() * np.outer(scale, scale)
 
@@ -89,7 +89,7 @@ def test_refining_changes_little(kind: str) -> None:
 def test_an_average_resists_less_than_what_is_averaged() -> None:
     """Linear tetrahedra are the coarse solver of smoothed ones: their stiffness is at least as large."""
     (smoothed, _), (linear, _) = (built(kind, 0.49, (2, 2, 3)) for kind in ("smoothed", "p1"))
-    basis = linear.constraint.basis()
+    basis = linear.constraint.build_basis()
     gap = (basis.T @ (linear.rest_curvature() - smoothed.rest_curvature()) @ basis).toarray()
     values = np.linalg.eigvalsh(gap)
     assert values.min() > -1e-10 * values.max()
@@ -102,13 +102,13 @@ def test_columns_that_are_done_change_nothing(kind: str) -> None:
     answers = {}
     for precision in ("float64", "float32"):
         problem, preconditioner = built(kind, 0.45, (2, 2, 3), precision)
-        free = problem.constraint.basis()
+        free = problem.constraint.build_basis()
         r = free @ np.random.default_rng(0).normal(size=(free.shape[1], 3))
-        live, out = np.array([True, False, True]), problem.device.zeros(problem.rows, 3)
-        preconditioner.apply(problem.device.array(r), live, out)
+        live, out = np.array([True, False, True]), problem.device.allocate(problem.rows, 3)
+        preconditioner.apply(problem.device.upload(r), live, out)
         for column in np.flatnonzero(live):
-            alone = problem.device.zeros(problem.rows, 1)
-            preconditioner.apply(problem.device.array(r[:, [column]]), np.ones(1, bool), alone)
+            alone = problem.device.allocate(problem.rows, 1)
+            preconditioner.apply(problem.device.upload(r[:, [column]]), np.ones(1, bool), alone)
             expected = alone.numpy()[:, 0]
             np.testing.assert_allclose(out.numpy()[:, column], expected, atol=1e-5 * np.abs(expected).max())
         answers[precision] = out.numpy()[:, live]

@@ -13,12 +13,12 @@ from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.effects import Elasticity, Resection, pushed_effects
+from sim.effects import Elasticity, Resection, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Resected, push
 from sim.material import BRAIN
-from sim.resected_fem import OperatedFem, finite_elements
+from sim.resected_fem import OperatedFem, build_fem
 
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=300.0)
 
@@ -41,8 +41,8 @@ def hollow(small_box):
 
 def pushed(anatomy, tissue):
     """How the tumour's vertices (n, 3) [m] move under a push on the open cortex."""
-    place = open_cortex(anatomy).nearest(np.zeros(3))
-    fem = Fem(anatomy, pushed_effects(anatomy, tissue), element="p1")
+    place = open_cortex(anatomy).find_nearest(np.zeros(3))
+    fem = Fem(anatomy, build_push_effects(anatomy, tissue), element="p1")
     return fem.deform(push(place.point, 0.1 * place.inward, footprint=7e-3), at=anatomy.tumour_nodes).displacement[0]
 
 
@@ -100,7 +100,9 @@ class TestLabels:
         assert part.volume == pytest.approx(masks.parts["necrosis"].sum() * (1e-3 * EDGE) ** 3)
         anatomy = make_anatomy(subject, MeshPlan(nodes=2500))
         whole = make_anatomy(replace(subject, parts=()), MeshPlan(nodes=2500))
-        assert anatomy.mesh.volumes[anatomy.mesh.within(NECROSIS_LABEL)].sum() == pytest.approx(part.volume, rel=0.03)
+        assert anatomy.mesh.volumes[anatomy.mesh.mark_elements(NECROSIS_LABEL)].sum() == pytest.approx(
+            part.volume, rel=0.03
+        )
         assert set(np.unique(whole.mesh.region)) == {1, 2} and anatomy.digest != whole.digest
         write_anatomy(tmp_path / "a.vtu", anatomy)
         for name in ("in_tumour", "tumour_nodes", "tumour_surface"):
@@ -127,7 +129,7 @@ def test_its_stiffness_is_its_own_or_the_tumours(small_box, hollow):
 
 def test_a_law_of_a_region_that_is_not_there_is_refused(small_box):
     with pytest.raises(InputError, match=r"a law is given for region 5 \(necrosis\), but the mesh has the regions"):
-        Fem(small_box, pushed_effects(small_box, Elasticity(BRAIN, {NECROSIS_LABEL: SOFT})))
+        Fem(small_box, build_push_effects(small_box, Elasticity(BRAIN, {NECROSIS_LABEL: SOFT})))
 
 
 def test_what_is_left_of_a_tumour_keeps_its_law(small_box):
@@ -136,12 +138,12 @@ def test_what_is_left_of_a_tumour_keeps_its_law(small_box):
     right = mesh.nodes[mesh.tets].mean(axis=1)[:, 0] > 0.0
     halved = replace(mesh, region=np.where(small_box.in_tumour & right, NECROSIS_LABEL, mesh.region))
     cut = Resection((tuple(np.flatnonzero(halved.within(TUMOUR_LABEL)).tolist()),))
-    effects = (*pushed_effects(small_box, Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})), cut)
-    operated = finite_elements(replace(small_box, mesh=halved), effects, element="p1")
+    effects = (*build_push_effects(small_box, Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})), cut)
+    operated = build_fem(replace(small_box, mesh=halved), effects, element="p1")
     assert isinstance(operated, OperatedFem)
-    left = operated.remains(1).anatomy
+    left = operated.get_remains(1).anatomy
     assert set(left.mesh.region.tolist()) == {1, NECROSIS_LABEL}
-    place = open_cortex(small_box).nearest(np.zeros(3))
+    place = open_cortex(small_box).find_nearest(np.zeros(3))
     loads = push(place.point, 0.1 * place.inward, footprint=7e-3)
     cut_open = replace(loads, causes=(*loads.causes, Resected(np.array([1]))))
     after = operated.deform(cut_open, at=left.tumour_nodes).displacement[0]

@@ -60,7 +60,7 @@ def cases_of(total: np.ndarray = TOTAL, time: float = 0.7) -> Cases:
 
 def select_rows(cases: Cases, index: np.ndarray) -> Cases:
     memory = {name: value[index] for name, value in cases.memory.items()}
-    return Cases(cases.loads.rows(index), cases.start_time[index], memory)
+    return Cases(cases.loads.select(index), cases.start_time[index], memory)
 
 
 def solve(problem: Problem, cases: Cases, accuracy: Accuracy = TIGHT, start: np.ndarray | None = None) -> Found:
@@ -102,7 +102,7 @@ def test_rows_do_not_depend_on_their_order(problem: Problem, batch: Found) -> No
 def test_history_arrives_in_its_rows(problem: Problem, batch: Found, device: Device) -> None:
     cases = cases_of()
     problem.begin(cases)
-    memory = problem.end(device.array(batch.u))
+    memory = problem.end(device.upload(batch.u))
     assert list(memory) == ["spring"]
     before, u = cases.memory["spring"], batch.u.T.reshape(len(TOTAL), COUNT, 3)
     np.testing.assert_allclose(memory["spring"], before + (1.0 - np.exp(-0.7)) * (u - before), atol=1e-14)
@@ -157,7 +157,7 @@ def test_energy_decreases_with_every_step(problem: Problem, device: Device) -> N
     cases, path = cases_of(), [np.zeros((ROWS, len(TOTAL)))]
     path += [solve(problem, cases, Accuracy(tolerance=1e-10, outer=outer)).u for outer in range(1, 12)]
     problem.begin(cases)
-    energies = np.array([problem.energy(device.array(u)) for u in path])
+    energies = np.array([problem.energy(device.upload(u)) for u in path])
     assert np.isfinite(energies).all()
     change = np.diff(energies, axis=0)
     assert (change <= 1e-12 * np.abs(energies).max()).all()
@@ -222,11 +222,11 @@ def test_negative_curvature_is_met_and_left(device: Device) -> None:
     problem.begin(Cases(loads, np.zeros(1)))
 
     def least(u: np.ndarray) -> float:
-        problem.linearise(device.array(u), np.zeros(1, bool))
+        problem.linearise(device.upload(u), np.zeros(1, bool))
         free = np.flatnonzero(~fem.anatomy.held.ravel())
         K = np.zeros((len(free), len(free)))
         for column, row in enumerate(free):
-            p, out = device.array(np.eye(problem.rows)[:, [row]]), device.zeros(problem.rows, 1)
+            p, out = device.upload(np.eye(problem.rows)[:, [row]]), device.allocate(problem.rows, 1)
             problem.add_curvature(p, out)
             K[:, column] = out.numpy()[free, 0]
         return float(np.linalg.eigvalsh(K)[0])
@@ -269,7 +269,7 @@ class Scaled:
         self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
     ) -> Direction:
         found = self.plain.find(problem, u, g, gap, forcing, taken)
-        return replace(found, d=problem.device.array(self.times(taken) * found.d.numpy()))
+        return replace(found, d=problem.device.upload(self.times(taken) * found.d.numpy()))
 
 
 def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, batch: Found) -> None:

@@ -41,14 +41,14 @@ def begun(problem: Problem, loads: Loads = LOADS) -> Problem:
 
 def walk(problem: Problem, descent: Descent, steps: int) -> list[tuple[np.ndarray, np.ndarray, Direction]]:
     """(u, g, direction) of the first steps of all columns from rest."""
-    u, taken, path = problem.device.zeros(ROWS, len(TOTAL)), np.ones(len(TOTAL)), []
+    u, taken, path = problem.device.allocate(ROWS, len(TOTAL)), np.ones(len(TOTAL)), []
     descent.begin()
     for _ in range(steps):
         g, _, _ = problem.residual(u)
         found = descent.find(problem, u, g, None, np.full(len(TOTAL), 1e-9), taken)
         path.append((u.numpy().copy(), g.numpy().copy(), found))
         taken = search(problem, u, found)
-        u = problem.device.array(u.numpy() + taken * found.d.numpy())
+        u = problem.device.upload(u.numpy() + taken * found.d.numpy())
     return path
 
 
@@ -66,8 +66,8 @@ def test_memory_leaves_with_its_columns(device: Device) -> None:
     problem = begun(read_problem(device))
     whole = descent_of(problem)
     path = walk(problem, whole, 4)
-    alone = begun(read_problem(device), LOADS.rows(rows))
-    u, taken = device.zeros(ROWS, 3), np.ones(3)
+    alone = begun(read_problem(device), LOADS.select(rows))
+    u, taken = device.allocate(ROWS, 3), np.ones(3)
     apart = descent_of(alone)
     apart.begin()
     for step in range(4):
@@ -77,7 +77,7 @@ def test_memory_leaves_with_its_columns(device: Device) -> None:
             found.d.numpy(), path[step][2].d.numpy()[:, rows], atol=1e-8 * np.abs(found.d.numpy()).max()
         )
         taken = search(alone, u, found)
-        u = device.array(u.numpy() + taken * found.d.numpy())
+        u = device.upload(u.numpy() + taken * found.d.numpy())
     whole.keep(device, rows)
     problem.keep(rows)
     g, _, _ = problem.residual(u)
@@ -93,10 +93,10 @@ def test_a_gap_is_closed_by_the_first_whole_step(device: Device) -> None:
     value = np.where(top[:, None], [1e-3, 0.0, -2e-3], 0.0)
     problem = compile_problem([Elasticity(), Held()], anatomy, device)
     problem.begin(Cases(Loads((Prescribed(value[None]),)), np.zeros(1)))
-    one = find_equilibrium(problem, descent_of(problem), device.zeros(ROWS, 1), Accuracy(tolerance=1e-9, outer=1))
+    one = find_equilibrium(problem, descent_of(problem), device.allocate(ROWS, 1), Accuracy(tolerance=1e-9, outer=1))
     np.testing.assert_allclose(one.u.numpy().reshape(-1, 3)[top], value[top], atol=1e-15)
     problem.begin(Cases(Loads((Prescribed(value[None]),)), np.zeros(1)))
-    done = find_equilibrium(problem, descent_of(problem), device.zeros(ROWS, 1), Accuracy(tolerance=1e-9))
+    done = find_equilibrium(problem, descent_of(problem), device.allocate(ROWS, 1), Accuracy(tolerance=1e-9))
     assert done.outcome[0].good
 
 
@@ -108,7 +108,7 @@ def test_newtons_radius_follows_the_steps(device: Device) -> None:
     def size(d: np.ndarray) -> np.ndarray:
         return np.sqrt((d * (K @ d)).sum(axis=0))
 
-    descent, u = NewtonCG(build_rest_solver(problem), 400), device.zeros(ROWS, 5)
+    descent, u = NewtonCG(build_rest_solver(problem), 400), device.allocate(ROWS, 5)
     g, _, _ = problem.residual(u)
     first = descent.find(problem, u, g, None, np.full(5, 1e-9), np.ones(5)).d.numpy()
     second = descent.find(problem, u, g, None, np.full(5, 1e-9), np.full(5, 0.1)).d.numpy()

@@ -14,7 +14,7 @@ from test_sim_label_volume import AFFINES, ball, ellipsoid, grid
 
 from sim.bodies.head_masks import Sources, read_head_masks
 from sim.bodies.label_map import read_labels
-from sim.bodies.label_volume import build_masked_subject, volume_subject
+from sim.bodies.label_volume import build_masked_subject, build_volume_subject
 from sim.bodies.voxels import Voxels
 from sim.errors import InputError
 
@@ -25,7 +25,7 @@ def test_volume_without_orientation_needs_axes(tmp_path):
     path = tmp_path / "l.nii"
     nibabel.save(nibabel.Nifti1Image(labels, None), path)
     with pytest.raises(InputError, match=r"neither sform nor qform, so its left side is unknown.* --axes RAS"):
-        volume_subject(path, (1,), (3,))
+        build_volume_subject(path, (1,), (3,))
     with pytest.raises(InputError, match="axes 'RAR' are no directions"):
         read_labels(path, Voxels(axes="RAR"))
     where = {}
@@ -45,7 +45,7 @@ def test_forms_that_swap_sides_say_left_and_right(tmp_path, signs, swapped):
     image.set_qform(np.diag([*signs, 1.0]) @ affine, 1)
     image.set_sform(affine, 1)
     nibabel.save(image, tmp_path / "l.nii")
-    note = volume_subject(tmp_path / "l.nii", (1,), (3,)).notes[0]
+    note = build_volume_subject(tmp_path / "l.nii", (1,), (3,)).notes[0]
     assert ("left and right are swapped in one of them" in note) == swapped
     assert "sform is taken" in note.lower()
 

@@ -67,7 +67,7 @@ def test_a_place_is_where_it_was_asked_for(template):
         assert way @ cortex.right == pytest.approx(right, abs=1.5) and way @ cortex.up == pytest.approx(up, abs=1.5)
         assert np.linalg.norm(place.inward) == pytest.approx(1.0)
         assert place.inward @ cortex.axis > 0.7  # into the brain
-        assert np.allclose(place.carried(template.mesh.nodes), place.point, atol=1e-15)
+        assert np.allclose(place.locate(template.mesh.nodes), place.point, atol=1e-15)
         assert np.isin(place.vertices, template.open_surface).all()
 
 

@@ -120,7 +120,7 @@ class TestMeshes:
             os.truncate(tmp_path / name, 60 * 10**9)  # of which the disk holds nothing
             with pytest.raises(InputError, match=r"size is 60 GB: at most 4\.29 GB are allowed\. Mesh coarser"):
                 read_mesh(tmp_path / name)
-        assert MeshBytes().of(10) == 2**28 and MeshBytes().of(2**23) == 100 * 2**23
+        assert MeshBytes().limit_bytes(10) == 2**28 and MeshBytes().limit_bytes(2**23) == 100 * 2**23
 
     @pytest.mark.parametrize("packing", ["zlib", "lzma"])
     def test_a_bomb_is_refused_before_it_is_inflated(self, tmp_path: Path, packing: str) -> None:

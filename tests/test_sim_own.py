@@ -120,7 +120,7 @@ class TestEffect:
         loads = Loads((*PRESS.causes, Pull(np.array([1.0, 2.0]))))
         answer(Elasticity(), Pulled((5,)), loads=loads)
         assert seen[0].tolist() == [1.0, 2.0] and remember((Pulled((5,)),)) and not remember((VEINS.Veins((5,)),))
-        assert loads.scaled(0.5).of(Pull).share.tolist() == [0.5, 1.0]
+        assert loads.scale(0.5).get(Pull).share.tolist() == [0.5, 1.0]
         with pytest.raises(InputError, match=r"loads hold Pull, which no effect uses: add the effect that it is for"):
             answer(Elasticity(), loads=loads)
 
@@ -162,11 +162,11 @@ class TestTwoTools:
         fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu", live=True, element="p1")
         last = None
         for size in (0.4, 0.7, 1.0):
-            last = fem.deform(Loads(TOOLS).scaled(size).rows(slice(0, 1)), start=last)
+            last = fem.deform(Loads(TOOLS).scale(size).select(slice(0, 1)), start=last)
             assert last.outcome[0].good
-        alone = fem.deform(Loads(TOOLS).rows(slice(0, 1)))
+        alone = fem.deform(Loads(TOOLS).select(slice(0, 1)))
         assert np.abs(last.displacement - alone.displacement).max() < 1e-3 * np.abs(alone.displacement).max()
-        one = fem.deform(Loads(TOOLS[:1]).rows(slice(0, 1)), start=last)
+        one = fem.deform(Loads(TOOLS[:1]).select(slice(0, 1)), start=last)
         assert one.outcome[0].good
 
     def test_each_tool_has_its_reaction(self):
@@ -178,8 +178,8 @@ class TestTwoTools:
 
     def test_who_takes_one_says_so(self):
         loads = Loads(TOOLS)
-        assert loads.every(Pushed) == loads.causes and loads.only(Pushed) is None
+        assert loads.get_all(Pushed) == loads.causes and loads.get_only(Pushed) is None
         with pytest.raises(InputError, match=r"2 causes Pushed, but one is supported"):
-            loads.of(Pushed)
+            loads.get(Pushed)
         with pytest.raises(InputError, match=r"each kind but Pushed once"):
             Loads((Nodal(np.zeros((1, 3, 3))), Nodal(np.zeros((1, 3, 3)))))

@@ -63,7 +63,7 @@ def mean_stress(mesh: TetMesh, element: str, material: Tissue, gradient: np.ndar
     """Volume mean of P (3, 3) [Pa] under an affine motion, by the virtual work of the elements' own nodal forces."""
     space, device = discretise(mesh, element), find_device("cpu", "float64")
     problem = compile_problem([Elasticity(material), Held()], base_held(mesh), device, space)
-    u = device.array((space.nodes @ gradient.T).reshape(-1, 1))
+    u = device.upload((space.nodes @ gradient.T).reshape(-1, 1))
     return problem.gradient(u).numpy().reshape(-1, 3).T @ space.nodes / mesh.volumes.sum()
 
 

@@ -51,8 +51,8 @@ def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accura
 )
 def test_the_table(more, one, few, many):
     plan = planned(**more)
-    assert [plan.steps(count) for count in (1, 2, WORTH)] == [one, few, many]
-    assert plan.steps(WORTH, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
+    assert [plan.list_steps(count) for count in (1, 2, WORTH)] == [one, few, many]
+    assert plan.list_steps(WORTH, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
 
 
 def test_contact_is_solved_apart_for_one_tool_kind_only():
@@ -72,7 +72,7 @@ def test_contact_is_solved_apart_for_one_tool_kind_only():
 )
 def test_what_is_avoided_is_not_tried(avoid, steps):
     plan = planned(live=True, element="smoothed", avoid=(avoid,))
-    assert {count: plan.steps(count) for count in steps} == steps
+    assert {count: plan.list_steps(count) for count in steps} == steps
     assert planned(**POSED, avoid=(SolverStep.CONTACT,)).contact is SolverStep.NEWTON
     assert planned(element="p2", avoid=(SolverStep.CLAMPED,)).single is None
 
@@ -156,7 +156,7 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     monkeypatch.setattr(strategy, "find_equilibrium", newton)
     answer = fem.deform(loads_of(np.tile(TOTAL[1], (count, 1))))
     assert all(outcome.good for outcome in answer.outcome)
-    assert tuple(tried) == fem.plan.steps(count)
+    assert tuple(tried) == fem.plan.list_steps(count)
 
 
 @pytest.mark.parametrize(

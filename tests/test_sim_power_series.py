@@ -65,14 +65,14 @@ def test_a_linear_body_has_one_order_only(box):
 def test_linear_solution_is_same_without_inverse():
     """What a series is made of: by a factor, and by conjugate gradients where none pays."""
     problem, preconditioner = built("smoothed", 0.45, (2, 2, 3))
-    free = problem.constraint.basis()
+    free = problem.constraint.build_basis()
     force = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 3))
     direct, iterated = (RestStiffnessSolver(problem, preconditioner, 400, largest_factor=most) for most in (10**6, 0))
     assert direct.exact is not None and iterated.exact is None
-    one, other = (resting.answer(problem.device.array(force)).numpy() for resting in (direct, iterated))
+    one, other = (resting.solve(problem.device.upload(force)).numpy() for resting in (direct, iterated))
     np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(one).max())
     with pytest.raises(InputError, match="did not reach 1e-09 in 1 iterations"):
-        replace(iterated, inner=1).answer(problem.device.array(force))
+        replace(iterated, inner=1).solve(problem.device.upload(force))
 
 
 def test_no_load_has_a_series_of_nothing(box):
@@ -124,9 +124,9 @@ def test_directions_tell_every_form(sizes, order):
 def test_columns_are_mixed_alike_by_warp_and_by_numpy():
     device = find_device("cpu", "float64")
     random = np.random.default_rng(0)
-    x, weight = device.array(random.normal(size=(7, 12))), random.normal(size=(3, 5))
-    by_warp = device.zeros(7, 20)
-    device.launch(build_mixing_kernel(device), (7, 4), [x, device.array(weight)], [by_warp])
+    x, weight = device.upload(random.normal(size=(7, 12))), random.normal(size=(3, 5))
+    by_warp = device.allocate(7, 20)
+    device.launch(build_mixing_kernel(device), (7, 4), [x, device.upload(weight)], [by_warp])
     wanted = np.einsum("rgt,tj->rgj", x.numpy().reshape(7, 4, 3), weight).reshape(7, 20)
     assert np.allclose(by_warp.numpy(), wanted) and np.allclose(mix_columns(device, x, weight).numpy(), wanted)
 
@@ -150,7 +150,7 @@ def test_what_is_read_and_how_many_at_a_time_do_not_matter(box):
     nodes, modes = box.tumour_nodes, np.random.default_rng(0).normal(size=(4, len(box.tumour_nodes), 3))
     wanted = np.einsum("tgnk,rnk->gtr", series(whole, pushes(1.0), 3, nodes), modes)
     for fem in (whole, some):
-        found = fem.series(pushes(1.0), 3, fem.reading(nodes, modes))
+        found = fem.compute_series(pushes(1.0), 3, fem.build_reading(nodes, modes))
         assert np.allclose(found, wanted, atol=1e-6 * np.abs(wanted).max(axis=(0, 2))[None, :, None])
 
 
@@ -161,16 +161,16 @@ def test_what_has_no_series_is_refused(box):
     with pytest.raises(InputError, match="not `Displaced`"):
         series(fem, Loads((Displaced(POINT, 0.01 * FORCE, RADIUS),)), 3, box.tumour_nodes)
     with pytest.raises(InputError, match="no vertex 99999"):
-        fem.reading(np.array([99999]), np.ones((1, 1, 3)))
+        fem.build_reading(np.array([99999]), np.ones((1, 1, 3)))
     with pytest.raises(InputError, match="2 loads cannot be grouped by 3"):
         series(fem, pushes(1.0), 3, box.tumour_nodes, 3)
 
 
 def test_what_does_not_fit_into_memory_is_refused(box, monkeypatch):
     fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
-    reading = fem.reading(box.tumour_nodes, np.ones((1, len(box.tumour_nodes), 3)))
+    reading = fem.build_reading(box.tumour_nodes, np.ones((1, len(box.tumour_nodes), 3)))
     monkeypatch.setattr("sim.runtime.memory.measure_host_bytes", lambda budget: 2_000_000)
     with pytest.raises(InputError, match="free"):
-        fem.series(pushes(1.0), 3, reading)
+        fem.compute_series(pushes(1.0), 3, reading)
     with pytest.raises(InputError, match="free"):
-        fem.reading(box.tumour_nodes, np.ones((50, len(box.tumour_nodes), 3)))
+        fem.build_reading(box.tumour_nodes, np.ones((50, len(box.tumour_nodes), 3)))

@@ -117,7 +117,7 @@ def test_a_cause_that_does_not_act_is_not_launched(launches: list[str]) -> None:
     fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], TIGHT, "cpu", element="p1")
     launches.clear()
     fem.problem.begin(Cases(Loads((Nodal(top_forces(MESH, np.array([[0.1, 0.0, 0.0]]))),)), np.zeros(1)))
-    fem.problem.gradient(fem.problem.device.zeros(fem.problem.rows, 1))
+    fem.problem.gradient(fem.problem.device.allocate(fem.problem.rows, 1))
     assert len([name for name in launches if "subtract" in name]) == 1
     assert not [name for name in launches if "press" in name or "spread" in name]
 
@@ -149,14 +149,14 @@ def test_the_potential_is_the_sum_of_its_terms(device: Device) -> None:
     problem.begin(Cases(Loads((Nodal(top_forces(MESH, np.array([[0.1, 0.0, 0.2], [0.0, 0.0, -0.1]]))),)), np.zeros(2)))
     parts, total = [], np.zeros((ROWS, 2))
     for term in problem.terms:
-        out, gradient = wp.zeros(2, dtype=wp.float64, device="cpu"), device.zeros(ROWS, 2)
-        term.energy(device.array(u), out)
-        term.add_gradient(device.array(u), gradient)
+        out, gradient = wp.zeros(2, dtype=wp.float64, device="cpu"), device.allocate(ROWS, 2)
+        term.energy(device.upload(u), out)
+        term.add_gradient(device.upload(u), gradient)
         parts.append(out.numpy())
         total += gradient.numpy()
     assert all(part.all() for part in parts)
-    np.testing.assert_allclose(problem.energy(device.array(u)), np.sum(parts, axis=0), rtol=1e-13)
-    np.testing.assert_allclose(problem.gradient(device.array(u)).numpy(), total, atol=1e-13)
+    np.testing.assert_allclose(problem.energy(device.upload(u)), np.sum(parts, axis=0), rtol=1e-13)
+    np.testing.assert_allclose(problem.gradient(device.upload(u)).numpy(), total, atol=1e-13)
     X = MESH.nodes[MESH.tets]
     rest = np.swapaxes(X[:, 1:] - X[:, :1], 1, 2)
     for column in range(2):

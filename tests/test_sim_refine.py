@@ -7,9 +7,9 @@ import pytest
 from boxes import box as block
 from boxes import hold
 
-from sim.bodies.refine import refined
+from sim.bodies.refine import refine
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
+from sim.bodies.template import Tumour, build_template_subject
 from sim.errors import InputError
 from sim.geometry.surface import compute_areas, compute_edge_lengths
 from sim.geometry.tetmesh import TetMesh, compute_row_keys
@@ -18,7 +18,7 @@ from sim.geometry.tetmesh import TetMesh, compute_row_keys
 def test_the_body_stays_and_every_edge_is_halved():
     mesh = block((2, 2, 3), 0.1, distortion=0.2)
     mesh = TetMesh(mesh.nodes, mesh.tets, np.arange(len(mesh.tets)) % 3)
-    fine = refined(hold(mesh, mesh.nodes[:, 2] < 1e-9)).mesh
+    fine = refine(hold(mesh, mesh.nodes[:, 2] < 1e-9)).mesh
     assert len(fine.tets) == 8 * len(mesh.tets)
     np.testing.assert_array_equal(fine.nodes[: len(mesh.nodes)], mesh.nodes)
     assert (fine.volumes > 0.0).all()
@@ -32,7 +32,7 @@ def test_the_body_stays_and_every_edge_is_halved():
 
 
 def test_what_holds_the_body_holds_it_still(box):
-    fine = refined(box)
+    fine = refine(box)
     assert fine.held[: len(box.mesh.nodes)].tolist() == box.held.tolist()
     # Of the finer surface, what lies inside the opening's triangles is open and the rest is held.
     assert len(fine.open_surface) == 4 * len(box.open_surface)
@@ -47,7 +47,7 @@ def test_what_holds_the_body_holds_it_still(box):
 
 
 def test_refinement_near_opening_halves_only_those_cells(box):
-    fine = refined(box, near_opening=True)
+    fine = refine(box, near_opening=True)
     mesh, count = fine.mesh, len(box.mesh.nodes)
     np.testing.assert_array_equal(mesh.nodes[:count], box.mesh.nodes)
     assert (mesh.volumes > 0.0).all() and np.isin(np.arange(len(mesh.nodes)), mesh.tets).all()
@@ -65,25 +65,25 @@ def test_refinement_near_opening_halves_only_those_cells(box):
     opened = box.mesh.nodes[np.unique(box.open_surface)]
     far = np.linalg.norm(mesh.nodes[count:, None] - opened, axis=2).min(axis=1).max()
     assert far < 2.5 * compute_edge_lengths(box.mesh.nodes[box.open_surface]).mean()
-    assert 0 < len(mesh.nodes) - count < 0.5 * (len(refined(box).mesh.nodes) - count)
+    assert 0 < len(mesh.nodes) - count < 0.5 * (len(refine(box).mesh.nodes) - count)
 
 
 def test_fine_opening_of_a_mesh_plan_is_refined():
-    subject = template_subject(Tumour())
+    subject = build_template_subject(Tumour())
     plain, fine = (make_anatomy(subject, MeshPlan(2000, fine_opening=each)) for each in (False, True))
     assert len(fine.open_surface) == 4 * len(plain.open_surface) and fine.digest != plain.digest
 
 
 def test_fixed_or_sliding_surface_is_not_open(box):
     everywhere = np.isin(np.arange(len(box.mesh.nodes)), box.mesh.surface)
-    fine = refined(replace(box, craniotomy=everywhere))
+    fine = refine(replace(box, craniotomy=everywhere))
     assert fine.craniotomy.any() and not fine.held[fine.craniotomy].any()
 
 
 def test_a_quadratic_mesh_is_refused():
     mesh = TetMesh(np.vstack([np.zeros(3), np.eye(3), _middles()]), [[0, 1, 2, 3]], [0], [[4, 5, 6, 7, 8, 9]])
     with pytest.raises(InputError, match="linear one"):
-        refined(hold(mesh, np.ones(10, bool)))
+        refine(hold(mesh, np.ones(10, bool)))
 
 
 def _middles():

@@ -19,9 +19,9 @@ from sim.elements import ELEMENTS
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
-from sim.loads import Loads, Nodal, Posture, Resected, Touching, posture, push
+from sim.loads import Loads, Nodal, Posture, Resected, Touching, build_posture, push
 from sim.material import Material
-from sim.resected_fem import OperatedFem, finite_elements
+from sim.resected_fem import OperatedFem, build_fem
 from sim.runtime.device import find_device
 from sim.tools import Ball
 
@@ -36,7 +36,7 @@ def compact(anatomy: Anatomy) -> tuple[Anatomy, np.ndarray]:
 
 
 def solver(steps: Resection = STEPS, element: str | None = "p1", **values: object) -> OperatedFem:
-    made = finite_elements(BODY, (*EFFECTS, steps), TIGHT, "cpu", element=element, **values)  # type: ignore
+    made = build_fem(BODY, (*EFFECTS, steps), TIGHT, "cpu", element=element, **values)  # type: ignore
     assert isinstance(made, OperatedFem)
     return made
 
@@ -49,13 +49,11 @@ def operated() -> OperatedFem:
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_what_is_left_answers_as_the_body_meshed_without_it(element: str) -> None:
     made = solver(element=element)
-    loads = Loads((*lying([2, 1]).causes, *push([0.005, 0.05, 0.06], [0.0, 0.02, -0.1], 0.012).rows([0, 0]).causes))
+    loads = Loads((*lying([2, 1]).causes, *push([0.005, 0.05, 0.06], [0.0, 0.02, -0.1], 0.012).select([0, 0]).causes))
     answer = made.deform(loads)
     for row, done in enumerate((2, 1)):
-        body, used = compact(made.remains(done).anatomy)
-        alone = Fem(body, EFFECTS, TIGHT, "cpu", element=element).deform(
-            loads.without_kind(Resected).rows(np.array([row]))
-        )
+        body, used = compact(made.get_remains(done).anatomy)
+        alone = Fem(body, EFFECTS, TIGHT, "cpu", element=element).deform(loads.drop(Resected).select(np.array([row])))
         assert alone.outcome[0].good and answer.outcome[row].good
         size = np.abs(alone.displacement).max()
         assert size > 1e-4
@@ -67,11 +65,11 @@ def test_what_is_left_answers_as_the_body_meshed_without_it(element: str) -> Non
 def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
     curved = quadratic(box((2, 2, 2), 0.04, distortion=0.1), curved=0.05)
     body, effects = base_held(curved), EFFECTS[:3]
-    made = finite_elements(body, (*effects, Resection((within((1, 1, 1), (2, 2, 2), curved),))), TIGHT, "cpu")
+    made = build_fem(body, (*effects, Resection((within((1, 1, 1), (2, 2, 2), curved),))), TIGHT, "cpu")
     assert isinstance(made, OperatedFem)
-    left, used = compact(made.remains(1).anatomy)
-    alone = Fem(left, effects, TIGHT, "cpu").deform(posture(DOWN, -1.0))
-    answer = made.deform(posture(DOWN, -1.0))
+    left, used = compact(made.get_remains(1).anatomy)
+    alone = Fem(left, effects, TIGHT, "cpu").deform(build_posture(DOWN, -1.0))
+    answer = made.deform(build_posture(DOWN, -1.0))
     assert 0 < len(used) < len(curved.nodes)
     np.testing.assert_allclose(
         answer.displacement[0, used], alone.displacement[0], atol=1e-9 * np.abs(alone.displacement).max()
@@ -79,13 +77,13 @@ def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
 
 
 def test_without_a_cause_all_steps_are_done(operated: OperatedFem) -> None:
-    silent = operated.deform(posture(DOWN, -1.0))
+    silent = operated.deform(build_posture(DOWN, -1.0))
     said = operated.deform(lying([2]))
     np.testing.assert_array_equal(silent.displacement, said.displacement)
 
 
 def test_no_step_is_the_whole_body(operated: OperatedFem) -> None:
-    plain = Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(posture(DOWN, -1.0))
+    plain = Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(build_posture(DOWN, -1.0))
     np.testing.assert_array_equal(operated.deform(lying([0])).displacement, plain.displacement)
 
 
@@ -105,11 +103,11 @@ def test_without_weight_nothing_moves(operated: OperatedFem) -> None:
 
 def test_a_wall_is_free(operated: OperatedFem) -> None:
     """Forces on the cavity's own wall are answered: it is no longer inside."""
-    wall = np.setdiff1d(np.unique(operated.remains(2).anatomy.mesh.surface), np.unique(MESH.surface))
+    wall = np.setdiff1d(np.unique(operated.get_remains(2).anatomy.mesh.surface), np.unique(MESH.surface))
     force = np.zeros((1, len(MESH.nodes), 3))
     force[0, wall, 2] = -0.01
     effects = (Elasticity(SOFT), Held(), NodalForce(), STEPS)
-    answer = finite_elements(BODY, effects, TIGHT, "cpu", element="p1").deform(Loads((Nodal(force),)))
+    answer = build_fem(BODY, effects, TIGHT, "cpu", element="p1").deform(Loads((Nodal(force),)))
     assert len(wall) and (answer.displacement[0, wall, 2] < 0.0).all()
 
 
@@ -151,11 +149,11 @@ class TestAcrossCuts:
     def test_velocities_go_on(self, element: str) -> None:
         """Those of mid-edge nodes too: a hundredth of a step later nothing has moved elsewhere than it was moving."""
         effects = (*EFFECTS[:3], Inertia(), STEPS)
-        made = finite_elements(BODY, effects, Accuracy(tolerance=1e-9), "cpu", element=element)
+        made = build_fem(BODY, effects, Accuracy(tolerance=1e-9), "cpu", element=element)
         first = made.deform(replace(lying([0]), time=np.array([0.01])))
         second = made.deform(replace(lying([1]), time=np.array([0.0101])), first)
         still = made.deform(replace(lying([1]), time=np.array([0.0101])), replace(first, memory={}))
-        stays = ~made.remains(1).anatomy.orphaned  # type: ignore
+        stays = ~made.get_remains(1).anatomy.orphaned  # type: ignore
         one, other, dead = (answer.displacement[0, stays] for answer in (first, second, still))
         flown = 1e-4 * np.linalg.norm(first.memory["inertia"][0, : len(MESH.nodes)][stays], axis=1)
         moved = np.linalg.norm(other - one, axis=1)
@@ -217,15 +215,15 @@ class TestHardCases:
         body = replace(hold(MESH, MESH.nodes[:, 2] < 1e-9, normal), craniotomy=opened)
         cut = Resection((within((0, 0, 0), (1, 1, 4)),))
         effects = (Elasticity(SOFT), Held(), Slide(), Gravity(direction=(0.0, 0.0, -1.0)))
-        made = finite_elements(body, (*effects, cut), TIGHT, "cpu", element="p1")
+        made = build_fem(body, (*effects, cut), TIGHT, "cpu", element="p1")
         assert isinstance(made, OperatedFem)
-        left = made.remains(1).anatomy
+        left = made.get_remains(1).anatomy
         gone = left.orphaned
         assert (gone & BODY.held[:, 0]).any() and (gone & normal.any(axis=1)).any() and (gone & opened).any()
         assert left.held[gone].all() and not left.slide_normal[gone].any() and not left.craniotomy[gone].any()
         compacted, used = compact(left)
-        alone = Fem(compacted, effects, TIGHT, "cpu", element="p1").deform(posture(DOWN, 0.03))
-        answer = made.deform(posture(DOWN, 0.03))
+        alone = Fem(compacted, effects, TIGHT, "cpu", element="p1").deform(build_posture(DOWN, 0.03))
+        answer = made.deform(build_posture(DOWN, 0.03))
         np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-12)
 
     def test_a_tissue_that_is_taken_altogether_needs_no_law(self) -> None:
@@ -233,7 +231,7 @@ class TestHardCases:
         region[list(TOP)] = 2
         body = base_held(replace(MESH, region=region))
         effects = (Elasticity(SOFT, {2: Material("linear", 9000.0, 0.3)}), *EFFECTS[1:])
-        answer = finite_elements(body, (*effects, Resection((TOP,))), TIGHT, "cpu", element="p1").deform(lying([1]))
+        answer = build_fem(body, (*effects, Resection((TOP,))), TIGHT, "cpu", element="p1").deform(lying([1]))
         np.testing.assert_allclose(answer.displacement, solver(Resection((TOP,))).deform(lying([1])).displacement)
 
     @pytest.mark.parametrize(
@@ -267,7 +265,7 @@ class TestHardCases:
         """One held edge: the piece turns about it."""
         floor = (MESH.nodes[:, 2] < 1e-9) & (MESH.nodes[:, 0] > 0.06 - 1e-9)
         edge = replace(BODY, held=np.repeat(((MESH.nodes[:, 2] > 0.06 - 1e-9) | floor)[:, None], 3, axis=1))
-        made = finite_elements(edge, (*EFFECTS, Resection((self.MIDDLE_LAYER,))), TIGHT, "cpu", element="p1")
+        made = build_fem(edge, (*EFFECTS, Resection((self.MIDDLE_LAYER,))), TIGHT, "cpu", element="p1")
         with pytest.raises(InputError, match="can move rigidly in 1 of 6 ways"):
             made.deform(lying([1]))
 
@@ -286,17 +284,17 @@ class TestHardCases:
         with pytest.raises(InputError, match=r"sim\.finite_elements"):
             compile_problem((*EFFECTS, STEPS), BODY, find_device("cpu", "float64"))
         with pytest.raises(InputError, match="asked for 2 times"):
-            finite_elements(BODY, (*EFFECTS, STEPS, STEPS))
+            build_fem(BODY, (*EFFECTS, STEPS, STEPS))
         with pytest.raises(InputError, match="Resected, which no effect uses: add the effect Resection"):
             Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(lying([1]))
 
     def test_without_a_resection_it_is_the_plain_solver(self) -> None:
-        assert isinstance(finite_elements(BODY, EFFECTS, TIGHT, "cpu"), Fem)
+        assert isinstance(build_fem(BODY, EFFECTS, TIGHT, "cpu"), Fem)
 
 
 def test_half_a_load_is_of_the_same_body() -> None:
-    half = lying([1]).scaled(0.5)
-    assert half.of(Resected).done.tolist() == [1.0] and half.of(Posture).share.tolist() == [0.5]  # type: ignore
+    half = lying([1]).scale(0.5)
+    assert half.get(Resected).done.tolist() == [1.0] and half.get(Posture).share.tolist() == [0.5]  # type: ignore
 
 
 def test_bone_that_only_bars_the_way_keeps_nothing_on() -> None:
@@ -306,8 +304,8 @@ def test_bone_that_only_bars_the_way_keeps_nothing_on() -> None:
     effects = (Elasticity(SOFT), Held(), SkullContact(), Gravity(direction=(0.0, 0.0, -1.0)))
     left = list_remaining_bodies(body, (*effects, cut))[1].anatomy
     assert left.slide_normal.any() and left.orphaned.any()
-    aside = posture(np.array([1.0, 0.0, -0.2]), -1.0)
-    answer = finite_elements(body, (*effects, cut), TIGHT, "cpu", element="p1").deform(aside)
+    aside = build_posture(np.array([1.0, 0.0, -0.2]), -1.0)
+    answer = build_fem(body, (*effects, cut), TIGHT, "cpu", element="p1").deform(aside)
     compacted, used = compact(left)
     alone = Fem(compacted, effects, TIGHT, "cpu", element="p1").deform(aside)
     np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-9)
@@ -324,24 +322,22 @@ def test_what_nobody_asks_to_be_held_is_free() -> None:
     body = hold(MESH, MESH.nodes[:, 2] < 1e-9, normal)
     sliding = (Elasticity(SOFT), Slide(), Gravity(direction=(0.0, 0.0, -1.0)))
     corner = Resection((within((2, 2, 2), (3, 3, 4)),))
-    answer = finite_elements(body, (*sliding, corner), TIGHT, "cpu", element="p1").deform(lying([1]))
+    answer = build_fem(body, (*sliding, corner), TIGHT, "cpu", element="p1").deform(lying([1]))
     bare, used = compact(compute_remains(hold(MESH, np.zeros(len(MESH.nodes), bool), normal), corner)[1].anatomy)
     assert len(used) == len(MESH.nodes) - 1
-    alone = Fem(bare, sliding, TIGHT, "cpu", element="p1").deform(posture(DOWN, -1.0))
+    alone = Fem(bare, sliding, TIGHT, "cpu", element="p1").deform(build_posture(DOWN, -1.0))
     np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-12)
     with pytest.raises(InputError, match="can move rigidly in 6 of 6 ways"):
-        finite_elements(body, (Elasticity(SOFT), Resection((NEXT,))), TIGHT, "cpu").deform(
-            lying([0]).without_kind(Posture)
-        )
+        build_fem(body, (Elasticity(SOFT), Resection((NEXT,))), TIGHT, "cpu").deform(lying([0]).drop(Posture))
 
 
 def test_no_cases_have_no_answers() -> None:
-    fem = finite_elements(BODY, (*EFFECTS, Inertia(), STEPS), TIGHT, "cpu")
+    fem = build_fem(BODY, (*EFFECTS, Inertia(), STEPS), TIGHT, "cpu")
     assert fem.deform(lying([])).displacement.shape == (0, len(MESH.nodes), 3)
 
 
 def test_a_tool_stays_where_it_is_when_tissue_is_taken() -> None:
-    fem = finite_elements(BODY, (*EFFECTS[:2], ToolContact((Ball(0.01),)), STEPS), TIGHT, "cpu")
+    fem = build_fem(BODY, (*EFFECTS[:2], ToolContact((Ball(0.01),)), STEPS), TIGHT, "cpu")
     pose = np.eye(4)
     pose[:3, 3] = [0.01, 0.03, 0.057]
     standing = Touching(pose[None, None])

@@ -16,7 +16,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Prescribed, Resected
 from sim.material import Material
-from sim.resected_fem import finite_elements
+from sim.resected_fem import build_fem
 
 RELAXING = Material("neo-hookean", 3000.0, 0.4, prony=((0.5, 0.2), (0.2, 5.0)))
 
@@ -24,7 +24,7 @@ RELAXING = Material("neo-hookean", 3000.0, 0.4, prony=((0.5, 0.2), (0.2, 5.0)))
 @pytest.mark.parametrize("element", ["p1", "p2"])
 def test_batches_of_unequal_steps_keep_their_own_history(element: str) -> None:
     """What elements went through is kept case by case: another body's beside it, or another's cut, takes none away."""
-    fem = finite_elements(BODY, (*EFFECTS[1:], Elasticity(RELAXING), Inertia(), STEPS), TIGHT, "cpu", element=element)
+    fem = build_fem(BODY, (*EFFECTS[1:], Elasticity(RELAXING), Inertia(), STEPS), TIGHT, "cpu", element=element)
     frames = [(0, 1), (1, 1), (1, 2)]
 
     def at(frame: int, rows: list[int]) -> Loads:
@@ -55,7 +55,7 @@ class TestMemory:
         height = mesh.nodes[:, 2]
         held = np.column_stack([np.ones((len(height), 2), bool), (height < 1e-9) | (np.abs(height - 0.02) < 1e-9)])
         effects = (Elasticity(RELAXING, regions), Held(), self.FAR)
-        made = finite_elements(hold(mesh, held), effects, TIGHT, "cpu", element=element)
+        made = build_fem(hold(mesh, held), effects, TIGHT, "cpu", element=element)
         lifted = np.where(height[:, None] > 0.019, [0.0, 0.0, 2e-3], 0.0)[None]
         found, last = [], None
         for frame, time in enumerate(self.TIMES):
@@ -101,7 +101,7 @@ class TestMemory:
         found = []
         for tissue in (RELAXING, longer):
             effects = (Elasticity(RELAXING, {2: tissue}), Held(), Gravity(direction=(0.0, 0.0, -1.0)), STEPS)
-            made, last = finite_elements(body, effects, TIGHT, "cpu"), None
+            made, last = build_fem(body, effects, TIGHT, "cpu"), None
             for frame, done in enumerate(([0, 0], [0, 1], [1, 0], [1, 1])):
                 last = made.deform(replace(lying(done), time=np.full(2, 0.1 * (frame + 1))), last)
             assert last is not None and all(outcome.good for outcome in last.outcome)
@@ -113,19 +113,19 @@ class TestMemory:
         effects = (Elasticity(RELAXING), Held(), Gravity(direction=(0.0, 0.0, -1.0)), Inertia())
         plain, made = (
             Fem(BODY, effects, TIGHT, "cpu", element="p1"),
-            finite_elements(BODY, (*effects, STEPS), TIGHT, "cpu", element="p1"),
+            build_fem(BODY, (*effects, STEPS), TIGHT, "cpu", element="p1"),
         )
         one = other = None
         for time in (0.01, 0.02, 0.05):
             loads = replace(lying([0]), time=np.array([time]))
-            one, other = plain.deform(loads.without_kind(Resected), one), made.deform(loads, other)
+            one, other = plain.deform(loads.drop(Resected), one), made.deform(loads, other)
             np.testing.assert_array_equal(one.displacement, other.displacement)
             assert {"inertia", "viscoelasticity neo-hookean"} <= set(one.memory) == set(other.memory) - {"resection"}
             for name, value in one.memory.items():
                 np.testing.assert_array_equal(value, other.memory[name])
 
     def test_a_history_of_another_body_is_a_sentence(self) -> None:
-        made = finite_elements(BODY, (Elasticity(RELAXING), Held(), STEPS), TIGHT, "cpu", element="p1")
+        made = build_fem(BODY, (Elasticity(RELAXING), Held(), STEPS), TIGHT, "cpu", element="p1")
         strange = replace(
             guess(np.zeros((1, len(MESH.nodes), 3))), memory={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}
         )

@@ -5,11 +5,11 @@ import pytest
 from conftest import make_box
 
 from sim.accuracy import REFERENCE
-from sim.effects import NodalForce, pushed_effects
+from sim.effects import NodalForce, build_push_effects
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.material import MATERIALS, Material
-from sim.minimisers.second_order import second_order
+from sim.minimisers.second_order import compute_second_order
 
 
 @pytest.fixture(scope="module")
@@ -31,18 +31,18 @@ def test_tissue_that_stiffens(tiny_box):
 
 def check(box, tissue, element):
     """Forces on four nodes at once, of which all pairs are wanted, and of which some are."""
-    fem = Fem(box, (*pushed_effects(box, tissue), NodalForce()), REFERENCE, "cpu", element=element)
+    fem = Fem(box, (*build_push_effects(box, tissue), NodalForce()), REFERENCE, "cpu", element=element)
     nodes, asked = np.unique(box.open_surface)[[0, 2, 3, 7]], box.tumour_nodes[:5]
     random = np.random.default_rng(3)
     force = random.normal(size=(6, 4, 3)) * 1e-2
     field = np.zeros((6, len(box.mesh.nodes), 3))
     field[:, nodes] = force
-    reading = fem.reading(asked, np.eye(3 * len(asked)).reshape(-1, len(asked), 3))
-    wanted = fem.series(Loads((Nodal(field),)), 2, reading)[:, 1]
-    units = fem.reading(nodes, np.eye(12).reshape(-1, 4, 3))
+    reading = fem.build_reading(asked, np.eye(3 * len(asked)).reshape(-1, len(asked), 3))
+    wanted = fem.compute_series(Loads((Nodal(field),)), 2, reading)[:, 1]
+    units = fem.build_reading(nodes, np.eye(12).reshape(-1, 4, 3))
     near = np.ones((4, 4), bool)
     heard = []
-    pairs, table = second_order(
+    pairs, table = compute_second_order(
         fem.problem, units.answers, reading.answers, near, lambda done, total: heard.append((done, total))
     )
     assert len(pairs) == 12 * 13 // 2 and (pairs[:, 0] <= pairs[:, 1]).all() and heard[-1][0] == heard[-1][1]
@@ -50,7 +50,7 @@ def check(box, tissue, element):
     found = (flat[:, pairs[:, 0]] * flat[:, pairs[:, 1]]) @ table
     assert np.linalg.norm(found - wanted) < 2e-4 * np.linalg.norm(wanted)
     near[0, 3] = near[3, 0] = False
-    fewer, part = second_order(fem.problem, units.answers, reading.answers, near)
+    fewer, part = compute_second_order(fem.problem, units.answers, reading.answers, near)
     kept = ~((pairs[:, 0] // 3 == 0) & (pairs[:, 1] // 3 == 3))
     np.testing.assert_array_equal(fewer, pairs[kept])
     np.testing.assert_allclose(part, table[kept], rtol=1e-4, atol=1e-5 * np.abs(table).max())

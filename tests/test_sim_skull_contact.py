@@ -41,8 +41,8 @@ def body(element: str, *effects: Effect) -> Fem:
 def bears(fem: Fem, loads: Loads, found: Deformation) -> np.ndarray:
     """Force (N, 3) [N] of the skull on every node."""
     device = fem.problem.device
-    out = device.zeros(fem.problem.rows, 1)
-    fem.problem.barriers[0].add_gradient(device.array(fem.guess(loads, found)), out)
+    out = device.allocate(fem.problem.rows, 1)
+    fem.problem.barriers[0].add_gradient(device.upload(fem.guess(loads, found)), out)
     return -out.numpy().reshape(-1, 3)
 
 
@@ -92,7 +92,7 @@ def test_brain_that_starts_at_rest_may_come_far() -> None:
     skull, rest = body("p1", SkullContact(GAP)).problem.barriers[0], np.zeros((1, len(MESH.nodes), 3))
 
     def far(displacement: np.ndarray | None, anew: np.ndarray | None = None) -> float:
-        return float(skull.gaps(Cases(lifted(1.0), np.zeros(1), displacement=displacement, anew=anew))[0])
+        return float(skull.count_gaps(Cases(lifted(1.0), np.zeros(1), displacement=displacement, anew=anew))[0])
 
     assert far(None) == far(rest) == far(rest + 1e-4, np.ones(1, bool)) > 10.0 * far(rest + 1e-4)
 
@@ -135,8 +135,8 @@ def test_a_body_that_turns_slides_along_a_round_skull() -> None:
             1000.0,
             device,
         )
-        out = device.zeros(3, 1)
-        skull.add_gradient(device.array(at[:, None]), out)
+        out = device.allocate(3, 1)
+        skull.add_gradient(device.upload(at[:, None]), out)
         return out.numpy()[:, 0]
 
     before, after = force(round_wall, 3e-5 * n), force(round_wall, u)

@@ -11,7 +11,7 @@ from sim.anatomy import Anatomy
 from sim.diagnostics.skull_leak import Leak, integrate_surface_normals
 from sim.discretisation.element import build_quadratic_elements
 from sim.discretisation.space import discretise
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.fem import MIDDLES, Fem
 from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 from sim.geometry.tetmesh import TetMesh, orient_tetrahedra
@@ -62,7 +62,7 @@ def egg():
 
 
 def pressed(anatomy, element):
-    fem = Fem(anatomy, pushed_effects(anatomy, BRAIN, "slide"), TRAIN, "cpu", element=element)
+    fem = Fem(anatomy, build_push_effects(anatomy, BRAIN, "slide"), TRAIN, "cpu", element=element)
     top = anatomy.mesh.nodes[anatomy.mesh.nodes[:, 2].argmax()]
     return fem.deform(push(top, np.array([0.05, 0.0, -0.15]), 8e-3))
 
@@ -98,7 +98,7 @@ def test_leak_shrinks_with_the_size_it_is_averaged_over(egg, element):
         assert swept[egg.slide_normal.any(axis=1)].max() < 1e-5 * np.abs(swept[egg.craniotomy]).sum()
     device = find_device("cpu", "float64")
     shares = [
-        Leak(egg, space, device, around).share(device.array(u.reshape(-1, 1)))[0] for around in (1e-6, 12e-3, 0.05)
+        Leak(egg, space, device, around).share(device.upload(u.reshape(-1, 1)))[0] for around in (1e-6, 12e-3, 0.05)
     ]
     assert shares[0] > 1.5 * shares[1] > 1.5 * shares[2] > 0.0
 
@@ -109,7 +109,7 @@ def test_mid_edge_nodes_count(egg):
     u = space.interpolate_field(answer.displacement[0])
     u[len(egg.mesh.nodes) :] += answer.memory[MIDDLES][0]
     device = find_device("cpu", "float64")
-    assert Leak(egg, space, device).share(device.array(u.reshape(-1, 1)))[0] == pytest.approx(
+    assert Leak(egg, space, device).share(device.upload(u.reshape(-1, 1)))[0] == pytest.approx(
         answer.leaked[0], rel=1e-3
     )
     swept = np.einsum("ni,ni->n", integrate_surface_normals(space.nodes, space.surface), u)
@@ -119,7 +119,7 @@ def test_mid_edge_nodes_count(egg):
 def test_a_body_at_rest_lets_nothing_pass(egg):
     device = find_device("cpu", "float64")
     leak = Leak(egg, discretise(egg.mesh, "p1"), device)
-    assert leak.share(device.zeros(3 * len(egg.mesh.nodes), 2)).tolist() == [0.0, 0.0]
+    assert leak.share(device.allocate(3 * len(egg.mesh.nodes), 2)).tolist() == [0.0, 0.0]
 
 
 def test_of_a_skull_without_an_opening_there_is_no_share(egg):
@@ -129,6 +129,6 @@ def test_of_a_skull_without_an_opening_there_is_no_share(egg):
     normal[whole, 2] = 1.0
     closed = Anatomy(egg.mesh, egg.held, normal, np.zeros(len(normal), bool))
     device, space = find_device("cpu", "float64"), discretise(egg.mesh, "p1")
-    grown = device.array((0.01 * egg.mesh.nodes).reshape(-1, 1))
+    grown = device.upload((0.01 * egg.mesh.nodes).reshape(-1, 1))
     leak = Leak(closed, space, device)
-    assert np.isnan(leak.share(grown)).all() and (leak.share(device.zeros(*grown.shape)) == 0.0).all()
+    assert np.isnan(leak.share(grown)).all() and (leak.share(device.allocate(*grown.shape)) == 0.0).all()

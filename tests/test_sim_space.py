@@ -59,7 +59,7 @@ def test_an_added_node_is_held_where_a_surface_triangle_is() -> None:
     """Component by component; not where two held nodes are joined through the body."""
     held = np.random.default_rng(0).uniform(size=THIN.nodes.shape) < 0.8
     space = discretise(THIN, "p2")
-    found = space.held(held)
+    found = space.extend_held(held)
     np.testing.assert_array_equal(found[: len(held)], held)
     expected = np.array(
         [np.any([held[t].all(axis=0) for t in triangles_round(THIN, e)] or [[False] * 3], axis=0) for e in space.edges]
@@ -74,7 +74,7 @@ def test_nodes_that_the_mesh_brings_are_held_as_the_mesh_says() -> None:
     mesh = quadratic(THIN)
     held = np.zeros((len(mesh.nodes), 3), bool)
     held[np.unique(mesh.tets)] = True
-    np.testing.assert_array_equal(discretise(mesh, "p2").held(held), held)
+    np.testing.assert_array_equal(discretise(mesh, "p2").extend_held(held), held)
 
 
 def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:
@@ -85,7 +85,7 @@ def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:
     held = np.repeat((surface & (kind == 1))[:, None], 3, axis=1)
     normal = np.where((surface & (kind == 2))[:, None], ARM / LENGTH, 0.0)
     space = discretise(ROUND, "p2")
-    return space, held, normal, space.sliding(normal, held, FACING)
+    return space, held, normal, space.extend_normals(normal, held, FACING)
 
 
 def test_added_node_slides_along_adjacent_triangles() -> None:
@@ -119,7 +119,7 @@ def test_through_a_ball_that_slides_nothing_passes() -> None:
     surface = np.zeros(len(ROUND.nodes), bool)
     surface[ROUND.surface] = True
     space = discretise(ROUND, "p2")
-    found = space.sliding(np.where(surface[:, None], ARM / LENGTH, 0.0), np.zeros((len(surface), 3), bool))
+    found = space.extend_normals(np.where(surface[:, None], ARM / LENGTH, 0.0), np.zeros((len(surface), 3), bool))
     wall = np.unique(space.surface)
     radial = space.nodes / np.maximum(np.linalg.norm(space.nodes, axis=1, keepdims=True), 1e-9)
     assert (np.einsum("ni,ni->n", found[wall], radial[wall]) > np.cos(np.radians(20.0))).all()
@@ -138,7 +138,7 @@ def test_beside_the_edge_of_a_box_a_face_slides_in_its_own_plane() -> None:
         held = np.zeros(normal.shape, bool)
         held[x & y, 1] = bound
         space = discretise(THIN, "p2")
-        found = space.sliding(normal, held)[len(normal) :]
+        found = space.extend_normals(normal, held)[len(normal) :]
         middle = space.nodes[len(normal) :]
         on_x, on_y = middle[:, 0] == 0.0, middle[:, 1] == 0.0
         for face, axis in ((on_x & ~on_y, 0), (on_y & ~on_x, 1)):

@@ -40,7 +40,7 @@ def test_axes_turn_the_matrix_into_its_eigenvalues(precision: Precision, digit: 
         value[i] = e
         axes[i] = N
 
-    given = device.array(matrices(), mat)
+    given = device.upload(matrices(), mat)
     count = len(given)
     value, axes = wp.zeros(count, dtype=vec, device="cpu"), wp.zeros(count, dtype=mat, device="cpu")
     device.launch(decompose, (count,), [given], [value, axes])

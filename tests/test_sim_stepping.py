@@ -6,7 +6,7 @@ from sim.strategy.stepping import Shares
 
 
 def test_step_size_grows_on_success_and_shrinks_on_failure():
-    shares, rows, good = Shares.at_rest(0.25, np.ones(2)), np.arange(2), np.array([True, False])
+    shares, rows, good = Shares.start(0.25, np.ones(2)), np.arange(2), np.array([True, False])
     aim, _ = shares.propose_shares(rows)
     shares.take(rows, aim, good)
     shares.resize(rows, good, np.array([9.0, 9.0]), cut=0.5, wider=3.0)

@@ -30,7 +30,7 @@ from sim.local_solvers.strained_descent import (
 )
 from sim.local_solvers.strained_part import StrainLimits
 from sim.minimisers.lbfgs import Lbfgs
-from sim.minimisers.lbfgs_kernels import BROKEN, DONE
+from sim.minimisers.lbfgs_kernels import DONE, NOT_FINITE
 from sim.minimisers.lbfgs_kernels import LIVE as GOING
 from sim.strategy.plan import SolverStep
 
@@ -55,7 +55,7 @@ def descent_on(
 def hard(element: str = "smoothed") -> tuple[Problem, Discretisation, wp.array]:
     """A hard pull on the opening, and rest."""
     problem, space = begun(LAW, element, HARD)
-    return problem, space, problem.device.zeros(problem.rows, 1)
+    return problem, space, problem.device.allocate(problem.rows, 1)
 
 
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
@@ -65,7 +65,7 @@ def test_it_ends_where_the_whole_does(element: str) -> None:
     for column, total in enumerate(TOTAL):
         problem, _ = begun(LAW, element, total[None])
         descent = descent_on(problem, space)
-        found = descent.descend(problem.device.zeros(problem.rows, 1), np.full(1, FINE), 200)
+        found = descent.descend(problem.device.allocate(problem.rows, 1), np.full(1, FINE), 200)
         assert found.status[0] == DONE and found.residual[0] <= FINE
         np.testing.assert_allclose(found.u.numpy()[:, 0], expected[:, column], atol=1e-5 * np.abs(expected).max())
 
@@ -84,7 +84,7 @@ def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytes
     problem, space, rest = hard("p1")
     factor = factor_of(problem)
     bent = descent_on(problem, space).descend(rest, np.full(1, 1e-2), 100).u
-    basis, definite = problem.constraint.basis(), problem.device.array(np.zeros(1), wp.int32)
+    basis, definite = problem.constraint.build_basis(), problem.device.upload(np.zeros(1), wp.int32)
     for term in problem.terms:
         term.linearise(bent, definite)
     now = sum(
@@ -101,9 +101,9 @@ def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytes
     )  # fmt: skip
     descent = descent_on(problem, space, EVERY)
     descent.descend(bent, np.full(1, 1e-12), 2)
-    preconditioner, out = StiffenedPreconditioner(factor, problem), problem.device.zeros(problem.rows, 1)
+    preconditioner, out = StiffenedPreconditioner(factor, problem), problem.device.allocate(problem.rows, 1)
     preconditioner.stiffening = kept[0]
-    preconditioner.apply(problem.device.array(force), np.ones(1, bool), out)
+    preconditioner.apply(problem.device.upload(force), np.ones(1, bool), out)
     off = np.linalg.norm(out.numpy()[:, 0] - exact) / np.linalg.norm(exact)
     assert off < 1e-3 < 0.03 < np.linalg.norm(at_rest - exact) / np.linalg.norm(exact)
 
@@ -157,8 +157,10 @@ def test_where_the_model_is_not_positive_the_rest_stands_in() -> None:
     problem, space, _ = hard("p1")
     factor, rows = factor_of(problem), np.arange(3 * len(space.nodes))
     preconditioner = StiffenedPreconditioner(factor, problem)
-    g = problem.device.array(problem.constraint.basis() @ np.ones((problem.constraint.basis().shape[1], 1)))
-    plain, out = problem.device.zeros(problem.rows, 1), problem.device.zeros(problem.rows, 1)
+    g = problem.device.upload(
+        problem.constraint.build_basis() @ np.ones((problem.constraint.build_basis().shape[1], 1))
+    )
+    plain, out = problem.device.allocate(problem.rows, 1), problem.device.allocate(problem.rows, 1)
     factor.apply(g, np.ones(1, bool), plain)
     size = len(rows)
     added = 1e6 * np.eye(size, dtype=np.float32)
@@ -176,8 +178,8 @@ def test_the_budget_leaves_a_finite_state_and_says_so() -> None:
     assert found.status[0] == GOING and found.steps[0] <= 3 and found.left.tolist() == [0]
     _, free, scale = problem.residual(found.u)
     np.testing.assert_allclose(found.residual, free / scale, rtol=1e-6)
-    broken = descent.descend(problem.device.array(np.full((problem.rows, 1), np.nan)), np.full(1, 1e-12), 20)
-    assert broken.status[0] == BROKEN
+    broken = descent.descend(problem.device.upload(np.full((problem.rows, 1), np.nan)), np.full(1, 1e-12), 20)
+    assert broken.status[0] == NOT_FINITE
 
 
 def live(*avoid: SolverStep) -> Fem:

@@ -54,7 +54,7 @@ def solver(
 
 def bent(problem: Problem, size: float) -> wp.array:
     """Two columns: nodes moved at random, and a quarter as far."""
-    motion = problem.device.array(size * np.random.default_rng(3).normal(size=(problem.rows, 1)) * [[1.0, 0.25]])
+    motion = problem.device.upload(size * np.random.default_rng(3).normal(size=(problem.rows, 1)) * [[1.0, 0.25]])
     problem.constraint.project_nodes(motion)
     return motion
 
@@ -64,10 +64,10 @@ def stiffer(fem: Fem, u: wp.array, column: int) -> np.ndarray:
     problem, parts = fem.problem, []
     problem.begin(Cases(down(1e-3), np.zeros(1)))
     for definite in (False, True):
-        problem.linearise(problem.device.array(u.numpy()[:, [column]]), np.array([definite]))
+        problem.linearise(problem.device.upload(u.numpy()[:, [column]]), np.array([definite]))
         parts.append(np.zeros((problem.rows, problem.rows)))
         for first in range(problem.rows):
-            p, out = problem.device.zeros(problem.rows, 1), problem.device.zeros(problem.rows, 1)
+            p, out = problem.device.allocate(problem.rows, 1), problem.device.allocate(problem.rows, 1)
             p.numpy()[first] = 1.0
             for term in problem.terms:
                 if isinstance(term, ElasticityTerm):
@@ -84,14 +84,14 @@ def test_added_curvature_is_excess_over_rest(element: str, tissue: str) -> None:
     u = bent(problem, 4e-4)
     expected = stiffer(fem, u, 0)
     problem.begin(Cases(down(1e-3, 1e-3), np.zeros(2)))
-    every, first = np.ones(count, bool), problem.device.array(np.zeros(1), wp.int32)
-    place = problem.device.array(np.arange(count)[:, None], wp.int32)
+    every, first = np.ones(count, bool), problem.device.upload(np.zeros(1), wp.int32)
+    place = problem.device.upload(np.arange(count)[:, None], wp.int32)
     out = wp.zeros((1, 3 * count, 3 * count), dtype=wp.float64, device="cpu")
     terms = [term for term in problem.terms if isinstance(term, Strained)]
     assert terms
     for term in terms:
-        some = problem.device.array(term.elements_on(every), wp.int32)
-        term.add_stiffening(some, u, first, problem.device.zeros(1), place, out)
+        some = problem.device.upload(term.elements_on(every), wp.int32)
+        term.add_stiffening(some, u, first, problem.device.allocate(1), place, out)
     np.testing.assert_allclose(out.numpy()[0], expected, atol=1e-9 * np.abs(expected).max())
 
 
@@ -109,11 +109,11 @@ def test_strain_is_the_largest_round_each_node() -> None:
     inside = nodes[table].all(axis=1)
     expected = np.zeros(fem.space.count)
     np.maximum.at(expected, table[inside].ravel(), np.repeat(size[inside], 4))
-    found = problem.device.zeros(fem.space.count, 1)
+    found = problem.device.allocate(fem.space.count, 1)
     for term in problem.terms:
         if isinstance(term, Strained):
-            some = problem.device.array(term.elements_on(nodes), wp.int32)
-            term.raise_strain(some, u, problem.device.array(np.zeros(1), wp.int32), found)
+            some = problem.device.upload(term.elements_on(nodes), wp.int32)
+            term.raise_strain(some, u, problem.device.upload(np.zeros(1), wp.int32), found)
     assert expected.max() > 0.1
     np.testing.assert_allclose(found.numpy()[:, 0], expected, rtol=1e-9)
 
@@ -123,7 +123,7 @@ def find_model(strains: StrainLimits) -> tuple[Fem, ContactDescent, wp.array, St
     fem, descent = solver(strains=strains)
     u = bent(fem.problem, 4e-4)
     part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable), strains)
-    model = part.model(u, BOTH)
+    model = part.build_model(u, BOTH)
     assert model is not None
     return fem, descent, u, model
 
@@ -131,20 +131,20 @@ def find_model(strains: StrainLimits) -> tuple[Fem, ContactDescent, wp.array, St
 def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
     """H + H E M E' H, against K0 + D over the free motions; and what it changes between the nodes that are touched."""
     fem, descent, u, model = find_model(EVERY)
-    problem, basis = fem.problem, fem.problem.constraint.basis()
+    problem, basis = fem.problem, fem.problem.constraint.build_basis()
     force = np.random.default_rng(4).normal(size=(problem.rows, 2))
-    rest = descent.compliance.answered(force)
+    rest = descent.compliance.apply(force)
     near = rest[descent.compliance.rows]
     own = np.zeros_like(force)
-    own[descent.compliance.rows] = model.pressed(problem.device, problem.device.array(near)).numpy()
-    found = rest + descent.compliance.answered(own)
+    own[descent.compliance.rows] = model.apply_stiffness(problem.device, problem.device.upload(near)).numpy()
+    found = rest + descent.compliance.apply(own)
     touched = descent.compliance.rows[: 3 * len(descent.barrier.touchable)]
     for column in range(2):
         whole = problem.rest_curvature().toarray() + stiffer(fem, u, column)
         inverse = basis @ np.linalg.solve(basis.T @ whole @ basis, basis.T.toarray())
         expected = inverse @ force[:, column]
         np.testing.assert_allclose(found[:, column], expected, atol=2e-5 * np.abs(expected).max())
-        at_rest = descent.compliance.between(np.ones(len(descent.compliance.nodes), bool))[: len(touched)]
+        at_rest = descent.compliance.build_matrix(np.ones(len(descent.compliance.nodes), bool))[: len(touched)]
         now = at_rest[:, : len(touched)] + model.own[column, :-1, :-1]
         np.testing.assert_allclose(now, inverse[np.ix_(touched, touched)], atol=2e-5 * np.abs(inverse).max())
 
@@ -152,11 +152,11 @@ def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
 def test_those_are_chosen_that_are_strained_most() -> None:
     """As many as there is room for, and none that is hardly strained."""
     fem, descent, u, model = find_model(StrainLimits(least=0.08, nodes=20, cut=1.0))
-    strain = fem.problem.device.zeros(fem.space.count, 2)
-    every, columns = np.ones(fem.space.count, bool), fem.problem.device.array(BOTH, wp.int32)
+    strain = fem.problem.device.allocate(fem.space.count, 2)
+    every, columns = np.ones(fem.space.count, bool), fem.problem.device.upload(BOTH, wp.int32)
     for term in fem.problem.terms:
         if isinstance(term, Strained):
-            some = fem.problem.device.array(term.elements_on(every), wp.int32)
+            some = fem.problem.device.upload(term.elements_on(every), wp.int32)
             term.raise_strain(some, u, columns, strain)
     assert model.nodes.shape[1] <= 20
     for column in range(2):
@@ -171,7 +171,7 @@ def test_those_are_chosen_that_are_strained_most() -> None:
 def test_columns_of_different_widths_go_together() -> None:
     _, _, _, narrow = find_model(StrainLimits(least=0.08, nodes=20, cut=1.0))
     _, _, _, wide = find_model(EVERY)
-    both = narrow.merge_columns(np.array([1]), wide.rows(np.array([0])))
+    both = narrow.merge_columns(np.array([1]), wide.select(np.array([0])))
     size = narrow.matrix.shape[1]
     np.testing.assert_array_equal(both.matrix[0, :size, :size], narrow.matrix[0])
     assert not both.matrix[0, size:].any() and not both.matrix[0, :, size:].any()
@@ -186,7 +186,7 @@ def test_model_is_absent_where_valid_only_in_patches() -> None:
     fem, descent = solver()
     u, few = bent(fem.problem, 4e-4), StrainLimits(least=0.08, nodes=5, cut=0.1)
     part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable), few)
-    assert part.model(u, BOTH) is None and part.model(u, BOTH[1:]) is not None
+    assert part.build_model(u, BOTH) is None and part.build_model(u, BOTH[1:]) is not None
 
 
 def test_deep_poses_take_fewer_steps_to_the_same_end() -> None:

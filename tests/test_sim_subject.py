@@ -24,7 +24,7 @@ from test_sim_label_volume import (
 
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies import mesher
-from sim.bodies.label_volume import volume_subject
+from sim.bodies.label_volume import build_volume_subject
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.errors import InputError
 from sim.geometry.tetmesh import compute_dihedral_angles
@@ -32,7 +32,7 @@ from sim.geometry.tetmesh import compute_dihedral_angles
 
 def test_the_same_volume_gives_the_same_anatomy(tmp_path):
     path, _, _ = labelled(tmp_path / "labels.nii", AFFINES["oblique"])
-    first, second = (make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)) for _ in range(2))
+    first, second = (make_anatomy(build_volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)) for _ in range(2))
     assert first.digest == second.digest
 
 
@@ -41,7 +41,7 @@ def test_a_tumour_that_reaches_or_breaks_the_cortex_is_meshed(tmp_path, rise):
     middle = MIDDLE + [0.0, 0.0, AXES[2] - RADIUS + rise]
     path, labels, affine = labelled(tmp_path / "l.nii", AFFINES["straight"], lambda points: ball(points, middle))
     voxel = 1e-9 * abs(np.linalg.det(affine[:3, :3]))
-    anatomy = make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=4000))
+    anatomy = make_anatomy(build_volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=4000))
     mesh = anatomy.mesh
     assert compute_dihedral_angles(mesh.nodes, mesh.tets).min() > 5.0
     assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx((labels > 2).sum() * voxel, rel=0.02)
@@ -60,7 +60,7 @@ def test_components_and_holes(tmp_path):
     labels[:4, :4, :4] = 1  # a speck of brain
     labels[-4:, -4:, -4:] = 3  # a speck of tumour, outside
     labels[tuple(np.array(labels.shape) // 2 + [0, 12, 0])] = 3  # one voxel, inside
-    subject = volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3, 4))
+    subject = build_volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3, 4))
     text = " ".join(subject.notes)
     for part in ("of brain that is not connected", "of holes", "of tumour outside", "of tumour in specks"):
         assert part in text
@@ -89,7 +89,7 @@ def test_a_rough_cortex_is_meshed(tmp_path, monkeypatch):
     affine, places = grid(AFFINES["straight"])
     rough = np.linalg.norm((places - MIDDLE) / AXES, axis=-1) < 0.9 + roughness(places.shape[:-1], 0.15, 2.0, 1)
     labels = np.where(ball(places), 3, rough)
-    subject = volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3,))
+    subject = build_volume_subject(save(tmp_path / "l.nii", labels, affine), (1,), (3,))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mesh = make_anatomy(subject, MeshPlan(nodes=2000)).mesh
@@ -103,12 +103,12 @@ def test_a_rough_cortex_is_meshed(tmp_path, monkeypatch):
 def test_what_is_fitted_without_folds_is_left_as_it_is(tmp_path, monkeypatch):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"])
     monkeypatch.delattr(mesher, "prevent_folds")
-    assert len(make_anatomy(volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)).mesh.nodes)
+    assert len(make_anatomy(build_volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)).mesh.nodes)
 
 
 def test_mesh_without_tumour_detail_names_needed_nodes(tmp_path):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(0.6, 2.0))
-    subject, plan = volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)
+    subject, plan = build_volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)
     with pytest.raises(InputError, match="too intricate for 2000 nodes: ask for") as caught:
         make_anatomy(subject, plan)
     enough = int(re.search(r"ask for (\d+)", str(caught.value))[1])
@@ -121,7 +121,7 @@ def test_mesh_without_tumour_detail_names_needed_nodes(tmp_path):
 
 
 def test_small_pieces_are_another_reason_than_intricate_surfaces(tmp_path):
-    subject = volume_subject(with_plates(tmp_path / "l.nii", 12), (1,), (3,))
+    subject = build_volume_subject(with_plates(tmp_path / "l.nii", 12), (1,), (3,))
     with pytest.raises(
         InputError, match=r"12 of the tumour's 13 pieces, 1.\d ml in all, are too small for 2000 nodes: "
     ):
@@ -132,4 +132,4 @@ def test_labels_as_rough_as_their_voxels_are_to_be_smoothed(tmp_path):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(1.5, 1.2))
     plan = MeshPlan(nodes=2000, meshing=mesher.Meshing(more=(1.25,)))
     with pytest.raises(InputError, match="too intricate for 2000 nodes: smooth the labels"):
-        make_anatomy(volume_subject(path, (1, 2), (3, 4)), plan)
+        make_anatomy(build_volume_subject(path, (1, 2), (3, 4)), plan)

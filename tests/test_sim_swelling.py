@@ -26,7 +26,7 @@ from sim.geometry.surface import normalise_vectors
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Resected
 from sim.material import Tissue
-from sim.resected_fem import finite_elements
+from sim.resected_fem import build_fem
 from sim.runtime.device import find_device
 
 MESH = box((2, 2, 2), 0.1, distortion=0.15)
@@ -52,7 +52,7 @@ def posed(made_of: Tissue, pulsation: Pulsation, element: str, time: float) -> t
 
 def forces(problem: Problem, motion: np.ndarray) -> np.ndarray:
     """(N, 3) [N] that a motion (N, 3) [m] takes."""
-    return problem.gradient(problem.device.array(motion.reshape(-1, 1))).numpy().reshape(-1, 3)
+    return problem.gradient(problem.device.upload(motion.reshape(-1, 1))).numpy().reshape(-1, 3)
 
 
 @pytest.mark.parametrize("theta", [1e-6, 0.3, -0.3])
@@ -106,7 +106,7 @@ def test_times() -> None:
     size = np.abs(answer.displacement[1]).max()
     np.testing.assert_allclose(answer.displacement[3], answer.displacement[1], atol=1e-8 * size)
     assert np.abs(answer.displacement[2] - answer.displacement[1]).max() > 0.1 * size
-    swelling = Pulsation(Wave(1.0, 0.01), Wave(0.25, 0.02)).swelling(np.array([0.0, 0.25, 1.0, 3.0]))
+    swelling = Pulsation(Wave(1.0, 0.01), Wave(0.25, 0.02)).compute_swelling(np.array([0.0, 0.25, 1.0, 3.0]))
     np.testing.assert_allclose(swelling, [0.0, 0.01 + 0.02 * np.sin(np.pi / 8.0), 0.02, -0.02], atol=1e-15)
 
 
@@ -182,5 +182,5 @@ def test_tissue_that_is_taken_altogether_swells_no_more() -> None:
     body = base_held(replace(MESH, region=region))
     effects = [Elasticity(), Held(), Pulsation(regions=(1,)), Resection(((0,),))]
     asked = Loads((Resected(np.array([0, 1])),), np.full(2, 0.25))
-    answer = finite_elements(body, effects, TIGHT, "cpu").deform(asked)
+    answer = build_fem(body, effects, TIGHT, "cpu").deform(asked)
     assert answer.displacement[0].any() and not answer.displacement[1].any()

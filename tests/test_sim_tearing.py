@@ -10,7 +10,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.tearing import torn
+from sim.tearing import solve_with_debonding
 
 TISSUE = Material("neo-hookean", 3000.0, 0.4)
 SIDE = 30e-3  # [m]: six times as long as the bond's tractions are means over
@@ -44,7 +44,7 @@ def test_overloaded_bonds_release_outside_the_skull(slab, element):
     loads = lifted(slab, 0.05)
     whole = Fem(slab, effects(1e3), REFERENCE, "cpu", element=element).deform(loads)
     strength = 1e3 * 0.8 * float(whole.bond[0])
-    found = torn(slab, effects(strength), loads, REFERENCE, "cpu", element)
+    found = solve_with_debonding(slab, effects(strength), loads, REFERENCE, "cpu", element)
     bonded = slab.slide_normal.any(axis=1)
     gone = np.union1d(found.sliding, found.free)
     assert found.rested and found.rounds > 1 and 0 < len(gone) < bonded.sum() and bonded[gone].all()
@@ -55,7 +55,7 @@ def test_overloaded_bonds_release_outside_the_skull(slab, element):
     assert np.abs(moved[found.sliding, 2]).max(initial=0.0) < 1e-9 and np.abs(moved[gone]).max() > 1e-5
     assert moved[found.free, 2].min(initial=0.0) > -1e-7  # the skull is below
     # A body that is held less gives way more: its loads do more work.
-    force = loads.of(Nodal).force[0]
+    force = loads.get(Nodal).force[0]
     assert np.vdot(force, moved) > 1.001 * np.vdot(force, whole.displacement[0])
 
 
@@ -73,7 +73,7 @@ def sample_draw_scenario(slab):
 def test_without_strength_the_skull_only_presses(slab, load):
     """Signorini's conditions: nothing passes, nothing is pulled, and what is off bears nothing."""
     loads = load(slab)
-    found = torn(slab, effects(1e-6), loads, REFERENCE, "cpu", "p1")
+    found = solve_with_debonding(slab, effects(1e-6), loads, REFERENCE, "cpu", "p1")
     assert found.rested and found.answer.bond[0] == 0.0 and len(found.sliding) and len(found.free)
     held = slab.held.copy()
     held[found.sliding, 2] = True
@@ -84,7 +84,7 @@ def test_without_strength_the_skull_only_presses(slab, load):
 
 def test_a_bond_that_holds_is_solved_once(slab):
     loads = lifted(slab, 0.05)
-    found = torn(slab, effects(1e5), loads, REFERENCE, "cpu")
+    found = solve_with_debonding(slab, effects(1e5), loads, REFERENCE, "cpu")
     whole = Fem(slab, effects(1e5), REFERENCE, "cpu").deform(loads)
     assert found.rounds == 1 and found.rested and not len(found.sliding) and not len(found.free)
     np.testing.assert_array_equal(found.answer.displacement, whole.displacement)
@@ -93,6 +93,6 @@ def test_a_bond_that_holds_is_solved_once(slab):
 def test_what_cannot_tear_is_refused(slab):
     loads = lifted(slab, 0.05)
     with pytest.raises(InputError, match="2 loads debond separately: give one at a time"):
-        torn(slab, effects(1e3), loads.rows([0, 0]), device="cpu")
+        solve_with_debonding(slab, effects(1e3), loads.select([0, 0]), device="cpu")
     with pytest.raises(InputError, match="there is no bond: add Bonded"):
-        torn(slab, (Elasticity(TISSUE), Held(), Slide(), NodalForce()), loads, device="cpu")
+        solve_with_debonding(slab, (Elasticity(TISSUE), Held(), Slide(), NodalForce()), loads, device="cpu")

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.mesher import Meshing
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Head, Tumour, template_subject
+from sim.bodies.template import Head, Tumour, build_template_subject
 from sim.errors import InputError
 from sim.geometry.geodesic import compute_geodesic_distances
 from sim.geometry.tetmesh import compute_dihedral_angles
@@ -16,7 +16,7 @@ from sim.geometry.tetmesh import compute_dihedral_angles
 
 @pytest.fixture(scope="module")
 def subject():
-    return template_subject(Tumour())
+    return build_template_subject(Tumour())
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def spread_points(mesh, count):
 
 
 def test_at_17k_nodes_angles_surface_and_volume_are_as_promised():
-    subject = template_subject(Tumour(shape="lobed", seed=7))
+    subject = build_template_subject(Tumour(shape="lobed", seed=7))
     mesh = make_anatomy(subject, MeshPlan(nodes=17_000)).mesh
     assert abs(len(mesh.nodes) - 17_000) <= 1_700
     assert compute_dihedral_angles(mesh.nodes, mesh.tets).min() >= 10.0
@@ -76,7 +76,7 @@ def test_it_has_the_volume_of_a_person(anatomy):
 
 def test_the_cap_lies_as_deep_as_asked():
     for cover in (0.003, 0.025):
-        subject = template_subject(Tumour(cover=cover, shape="lobed", seed=1))
+        subject = build_template_subject(Tumour(cover=cover, shape="lobed", seed=1))
         inward = subject.tumour.middle - subject.site
         inward /= np.linalg.norm(inward)
         assert subject.tumour((subject.site + cover * inward)[None])[0] == pytest.approx(0.0, abs=1e-6)
@@ -84,19 +84,19 @@ def test_the_cap_lies_as_deep_as_asked():
 
 
 def test_tumour_and_craniotomy_are_where_requested():
-    subject = template_subject(Tumour(middle=(-0.030, 0.010, 0.040), radius=0.010))
+    subject = build_template_subject(Tumour(middle=(-0.030, 0.010, 0.040), radius=0.010))
     np.testing.assert_array_equal(subject.tumour.middle, [-0.030, 0.010, 0.040])
     assert [piece.volume for piece in subject.pieces] == [subject.tumour_volume]
     arm = subject.site - subject.tumour.middle
     assert subject.site[0] < -0.02 and 0.01 < np.linalg.norm(arm) < 0.04
     with pytest.raises(InputError, match=r"at 0, 0, 200 mm reaches out"):
-        template_subject(Tumour(middle=(0.0, 0.0, 0.2)))
+        build_template_subject(Tumour(middle=(0.0, 0.0, 0.2)))
     with pytest.raises(InputError, match="finite"):
         Tumour(middle=(0.0, float("nan"), 0.0))
 
 
 def test_seeds_vary_the_lobed_shape_but_not_its_volume():
-    first, again, other = (template_subject(Tumour(shape="lobed", seed=seed)).tumour for seed in (1, 1, 2))
+    first, again, other = (build_template_subject(Tumour(shape="lobed", seed=seed)).tumour for seed in (1, 1, 2))
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(50_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -151,7 +151,7 @@ def test_what_cannot_be_placed_is_refused(subject):
         with pytest.raises(InputError, match=reason):
             Tumour(**values)
     with pytest.raises(InputError, match="reaches out of the brain"):
-        template_subject(Tumour(radius=0.035, cover=0.06, site="frontal"))
+        build_template_subject(Tumour(radius=0.035, cover=0.06, site="frontal"))
     for values, reason in (
         ({"nodes": 100}, "100 nodes are outside"),
         ({"craniotomy": 0.2}, "outside 15 to 120 mm"),

@@ -43,30 +43,30 @@ def noise(*shape: int) -> np.ndarray:
 
 def energy(term: Term, device: Device, u: np.ndarray) -> np.ndarray:
     out = wp.zeros(u.shape[1], dtype=wp.float64, device="cpu")
-    term.energy(device.array(u), out)
+    term.energy(device.upload(u), out)
     return out.numpy()
 
 
 def gradient(term: Term, device: Device, u: np.ndarray) -> np.ndarray:
-    out = device.zeros(*u.shape)
-    term.add_gradient(device.array(u), out)
+    out = device.allocate(*u.shape)
+    term.add_gradient(device.upload(u), out)
     return out.numpy()
 
 
 def curvature(term: Term, device: Device, p: np.ndarray) -> np.ndarray:
-    out = device.zeros(*p.shape)
-    term.add_curvature(device.array(p), out)
+    out = device.allocate(*p.shape)
+    term.add_curvature(device.upload(p), out)
     return out.numpy()
 
 
 def linearise(term: Term, device: Device, u: np.ndarray, definite: bool = False) -> None:
     flags = wp.array(np.full(u.shape[1], int(definite), np.int32), dtype=wp.int32, device="cpu")
-    term.linearise(device.array(u), flags)
+    term.linearise(device.upload(u), flags)
 
 
 def longest_step(term: Term, device: Device, u: np.ndarray, du: np.ndarray) -> np.ndarray:
     out = wp.full(u.shape[1], 1.0, dtype=device.scalar, device="cpu")
-    term.longest_step(device.array(u), device.array(du), out)
+    term.longest_step(device.upload(u), device.upload(du), out)
     return out.numpy()
 
 
@@ -109,15 +109,15 @@ def test_curvature_is_symmetric_and_its_blocks_are_the_diagonal(term: Term, exam
 
 def test_everything_is_added_to_what_is_there(term: Term, example: Example, device: Device) -> None:
     already = noise(*example.u.shape)
-    out = device.array(already)
-    term.add_gradient(device.array(example.u), out)
+    out = device.upload(already)
+    term.add_gradient(device.upload(example.u), out)
     np.testing.assert_allclose(out.numpy() - already, gradient(term, device, example.u), atol=1e-10)
     linearise(term, device, example.u)
-    out = device.array(already)
-    term.add_curvature(device.array(example.u), out)
+    out = device.upload(already)
+    term.add_curvature(device.upload(example.u), out)
     np.testing.assert_allclose(out.numpy() - already, curvature(term, device, example.u), atol=1e-10)
     total = wp.array(np.array([1.0, 2.0, 3.0]), dtype=wp.float64, device="cpu")
-    term.energy(device.array(example.u), total)
+    term.energy(device.upload(example.u), total)
     np.testing.assert_allclose(total.numpy() - [1.0, 2.0, 3.0], energy(term, device, example.u), atol=1e-12)
 
 
@@ -146,7 +146,7 @@ def test_definite_is_asked_column_by_column(term: Term, example: Example, device
     plain = curvature(term, device, p)
     linearise(term, device, u, definite=True)
     definite = curvature(term, device, p)
-    term.linearise(device.array(u), wp.array(np.array([0, 1, 0]), dtype=wp.int32, device="cpu"))
+    term.linearise(device.upload(u), wp.array(np.array([0, 1, 0]), dtype=wp.int32, device="cpu"))
     mixed = curvature(term, device, p)
     np.testing.assert_array_equal(mixed, np.where([False, True, False], definite, plain))
 
@@ -161,12 +161,12 @@ def test_keeping_columns_is_starting_with_them(
     def answers() -> list[np.ndarray]:
         linearise(term, device, u)
         found = [energy(term, device, u), gradient(term, device, u), curvature(term, device, p)]
-        memory = term.end(device.array(u))
+        memory = term.end(device.upload(u))
         return found if memory is None else [*found, memory]
 
     term.keep(index)
     kept = answers()
-    term.begin(example.cases.rows(index))
+    term.begin(example.cases.select(index))
     for after, fresh in zip(kept, answers(), strict=True):
         np.testing.assert_allclose(after, fresh, rtol=1e-13, atol=1e-15)
         assert after.shape[0 if after is kept[0] or after.ndim >= 3 else -1] == len(index)
@@ -208,13 +208,13 @@ def test_longest_step_of_a_tiny_motion_is_all_of_it(term: Term, example: Example
 
 def test_longest_step_only_lowers(term: Term, example: Example, device: Device) -> None:
     out = wp.full(3, 1e-9, dtype=device.scalar, device="cpu")
-    term.longest_step(device.array(example.u), device.array(example.flung), out)
+    term.longest_step(device.upload(example.u), device.upload(example.flung), out)
     assert (out.numpy() <= 1e-9).all()
 
 
 def test_linearisation_does_not_follow_the_state(term: Term, example: Example, device: Device) -> None:
     """The outer iteration moves u in place: the curvature stays where it was taken."""
-    u, p = device.array(example.u), noise(*example.u.shape)
+    u, p = device.upload(example.u), noise(*example.u.shape)
     term.linearise(u, wp.zeros(3, dtype=wp.int32, device="cpu"))
     before = curvature(term, device, p)
     u.assign(1.5 * example.u)
@@ -250,7 +250,7 @@ def test_every_tool_of_the_examples_is_felt(name: str, device: Device) -> None:
     term = example.build(device)
     assert isinstance(term, ToolContactTerm)
     term.begin(example.cases)
-    force = term.reaction(device.array(example.u))[:, :, :3]
+    force = term.compute_reaction(device.upload(example.u))[:, :, :3]
     assert (np.linalg.norm(force, axis=2) > 0.0).all()
     bears = -gradient(term, device, example.u).T.reshape(3, -1, 3).sum(axis=1)
     np.testing.assert_allclose(force.sum(axis=1), bears, atol=1e-9)
@@ -262,4 +262,4 @@ def test_history_creeps_and_travels_rows_first(device: Device) -> None:
     spring.begin(example.cases)
     before, u = example.cases.memory["spring"], example.u.T.reshape(3, -1, 3)
     share = 1.0 - np.exp(-np.array([0.5, 2.0, 0.1]))[:, None, None]
-    np.testing.assert_allclose(spring.end(device.array(example.u)), before + share * (u - before), atol=1e-15)
+    np.testing.assert_allclose(spring.end(device.upload(example.u)), before + share * (u - before), atol=1e-15)

@@ -97,8 +97,8 @@ def test_boundary_of_a_region_inside() -> None:
     inner = (np.abs(mesh.nodes[mesh.tets].mean(axis=1) - 0.05) < 0.025).all(axis=1)
     mesh = TetMesh(mesh.nodes, mesh.tets, np.where(inner, 2, 1))
     assert len(mesh.find_boundary(2)) == 2 * 6 * 4
-    assert len(mesh.nodes_of(2)) == 27
-    np.testing.assert_array_equal(np.unique(mesh.find_boundary(2)), np.setdiff1d(mesh.nodes_of(2), _centre(mesh)))
+    assert len(mesh.find_nodes(2)) == 27
+    np.testing.assert_array_equal(np.unique(mesh.find_boundary(2)), np.setdiff1d(mesh.find_nodes(2), _centre(mesh)))
     assert len(find_single_faces(mesh.tets)) == len(mesh.surface)
 
 

@@ -95,8 +95,8 @@ def test_a_tool_reads_what_the_base_bears(name: str, element: str) -> None:
     fem, found = body(name, element), answer(name, element)
     force, moment = found.reaction[0, 0, :3], found.reaction[0, 0, 3:]
     assert force[2] < -0.003
-    elastic = fem.problem.device.zeros(fem.problem.rows, 1)
-    u = fem.problem.device.array(fem.guess(pressed(DEPTHS[name]), found))
+    elastic = fem.problem.device.allocate(fem.problem.rows, 1)
+    u = fem.problem.device.upload(fem.guess(pressed(DEPTHS[name]), found))
     for term in fem.problem.terms:
         if term.passive:
             term.add_gradient(u, elastic)

@@ -50,7 +50,7 @@ def stresses(problem: Problem, nodes: np.ndarray, path: np.ndarray, times: np.nd
     """Mean first Piola-Kirchhoff stress (n, 3, 3) [Pa] along displacement gradients (n, 3, 3), the same everywhere."""
     found, memory, before = [], {}, 0.0
     for H, time in zip(path, times, strict=True):
-        u = problem.device.array((nodes @ H.T).reshape(-1, 1))
+        u = problem.device.upload((nodes @ H.T).reshape(-1, 1))
         problem.begin(Cases(Loads((), np.array([time])), np.array([before]), memory))
         found.append(problem.gradient(u).numpy().reshape(-1, 3).T @ nodes / MESH.volumes.sum())
         memory, before = problem.end(u), time
@@ -95,11 +95,11 @@ def test_at_once_it_is_the_law_itself(law: str, element: str) -> None:
     u, p = np.random.default_rng(1).normal(size=(2, nodes.size, 1))
     found = []
     for problem in (plain, viscous):
-        at = problem.device.array(2e-3 * u)
+        at = problem.device.upload(2e-3 * u)
         problem.begin(Cases(Loads((), np.zeros(1)), np.zeros(1)))
         problem.linearise(at, np.zeros(1, bool))
-        bent = problem.device.zeros(*u.shape)
-        problem.add_curvature(problem.device.array(p), bent)
+        bent = problem.device.allocate(*u.shape)
+        problem.add_curvature(problem.device.upload(p), bent)
         found.append((problem.gradient(at).numpy(), bent.numpy()))
     assert plain.plain and not viscous.plain
     for one, other in zip(*found, strict=True):

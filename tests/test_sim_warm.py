@@ -75,6 +75,6 @@ def test_memory_and_warmth_travel_with_their_rows():
     first, second = ride(fem, loads[:2], drops=False)
     both = join_deformations([second, second])
     assert set(both.warm) == set(second.warm) and all(len(value) == 2 for value in both.warm.values())
-    again = both.rows(np.array([1]))
+    again = both.select(np.array([1]))
     np.testing.assert_array_equal(fem.deform(loads[2], again).displacement, fem.deform(loads[2], second).displacement)
     assert not join_deformations([first, replace(second, warm={})]).warm

@@ -33,13 +33,13 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(pretender, tmp_
     simulate(tmp_path / "data.h5", pretender, draw("palpation", pretender.anatomy, count, 0), {"preset": "palpation"})
     data = read_dataset(tmp_path / "data.h5")
     trained = train(data, ["linear"])
-    model, good = trained.models["linear"], data.loads.rows(np.flatnonzero(data.good))
+    model, good = trained.models["linear"], data.loads.select(np.flatnonzero(data.good))
     truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good]
 
     apart = np.arange(len(good))[-trained.calibrated :]
-    answer = model.deform(good.rows(apart), at=data.anatomy.tumour_nodes).displacement
+    answer = model.deform(good.select(apart), at=data.anatomy.tumour_nodes).displacement
     error = np.linalg.norm(answer - truth[apart], axis=2).max(axis=1)
-    near = collect_missed(model, open_patch(data.anatomy), get_only_pushes(good.rows(apart)), error)
+    near = collect_missed(model, open_patch(data.anatomy), get_only_pushes(good.select(apart)), error)
     bounds = bound_by(near, TUMOUR, float(model.bounds.growth))
     pairs = ((model.bounds.weights, bounds.weights), (model.bounds.quantile, bounds.quantile))
     assert [np.allclose(*pair) for pair in pairs] == 2 * [trained.calibrated >= ENOUGH] == 2 * [count > 600]
@@ -52,5 +52,5 @@ def test_a_correction_that_does_not_help_is_left_out(box, pretender, tmp_path):
     model = train(read_dataset(tmp_path / "data.h5"), ["linear"]).models["linear"]
     loads = draw("palpation", box, 20, 5)
     answer, gauge = linear.deform(loads), build_tip_gauge(box)
-    truth = gauge.distances(loads, answer.displacement, answer.nodes)
+    truth = gauge.compute_distances(loads, answer.displacement, answer.nodes)
     assert np.abs(model.predict_distance(loads).value - truth).max() < 2e-5

@@ -17,7 +17,7 @@ from on_devices import gone, mortal, small_body
 from scenes.cli import main
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import write_anatomy
-from sim.effects import NodalForce, pushed_effects
+from sim.effects import NodalForce, build_push_effects
 from sim.errors import InputError
 from sim.material import BRAIN
 from sim.runtime.processes import process_pool
@@ -57,7 +57,7 @@ def undated(path):
 
 @pytest.mark.parametrize("batch", [1, 8])
 def test_a_file_does_not_depend_on_how_many_devices_made_it(tmp_path, body, batch):
-    effects, loads = (*pushed_effects(body, BRAIN), NodalForce()), draw("palpation", body, COUNT, 0)
+    effects, loads = (*build_push_effects(body, BRAIN), NodalForce()), draw("palpation", body, COUNT, 0)
     counts = []
     for devices in (["cpu"], ["cpu", "cpu"]):
         with open_solvers(LazyFem(body, effects, TRAIN, "smoothed", batch, COUNT), devices, print) as solver:
@@ -76,7 +76,7 @@ def test_a_file_does_not_depend_on_how_many_devices_made_it(tmp_path, body, batc
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
 def test_two_processes_on_one_card_answer_as_one(tmp_path, body):
     """To the tolerance: sums on a card are taken in any order, so that not even one process repeats its last bits."""
-    effects, loads = (*pushed_effects(body, BRAIN), NodalForce()), draw("palpation", body, 64, 0)
+    effects, loads = (*build_push_effects(body, BRAIN), NodalForce()), draw("palpation", body, 64, 0)
     found = []
     for devices in (["cuda:0"], ["cuda:0", "cuda:0"]):
         with open_solvers(LazyFem(body, effects, TRAIN, None, 8, 64), devices, print) as solver:
@@ -111,7 +111,7 @@ def test_killed_process_loses_no_finished_case(tmp_path, body):
 @pytest.mark.parametrize("devices", [("cpu",), ("cpu", "cpu")])
 def test_a_batch_that_no_memory_holds_begins_no_file(body, devices):
     """A file keeps its batch, so that a smaller one would be refused beside it."""
-    asked = LazyFem(body, (*pushed_effects(body, BRAIN), NodalForce()), TRAIN, "p1", 10**9, 2 * 10**9)
+    asked = LazyFem(body, (*build_push_effects(body, BRAIN), NodalForce()), TRAIN, "p1", 10**9, 2 * 10**9)
     refused = pytest.raises(InputError, match=r"the results of 1000000000 loads take about .* are free: solve at most")
     with refused, open_solvers(asked, devices, print):
         pytest.fail("it would begin")

@@ -17,7 +17,7 @@ from test_surrogate_dataset import unfinished as stopped
 from scenes.cli import main
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
@@ -327,7 +327,7 @@ def test_a_data_set_explains_itself(tmp_path):
         load = push(tool["point"][1], tool["force"][1], tool["footprint"][1])
         stored = file["answers/displacement"][1]
         vertex, response = int(file["unit/node"][4]), file["unit/displacement"][4]
-    fem = Fem(anatomy, pushed_effects(anatomy, tissue), device="cpu", element=element)
+    fem = Fem(anatomy, build_push_effects(anatomy, tissue), device="cpu", element=element)
     again = fem.deform(load).displacement[0]
     assert np.abs(stored).max() > 1e-4 and np.abs(again - stored).max() < 1e-3 * np.abs(stored).max()
     assert response[vertex].argmax() == 1 and response[vertex, 1] > 0.0  # row 4: the second node, along y

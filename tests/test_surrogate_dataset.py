@@ -12,7 +12,7 @@ from boxes import box as cube
 
 from sim.deformation import Outcome
 from sim.errors import InputError
-from sim.loads import Loads, Posture, Pushed, posture, push
+from sim.loads import Loads, Posture, Pushed, build_posture, push
 from surrogate.data.dataset import SEAL, read_dataset, read_embedded, read_loads, write_embedded, write_loads
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
@@ -35,7 +35,7 @@ def test_what_is_written_is_read(tmp_path, box, pretender, loads):
     assert (said.loads, said.units) == (len(loads), units) and min(said.unit_seconds, said.load_seconds) > 0.0
     assert solved == len(loads) + units and seen[-1] == (solved, solved) and not list(tmp_path.glob("*.partial"))
     assert data.anatomy.digest == box.digest and data.provenance["preset"] == "palpation"
-    assert np.array_equal(data.loads.of(Pushed).force, loads.of(Pushed).force)
+    assert np.array_equal(data.loads.get(Pushed).force, loads.of(Pushed).force)
     whole = pretender.deform(loads).displacement
     assert np.allclose(data.read_displacement(np.arange(len(box.mesh.nodes))), whole, rtol=0, atol=1e-7 * whole.max())
     assert np.array_equal(
@@ -46,13 +46,15 @@ def test_what_is_written_is_read(tmp_path, box, pretender, loads):
 
 
 def test_postures_are_stored(tmp_path):
-    both = Loads((*push(np.zeros(3), np.ones((2, 3)), 0.01).causes, *posture([[0.0, -1.0, 0.0]], [0.01, 0.02]).causes))
+    both = Loads(
+        (*push(np.zeros(3), np.ones((2, 3)), 0.01).causes, *build_posture([[0.0, -1.0, 0.0]], [0.01, 0.02]).causes)
+    )
     with h5py.File(tmp_path / "data.h5", "w") as file:
         write_loads(file, both)
         read = read_loads(file)
     assert [type(cause) for cause in read.causes] == [Pushed, Posture]
-    for name, array in vars(both.of(Posture)).items():
-        assert np.array_equal(getattr(read.of(Posture), name), array)
+    for name, array in vars(both.get(Posture)).items():
+        assert np.array_equal(getattr(read.get(Posture), name), array)
 
 
 @pytest.mark.parametrize("mesh", [cube((2, 2, 2)), quadratic(cube((2, 2, 2)), curved=0.05)], ids=["p1", "p2"])

@@ -8,7 +8,7 @@ from conftest import make_box
 from poison import poisoned
 
 from sim.accuracy import REFERENCE, TRAIN
-from sim.effects import NodalForce, pushed_effects
+from sim.effects import NodalForce, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
@@ -48,11 +48,11 @@ def every_motion(fem, nodes):
 
 
 def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
-    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", batch=200, element="p1")
+    fem = Fem(box, build_push_effects(box, TISSUE), REFERENCE, "cpu", batch=200, element="p1")
     nodes = box.tumour_nodes
     loads = pushes(patch, 30, 3, (7e-3, 7e-3))
     reading = every_motion(fem, nodes)
-    exact = fem.series(Loads((loads,)), ORDERS, reading)
+    exact = fem.compute_series(Loads((loads,)), ORDERS, reading)
     (triangles, places), radii = add_edge_midpoints(patch), np.array([7e-3])
     heard = []
     table = tabulate(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
@@ -81,7 +81,7 @@ def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
 
 def simulated(path, box, count=160):
     """Pushes of one width on a box."""
-    fem = Fem(box, (*pushed_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
+    fem = Fem(box, (*build_push_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     loads = Loads((pushes(open_patch(box), count, 5, (7e-3, 7e-3), 0.25),))
     simulate(path, fem, loads, {"tissue": to_tissue_json(TISSUE), "element": "p1"})
     return read_dataset(path)
@@ -111,13 +111,13 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, p
     loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
     nodes = (expansion.tumour, expansion.cortex)
     bases = expansion.build_bases(Examples(loads, *(data.read_displacement(at)[some] for at in nodes)), ADDED, COARSE)
-    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
+    fem = Fem(box, build_push_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     places = np.array([0, 17, 60, 120, 198])
     point = np.repeat(add_edge_midpoints(patch)[1][places], 3, axis=0)
     units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
     predicted = expansion.build_series(bases, np.zeros(len(expansion.places), bool))
     for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact, strict=True):
-        wanted = fem.series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
+        wanted = fem.compute_series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
         for terms in SPANS[len(exact) :]:
             table = found.table.values.reshape(len(expansion.places), *wanted.shape[1:])
             miss = np.linalg.norm((table[places] - wanted)[:, terms])
@@ -126,11 +126,11 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, p
 
 def test_two_series_orders_are_exact_for_any_tool(expansion, box):
     """Of loads inside the rim nothing is left of them; over it the table holds what is missing."""
-    fem = Fem(box, pushed_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
+    fem = Fem(box, build_push_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     loads = pushes(expansion.patch, 40, 8, (7e-3, 7e-3))
     inside = expansion.patch.compute_edge_distance(loads.point) > loads.footprint
     assert 10 < inside.sum() < 40
-    exact = fem.series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
+    exact = fem.compute_series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
     size = split_forces(loads)[0][:, None, None]
     found = [
         size * part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]

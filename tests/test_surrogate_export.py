@@ -16,10 +16,10 @@ from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.deformation import Outcome
 from sim.discretisation.footprint import compute_footprint_weights
-from sim.effects import NodalForce, pushed_effects
+from sim.effects import NodalForce, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Pushed, push, stacked
+from sim.loads import Pushed, push, stack
 from sim.material import Material, to_tissue_json
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
@@ -47,7 +47,7 @@ def block():
 @pytest.fixture(scope="module")
 def models(block, tmp_path_factory):
     path = tmp_path_factory.mktemp("exchange") / "data.h5"
-    fem = Fem(block, (*pushed_effects(block, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
+    fem = Fem(block, (*build_push_effects(block, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     provenance = {"tissue": to_tissue_json(TISSUE), "element": "p1"}
     simulate(path, fem, draw("palpation", block, 100, 3), provenance)
     data = read_dataset(path)
@@ -63,7 +63,7 @@ def loads(block, models):
     training, patch = models["linear"].envelope, open_patch(block)
     corner = patch.points[np.argsort(np.linalg.norm(patch.points, axis=1))[:2]]
     at, down = training.points[0], np.array([0.0, 0.0, -0.2])
-    return stacked(
+    return stack(
         [
             draw("palpation", block, 5, 99),
             push(np.vstack([corner, corner.mean(axis=0)]), down, 6e-3),
@@ -87,7 +87,7 @@ def asked(session, loads, patch):
     heard = push(given["point"], given["force"], given["footprint"])
     if "weight" in {port.name for port in session.get_inputs()}:
         weight = compute_footprint_weights(
-            patch.points, patch.triangles, heard.of(Pushed).point, heard.of(Pushed).footprint
+            patch.points, patch.triangles, heard.get(Pushed).point, heard.get(Pushed).footprint
         )
         given["weight"] = weight.toarray().astype(np.float32)
     names = [port.name for port in session.get_outputs()]

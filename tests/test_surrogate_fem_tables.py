@@ -10,7 +10,7 @@ import pytest
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Outcome
-from sim.effects import Elasticity, Held, NodalForce, ToolContact, pushed_effects
+from sim.effects import Elasticity, Held, NodalForce, ToolContact, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Touching
@@ -44,7 +44,7 @@ def features(anatomy: Anatomy, loads: Loads) -> np.ndarray:
 
 
 def bodily(anatomy: Anatomy, tissue: Material) -> Fem:
-    return Fem(anatomy, pushed_effects(anatomy, tissue), REFERENCE, "cpu", element="p1")
+    return Fem(anatomy, build_push_effects(anatomy, tissue), REFERENCE, "cpu", element="p1")
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_it_answers_as_finite_elements_of_linear_tissue_do(box, pressed):
     split = len(bases[0].modes)
     found = bases[0].decode(answered[:, :split]), bases[1].decode(answered[:, split:])
     for nodes, ours in ((box.tumour_nodes, found[0]), (cortex, found[1])):
-        theirs = truth.at(nodes).displacement
+        theirs = truth.restrict(nodes).displacement
         off = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
         assert off.mean() < 0.03
         assert off.max() < 0.06
@@ -132,7 +132,7 @@ def test_unit_responses_are_those_of_small_forces(box):
     truth = Fem(box, [Elasticity(SOFT), Held(), NodalForce()], REFERENCE, "cpu", element="p1").deform(
         Loads((Nodal(force),))
     )
-    np.testing.assert_allclose(found, 1e4 * truth.at(at).displacement, atol=1e-5 * np.abs(found).max())
+    np.testing.assert_allclose(found, 1e4 * truth.restrict(at).displacement, atol=1e-5 * np.abs(found).max())
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class Stiffening:
             loads.times,
             compute_wrench(force, get_poses(loads, BALL), BALL),
         )
-        return answer if at is None else answer.at(at)
+        return answer if at is None else answer.restrict(at)
 
 
 @pytest.fixture(scope="module")
@@ -262,7 +262,7 @@ def test_it_is_stored_and_answers_alone_as_in_company(tmp_path, trained, box):
             np.testing.assert_array_equal(
                 *(getattr(model.deform(fresh), what) for model in (again[name], trained.models[name]))
             )
-        alone = [again[name].deform(fresh.rows(slice(row, row + 1))).displacement[0] for row in range(6)]
+        alone = [again[name].deform(fresh.select(slice(row, row + 1))).displacement[0] for row in range(6)]
         np.testing.assert_allclose(alone, together, atol=1e-8)
 
 

@@ -11,7 +11,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from surrogate.fitting import fit
 from surrogate.fitting.fit import SOFT, compute_probability, estimate_young_moduli, weigh_tissues
-from surrogate.fitting.frame import Frame, Tool, find_foot
+from surrogate.fitting.frame import ObservedFrame, Tool, find_foot
 from surrogate.fitting.responses import POISSONS, RATIOS, build_drained_loads, build_force_loads, solve_responses
 from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 from surrogate.fitting.weighing import find_unsupported
@@ -39,7 +39,7 @@ def build_tool_frame(body, motion, seed=0):
     """What is seen of a motion (V, 3) [m] without error, on most of the open cortex."""
     evidence = sample_seen_patch(body, motion, np.random.default_rng(seed), 60, 0.9)
     rest, moved = evidence.at[::3], evidence.value.reshape(-1, 3)
-    return Frame(Observation(rest + moved, rest, np.full(len(rest), 5e-5), rigid=0.0))
+    return ObservedFrame(Observation(rest + moved, rest, np.full(len(rest), 5e-5), rigid=0.0))
 
 
 def drained_frames(body, drained, skull, poisson, ratio):

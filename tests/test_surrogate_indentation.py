@@ -30,7 +30,7 @@ def test_a_pose_is_where_the_ball_is_deepest(box):
     bumpy = replace(patch, points=domed(patch.points))
     loads = draw_poses("palpation", box, 60, 3)
     pushed = to_indentation(loads, BALL, bumpy)
-    cause = loads.of(Touching)
+    cause = loads.get(Touching)
     assert cause is not None
     pose = cause.pose[:, 0]
     middle = pose[:, :3, 3] + BALL.radius * pose[:, :3, 2]
@@ -56,7 +56,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 def test_how_a_ball_came_there_is_nothing(box):
     """On a flat cortex an oblique way is a straight one to beside it; a ball sunk to its middle has the normal."""
     patch = open_patch(box)
-    forces = draw("palpation", box, 40, 0).of(Pushed)
+    forces = draw("palpation", box, 40, 0).get(Pushed)
     assert forces is not None
     normal = patch.find_normals(forces.point)
     motion = 3e-3 * unit(forces.force)

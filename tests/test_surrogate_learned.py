@@ -13,7 +13,7 @@ from poison import poisoned
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.errors import InputError
-from sim.loads import Displaced, Loads, Nodal, Posture, Pushed, push, stacked
+from sim.loads import Displaced, Loads, Nodal, Posture, Pushed, push, stack
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
@@ -33,7 +33,7 @@ from surrogate.training.train import LEARNERS, train
 def data(tmp_path_factory, pretender):
     path = tmp_path_factory.mktemp("learned") / "data.h5"
     loads = draw("palpation", pretender.anatomy, 360, 0)
-    size = np.linalg.norm(loads.of(Pushed).force, axis=1)
+    size = np.linalg.norm(loads.get(Pushed).force, axis=1)
     failing = type(pretender)(pretender.anatomy, float(np.quantile(size, 0.97)))
     simulate(path, failing, loads, {"preset": "palpation"})
     return read_dataset(path)
@@ -69,7 +69,7 @@ def test_every_model_is_a_deformer(model, box, fresh):
 
 
 def test_no_force_no_motion_and_weak_loads_in_proportion(model, fresh):
-    assert not model.deform(stacked([fresh.scaled(0.0), fresh.scaled(1e-200)])).displacement.any()  # 1e-400 is zero
+    assert not model.deform(stack([fresh.scaled(0.0), fresh.scaled(1e-200)])).displacement.any()  # 1e-400 is zero
     weak = fresh.scaled(1e-6)
     assert np.allclose(3.0 * model.deform(weak).displacement, model.deform(weak.scaled(3.0)).displacement, rtol=1e-5)
     assert model.deform(fresh.scaled(0.0)).outcome[0] is Outcome.PREDICTED

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes.play.deformers import GUARDED, Theatre
+from scenes.play.deformers import GUARDED, PatientSetup
 from scenes.script.scene import find_scene
 from scenes.script.tool import Probe
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Outcome, guess
-from sim.effects import Elasticity, Held, ToolContact, pushed_effects
+from sim.effects import Elasticity, Held, ToolContact, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Pushed, Touching
@@ -98,7 +98,7 @@ class Fading:
 
     def __init__(self, anatomy: Anatomy):
         self.anatomy, self.patch = anatomy, open_patch(anatomy)
-        fem = Fem(anatomy, pushed_effects(anatomy, SOFT), REFERENCE, "cpu", element="p1")
+        fem = Fem(anatomy, build_push_effects(anatomy, SOFT), REFERENCE, "cpu", element="p1")
         cortex = np.setdiff1d(self.patch.nodes, anatomy.tumour_nodes)
         self.contact, self.bases = condense_contact(fem, [anatomy.tumour_nodes, cortex], BALL)
 
@@ -114,7 +114,7 @@ class Fading:
         reaction, nodes = compute_wrench(force, get_poses(loads, BALL), BALL), np.arange(moved.shape[1])
         outcome = (Outcome.CONVERGED,) * count
         answer = Deformation(moved, nodes, outcome, np.zeros(count, int), np.zeros(count), loads.times, reaction)
-        return answer if at is None else answer.at(at)
+        return answer if at is None else answer.restrict(at)
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def test_a_model_learns_what_time_does_and_keeps_it(tmp_path, model, box):
     causes, nodes = draw_poses("palpation", box, 30, 77, BALL).causes, box.tumour_nodes
     fresh, truth = Loads(causes, sample_times(30, 77)), Fading(box)
     answer, right = model.deform(fresh), truth.deform(fresh)
-    moved = right.at(nodes).displacement
+    moved = right.restrict(nodes).displacement
     assert compute_point_errors(model, fresh, moved, nodes).mean() < 0.01 * np.linalg.norm(moved, axis=2).mean()
     force = np.linalg.norm(right.reaction[:, 0, :3], axis=1)
     assert np.linalg.norm((answer.reaction - right.reaction)[:, 0, :3], axis=1).mean() < 0.02 * force.mean()
@@ -150,7 +150,7 @@ def test_a_model_learns_what_time_does_and_keeps_it(tmp_path, model, box):
 def test_answers_follow_from_the_ones_before(model, box):
     """A tool that is held: its force goes on falling, as its own history has it; lifted off it is not relied on."""
     loads = draw_poses("palpation", box, 3, 5, BALL)
-    touching = loads.of(Touching)
+    touching = loads.get(Touching)
     assert touching is not None
     answer, forces = None, []
     for time in (BROUGHT, 1.5, 3.0, 9.0):
@@ -198,7 +198,7 @@ def test_a_model_plays_the_series_that_it_learned_and_no_other(model, box):
 def test_it_plays_alone_frame_by_frame(model, box):
     """Finite elements cannot stand behind it, and a frame of a straight run depends on those before."""
     scene = replace(find_scene("palpate"), effects=EFFECTS, tool=Probe(BALL.radius))
-    theatre = Theatre(box, None, {"contact": model}, "cpu")
+    theatre = PatientSetup(box, None, {"contact": model}, "cpu")
     scene = replace(scene, element="p1")
     assert theatre.list_deformers(scene) == ("contact", "fem") and theatre.select_default(scene) == "contact"
     assert describe_error(replace(model, bound=1e-3)).endswith(

@@ -11,7 +11,7 @@ from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Deformation, Outcome
-from sim.effects import Elasticity, Held, Retraction, ToolContact, pushed_effects
+from sim.effects import Elasticity, Held, Retraction, ToolContact, build_push_effects
 from sim.fem import Fem
 from sim.loads import Loads, Retracted, Touching
 from sim.material import BRAIN, Material, to_tissue_json
@@ -37,7 +37,7 @@ SOFT = Material("linear", 3000.0, 0.45)
 
 
 def condensed_box(box: Anatomy, tool: BuiltIn | None) -> tuple[RigidContact, list[Basis]]:
-    fem = Fem(box, pushed_effects(box, SOFT), REFERENCE, "cpu", element="p1")
+    fem = Fem(box, build_push_effects(box, SOFT), REFERENCE, "cpu", element="p1")
     return condense_contact(fem, [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)], tool)
 
 
@@ -86,7 +86,7 @@ def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box):
     force = condensed_box(box, ROD_OF_4)[0].compute_nodal_forces(compute_core_features(patch, rod))
     alike = condensed_box(box, ball)[0].compute_nodal_forces(compute_tool_features(patch, round_))
     np.testing.assert_allclose(force, alike, atol=0.02 * np.abs(alike).max())
-    turned = loads.of(Touching)
+    turned = loads.get(Touching)
     assert turned is not None
     pose = turned.pose.copy()
     pose[0, 0, :3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -133,7 +133,7 @@ def test_no_facet_is_entered_and_finite_elements_answer_so(box, preset):
     truth = fem.deform(loads)
     assert all(outcome.good for outcome in truth.outcome)
     found = bases[0].decode((contact.predict(X) * X[:, 6:7])[:, : len(bases[0].modes)])
-    theirs = truth.at(box.tumour_nodes).displacement
+    theirs = truth.restrict(box.tumour_nodes).displacement
     off = np.linalg.norm(found - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
     assert off.mean() < 0.05 and off.max() < 0.1
     bears, reads = force.reshape(len(X), -1, 3).sum(axis=1), truth.reaction[:, 0, :3]
@@ -159,7 +159,7 @@ class Stiffening:
         reaction = np.nan_to_num(compute_wrench(force, get_poses(loads, ROD_OF_4), ROD_OF_4))
         outcome = (Outcome.CONVERGED,) * count
         answer = Deformation(displacement, nodes, outcome, np.zeros(count, int), np.zeros(count), loads.times, reaction)
-        return answer if at is None else answer.at(at)
+        return answer if at is None else answer.restrict(at)
 
 
 @pytest.fixture(scope="module")

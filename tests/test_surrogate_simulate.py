@@ -66,7 +66,7 @@ def test_displacements_are_those_of_the_finite_elements(folder, small_box):
     from sim.fem import Fem
 
     data = read_dataset(folder / "data.h5")
-    truth = Fem(small_box, (Elasticity(), Held(), ToolForce()), device="cpu").deform(data.loads.rows(np.arange(3)))
+    truth = Fem(small_box, (Elasticity(), Held(), ToolForce()), device="cpu").deform(data.loads.select(np.arange(3)))
     stored = data.read_displacement(slice(None))[:3]
     assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
 

@@ -18,7 +18,7 @@ from surrogate.training.train import train
 
 @pytest.fixture(scope="module")
 def pushed(box):
-    return draw("palpation", box, 400, 0).of(Pushed)
+    return draw("palpation", box, 400, 0).get(Pushed)
 
 
 def test_whole_sectors_are_left_out(box, pushed):
@@ -44,11 +44,11 @@ def test_upright_loads_cannot_be_split(box, pushed):
 def test_training_sees_what_its_split_allows(box, pretender, tmp_path):
     simulate(tmp_path / "data.h5", pretender, draw("palpation", box, 200, 0), {})
     data = read_dataset(tmp_path / "data.h5")
-    split = leave_sectors_out(data.loads.of(Pushed), open_patch(box))
+    split = leave_sectors_out(data.loads.get(Pushed), open_patch(box))
     order = np.flatnonzero(split.train)
     fewer = replace(split, disc=np.where(np.isin(np.arange(200), order[50:]), -2, split.disc))
     trained = train(data, ["linear"], split=fewer)
-    points = data.loads.of(Pushed).point
+    points = data.loads.get(Pushed).point
     assert np.allclose(trained.models["linear"].envelope.points, points[order[:50]])
     assert trained.split is fewer and fewer.train.sum() == 50 and fewer.test.sum() == split.test.sum()
 

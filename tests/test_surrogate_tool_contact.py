@@ -9,9 +9,9 @@ import pytest
 from scenes.script.shipped_files import get_spatula_model_path, get_template_path
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
-from sim.contact_pressure import pressure
+from sim.contact_pressure import compute_pressure
 from sim.deformation import join_deformations
-from sim.effects import Elasticity, Held, ToolContact, pushed_effects
+from sim.effects import Elasticity, Held, ToolContact, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Touching
@@ -44,7 +44,7 @@ def over(body: Anatomy, *places: tuple[float, float]) -> Loads:
 def model(box):
     """Contact on linear tissue, of which nothing is learned."""
     parts = [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)]
-    contact, bases = condense_contact(Fem(box, pushed_effects(box, SOFT), device="cpu", element="p1"), parts, BLADE)
+    contact, bases = condense_contact(Fem(box, build_push_effects(box, SOFT), device="cpu", element="p1"), parts, BLADE)
     contact = replace(contact, grip=np.array([1.0, 0.0]))
     asked = to_indentation(over(box, (0.0, 0.2), (1.0, 4.0)), BLADE, open_patch(box))
     known = compute_training_range(open_patch(box), asked)
@@ -81,7 +81,7 @@ def test_it_comes_straight_in_where_that_is_nearer(model, box):
     lifted = model.deform(over(box, (0.0, -1.0)), starts[2])
     assert not lifted.displacement.any() and not lifted.reaction[:, 0, :3].any()
     strange = replace(starts[2], warm={HELD: np.ones((1, 5))})
-    alone = there.rows(np.array([2]))
+    alone = there.select(np.array([2]))
     assert model.deform(alone, strange).displacement.tobytes() == model.deform(alone).displacement.tobytes()
     spoiled = replace(starts[2], warm={HELD: np.nan * starts[2].warm[HELD]})
     assert model.deform(alone, spoiled).displacement.tobytes() == model.deform(alone).displacement.tobytes()
@@ -95,8 +95,8 @@ def test_pressure_is_that_of_the_finite_elements(model, box):
     assert has_tool_pressure(model) and not found[2].any()
     np.testing.assert_array_equal(compute_tool_pressure(model, loads, replace(answer, warm={})), found)
     fem = Fem(box, (Elasticity(SOFT), Held(), ToolContact((BLADE,))), device="cpu", batch=1, element="p1")
-    touching = loads.rows(np.array([0, 1]))
-    truth = pressure(fem, touching, fem.deform(touching))
+    touching = loads.select(np.array([0, 1]))
+    truth = compute_pressure(fem, touching, fem.deform(touching))
     np.testing.assert_allclose(found[:2].max(axis=1), truth.max(axis=1), rtol=0.2)
     with pytest.raises(InputError, match="give the complete result"):
         compute_tool_pressure(model, loads, answer.at(box.tumour_nodes))
@@ -109,7 +109,7 @@ def test_the_spatula_that_ships_has_the_finite_elements_answers():
     model = load(get_spatula_model_path(), read_anatomy(get_template_path()))["contact-gp"]
     kept = np.load(Path(__file__).parent / "data" / "spatula_poses.npz")
     answer = model.deform(Loads((Touching(kept["pose"][:, None]),)))
-    off = np.linalg.norm(answer.at(model.anatomy.tumour_nodes).displacement - kept["tumour"], axis=2)
+    off = np.linalg.norm(answer.restrict(model.anatomy.tumour_nodes).displacement - kept["tumour"], axis=2)
     moved = np.linalg.norm(kept["tumour"], axis=2)
     assert (off.max(axis=1) <= answer.bound[1]).all()
     assert np.mean(off.mean(axis=1) / moved.mean(axis=1)) < 0.08

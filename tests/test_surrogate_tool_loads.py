@@ -19,7 +19,7 @@ from surrogate.data.tool_loads import (
 
 
 def pushes(*args):
-    return draw(*args).of(Pushed)
+    return draw(*args).get(Pushed)
 
 
 @pytest.mark.parametrize("name", TOOLS)

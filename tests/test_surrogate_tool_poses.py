@@ -36,11 +36,11 @@ SAID = {"shape": repr(BALL), "effects": repr(EFFECTS)}
 
 def test_draws_are_each_of_their_own_number(box):
     few, many = draw_poses("palpation", box, 10, 4), draw_poses("palpation", box, 30, 4)
-    some, all_of = few.of(Touching), many.of(Touching)
+    some, all_of = few.get(Touching), many.get(Touching)
     assert some is not None
     assert all_of is not None
     np.testing.assert_array_equal(some.pose, all_of.pose[:10])
-    other = draw_poses("palpation", box, 10, 5).of(Touching)
+    other = draw_poses("palpation", box, 10, 5).get(Touching)
     assert other is not None
     assert not np.array_equal(some.pose, other.pose)
     depth = np.linalg.norm(to_indentation(many, BALL, open_patch(box)).force, axis=1) / BALL.radius
@@ -83,7 +83,7 @@ def test_poses_train_where_there_is_no_force(data, trained, pretender, box):
     assert list_learners(data) == POSED
     model, fresh = trained.models["gp"], draw_poses("palpation", box, 100, 77)
     nodes = box.tumour_nodes
-    truth = PosedPretender(pretender).deform(fresh).at(nodes).displacement
+    truth = PosedPretender(pretender).deform(fresh).restrict(nodes).displacement
     error = compute_point_errors(model, fresh, truth, nodes)
     assert error.mean() < 0.05 * np.linalg.norm(truth, axis=2).mean()
     found = model.deform(fresh, at=nodes)
@@ -91,7 +91,7 @@ def test_poses_train_where_there_is_no_force(data, trained, pretender, box):
     assert (error.max(axis=1) <= found.bound[0]).mean() > 0.85
     assert found.reaction.shape == (100, 0, 6)
     cortex = open_patch(box).nodes
-    exact = PosedPretender(pretender).deform(fresh).at(cortex).displacement
+    exact = PosedPretender(pretender).deform(fresh).restrict(cortex).displacement
     assert np.linalg.norm(model.deform(fresh, at=cortex).displacement - exact) < 0.2 * np.linalg.norm(exact)
 
 
@@ -182,6 +182,6 @@ def test_the_command_makes_poses_that_finite_elements_answer(tmp_path, box, caps
     assert reaction is not None
     np.testing.assert_allclose(reaction, truth.reaction, atol=2e-3 * np.abs(truth.reaction).max())
     force = truth.reaction[:, 0, :3]
-    shaft = data.loads.of(Touching).pose[:, 0, :3, 2]  # pyright: ignore[reportOptionalMemberAccess]
+    shaft = data.loads.get(Touching).pose[:, 0, :3, 2]  # pyright: ignore[reportOptionalMemberAccess]
     assert (np.einsum("bi,bi->b", force, shaft) < 0.0).all()
     assert NodalForce not in {type(effect) for effect in fem.effects}

@@ -11,8 +11,8 @@ from surrogate.model.training_range import Envelope, Measured, compute_training_
 def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
     patch = open_patch(box)
     points = [[0.0, 0.0, 0.0], [3e-3, 0.0, 0.0], [3e-3, 4e-3, 0.0]]
-    training = push(points, [[0.0, 0.0, -0.1], [0.0, 0.0, -0.2], [0.0, 0.0, -0.15]], [5e-3, 6e-3, 5e-3]).of(Pushed)
-    held = push([[13e-3, 0.0, 0.0], [0.0, 4e-3, 0.0]], [[0.3, 0.0, -0.9], [0.0, 0.0, -0.9]], [9e-3, 9e-3]).of(Pushed)
+    training = push(points, [[0.0, 0.0, -0.1], [0.0, 0.0, -0.2], [0.0, 0.0, -0.15]], [5e-3, 6e-3, 5e-3]).get(Pushed)
+    held = push([[13e-3, 0.0, 0.0], [0.0, 4e-3, 0.0]], [[0.3, 0.0, -0.9], [0.0, 0.0, -0.9]], [9e-3, 9e-3]).get(Pushed)
     found = compute_training_range(patch, training)
     assert found.reach == pytest.approx(4e-3) and np.allclose(found.points, training.point)
     alone = Pushed(training.point[:1], training.force[:1], training.footprint[:1])

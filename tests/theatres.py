@@ -10,7 +10,7 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 from ar.optics.lens import Lens
-from scenes.play.deformers import Theatre, to_model_path
+from scenes.play.deformers import PatientSetup, to_model_path
 from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.script.head_posture import build_drained_turn
@@ -22,7 +22,7 @@ from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity, read_intensity, to_intensity_path, write_intensity
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
+from sim.bodies.template import Tumour, build_template_subject
 from sim.effects import Elasticity, Gravity, Held, NodalForce, Slide, ToolForce
 from sim.fem import Fem
 from sim.loads import Pushed
@@ -53,7 +53,7 @@ def knowing_nothing(anatomy: Anatomy, training: dict[str, str]) -> Learned:
     part = ModelPart(
         "nodal", Linear().fit(np.eye(width), np.zeros((width, 1))), Basis(nodes, np.zeros((1, 3 * len(nodes))))
     )
-    pushed = draw("palpation", anatomy, 2, 0).of(Pushed)
+    pushed = draw("palpation", anatomy, 2, 0).get(Pushed)
     return Learned(anatomy, (part,), compute_training_range(patch, pushed), 1.23e-4, training=training)
 
 
@@ -68,7 +68,7 @@ def trained_on(anatomy: Anatomy) -> dict[str, Learned]:
 
 
 @cache
-def theatre_of(anatomy: Anatomy) -> Theatre:
+def theatre_of(anatomy: Anatomy) -> PatientSetup:
     """Models `linear` and `svr`, and a scan of slanted stripes."""
     shared = os.environ.get("SULCUS_TESTS_SHARED")
     kept = Path(shared or "", f"{anatomy.digest}.npz")
@@ -81,7 +81,7 @@ def theatre_of(anatomy: Anatomy) -> Theatre:
     stripes = 127.5 + 127.5 * np.sin(np.indices((40, 40, 24)).sum(axis=0) / 3.0)
     affine = np.diag([2e-3, 2e-3, 2e-3, 1.0])
     affine[:3, 3] = anatomy.mesh.nodes.mean(axis=0) - [0.04, 0.04, 0.02]
-    return Theatre(anatomy, Intensity(stripes.astype(np.uint8), affine), models, "cpu")
+    return PatientSetup(anatomy, Intensity(stripes.astype(np.uint8), affine), models, "cpu")
 
 
 @cache
@@ -91,17 +91,17 @@ def coarse_brain() -> Anatomy:
     kept = Path(shared or "", "coarse.vtu")
     if shared and kept.is_file():
         return read_anatomy(kept)
-    made = make_anatomy(template_subject(Tumour()), MeshPlan(2000))
+    made = make_anatomy(build_template_subject(Tumour()), MeshPlan(2000))
     if shared:
         write_anatomy(kept, made)
     return made
 
 
 @cache
-def template_theatre() -> Theatre:
+def template_theatre() -> PatientSetup:
     """The anatomy that ships, and finite elements that every scene on it shares."""
     path = get_template_path()
-    return Theatre(read_anatomy(path), read_intensity(to_intensity_path(path)), {}, "cpu")
+    return PatientSetup(read_anatomy(path), read_intensity(to_intensity_path(path)), {}, "cpu")
 
 
 @cache
@@ -115,7 +115,7 @@ def on_template(name: str) -> Player:
     return Player(Stage(small(name), theatre.site, theatre.intensity), template_fem())
 
 
-def put(theatre: Theatre, path: Path) -> Path:
+def put(theatre: PatientSetup, path: Path) -> Path:
     """The theatre as files: anatomy, scan and models beside it."""
     write_anatomy(path, theatre.anatomy)
     assert theatre.intensity is not None
@@ -141,7 +141,7 @@ def sinking() -> Scene:
     return replace(small(path=keep_idle, duration=0.2, effects=effects, tool=None, lying=lying), name="sinking")
 
 
-def player(theatre: Theatre, scene: Scene, deformer: str) -> Player:
+def player(theatre: PatientSetup, scene: Scene, deformer: str) -> Player:
     """As the commands make it."""
     return theatre.build_player(deformer, scene)
 

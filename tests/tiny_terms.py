@@ -26,7 +26,7 @@ class Spring:
     def begin(self, cases: Cases) -> None:
         count = len(cases.loads)
         anchor = np.asarray(cases.memory.get(self.name, np.zeros((count, self._rows // 3, 3))))
-        self._anchor = self._device.array(anchor.reshape(count, -1).T)
+        self._anchor = self._device.upload(anchor.reshape(count, -1).T)
         self._creep = 1.0 - np.exp(-(cases.loads.times - cases.start_time) / self._tau)
 
     def keep(self, columns: np.ndarray) -> None:

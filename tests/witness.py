@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 from conftest import make_box
 
-from scenes.play.deformers import Theatre
+from scenes.play.deformers import PatientSetup
 from scenes.play.player import Player
 from scenes.play.stage import Stage
 from scenes.script.scene import Scene, find_scene
@@ -74,7 +74,7 @@ def slippery(anatomy: Anatomy) -> Anatomy:
 def played(scene: Scene) -> dict[str, list[str]]:
     """Three frames of the scene's middle on a tiny box; the last is watched."""
     box = make_box((4, 4, 4), spacing=18e-3, tumour=16e-3, depth=30e-3, opening=26e-3)
-    theatre = Theatre(slippery(box), None, {}, "cpu")
+    theatre = PatientSetup(slippery(box), None, {}, "cpu")
     player = Player(Stage(scene, theatre.site), theatre.build_deformer("fem", scene))
     last = None
     for number in range(3):

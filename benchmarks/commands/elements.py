@@ -11,7 +11,7 @@ from pathlib import Path
 from scenes.options.shared_options import add_device, add_json
 from scenes.script.shipped_files import get_template_path
 from sim.bodies.meshfile import read_anatomy
-from sim.bodies.refine import refined
+from sim.bodies.refine import refine
 from sim.elements import ELEMENTS
 
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     from ..studies.elements import Press, limits, rows
 
     bodies = [read_anatomy(path) for path in args.anatomies or [get_template_path()]]
-    anatomies = bodies if args.coarse else [mesh for body in bodies for mesh in (body, refined(body))]
+    anatomies = bodies if args.coarse else [mesh for body in bodies for mesh in (body, refine(body))]
     table = sys.stderr if args.json else sys.stdout
     where = describe_machine(args.device)
     print(f"{where}\n\n| nu | element | vertices | tumour moves [mm] | set-up [s] | solve [s] | outer |", file=table)

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         open_journal(kept, stated) as journal,
         tqdm(total=len(args.sizes) * len(args.batch), unit="row", file=sys.stderr) as bar,
     ):
-        found = [row for row in journal.rows(Row) if row.size in args.sizes and row.asked in args.batch]
+        found = [row for row in journal.read_rows(Row) if row.size in args.sizes and row.asked in args.batch]
         bar.update(len(found))
         for row in rows(trial, args.sizes, args.batch, tuple(found), bar.set_description):
             journal.append(row)

@@ -16,7 +16,7 @@ from scenes.options.tissue_options import add_tissue_arguments, parse_elasticity
 from scenes.script.shipped_files import get_template_path
 from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from scenes.analysis.budget import PROMISED
     from scenes.analysis.measurement import describe_machine
     from scenes.script.scene import find_scene
-    from scenes.script.site import build_site
+    from scenes.script.site import build_craniotomy_frame
 
     from ..studies.live import RIDES, errors, frames_of, live_fem, loads_of, tally
 
@@ -56,9 +56,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(
             f"--frames {args.frames} --checked {checked} measures nothing: give 1 <= --checked <= --frames."
         )
-    site = build_site(read_anatomy(args.anatomy or get_template_path()))
+    site = build_craniotomy_frame(read_anatomy(args.anatomy or get_template_path()))
     scene = replace(
-        find_scene("press"), effects=pushed_effects(site.anatomy, parse_elasticity(args, site.anatomy.mesh))
+        find_scene("press"), effects=build_push_effects(site.anatomy, parse_elasticity(args, site.anatomy.mesh))
     )
     fem = live_fem(scene, site, args.device, args.element)
     found = []

@@ -148,13 +148,13 @@ def finer_of(args: argparse.Namespace) -> Anatomy:
     """The mesh that the truths are solved on."""
     from sim.bodies.meshfile import read_anatomy, write_anatomy
     from sim.bodies.subject import MeshPlan, make_anatomy
-    from sim.bodies.template import Tumour, template_subject
+    from sim.bodies.template import Tumour, build_template_subject
 
     kept = args.finer or (args.folder and args.folder / f"template-{args.nodes}.vtu")
     if args.finer or (kept and kept.is_file()):
         return read_anatomy(kept)
     print(f"benchmarks locate: meshing with about {args.nodes} nodes ...", file=sys.stderr)
-    anatomy = make_anatomy(template_subject(Tumour()), MeshPlan(args.nodes))
+    anatomy = make_anatomy(build_template_subject(Tumour()), MeshPlan(args.nodes))
     if kept:
         kept.parent.mkdir(parents=True, exist_ok=True)
         write_anatomy(kept, anatomy)

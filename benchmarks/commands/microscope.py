@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure."""
-    from scenes.script.sight import StereoSight
+    from scenes.script.sight import StereoObservation
 
     from ..studies.stereo_study import rows
 
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     check_at_least("--every", args.every, 1)
     theatre = build_requested_theatre(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)
-    if isinstance(scene.sight, StereoSight):
+    if isinstance(scene.sight, StereoObservation):
         sight = replace(scene.sight, named=not args.cloud, vessels=not args.plain)
         scene = replace(scene, sight=sight)
     with bar("estimates") as heard:

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Train each learner once for every position left out, and score them on the loads there."""
     data = read_dataset(args.data)
     good = np.flatnonzero(data.good)[: args.count]
-    loads, nodes = data.loads.rows(good), published_nodes(data.anatomy)
+    loads, nodes = data.loads.select(good), published_nodes(data.anatomy)
     truth = data.read_displacement(nodes)[good]
     sites, scores, seconds = positions_of(loads), [], []
     for name in args.learners:

@@ -18,7 +18,7 @@ from scenes.options.shared_options import add_anatomy, add_device, add_json, add
 from scenes.options.tissue_options import add_tissue_arguments, parse_elasticity
 from scenes.script.shipped_files import get_template_path
 from sim.bodies.meshfile import read_anatomy
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if args.count < 2 or args.batch < 1:
         raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")
     anatomy = read_anatomy(args.anatomy or get_template_path())
-    effects = pushed_effects(anatomy, parse_elasticity(args, anatomy.mesh))
+    effects = build_push_effects(anatomy, parse_elasticity(args, anatomy.mesh))
     trial = Trial(anatomy, effects, args.element, args.device, args.batch)
     stated = {"anatomy": anatomy.digest, "effects": repr(effects), "element": args.element}
     stated |= {"count": str(args.count), "seed": str(args.seed)}
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         open_journal(kept, stated) if kept else nullcontext() as journal,
         tqdm(total=args.count, unit="load", file=sys.stderr) as bar,
     ):
-        found = journal.rows(Record) if journal is not None else []
+        found = journal.read_rows(Record) if journal is not None else []
         bar.update(len(found))
         for some in records(trial, args.count, args.seed, tuple(found)):
             found += some

@@ -25,13 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row."""
     from scenes.analysis.measurement import describe_machine
-    from scenes.script.site import build_site
+    from scenes.script.site import build_craniotomy_frame
     from sim.runtime.device import find_device
 
     from ..studies.shortcuts import measure, works
 
     check_at_least("--runs", args.runs, 1)
-    site = build_site(read_anatomy(args.anatomy or get_template_path()))
+    site = build_craniotomy_frame(read_anatomy(args.anatomy or get_template_path()))
     table, where = sys.stderr if args.json else sys.stdout, describe_machine(args.device)
     print(f"{where}\n\n| shortcut | work | runs | with: median, p95 [ms] | without | ratio | of totals |", file=table)
     print(f"|{'---|' * 7}", file=table)

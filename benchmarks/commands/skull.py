@@ -12,7 +12,7 @@ from scenes.options.shared_options import add_device, add_json
 from sim.arguments import check_at_least
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
+from sim.bodies.template import Tumour, build_template_subject
 from sim.effects import SKULLS
 from surrogate.data.tool_loads import PRESETS, draw
 
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     check_at_least("--loads", args.loads, 1)
     plans = [MeshPlan(count) for count in args.nodes]
     bodies = [read_anatomy(path) for path in args.anatomies]
-    bodies = bodies or [make_anatomy(template_subject(Tumour()), plan) for plan in plans]
+    bodies = bodies or [make_anatomy(build_template_subject(Tumour()), plan) for plan in plans]
     loads = draw(args.preset, bodies[0], args.loads, 0)
     table = sys.stderr if args.json else sys.stdout
     where = describe_machine(args.device)

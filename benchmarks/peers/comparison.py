@@ -164,7 +164,7 @@ def case_of(anatomy: Anatomy, loads: int, seed: int) -> Case:
         An anatomy without open cortex, or fewer loads than one.
     """
     held = np.asarray((anatomy.held | (anatomy.slide_normal != 0.0)).any(axis=1))
-    (pushed,) = draw("palpation", anatomy, loads, seed).every(Pushed)
+    (pushed,) = draw("palpation", anatomy, loads, seed).get_all(Pushed)
     mesh = anatomy.mesh
     weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
     force = weights[:, :, None] * pushed.force[:, None, :]

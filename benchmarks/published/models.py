@@ -82,7 +82,7 @@ class Published:
         answer = build_prediction(
             displacement, self.nodes, loads, outside, begun, np.array(np.nan), "published protocol"
         )
-        return answer if at is None else answer.at(np.asarray(at))
+        return answer if at is None else answer.restrict(np.asarray(at))
 
 
 def published_nodes(anatomy: Anatomy) -> np.ndarray:

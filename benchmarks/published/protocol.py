@@ -55,8 +55,8 @@ class InTurn:
         """
         position = find_nearest(get_only_pushes(loads).point, self.positions)[0]
         rows = [np.flatnonzero(position == which) for which in np.unique(position)]
-        answers = [self.models[position[some[0]]].deform(loads.rows(some), at=at) for some in rows]
-        return join_deformations(answers).rows(np.argsort(np.concatenate(rows)))
+        answers = [self.models[position[some[0]]].deform(loads.select(some), at=at) for some in rows]
+        return join_deformations(answers).select(np.argsort(np.concatenate(rows)))
 
 
 def positions_of(loads: Loads) -> np.ndarray:
@@ -89,5 +89,5 @@ def trained_in_turn(
     models = []
     for which in range(len(positions)):
         others = np.flatnonzero(position != which)
-        models.append(published_model(name, anatomy, loads.rows(others), truth[others], progress))
+        models.append(published_model(name, anatomy, loads.select(others), truth[others], progress))
     return InTurn(positions, tuple(models))

@@ -10,8 +10,8 @@ import numpy as np
 from scenes.analysis.measurement import time_work
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
-from sim.bodies.refine import refined
-from sim.effects import ToolContact, ToolForce, pushed_effects
+from sim.bodies.refine import refine
+from sim.effects import ToolContact, ToolForce, build_push_effects
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Tissue
@@ -74,7 +74,7 @@ def rows(
     normal, places = _line(anatomy)
     T = np.zeros((len(places), 1, 4, 4))
     T[..., :3, :3], T[..., 3, 3] = build_axes_about(normal[None]), 1.0
-    fine = refined(anatomy, near_opening=True)
+    fine = refine(anatomy, near_opening=True)
     for element in elements:
         solvers = [_solver(body, element, radius, tissue, device) for body in (anatomy, fine)]
         for depth in depths:
@@ -101,5 +101,5 @@ def _line(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _solver(anatomy: Anatomy, element: str, radius: float, tissue: Tissue, device: str) -> Fem:
-    passive = (effect for effect in pushed_effects(anatomy, tissue) if not isinstance(effect, ToolForce))
+    passive = (effect for effect in build_push_effects(anatomy, tissue) if not isinstance(effect, ToolForce))
     return Fem(anatomy, [*passive, ToolContact((Ball(radius),))], TRAIN, device, element=element)

@@ -11,7 +11,7 @@ from scenes.analysis.measurement import time_work
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.discretisation.footprint import find_nearest_on
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, push
@@ -106,10 +106,10 @@ def above_tumour(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
 
 def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, device: str) -> Row:
     mesh = anatomy.mesh
-    effects = pushed_effects(anatomy, Material(press.law, press.young, poisson))
+    effects = build_push_effects(anatomy, Material(press.law, press.young, poisson))
     fem, set_up = time_work(Fem, anatomy, effects, ACCURACY, device, element=element)
     loads = _loads(anatomy, press)
-    fem.deform(loads.scaled(1e-3))  # kernels are compiled or loaded at their first launch
+    fem.deform(loads.scale(1e-3))  # kernels are compiled or loaded at their first launch
     answer, seconds = time_work(fem.deform, loads)
     motion = np.linalg.norm(tumour_motion(anatomy, answer.displacement)[0])
     return Row(

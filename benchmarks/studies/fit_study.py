@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.loads import Pushed
 from surrogate.fitting.fit import fit_from_evidence
-from surrogate.fitting.frame import Frame, Tool
+from surrogate.fitting.frame import ObservedFrame, Tool
 from surrogate.fitting.responses import Responses, build_drained_loads, build_force_loads, solve_responses
 from surrogate.fitting.tissue import CLASSES, FittedTissue
 from surrogate.locating.locator import Locator
@@ -84,7 +84,7 @@ def fitted_to(
     patient, frames = seen.patient, []
     for number, motion in enumerate(seen.motion):
         observation = observed(locator.anatomy, motion, sight, (seed, patient.number, number))
-        frames.append(Frame(observation, _tools(library.tools, patient, number, read and not number)))
+        frames.append(ObservedFrame(observation, _tools(library.tools, patient, number, read and not number)))
     pressed = library.pressed_on(patient.places) if patient.places else None
     return fit_from_evidence(locator, frames, library.drained, pressed, device)
 

@@ -72,7 +72,7 @@ class Seen:
 
 def places(anatomy: Anatomy, seed: int = 0) -> Pushed:
     """Where tools may press, how wide they are, and which way their forces lean: one a place."""
-    found = drawn_loads("palpation", anatomy, PLACES, 1000 + seed).of(Pushed)
+    found = drawn_loads("palpation", anatomy, PLACES, 1000 + seed).get(Pushed)
     assert found is not None
     return found
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from scenes.analysis.measurement import time_work
 from scenes.script.scene import Scene
-from scenes.script.site import Site
+from scenes.script.site import CraniotomyFrame
 from scenes.script.tool import Probe
 from scenes.script.tool_paths import stroke_cortex
 from sim.accuracy import LIVE, Accuracy
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import Loads, stacked
+from sim.loads import Loads, stack
 
 SPEED = 20e-3
 # Frames before the first that counts: the tool arrives, and kernels are loaded.
@@ -64,7 +64,7 @@ class Tally:
     error: float
 
 
-def loads_of(ride: Ride, scene: Scene, site: Site, frames: int) -> list[Loads]:
+def loads_of(ride: Ride, scene: Scene, site: CraniotomyFrame, frames: int) -> list[Loads]:
     """The loads of each frame, those of the warm-up first.
 
     Raises
@@ -92,15 +92,15 @@ def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
             yield Frame(load, replace(last, memory={}, warm={}), seconds)
 
 
-def live_fem(scene: Scene, site: Site, device: str, element: str) -> Fem:
+def live_fem(scene: Scene, site: CraniotomyFrame, device: str, element: str) -> Fem:
     """Finite elements for live frames."""
     return Fem(site.anatomy, scene.effects, LIVE, device, element=element, live=True)
 
 
-def errors(frames: Sequence[Frame], scene: Scene, site: Site, element: str) -> np.ndarray:
+def errors(frames: Sequence[Frame], scene: Scene, site: CraniotomyFrame, element: str) -> np.ndarray:
     """Largest distance (n,) [m] over all nodes between each frame's answer and the converged solution."""
     exact = Fem(site.anatomy, scene.effects, CONVERGED, "cpu", element=element)
-    converged = exact.deform(stacked([frame.loads for frame in frames])).displacement
+    converged = exact.deform(stack([frame.loads for frame in frames])).displacement
     found = np.concatenate([frame.answer.displacement for frame in frames])
     return np.linalg.norm(found - converged, axis=2).max(axis=1)
 

@@ -123,7 +123,7 @@ def ogden(share: float, poisson: float = POISSON) -> Ogden:
 
 def loads_of(anatomy: Anatomy, draw: Draw) -> Loads:
     """What moves a twin of this body."""
-    pushed = drawn_loads(draw.tool, anatomy, 1, draw.push).of(Pushed)
+    pushed = drawn_loads(draw.tool, anatomy, 1, draw.push).get(Pushed)
     assert pushed is not None
     if "tool" not in draw.cause:
         pushed = Pushed(pushed.point, 0.0 * pushed.force, pushed.footprint)

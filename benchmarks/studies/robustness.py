@@ -71,19 +71,19 @@ def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iter
         loads = draw(preset, trial.anatomy, wanted, seed)
         for start in range(first // trial.batch * trial.batch, len(loads), trial.batch):
             index = np.arange(start, min(start + trial.batch, len(loads)))
-            some = loads.rows(index)
+            some = loads.select(index)
             answer, seconds = time_work(fem.deform, some)
             again = np.full(len(index), np.nan)
             chosen = np.flatnonzero(index % CHECKED == 0)
             if len(chosen):
-                again[chosen] = double.residual(some.rows(chosen), answer.rows(chosen))
+                again[chosen] = double.residual(some.select(chosen), answer.select(chosen))
             yield _written(preset, index, some, answer, again, seconds / len(index))[max(first - start, 0) :]
 
 
 def _written(
     preset: str, index: np.ndarray, loads: Loads, answer: Deformation, again: np.ndarray, seconds: float
 ) -> list[Record]:
-    (pushed,) = loads.every(Pushed)
+    (pushed,) = loads.get_all(Pushed)
     force = np.linalg.norm(pushed.force, axis=1)
     return [
         Record(

@@ -17,7 +17,7 @@ from scenes.analysis.measurement import time_work, watch_gpu_memory
 from scenes.report.finite_elements import build_template_mesh
 from sim.accuracy import TRAIN
 from sim.bodies.meshfile import read_anatomy
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN
@@ -89,15 +89,15 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
     needed = estimate_needed(anatomy, trial.element, TRAIN, trial.device, batch, batch)
     if needed is not None:
         print(f"{needed}.", file=sys.stderr)
-        needed.demand()
+        needed.check_fits()
     with watch_gpu_memory(trial.device) as card:
-        effects = pushed_effects(anatomy, BRAIN)
+        effects = build_push_effects(anatomy, BRAIN)
         fem, made = time_work(Fem, anatomy, effects, TRAIN, trial.device, batch, trial.element)
         loads = draw("palpation", anatomy, max(LOADS, batch) + 1, SEED)
-        fem.deform(loads.rows(np.array([-1])).scaled(1e-3))  # kernels are compiled or loaded at their first launch
+        fem.deform(loads.select(np.array([-1])).scale(1e-3))  # kernels are compiled or loaded at their first launch
         seconds, outer, good = [], [], 0
         while sum(seconds) < PATIENCE and len(outer) + batch <= max(LOADS, batch):
-            some = loads.rows(np.arange(len(outer), len(outer) + batch))
+            some = loads.select(np.arange(len(outer), len(outer) + batch))
             answer, spent = time_work(fem.deform, some)
             seconds.append(spent)
             outer += list(answer.iterations)

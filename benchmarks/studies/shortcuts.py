@@ -9,9 +9,9 @@ import numpy as np
 
 from scenes.analysis.measurement import time_work
 from scenes.script.scene import find_scene
-from scenes.script.site import Site
+from scenes.script.site import CraniotomyFrame
 from sim.accuracy import LIVE, TRAIN, Accuracy
-from sim.effects import Effect, ToolContact, pushed_effects
+from sim.effects import Effect, ToolContact, build_push_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import BRAIN
@@ -79,14 +79,14 @@ class Row:
         return self.total_without / self.total
 
 
-def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
+def works(site: CraniotomyFrame, runs: int, on_cuda: bool) -> Iterator[Work]:
     """What is measured; of each the first load only warms up."""
     anatomy, some = site.anatomy, BATCH_ON_CUDA if on_cuda else BATCH
-    pushed = pushed_effects(anatomy, BRAIN)
+    pushed = build_push_effects(anatomy, BRAIN)
     loads = draw("palpation", anatomy, runs + 1, SEED)
-    single = [loads.rows(np.array([row])) for row in range(len(loads))]
+    single = [loads.select(np.array([row])) for row in range(len(loads))]
     many = draw("palpation", anatomy, some * (runs + 1), SEED)
-    batches = [many.rows(np.arange(first, first + some)) for first in range(0, len(many), some)]
+    batches = [many.select(np.arange(first, first + some)) for first in range(0, len(many), some)]
     for element in ("smoothed", "p1"):
         name = f"{some} palpation loads together, {element}"
         yield Work("nonlinear elimination near the opening", name, SolverStep.NEAR, batches, pushed, element=element)
@@ -94,7 +94,7 @@ def works(site: Site, runs: int, on_cuda: bool) -> Iterator[Work]:
     yield Work("nonlinear elimination, clamped", name, SolverStep.CLAMPED, single, pushed, element="p2")
     yield Work("L-BFGS before Newton", "a palpation load from rest", SolverStep.LBFGS, single, pushed)
     poses = draw_poses("palpation", anatomy, POSES * (runs + 1), SEED)
-    together = [poses.rows(np.arange(first, first + POSES)) for first in range(0, len(poses), POSES)]
+    together = [poses.select(np.arange(first, first + POSES)) for first in range(0, len(poses), POSES)]
     tool = (*pushed, ToolContact((choose_ball("palpation"),)))
     yield Work("contact solved apart", f"{POSES} poses of a ball together", SolverStep.CONTACT, together, tool)
     for scene, step, shortcut in (
@@ -125,7 +125,7 @@ def tried(fem: Fem, step: SolverStep | None) -> bool:
     )
 
 
-def measure(work: Work, site: Site, device: str) -> Row | None:
+def measure(work: Work, site: CraniotomyFrame, device: str) -> Row | None:
     """Time a work with and without its shortcut, load by load in turn; None where the shortcut is not taken."""
     avoid = () if work.step is None else (work.step,)
     batch = len(work.loads[0])

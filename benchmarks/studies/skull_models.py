@@ -11,11 +11,11 @@ from scenes.analysis.measurement import time_work
 from sim.accuracy import STRAINED
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, join_deformations
-from sim.effects import Bonded, pushed_effects
+from sim.effects import Bonded, build_push_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
-from sim.tearing import TEARING, Tearing, torn
+from sim.tearing import TEARING, Tearing, solve_with_debonding
 
 from .elements import tumour_motion
 
@@ -67,7 +67,7 @@ def rows(
 
 def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str, tearing: Tearing) -> Row:
     mesh, tissue = anatomy.mesh, Material("neo-hookean", 3000.0, poisson)
-    weak = loads.rows(slice(0, 1)).scaled(1e-3)
+    weak = loads.select(slice(0, 1)).scale(1e-3)
     _answered(anatomy, skull, tissue, weak, device, tearing)  # kernels are compiled or loaded
     answer, good, seconds = _answered(anatomy, skull, tissue, loads, device, tearing)
     if not good.any():
@@ -85,15 +85,17 @@ def _answered(
 ) -> tuple[Deformation, np.ndarray, float]:
     """Answers, which of them are good (B,), and seconds a load: set-up left out, but for what tears, which needs it."""
     if skull in TORN:
-        effects = [TORN[skull] if isinstance(one, Bonded) else one for one in pushed_effects(anatomy, tissue)]
-        each = [loads.rows(np.array([row])) for row in range(len(loads))]
-        found = [time_work(torn, anatomy, effects, load, STRAINED, device, tearing=tearing) for load in each]
+        effects = [TORN[skull] if isinstance(one, Bonded) else one for one in build_push_effects(anatomy, tissue)]
+        each = [loads.select(np.array([row])) for row in range(len(loads))]
+        found = [
+            time_work(solve_with_debonding, anatomy, effects, load, STRAINED, device, tearing=tearing) for load in each
+        ]
         good = np.array([one.rested and one.answer.outcome[0].good for one, _ in found])
         return (
             join_deformations([one.answer for one, _ in found]),
             good,
             float(np.mean([seconds for _, seconds in found])),
         )
-    fem = Fem(anatomy, pushed_effects(anatomy, tissue, skull), STRAINED, device)
+    fem = Fem(anatomy, build_push_effects(anatomy, tissue, skull), STRAINED, device)
     answer, seconds = time_work(fem.deform, loads)
     return answer, np.array([outcome.good for outcome in answer.outcome]), seconds / len(loads)

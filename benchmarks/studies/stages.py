@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.analysis.measurement import time_work
-from scenes.play.deformers import Theatre
+from scenes.play.deformers import PatientSetup
 from scenes.play.player import Player
 from sim.accuracy import LIVE, TRAIN
 from sim.fem import Fem
@@ -37,7 +37,7 @@ def figure(name: str, unit: str, scale: float, runs: int, note: str, work: Calla
 
 
 def rows(
-    theatre: Theatre,
+    theatre: PatientSetup,
     player: Player,
     deformer: str,
     solves: int,
@@ -52,7 +52,7 @@ def rows(
     nodes = theatre.anatomy.tumour_nodes
     size = f"{len(theatre.anatomy.mesh.nodes)} nodes, {len(theatre.anatomy.mesh.tets)} tetrahedra"
     loads = draw("palpation", theatre.anatomy, solves, seed=20)
-    single = [loads.rows(np.array([row])) for row in range(len(loads))]
+    single = [loads.select(np.array([row])) for row in range(len(loads))]
 
     fem, seconds = time_work(theatre.build_fem, scene, TRAIN, batch)
     seconds += time_work(fem.deform, single[0])[1]

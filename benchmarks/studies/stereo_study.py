@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scenes.play.deformers import Theatre
+from scenes.play.deformers import PatientSetup
 from scenes.play.observer import TumourEstimate
 from scenes.script.scene import Scene
-from scenes.script.sight import StereoSight
+from scenes.script.sight import StereoObservation
 from sim.errors import InputError
 
 
@@ -54,7 +54,7 @@ class Row:
 
 
 def rows(
-    theatre: Theatre,
+    theatre: PatientSetup,
     scene: Scene,
     seeds: Sequence[int],
     every: int,
@@ -67,7 +67,7 @@ def rows(
     InputError
         A scene that no pair of eyes sees; an anatomy without a locator.
     """
-    if not isinstance(scene.sight, StereoSight):
+    if not isinstance(scene.sight, StereoObservation):
         raise InputError(f"no pair of eyes sees the scene {scene.name}: choose one with a StereoSight, as microscope.")
     player, numbers = theatre.build_player("fem", scene), range(0, len(scene.times), every)
     seen, last, total, done = [], None, len(numbers) * (1 + len(seeds)), 0

@@ -15,7 +15,7 @@ from scenes.analysis.measurement import time_work
 from sim.accuracy import REFERENCE, STRAINED
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation
-from sim.effects import Effect, pushed_effects
+from sim.effects import Effect, build_push_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
@@ -210,14 +210,14 @@ def rows(
     InputError
         As `on_each`.
     """
-    trial = replace(trial, effects=(*pushed_effects(trial.anatomy, material), *tools))
+    trial = replace(trial, effects=(*build_push_effects(trial.anatomy, material), *tools))
     with on_each(devices or (trial.device,), trial) as asked:
         known = asked(facts, None)
         nodes, preconditioner, _ = known[0]
         # Judged on the host whatever the device: other kernels and other arithmetic than those that are measured.
         judge = replace(trial, device="cpu", batch=CHECKED).fem(REFERENCE)
         for preset, (loads, drawing) in sets.items():
-            asked(warmed, loads.rows(slice(trial.batch)))
+            asked(warmed, loads.select(slice(trial.batch)))
             done()
             seconds, converged = [], []
             steps = np.zeros(0)
@@ -227,7 +227,7 @@ def rows(
                 converged.append(sum(each.converged for each in found))
                 steps = np.concatenate([each.steps for each in found])
                 done()
-            chosen = loads.rows(checked(len(loads)))
+            chosen = loads.select(checked(len(loads)))
             again = np.concatenate([judge.residual(chosen, answer) for answer in asked(solved, chosen)])
             done()
             yield Row(

@@ -9,7 +9,7 @@ from surrogate.evaluation.choose import Offer
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 
-from ..play.deformers import Theatre
+from ..play.deformers import PatientSetup
 from ..script.scene import Scene
 from .measurement import time_work
 
@@ -19,7 +19,7 @@ TIMED = 24
 PROMISED = 5e-5
 
 
-def time_offers(theatre: Theatre, scene: Scene) -> list[Offer]:
+def time_offers(theatre: PatientSetup, scene: Scene) -> list[Offer]:
     """One offer for each deformer that states an error, timed on moments of the scene, as they are played."""
     made = []
     times = scene.times[np.linspace(0, len(scene.times) - 1, TIMED + 1).astype(int)]

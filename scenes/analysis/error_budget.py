@@ -19,7 +19,7 @@ from sim.errors import InputError
 from surrogate.locating.calibration import RADIUS_SQUARED
 
 from ..script.priors import MESH, OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
 from .tracking_errors import CORNER, change_calibration, compute_row_delay, project_by_rows, project_corners
@@ -68,7 +68,7 @@ class Filmed:
         is drawn on is by `latency` later [s] than the one that was tracked.
     """
 
-    site: Site
+    site: CraniotomyFrame
     viewpoint: Viewpoint
     duration: float
     T_scan_patient: np.ndarray

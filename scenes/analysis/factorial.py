@@ -11,9 +11,9 @@ import numpy as np
 from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
+from sim.bodies.template import Tumour, build_template_subject
 from sim.fem import Fem
-from sim.loads import Loads, push, stacked
+from sim.loads import Loads, push, stack
 from sim.material import BRAIN
 
 from .loglog_chart import ChartPanel, Curve
@@ -49,11 +49,11 @@ class Cell:
 def solve_cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[Cell]:
     """Solve every combination on template meshes of about `nodes` nodes; the tool presses at three places."""
     for opening, depth in product(levels["opening [mm]"], levels["depth [mm]"]):
-        subject = template_subject(Tumour(cover=1e-3 * float(depth)))
+        subject = build_template_subject(Tumour(cover=1e-3 * float(depth)))
         anatomy = make_anatomy(subject, MeshPlan(nodes, 1e-3 * float(opening)))
         cortex = open_cortex(anatomy)
         places = [cortex.place(*place) for place in PLACES]
-        forces = stacked([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])
+        forces = stack([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])
         study = SensitivityStudy(anatomy, forces, _body(DEFAULT), device=device)
         default = study.build_fem(study.body).deform(forces)
         motions = match_motion(anatomy, forces, default)

@@ -11,10 +11,10 @@ from sim.accuracy import STRAINED, Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.deformation import Deformation, guess
 from sim.discretisation.footprint import compute_footprint_weights
-from sim.effects import SKULLS, Elasticity, ToolDisplacement, pushed_effects
+from sim.effects import SKULLS, Elasticity, ToolDisplacement, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.loads import MAGNITUDE, Displaced, Loads, Pushed, stacked
+from sim.loads import MAGNITUDE, Displaced, Loads, Pushed, stack
 from sim.material import BRAIN, Material
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.tool_loads import find_perpendiculars
@@ -106,7 +106,7 @@ def apply_aim(loads: Loads, aim: Aim, patch: Patch) -> Loads:
     if aim.shift:
         first, second = find_perpendiculars(patch.find_normals(cause.point))
         points = [cause.point + aim.shift * way for way in (first, -first, second, -second)]
-    return stacked(
+    return stack(
         [Loads((replace(cause, **{name: one, "point": point}),), loads.time) for one in vectors for point in points]
     )
 
@@ -159,7 +159,7 @@ class SensitivityStudy:
     def build_fem(self, body: BodyVariant) -> Fem:
         """Return the finite elements of a body, for tools of either kind."""
         tissue = body.tissue
-        _, *others = pushed_effects(self.anatomy, tissue, body.skull)
+        _, *others = build_push_effects(self.anatomy, tissue, body.skull)
         elasticity = Elasticity(tissue, {TUMOUR_LABEL: replace(tissue, young=body.tumour * tissue.young)})
         effects = (elasticity, *others, ToolDisplacement())
         return Fem(self.anatomy, effects, self.accuracy, self.device, element=body.element)
@@ -184,7 +184,7 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
     known = match_motion(study.anatomy, study.loads, pushed)
     defaults = ((study.loads, pushed), (known, fem.deform(known, guess(pushed.displacement))))
     rest = np.zeros((len(study.loads), len(nodes), 3))
-    whole = [change(default.at(nodes), default.at(nodes), rest) for _, default in defaults]
+    whole = [change(default.restrict(nodes), default.restrict(nodes), rest) for _, default in defaults]
     yield SensitivityRow(Variant("motion itself", "", "", body), *whole)
     for variant in changed:
         if variant.body != body:
@@ -193,7 +193,7 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
         for loads, default in defaults:
             asked = apply_aim(loads, variant.aim, patch)
             start = np.tile(default.displacement, (len(asked) // len(loads), 1, 1))
-            of_default = default.at(nodes)
+            of_default = default.restrict(nodes)
             found.append(change(fem.deform(asked, guess(start), nodes), of_default, of_default.displacement))
         yield SensitivityRow(variant, *found)
 
@@ -231,7 +231,7 @@ def match_motion(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
 
     The mean motion of each footprint, from the motion of the mesh's own vertices: on quadratic elements nearly.
     """
-    cause = loads.only(Pushed)
+    cause = loads.get_only(Pushed)
     if cause is None:
         raise InputError("known motions are derived from forces: give `Pushed` loads alone.")
     mesh = anatomy.mesh

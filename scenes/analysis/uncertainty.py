@@ -16,7 +16,7 @@ from sim.errors import InputError
 from sim.material import LAWS, Material
 from sim.skulls import Bonded, SkullContact, Slide
 
-from ..play.deformers import Theatre
+from ..play.deformers import PatientSetup
 from ..play.stage import Stage
 from ..script.priors import (
     MESH,
@@ -187,7 +187,7 @@ def list_moments(scene: Scene) -> tuple[float, ...]:
     return tuple(np.linspace(0.0, scene.duration, MOMENTS).tolist())
 
 
-def solve_nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
+def solve_nominal(theatre: PatientSetup, scene: Scene) -> SurfaceMotions:
     """Solve the scene as it is.
 
     Raises
@@ -207,7 +207,7 @@ def solve_nominal(theatre: Theatre, scene: Scene) -> SurfaceMotions:
     return SurfaceMotions(list_moments(scene), answer.motions, tuple(normals))
 
 
-def solve_scene(theatre: Theatre, scene: Scene) -> Answer:
+def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
     """Return the tumour's motions at each moment; None where some has no equilibrium.
 
     A moment that has none from the one before is gone to by way of times between.
@@ -240,10 +240,10 @@ def solve_scene(theatre: Theatre, scene: Scene) -> Answer:
 
 
 def _surface(stage: Stage, answer: Deformation) -> np.ndarray:
-    return answer.at(stage.tumour_vertices).displacement[0]
+    return answer.restrict(stage.tumour_vertices).displacement[0]
 
 
-def solve_ensemble(theatre: Theatre, scene: Scene, draws: Sequence[PatientSample]) -> Iterator[Answer]:
+def solve_ensemble(theatre: PatientSetup, scene: Scene, draws: Sequence[PatientSample]) -> Iterator[Answer]:
     """Yield the motions of every draw."""
     for draw in draws:
         yield solve_scene(theatre, apply_sample(scene, draw))
@@ -269,7 +269,7 @@ def filter_sound_draws(scene: Scene, draws: Sequence[PatientSample], answers: It
 
 
 def estimate_uncertainty(
-    theatre: Theatre,
+    theatre: PatientSetup,
     scene: Scene,
     still: SurfaceMotions,
     draws: Sequence[PatientSample],

@@ -7,7 +7,7 @@ from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.material import Material
 
 from ..script.scene import Bounds, Scene
-from ..script.sight import Sight
+from ..script.sight import PointObservation
 from ..script.tool import Probe
 from ..script.tool_paths import press
 from ..script.viewpoint import Viewpoint
@@ -23,7 +23,7 @@ SCENE = Scene(
     tool=Probe(radius=10e-3),  # under a smaller one tetrahedra are inverted
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Bonded(), ToolForce()),
-    sight=Sight(),
+    sight=PointObservation(),
     viewpoint=Viewpoint(fov=np.radians(13.0), width=800, height=600),
     # The tumour moves little more than the rigid error: in four frames 43 % of the motion is removed.
     bounds=Bounds(overlap=0.75, error=2e-3, removed=0.3),

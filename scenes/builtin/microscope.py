@@ -8,7 +8,7 @@ from sim.material import Material
 
 from ..script.head_posture import build_drainage
 from ..script.scene import Bounds, Scene
-from ..script.sight import StereoSight
+from ..script.sight import StereoObservation
 from ..script.tool import Probe
 from ..script.tool_paths import Touch, press
 from ..script.viewpoint import Viewpoint
@@ -34,7 +34,7 @@ SCENE = Scene(
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),
     lying=build_drainage(2.0, to=0.2),
-    sight=StereoSight(),
+    sight=StereoObservation(),
     viewpoint=Viewpoint(distance=0.3, tilt=-0.4, fov=np.radians(9.0), width=800, height=600, eye="left", field=1.0),
     bounds=Bounds(overlap=0.7, error=3e-3, drawn=2.5, removed=0.5),
 )

@@ -6,7 +6,7 @@ from sim.material import Material
 
 from ..script.head_posture import build_drainage
 from ..script.scene import Bounds, Scene
-from ..script.sight import Sight
+from ..script.sight import PointObservation
 from ..script.viewpoint import Viewpoint
 
 # Softer than usual, with a stiffer tumour: the estimate is given neither.
@@ -20,7 +20,7 @@ SCENE = Scene(
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity()),
     tool=None,
     lying=build_drainage(3.0, to=0.2),
-    sight=Sight(),
+    sight=PointObservation(),
     viewpoint=Viewpoint(width=800, height=600),
     # # The truth's dashed outline is drawn with an error of up to 0.4 pixels at a live solution: in one frame that
     # makes 2.2.

@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     for path in check_no_foreign_files(args.out, anatomy.digest, args.force):
         print(f"{path}: was made with the anatomy that is replaced: simulate and train anew.", file=sys.stderr)
     with time_stage("write the mesh"):
-        intensity = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
+        intensity = subject.intensity and subject.intensity.crop(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
         write_anatomy(args.out, anatomy)
         if intensity is None:
             beside.unlink(missing_ok=True)  # belongs to an earlier mesh of this name
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
     for part in subject.parts:
-        if not anatomy.mesh.within(part.label).any():
+        if not anatomy.mesh.mark_elements(part.label).any():
             said = f"has no {name_region(part.label)}, of which the labels mark {1e6 * part.volume:.2g} ml"
             print(f"{args.out}: {said}: where it matters, ask for more nodes.", file=sys.stderr)
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
@@ -186,7 +186,7 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
 
 def _volume(mesh: TetMesh, part: SubjectPart) -> float:
     """[m^3] of the tetrahedra of a part."""
-    return float(mesh.volumes[mesh.within(part.label)].sum())
+    return float(mesh.volumes[mesh.mark_elements(part.label)].sum())
 
 
 def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
 
     from ..analysis.error_budget import ErrorBudget, Filmed, OverlayErrors
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..script.priors import PatientSample
     from ..script.scene import Scene
 
@@ -148,7 +148,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _seen(args: argparse.Namespace, theatre: Theatre) -> Scene:
+def _seen(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
     """Return the scene with a calibrated camera.
 
     Raises
@@ -201,7 +201,7 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
     return covariance
 
 
-def _bodies(args: argparse.Namespace, theatre: Theatre, scene: Scene, count: int, seed: int) -> Bodies:
+def _bodies(args: argparse.Namespace, theatre: PatientSetup, scene: Scene, count: int, seed: int) -> Bodies:
     """Sample bodies from the priors and solve the tumour's surface motion; drop those without equilibrium.
 
     Raises
@@ -228,7 +228,7 @@ def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarr
     return np.stack([answer[number] for _, answer in bodies]), sample_mesh_errors(scene, draws), own
 
 
-def _promised(theatre: Theatre, scene: Scene, time: float) -> float:
+def _promised(theatre: PatientSetup, scene: Scene, time: float) -> float:
     """Return the bound [m] of the model that plays a scene, at a time [s]; 0 where finite elements do."""
     player = theatre.build_player(theatre.select_default(scene), scene)
     number = int(np.abs(scene.times - time).argmin())

@@ -24,7 +24,7 @@ from ..options.theatre_options import (
 
 if TYPE_CHECKING:
     from ..play.checks import SceneFigures
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..play.player import Frame
     from ..script.scene import Scene
     from ..script.uncertainty import TumourError
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if passed else 1
 
 
-def _tracking(args: argparse.Namespace, theatre: Theatre, table: TextIO) -> dict[str, object]:
+def _tracking(args: argparse.Namespace, theatre: PatientSetup, table: TextIO) -> dict[str, object]:
     """Check the overlay on a synthetic video whose markers disappear and return."""
     from ..tracked.drawn_film import build_synthetic_video
     from ..tracked.tracking_checks import build_default_pipeline, measure_tracking

@@ -22,7 +22,7 @@ from ..options.shared_options import add_json, add_seed, to_json_line
 from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre
 
 if TYPE_CHECKING:
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..play.player import Player
     from ..script.scene import Scene
     from ..tracked.filming import Trouble, VideoFrame
@@ -148,7 +148,7 @@ def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
             )
 
 
-def _scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
+def _scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
     """Return the scene as the camera sees it, and no longer than is asked for."""
     scene = add_targets(args, build_requested_scene(args, args.scene, theatre))
     if args.readout is not None:

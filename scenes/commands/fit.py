@@ -20,7 +20,7 @@ from .locate import describe_left_out
 from .locator import REGIONS, find_locator
 
 if TYPE_CHECKING:
-    from surrogate.fitting.frame import Frame
+    from surrogate.fitting.frame import ObservedFrame
     from surrogate.fitting.tissue import FittedTissue
 
 
@@ -94,13 +94,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _frames(args: argparse.Namespace) -> list[Frame]:
-    from surrogate.fitting.frame import Frame, read_tools
+def _frames(args: argparse.Namespace) -> list[ObservedFrame]:
+    from surrogate.fitting.frame import ObservedFrame, read_tools
     from surrogate.locating.observed_files import read_observation
 
     tools = ((),) * len(args.frames) if args.tool_log is None else read_tools(args.tool_log, len(args.frames))
     seen = [replace(read_observation(path), rigid=1e-3 * args.rigid) for path in args.frames]
-    return [Frame(*each) for each in zip(seen, tools, strict=True)]
+    return [ObservedFrame(*each) for each in zip(seen, tools, strict=True)]
 
 
 def _numbers(tissue: FittedTissue, out: Path) -> dict[str, object]:

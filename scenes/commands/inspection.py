@@ -156,7 +156,7 @@ def inspect_subject(masks: HeadMasks, subject: Subject, regions: Mapping[int, Ti
 
 def _tissue(label: int, regions: Mapping[int, Tissue]) -> str:
     """Describe the tissue of a region."""
-    tissue = Elasticity(None, regions).of(label)
+    tissue = Elasticity(None, regions).get_law(label)
     around = "tumour" if label == NECROSIS_LABEL else "brain"
     return f"as stiff as the {around}" if tissue is None else str(tissue)
 

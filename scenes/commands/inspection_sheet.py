@@ -138,7 +138,7 @@ def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.
     colour = np.tile(np.array(GROUND, float), (len(points), 1))
     tint = 1.0
     if subject.intensity is not None:
-        grey = subject.intensity.at(points)
+        grey = subject.intensity.interpolate(points)
         white = np.quantile(grey[layers["brain"]], 0.98) if layers["brain"].any() else grey.max()
         colour = np.repeat(np.clip(grey / (white or 1.0), 0.0, 1.0)[:, None] * 235.0, 3, axis=1)
         tint = TINT

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
     data = read_dataset(args.data)
     models = load(args.model, data.anatomy)
-    loads = data.loads.rows(np.flatnonzero(data.good))
+    loads = data.loads.select(np.flatnonzero(data.good))
     nodes = data.anatomy.tumour_nodes
     truth = data.read_displacement(nodes)[data.good]
     for name, model in models.items():
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         name: compute_coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None
     }
     gauge = build_tip_gauge(data.anatomy)
-    distance = gauge.distances(loads, data.read_displacement(gauge.nodes)[data.good], gauge.nodes, data.tool)
+    distance = gauge.compute_distances(loads, data.read_displacement(gauge.nodes)[data.good], gauge.nodes, data.tool)
     ranged = {
         name: measure_distance_coverage(model, loads, distance)
         for name, model in models.items()

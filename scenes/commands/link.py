@@ -31,7 +31,7 @@ from .interrupt import run_until_ended
 if TYPE_CHECKING:
     from ..link.heard import TransformNames
     from ..link.session import LinkSession
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..tracked.tracked_tool import TrackedTool
 
 NAMES = "--tool-name", "--reference-name", "--camera-name", "--registration-name"
@@ -287,7 +287,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
     )
 
 
-def _tool_of(theatre: Theatre, path: Path) -> TrackedTool:
+def _tool_of(theatre: PatientSetup, path: Path) -> TrackedTool:
     """Return the tool that the best model of poses knows, at its tip as PLUS has it: z points away from the shaft."""
     from ..tracked.tracked_tool import TrackedTool
 

@@ -17,7 +17,7 @@ from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Outcome
-from sim.effects import Effect, NodalForce, ToolContact, ToolForce, pushed_effects
+from sim.effects import Effect, NodalForce, ToolContact, ToolForce, build_push_effects
 from sim.errors import InputError
 from sim.loads import Loads
 from sim.material import Tissue
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
         tool, loads = _drawn(args, anatomy, tissue)
     precision = "float32" if args.tolerance >= 1e-4 else "float64"
     accuracy = Accuracy(args.tolerance, precision=precision, limit_strain=args.tool_preset not in BEYOND_TISSUE)
-    effects: tuple[Effect, ...] = (*pushed_effects(anatomy, elasticity, args.skull), NodalForce())
+    effects: tuple[Effect, ...] = (*build_push_effects(anatomy, elasticity, args.skull), NodalForce())
     if tool is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
         effects = (*passive, ToolContact((tool,)))

@@ -22,7 +22,7 @@ from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissu
 from .fit import find_fitted_tissue
 
 if TYPE_CHECKING:
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..script.priors import PatientSample
     from ..script.scene import Scene
     from ..script.uncertainty import Uncertainty
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _flat(theatre: Theatre, scene: Scene, found: Uncertainty) -> dict[str, Any]:
+def _flat(theatre: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, Any]:
     """Figures of a scene, at the moment when the tumour may be farthest off [mm]."""
     from ..play.frame_text import format_errors
 

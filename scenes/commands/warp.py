@@ -18,7 +18,7 @@ from ..options.theatre_options import add_trajectory, build_requested_scene
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, apply_tissue_options
 
 if TYPE_CHECKING:
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..script.scene import Scene
     from ..warp.moment import DeformedAnatomy
 
@@ -148,7 +148,7 @@ def check_warp_options(args: argparse.Namespace) -> None:
             raise InputError(f"two images would both become {name}. Rename one, or warp them one after the other.")
 
 
-def build_scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
+def build_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
     """Return the scene that is asked for; a load is one whose tool pushes all the time.
 
     Raises
@@ -167,7 +167,7 @@ def build_scene(args: argparse.Namespace, theatre: Theatre) -> Scene:
     return scene
 
 
-def build_pushing_scene(theatre: Theatre, asked: tuple[float, float, float, float]) -> Scene:
+def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float, float]) -> Scene:
     """Return the scene of a round tool that pushes on the open cortex at X, Y, Z [mm, RAS] with a force [N].
 
     Raises
@@ -182,7 +182,7 @@ def build_pushing_scene(theatre: Theatre, asked: tuple[float, float, float, floa
     if not 0.0 < newton <= HARDEST:
         raise InputError(f"--load: a force of {newton:g} N is no push on a brain; give 0 to {HARDEST:g} N.")
     point, site = 1e-3 * np.array(place), theatre.site
-    nearest = site.nearest(point).point if np.isfinite(point).all() else np.full(3, np.inf)
+    nearest = site.find_nearest(point).point if np.isfinite(point).all() else np.full(3, np.inf)
     apart = 1e3 * float(np.linalg.norm(nearest - point))
     if not apart <= FARTHEST:
         middle = ", ".join(f"{1e3 * value:.0f}" for value in site.origin)
@@ -196,7 +196,7 @@ def build_pushing_scene(theatre: Theatre, asked: tuple[float, float, float, floa
 
 
 def select_moments(
-    args: argparse.Namespace, theatre: Theatre, scene: Scene | None
+    args: argparse.Namespace, theatre: PatientSetup, scene: Scene | None
 ) -> tuple[DeformedAnatomy, list[tuple[float, DeformedAnatomy]]]:
     """Return the moment that is asked for, and those of a sequence with their times [s]; None as scene: of a file.
 

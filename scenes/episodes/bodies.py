@@ -14,9 +14,9 @@ from sim.anatomy import PART_LABELS, REGION_NAMES, Anatomy
 from sim.bodies.intensity import Intensity, read_intensity, to_intensity_path, write_intensity
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
+from sim.bodies.template import Tumour, build_template_subject
 from sim.discretisation.space import recommend_element
-from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce, pushed_effects
+from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import Material
@@ -31,7 +31,7 @@ from surrogate.model.store import load, read_reported_errors, save
 from surrogate.training.expansion import Expansion
 from surrogate.training.train import train
 
-from ..play.deformers import Theatre, open_theatre, to_model_path
+from ..play.deformers import PatientSetup, open_theatre, to_model_path
 from ..script.shipped_files import get_template_path
 from .draws import build_generator, sample_value
 from .half_made import DATA, TABLE, check_resumed, forget
@@ -70,7 +70,7 @@ class EpisodeBody:
         """
         return (self.tissue, Held(), SKULLS["contact" if lets_go else self.drawn["bodies.tissue.skull"]], *more)
 
-    def open_theatre(self, device: str) -> Theatre:
+    def open_theatre(self, device: str) -> PatientSetup:
         """Open the body with its models, as its files have them.
 
         Raises
@@ -100,7 +100,7 @@ def _ratio(region: str) -> str:
 
 def _of_regions_in(values: Mapping[str, Any], anatomy: Anatomy) -> dict[str, Any]:
     """Return the sampled values without the stiffness of regions that an anatomy does not have."""
-    absent = {_ratio(name) for name, label in PART_LABELS.items() if not anatomy.mesh.within(label).any()}
+    absent = {_ratio(name) for name, label in PART_LABELS.items() if not anatomy.mesh.mark_elements(label).any()}
     return {name: value for name, value in values.items() if name not in absent}
 
 
@@ -181,12 +181,12 @@ def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intens
         about = {name: values[f"bodies.tumour.{name}"] for name in ("shape", "site", "seed")}
         radius, cover, opening = (1e-3 * values[f"bodies.tumour.{each}_mm"] for each in ("radius", "cover", "opening"))
         try:
-            subject = template_subject(Tumour(radius, cover, about["shape"], about["site"], about["seed"]))
+            subject = build_template_subject(Tumour(radius, cover, about["shape"], about["site"], about["seed"]))
             anatomy = make_anatomy(subject, MeshPlan(round(values["bodies.tumour.nodes"]), opening))
         except InputError as error:
             refused.append(str(error))
             continue
-        scan = subject.intensity and subject.intensity.around(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
+        scan = subject.intensity and subject.intensity.crop(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
         return anatomy, scan, _of_regions_in(values, anatomy)
     raise InputError(f"none of {TRIES} anatomies that were drawn can be meshed; the last: {refused[-1]}")
 
@@ -196,7 +196,7 @@ def _shipped(body: EpisodeBody, anatomy: Anatomy) -> bool:
     if body.drawn["bodies.anatomies"] != "template":
         return False
     models = load(to_model_path(get_template_path()), anatomy)
-    effects = pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"])
+    effects = build_push_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"])
     return any(find_rejection(model, effects, recommend_element(anatomy.mesh)) is None for model in models.values())
 
 
@@ -205,7 +205,7 @@ def _train(
 ) -> bool:
     """Simulate loads on a body, and train its model on them; the data are not kept. Whether some were there before."""
     learner = plan.contents.bodies.learner
-    effects = (*pushed_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"]), NodalForce())
+    effects = (*build_push_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"]), NodalForce())
     fem = Fem(anatomy, effects, TRAIN, device, 64)
     first = int(build_generator(seed, number, "bodies.learner").integers(2**31))
     stated = {

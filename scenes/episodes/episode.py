@@ -32,7 +32,7 @@ from surrogate.data.answer_rows import describe_tissue_source
 from surrogate.model.guarded import find_model
 from surrogate.model.learned import Learned
 
-from ..play.deformers import Theatre
+from ..play.deformers import PatientSetup
 from ..play.player import STAGES, Frame, Player
 from ..play.reference import TOGETHER, solve_reference_frames
 from ..play.stage import NAMES, Stage
@@ -142,7 +142,7 @@ WHOLE = EpisodeRecording()
 
 def collect(
     path: Path,
-    theatre: Theatre,
+    theatre: PatientSetup,
     player: Player,
     deformer: str,
     progress: Callable[[Iterable], Iterable],
@@ -309,7 +309,7 @@ def write_motion(
     else:
         outcomes = [outcome.name for outcome in truth.outcome]
         for of, which in (("tumour", nodes), ("cortex", cortex)):
-            columns[f"{of}_fem"] = rest[which] + truth.at(which).displacement
+            columns[f"{of}_fem"] = rest[which] + truth.restrict(which).displacement
         if truth.reaction.shape[1]:
             columns["reaction_fem"] = truth.reaction
     columns |= {"outcome_fem": outcomes, "fem_frames": numbers, **how.sensed(columns)}
@@ -325,7 +325,9 @@ def write_motion(
     return {name.lower(): outcomes.count(name) for name in sorted(set(outcomes))}
 
 
-def describe(file: h5py.File, theatre: Theatre, player: Player, deformer: str, recording: EpisodeRecording) -> None:
+def describe(
+    file: h5py.File, theatre: PatientSetup, player: Player, deformer: str, recording: EpisodeRecording
+) -> None:
     """Units, frames and provenance as attributes."""
     scene, camera, model = player.scene, player.camera, find_model(player.deformer)
     file.create_dataset("K", data=camera.K)

@@ -20,7 +20,7 @@ from sim.resected_fem import OperatedFem
 from sim.runtime.atomic_files import write_folder_atomically
 from sim.runtime.partial_files import list_partials, to_partial_path
 
-from ..play.deformers import Theatre
+from ..play.deformers import PatientSetup
 from ..play.reference import build_reference_fem
 from ..script.scene import Scene
 from .bodies import ABOUT, EpisodeBody, read_body, write_body
@@ -144,7 +144,7 @@ class Opened:
     """A body whose files were read, and the finite elements that were made for it, by the effects that they solve."""
 
     body: EpisodeBody
-    theatre: Theatre
+    theatre: PatientSetup
     made: dict[str, Fem | OperatedFem] = field(default_factory=dict)
 
     def get_fem(self, scene: Scene) -> Fem | OperatedFem:

@@ -15,7 +15,7 @@ from sim.errors import InputError
 
 from ..script.camera_paths import PATHS
 from ..script.scene import Scene
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.viewpoint import Appearance, Cottonoid, Viewpoint
 from .bodies import EpisodeBody
 from .draws import build_generator, sample_value
@@ -73,7 +73,7 @@ def sample_episode(contents: PlanContents, seed: int, number: int) -> EpisodeSam
 
 
 def build_scene(
-    plan: EpisodePlan, body: EpisodeBody, site: Site, asked: EpisodeSample, seed: int, number: int
+    plan: EpisodePlan, body: EpisodeBody, site: CraniotomyFrame, asked: EpisodeSample, seed: int, number: int
 ) -> Scene:
     """Build the scene of an episode on a body.
 
@@ -136,7 +136,7 @@ def _viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, numbe
         raise InputError(f"look.bent {look['bent']:g}: {error}") from error
 
 
-def _look(look: Mapping[str, Any], site: Site, seed: int, number: int) -> Appearance:
+def _look(look: Mapping[str, Any], site: CraniotomyFrame, seed: int, number: int) -> Appearance:
     """Light, colour and covers of an episode."""
     random = build_generator(seed, number, "look.covers")
     vessels = int(random.integers(2**31)) if random.random() < look["vessels"] else None

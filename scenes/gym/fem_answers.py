@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.contact_pressure import pressure
+from sim.contact_pressure import compute_pressure
 from sim.deformation import Deformation, join_deformations
 from sim.fem import Fem
 from sim.geometry.closest_point import find_closest_points
@@ -17,8 +17,8 @@ from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Resected, Touching
 from sim.resected_fem import OperatedFem
 
-from ..script.head_posture import Lying
-from ..script.site import Site
+from ..script.head_posture import HeadPose
+from ..script.site import CraniotomyFrame
 from .model_answers import Hertz
 from .touched import TissueRequest, Touched
 
@@ -62,10 +62,10 @@ class PosedElements:
         if self.ball is not None:
             highest = [self.ball.compute_pressure(float(each)) for each in size]
         else:
-            highest = pressure(self.fem, loads, answer).max(axis=1).tolist()
+            highest = compute_pressure(self.fem, loads, answer).max(axis=1).tolist()
         rows = [answer]
         if len(asked) > 1:
-            rows = [replace(answer.rows(np.array([row])), warm={}) for row in range(len(asked))]
+            rows = [replace(answer.select(np.array([row])), warm={}) for row in range(len(asked))]
         return [
             Touched(row.displacement[0], row.nodes, force[number], highest[number], row.outcome[0].good, memory=row)
             for number, row in enumerate(rows)
@@ -105,7 +105,7 @@ class CutElements:
         The tool's, on the brain's tissue.
     """
 
-    site: Site
+    site: CraniotomyFrame
     fem: OperatedFem
     ball: Hertz
     _solved: dict[tuple[int, int], Deformation] = field(default_factory=dict)
@@ -139,7 +139,7 @@ class CutElements:
                 start = self._at(level, done - 1)
             elif level > 0:
                 start = self._at(level - 1, done)
-            posture = Lying(fluid=1.0 - APART * level).build_posture(self.site.anatomy.mesh.nodes)
+            posture = HeadPose(fluid=1.0 - APART * level).build_posture(self.site.anatomy.mesh.nodes)
             self._solved[key] = self.fem.deform(Loads((posture, Resected(np.array([float(done)])))), start)
         return self._solved[key]
 
@@ -163,7 +163,7 @@ class CutElements:
         return self._surfaces[done]
 
     def _near(self, done: int) -> HealthySurface:
-        body = self.fem.remains(done).anatomy
+        body = self.fem.get_remains(done).anatomy
         left, brain = body.mesh, ~body.in_tumour
         surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
         tumour = self.site.anatomy.tumour_nodes

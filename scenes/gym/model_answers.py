@@ -18,7 +18,7 @@ from surrogate.data.indentation import to_indentation
 from surrogate.model.guarded import compute_tool_pressure
 from surrogate.model.learned import Learned
 
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from .touched import TissueRequest, Touched
 
 # Tolerance of the ball's depth [m], and maximum number of iterations.
@@ -89,7 +89,7 @@ class PressedModel:
         Whether all are answered at once.
     """
 
-    site: Site
+    site: CraniotomyFrame
     model: Learned
     ball: Hertz
     together: bool = False

@@ -22,12 +22,12 @@ from sim.runtime.device import find_device
 from sim.skulls import Bonded
 from surrogate.model.guarded import has_tool_pressure
 
-from ..play.deformers import Theatre, open_theatre
+from ..play.deformers import PatientSetup, open_theatre
 from ..play.learned_regions import find_learned_regions
 from ..play.stage import Stage
 from ..script.scene import Scene
 from ..script.shipped_files import get_spatula_model_path
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.tool import Blade, Probe
 from .fem_answers import CutElements, PosedElements
 from .model_answers import Hertz, PosedModel, PressedModel
@@ -61,11 +61,11 @@ class TaskSetting:
 
     task: GymTask
     scene: Scene
-    theatre: Theatre
+    theatre: PatientSetup
     answers: TissueModel
 
     @property
-    def site(self) -> Site:
+    def site(self) -> CraniotomyFrame:
         """The open cortex."""
         return self.theatre.site
 
@@ -181,7 +181,7 @@ def open_setting(
     return TaskSetting(task, scene, theatre, CutElements(theatre.site, fem, ball))
 
 
-def _touched(task: GymTask, scene: Scene, site: Site) -> Tissue:
+def _touched(task: GymTask, scene: Scene, site: CraniotomyFrame) -> Tissue:
     """Return the tissue that a ball presses: the one with the largest volume within its radius of the goals' centre.
 
     Where tissue is cut away, it is the brain's.
@@ -192,12 +192,12 @@ def _touched(task: GymTask, scene: Scene, site: Site) -> Tissue:
     near = np.linalg.norm(mesh.nodes[mesh.tets].mean(axis=1) - place, axis=1) < task.tool.radius
     labels = [] if task.cuts else np.unique(mesh.region[near]).tolist()
     most = max(labels, key=lambda label: mesh.volumes[near & (mesh.region == label)].sum(), default=None)
-    tissue = elasticity.default if most is None else elasticity.of(most)
+    tissue = elasticity.default if most is None else elasticity.get_law(most)
     assert tissue is not None
     return tissue
 
 
-def _refusals(task: GymTask, scene: Scene, theatre: Theatre) -> dict[str, str | None]:
+def _refusals(task: GymTask, scene: Scene, theatre: PatientSetup) -> dict[str, str | None]:
     """Return, by name, why a trained model is not applicable; None if it is. For a ball, models of pushes apply too."""
     if task.cuts:
         return dict.fromkeys(theatre.models, "tissue is cut away, which no model learned")
@@ -238,7 +238,7 @@ def _say_none(task: GymTask, anatomy: str, physics: str, model: str | None, why:
 
 
 @lru_cache(maxsize=4)
-def _theatre(anatomy: str, model: str | None, device: str) -> Theatre:
+def _theatre(anatomy: str, model: str | None, device: str) -> PatientSetup:
     body = None if anatomy == TEMPLATE else Path(anatomy)
     return open_theatre(body, None if model is None else Path(model), device)
 

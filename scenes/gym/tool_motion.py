@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.tool import Instrument, Probe
 
 # Largest height of a tool above the centre of the open cortex [m].
@@ -42,19 +42,19 @@ def compute_lever(tool: Instrument) -> float:
     return tool.radius if isinstance(tool, Probe) else 0.0
 
 
-def build_tool_frame(site: Site) -> np.ndarray:
+def build_tool_frame(site: CraniotomyFrame) -> np.ndarray:
     """Return the frame of twists and observations, as columns (3, 3): the open cortex's right, up, and outwards."""
     return np.column_stack([site.right, site.up, -site.axis])
 
 
-def lay_tool(site: Site, tool: Instrument, tip: np.ndarray) -> RobotTool:
+def lay_tool(site: CraniotomyFrame, tool: Instrument, tip: np.ndarray) -> RobotTool:
     """Return a tool in its first posture, its lowest point at `tip` (3,) [m]."""
     turned = tool.pose(tip, site.axis, site.right)[:3, :3]
     return RobotTool(tip - compute_lever(tool) * site.axis, turned)
 
 
 def move_tool(
-    hand: RobotTool, site: Site, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float
+    hand: RobotTool, site: CraniotomyFrame, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float
 ) -> RobotTool:
     """Return a tool after a twist (6,) [m, rad], in the frame of `build_tool_frame`, about its own point.
 

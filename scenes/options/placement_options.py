@@ -122,7 +122,7 @@ def _marked(subject: Subject, markup: Markup) -> Subject:
     """Return the subject opened at a point, where a trajectory enters the brain, or within an outline."""
     _demand_kind(markup, "--opening-at", Fiducial=1, Line=2, ClosedCurve=None)
     if markup.kind == "ClosedCurve":
-        outline = markup.curve()
+        outline = markup.fit_curve()
         return replace(subject, outline=outline, site=find_opening_within(subject.cortex, outline))
     ends = sorted(markup.points, key=lambda end: _depth(subject, end))
     along = ends[0] + np.linspace(0.0, 1.0, ON_LINE)[:, None] * (ends[-1] - ends[0])

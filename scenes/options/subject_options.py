@@ -14,7 +14,7 @@ from sim.bodies.head_masks import Sources
 from sim.bodies.healthy_heads import build_masked_head, read_fsaverage_head
 from sim.bodies.label_map import Label
 from sim.bodies.subject import Subject
-from sim.bodies.template import SITES, Head, Tumour, build_synthetic_subject, template_subject
+from sim.bodies.template import SITES, Head, Tumour, build_synthetic_subject, build_template_subject
 from sim.errors import InputError
 
 from .placement_options import point
@@ -200,4 +200,4 @@ def _in_head(tumour: Tumour, args: argparse.Namespace) -> Subject:
     head = Head() if volume is None else Head(volume)
     if args.head == "fsaverage":
         return build_synthetic_subject(tumour, read_fsaverage_head(head.volume), head)
-    return template_subject(tumour, head)
+    return build_template_subject(tumour, head)

@@ -15,9 +15,9 @@ from .shared_options import add_anatomy, add_device
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, apply_tissue_options
 
 if TYPE_CHECKING:
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..script.scene import Scene
-    from ..script.site import Site
+    from ..script.site import CraniotomyFrame
 
 
 def add_bodies(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +75,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_device(parser, "FEM")
 
 
-def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> Theatre:
+def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> PatientSetup:
     """Return the theatre that `add_theatre`'s arguments ask for, to play scenes of these names there.
 
     Raises
@@ -93,7 +93,7 @@ def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> Theatre:
     return replace(theatre, limit=1e-3 * args.guard)
 
 
-def build_requested_scene(args: argparse.Namespace, name: str, theatre: Theatre) -> Scene:
+def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientSetup) -> Scene:
     """A scene by name, of the tissue and on the element that `add_theatre`'s arguments ask for, if they ask for any.
 
     Raises
@@ -107,7 +107,7 @@ def build_requested_scene(args: argparse.Namespace, name: str, theatre: Theatre)
     return scene if args.trajectory is None else _approached(args, scene, theatre.site)
 
 
-def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
+def _approached(args: argparse.Namespace, scene: Scene, site: CraniotomyFrame) -> Scene:
     """Let the scene's tool follow the trajectory; a notice names what keeps it from that."""
     from sim.bodies.markups import read_markup
 
@@ -124,7 +124,7 @@ def _approached(args: argparse.Namespace, scene: Scene, site: Site) -> Scene:
     return replace(scene, path=approach.follow(scene.path), tool=approach.align_tool(scene.tool))
 
 
-def list_playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[Scene]) -> list[Scene]:
+def list_playable(args: argparse.Namespace, theatre: PatientSetup, scenes: Sequence[Scene]) -> list[Scene]:
     """Return the named scenes; by default all that the anatomy has a locator for, with a notice about the others."""
     left = [] if args.scenes else [scene for scene in scenes if theatre.is_without_locator(scene)]
     if left:
@@ -134,7 +134,7 @@ def list_playable(args: argparse.Namespace, theatre: Theatre, scenes: Sequence[S
     return [scene for scene in scenes if scene not in left]
 
 
-def choose_deformer(args: argparse.Namespace, theatre: Theatre, scene: Scene) -> str:
+def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scene) -> str:
     """Return the requested deformation model; one that a budget selected is reported, with the reason.
 
     Raises

@@ -17,7 +17,7 @@ from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
 
 if TYPE_CHECKING:
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..script.scene import Scene
 
 OWN = tuple(name for name in REGION_NAMES if name != "brain")
@@ -187,7 +187,7 @@ def reject_option(given: Mapping[str, object], material: str, owner: str) -> Non
             )
 
 
-def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: Theatre) -> Scene:
+def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: PatientSetup) -> Scene:
     """Return a scene with the requested tissue and element.
 
     Regions that no --region names are those of the scene, or of `find_learned_regions`; the latter are reported.

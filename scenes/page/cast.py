@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from sim.deformation import Deformation, Deformer
 
-from ..play.deformers import GUARDED, Theatre
+from ..play.deformers import GUARDED, PatientSetup
 from ..play.effect_ablation import remove_effect
 from ..play.player import Player
 from ..play.replay import ReplaySession
@@ -28,7 +28,7 @@ class SceneSolvers:
     `playable` is true if one of them is ready to compute.
     """
 
-    def __init__(self, theatre: Theatre, scene: Scene, deformer: str, turn: threading.Lock) -> None:
+    def __init__(self, theatre: PatientSetup, scene: Scene, deformer: str, turn: threading.Lock) -> None:
         """Have the `deformer` of that name play. Finite elements are prepared one at a time, by who holds `turn`.
 
         Raises

@@ -46,14 +46,14 @@ def compare_with_fem(truth: FemResult, player: Player, own: bool, shown: Deforma
     `shown` is the deformer's solution of these loads, if it depends on previous ones.
     """
     nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
-    right = truth.deformation.at(nodes).displacement[0]
+    right = truth.deformation.restrict(nodes).displacement[0]
     error = None
     if not own:
-        answer = player.deformer.deform(truth.loads, at=nodes) if shown is None else shown.at(nodes)
+        answer = player.deformer.deform(truth.loads, at=nodes) if shown is None else shown.restrict(nodes)
         error = np.linalg.norm(answer.displacement[0] - right, axis=1)
     motion = float(np.linalg.norm(right, axis=1).mean())
     off = (None, None) if error is None else (float(error.mean()), float(error.max()))
-    pushed = truth.loads.every(Pushed)
+    pushed = truth.loads.get_all(Pushed)
     lift = compute_lift(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
     gauge = measure_tip_distance(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
     distance = None if gauge is None else gauge.distance
@@ -84,7 +84,7 @@ def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: s
 def describe_change(truth: FemResult, player: Player, shown: Deformation, off: Sequence[str]) -> str:
     """Describe the tumour's distance from its position under all effects, for a solution without some."""
     nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
-    apart = truth.deformation.at(nodes).displacement[0] - shown.at(nodes).displacement[0]
+    apart = truth.deformation.restrict(nodes).displacement[0] - shown.restrict(nodes).displacement[0]
     mean = 1e3 * float(np.linalg.norm(apart, axis=1).mean())
     return (
         f"<p>without {escape(', '.join(off))} the tumour is {mean:.2f} mm from where all effects together have it</p>"

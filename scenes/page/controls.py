@@ -15,7 +15,7 @@ from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, R
 
 from ..script.camera_paths import PATHS
 from ..script.scene import SCENES, Scene
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.tool_paths import AIR, Touch
 from .beside import TIP, TUMOUR_MIDDLE
 from .requests import HAND, SCRIPT, Requests
@@ -40,7 +40,7 @@ HANDS = "A slider takes the tool in your hand; 'script' gives it back."
 
 def build_controls(
     scene: Scene,
-    site: Site,
+    site: CraniotomyFrame,
     names: tuple[str, ...],
     wish: Requests,
     give: Callable[[str], None],
@@ -95,13 +95,13 @@ def build_slice_control(now: str, choose: Callable[[str], None]) -> Dropdown:
     return Dropdown("slices", places, now or places[0], choose, hint=hint)
 
 
-def list_switchable_effects(scene: Scene, site: Site) -> list[str]:
+def list_switchable_effects(scene: Scene, site: CraniotomyFrame) -> list[str]:
     """Effects that a scene can be without: all but those that make it a body at rest."""
     kinds = (type(effect) for effect in scene.get_effects_on(site.anatomy))
     return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Bonded, Slide)]
 
 
-def is_animated(scene: Scene, site: Site) -> bool:
+def is_animated(scene: Scene, site: CraniotomyFrame) -> bool:
     """Return True if the scene evolves without tool input."""
     effects = scene.get_effects_on(site.anatomy)
     relaxing = remember(effect for effect in effects if isinstance(effect, Elasticity))
@@ -109,7 +109,7 @@ def is_animated(scene: Scene, site: Site) -> bool:
 
 
 def build_tool_controls(
-    scene: Scene, site: Site, wish: Requests, give: Callable[[str], None], take: Callable[..., None]
+    scene: Scene, site: CraniotomyFrame, wish: Requests, give: Callable[[str], None], take: Callable[..., None]
 ) -> list[Slider | Dropdown]:
     """Build the controls of the tool: who holds it, and its position within the opening, in patient directions."""
     assert scene.tool is not None

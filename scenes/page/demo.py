@@ -18,7 +18,7 @@ from sim.errors import InputError
 from sim.loads import Loads
 from surrogate.data.dataset import compute_loads_digest
 
-from ..play.deformers import AtRest, Theatre
+from ..play.deformers import AtRest, PatientSetup
 from ..play.player import Frame, Player
 from ..play.stage import Stage
 from ..play.waiting_notice import Busy
@@ -53,7 +53,7 @@ class Demo:
 
     def __init__(
         self,
-        theatre: Theatre,
+        theatre: PatientSetup,
         scene: Scene,
         deformer: str,
         host: str,

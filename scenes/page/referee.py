@@ -10,7 +10,7 @@ from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.loads import Loads
 
-from ..play.deformers import Theatre, plan_of
+from ..play.deformers import PatientSetup, plan_of
 from ..play.player import Player
 from ..play.replay import ReplaySession
 from ..script.scene import Scene
@@ -42,7 +42,7 @@ class FemWorker:
     its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.
     """
 
-    def __init__(self, theatre: Theatre, scene: Scene, turn: threading.Lock) -> None:
+    def __init__(self, theatre: PatientSetup, scene: Scene, turn: threading.Lock) -> None:
         """Start the thread; it holds `turn` while it prepares, so that of several one does at a time."""
         self.newest: Question | None = None
         self.truth: FemResult | None = None
@@ -95,7 +95,7 @@ class FemWorker:
         self.stop_soon()
         self.thread.join()
 
-    def _serve(self, theatre: Theatre, scene: Scene) -> None:
+    def _serve(self, theatre: PatientSetup, scene: Scene) -> None:
         try:
             self._judge(theatre, scene)
         except Exception as error:  # the page says it; the thread's own report goes to the terminal
@@ -103,7 +103,7 @@ class FemWorker:
             if not isinstance(error, InputError):
                 raise
 
-    def _judge(self, theatre: Theatre, scene: Scene) -> None:
+    def _judge(self, theatre: PatientSetup, scene: Scene) -> None:
         session = None
         while (question := self._next()) is not None:
             if session is None:
@@ -128,7 +128,7 @@ class FemWorker:
             self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)
             return None if self.closed.is_set() else self.newest
 
-    def _prepared(self, theatre: Theatre, scene: Scene) -> ReplaySession | None:
+    def _prepared(self, theatre: PatientSetup, scene: Scene) -> ReplaySession | None:
         """Return the finite elements; None where they are not wanted any more when it is their turn."""
         with self.turn:
             if self.closed.is_set() or self.newest is None:

@@ -12,12 +12,12 @@ from sim.anatomy import name_region
 from sim.deformation import Deformation, Outcome
 from sim.material import Material, Tissue
 
-from ..play.deformers import GUARDED, Theatre
+from ..play.deformers import GUARDED, PatientSetup
 from ..play.observer import ELLIPSOID_COLOUR, TumourEstimate
 from ..play.player import Frame, is_undeformed
 from ..play.stage import TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 from ..script.scene import Scene
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
 from .comparison import ComparisonRow
@@ -51,7 +51,7 @@ def describe_effect(name: str) -> str:
     return EFFECTS.get(name, name)
 
 
-def format_caption(theatre: Theatre, scene: Scene, anatomy: str) -> str:
+def format_caption(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
     """Describe the image: visible parts, meaning of the lines, and anatomy."""
     title = " ".join(scene.title.split())
     seen = SEEN if scene.sight is None else ESTIMATED
@@ -100,7 +100,7 @@ def to_stroke(colour: Sequence[float]) -> str:
     return 'stroke="#' + "".join(f"{round(255.0 * share):02x}" for share in colour) + '"'
 
 
-def describe_scene(theatre: Theatre, scene: Scene, anatomy: str) -> str:
+def describe_scene(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
     """Describe the anatomy, the side, and the tissue of the FEM model."""
     mesh = theatre.anatomy.mesh
     return (
@@ -110,14 +110,14 @@ def describe_scene(theatre: Theatre, scene: Scene, anatomy: str) -> str:
     )
 
 
-def describe_side_of_brain(site: Site) -> str:
+def describe_side_of_brain(site: CraniotomyFrame) -> str:
     """Describe the side of the opening, relative to the middle of the brain's width."""
     nodes = site.anatomy.mesh.nodes[:, 0]
     off = float(site.origin[0] - 0.5 * (nodes.min() + nodes.max()))
     return "near the midline" if abs(off) < MIDLINE else f"on the patient's {'right' if off > 0.0 else 'left'}"
 
 
-def describe_fem(theatre: Theatre, scene: Scene) -> str:
+def describe_fem(theatre: PatientSetup, scene: Scene) -> str:
     """Element and tissue that the theatre's finite elements have in a scene."""
     element, elasticity = theatre.choose_element(scene), scene.elasticity
     own = (f"; the {name_region(label)} of {describe_tissue(one)}" for label, one in elasticity.regions.items())

@@ -11,7 +11,7 @@ from ar.page.parts import SceneSurface, SceneViewpoint, Sign
 from ..play.observer import BALL, BALL_FACES, ELLIPSOID_COLOUR
 from ..play.player import Frame, Player
 from ..play.stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from .referee import FemResult
 
 FEM_COLOUR = TRUTH_COLOUR
@@ -49,7 +49,7 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
     ]
 
 
-def list_orientation_labels(site: Site) -> list[Sign]:
+def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
     """Return the patient's sides round the brain."""
     nodes = site.anatomy.mesh.nodes
     middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + BESIDE
@@ -57,7 +57,7 @@ def list_orientation_labels(site: Site) -> list[Sign]:
     return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
 
 
-def choose_viewpoint(site: Site) -> SceneViewpoint:
+def choose_viewpoint(site: CraniotomyFrame) -> SceneViewpoint:
     """Obliquely onto the open cortex."""
     eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
     return SceneViewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))

@@ -123,7 +123,7 @@ def measure(
     doubts = _doubts(frames, truth)
     moved = [
         np.linalg.norm(
-            truth.at(player.stage.select_stage(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1
+            truth.restrict(player.stage.select_stage(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1
         ).mean()
         for row, frame in enumerate(frames)
     ]

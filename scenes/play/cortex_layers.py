@@ -14,7 +14,7 @@ from ar.rendering.layer import Layer, Solid
 from sim.bodies.intensity import Intensity
 from sim.geometry.surface import normalise_vectors
 
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.tool import build_capsule
 from ..script.viewpoint import Cottonoid
 
@@ -32,7 +32,7 @@ DARK, MOTTLE, MOTTLED = 0.75, 0.12, 0.35e-3
 
 @lru_cache(maxsize=2)
 def add_vessels(
-    intensity: Intensity | None, site: Site, seed: int, dark: tuple[float, float, float], relief: float
+    intensity: Intensity | None, site: CraniotomyFrame, seed: int, dark: tuple[float, float, float], relief: float
 ) -> Solid:
     """Return the scan round an opening as a solid texture with vessels upon it, which the seed draws.
 
@@ -107,7 +107,7 @@ class Squares:
         return Layer("cotton", COTTON, carried + self.lift, self.triangles, COTTON_COLOUR, gloss=0.1)
 
 
-def build_squares(site: Site, cottonoids: Sequence[Cottonoid]) -> Squares:
+def build_squares(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> Squares:
     """Lay squares of cotton on an open cortex."""
     steps = np.linspace(-0.5, 0.5, PLACES)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -119,14 +119,14 @@ def build_squares(site: Site, cottonoids: Sequence[Cottonoid]) -> Squares:
         turn = np.array([[np.cos(each.angle), -np.sin(each.angle)], [np.sin(each.angle), np.cos(each.angle)]])
         at = each.side * grid @ turn.T + (each.x, each.y)
         triangles.append(faces + len(places))
-        places += [site.nearest(site.origin + x * site.right + y * site.up) for x, y in at]
+        places += [site.find_nearest(site.origin + x * site.right + y * site.up) for x, y in at]
     return Squares(
         np.array([place.vertices for place in places]), np.array([place.weights for place in places]),
         np.concatenate(triangles), -THICK * np.array([place.inward for place in places]),
     )  # fmt: skip
 
 
-def build_finger(site: Site, angle: float) -> Layer:
+def build_finger(site: CraniotomyFrame, angle: float) -> Layer:
     """A gloved finger that stands still over the edge of the opening, from a direction in the tangent plane [rad]."""
     out = np.cos(angle) * site.right + np.sin(angle) * site.up
     tip = site.origin + (site.clearance - OVER) * out - HIGH * site.axis

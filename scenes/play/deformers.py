@@ -19,7 +19,7 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.fem import Fem, describe_solver
 from sim.loads import Loads
-from sim.resected_fem import OperatedFem, finite_elements
+from sim.resected_fem import OperatedFem, build_fem
 from sim.runtime.device import find_device
 from surrogate.data.answer_rows import find_first_tissue
 from surrogate.locating.locator import Locator
@@ -33,8 +33,8 @@ from surrogate.model.store import load
 
 from ..script.scene import Scene, check_scene_exists
 from ..script.shipped_files import get_template_path
-from ..script.sight import Sight, StereoSight
-from ..script.site import Site, build_site
+from ..script.sight import PointObservation, StereoObservation
+from ..script.site import CraniotomyFrame, build_craniotomy_frame
 from ..script.uncertainty import Uncertainty, mark_of, read_uncertainties, to_uncertainty_path
 from .observer import Observer
 from .player import Player
@@ -47,7 +47,7 @@ TRUTH = "what an estimate is held against is the truth, as finite elements have 
 
 
 @dataclass(frozen=True, eq=False)
-class Theatre:
+class PatientSetup:
     """Anatomy, its T1 scan if there is one, models by name, trained on one data set, and uncertainties by scene.
 
     `locator_file` is the locator of its tumour, for scenes with an observation model. `limit` [m] is that of a guarded
@@ -63,9 +63,9 @@ class Theatre:
     limit: float | None = None
 
     @cached_property
-    def site(self) -> Site:
+    def site(self) -> CraniotomyFrame:
         """The open cortex."""
-        return build_site(self.anatomy)
+        return build_craniotomy_frame(self.anatomy)
 
     @cached_property
     def locator(self) -> Locator:
@@ -119,9 +119,9 @@ class Theatre:
         match scene.sight:
             case None:
                 return stage
-            case Sight():
+            case PointObservation():
                 return replace(stage, observer=Observer(self.site, self.locator, scene.sight))
-            case StereoSight():
+            case StereoObservation():
                 return replace(stage, observer=StereoObserver(stage, self.locator, scene.sight))
 
     def list_rejections(self, scene: Scene) -> dict[str, str | None]:
@@ -184,7 +184,7 @@ class Theatre:
     def build_fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | OperatedFem:
         """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
         effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
-        return finite_elements(self.anatomy, effects, accuracy, self.device, batch, element, live)
+        return build_fem(self.anatomy, effects, accuracy, self.device, batch, element, live)
 
     def choose_element(self, scene: Scene) -> str:
         """Return the element of a scene, or the one that is recommended for the mesh."""
@@ -250,7 +250,7 @@ class AtRest:
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Return a guess that nothing moves, whatever acts."""
         rest = guess(np.zeros((len(loads), *self.anatomy.mesh.nodes.shape)))
-        return rest if at is None else rest.at(at)
+        return rest if at is None else rest.restrict(at)
 
 
 def plan_of(deformer: Deformer) -> tuple[str, ...]:
@@ -265,7 +265,7 @@ def to_model_path(anatomy: Path) -> Path:
 
 def open_theatre(
     anatomy: Path | None = None, model: Path | None = None, device: str = "auto", scenes: Sequence[str] = ()
-) -> Theatre:
+) -> PatientSetup:
     """Read an anatomy (default: the template that ships) with the files next to it: scan, models, uncertainties.
 
     `scenes` are names of those that will play there.
@@ -287,4 +287,4 @@ def open_theatre(
     models = load(learnt, body) if model is not None or learnt.is_file() else {}
     intensity = read_intensity(scan) if scan.is_file() else None
     uncertainties = read_uncertainties(to_uncertainty_path(path))
-    return Theatre(body, intensity, models, device, to_locator_path(path), uncertainties)
+    return PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties)

@@ -15,8 +15,8 @@ from sim.effects import Effect, Elasticity
 from sim.errors import InputError
 
 from ..script.scene import Scene
-from ..script.site import Site
-from .deformers import Theatre
+from ..script.site import CraniotomyFrame
+from .deformers import PatientSetup
 from .stage import Stage
 
 # Frames that are not timed: kernels are loaded.
@@ -60,7 +60,7 @@ def remove_effect(scene: Scene, effect: Effect) -> Scene:
     return replace(scene, effects=tuple(other for other in scene.effects if other != effect))
 
 
-def measure_effects(theatre: Theatre, scene: Scene, every: int) -> Iterator[AblationRow]:
+def measure_effects(theatre: PatientSetup, scene: Scene, every: int) -> Iterator[AblationRow]:
     """Yield the row of the scene, then of each effect, with the scene's own tissue; solve each `every`-th frame.
 
     Raises
@@ -84,7 +84,7 @@ def measure_effects(theatre: Theatre, scene: Scene, every: int) -> Iterator[Abla
         yield _row(theatre, name, whole, less)
 
 
-def run(theatre: Theatre, scene: Scene, every: int) -> AblationRun:
+def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
     """Solve each `every`-th frame of a scene in order, each starting from the previous one.
 
     Raises
@@ -102,7 +102,9 @@ def run(theatre: Theatre, scene: Scene, every: int) -> AblationRun:
     return AblationRun(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
 
 
-def _solved(fem: Deformer, scene: Scene, site: Site, times: list[float]) -> tuple[list[np.ndarray], list[float]]:
+def _solved(
+    fem: Deformer, scene: Scene, site: CraniotomyFrame, times: list[float]
+) -> tuple[list[np.ndarray], list[float]]:
     """Displacements (V, 3) [m], NaN of what was cut out, and seconds of each frame."""
     last, found, seconds, stage = None, [], [], Stage(scene, site)
     for time in times:
@@ -123,7 +125,7 @@ def list_device_arrays() -> list[wp.array]:
     return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
 
 
-def _row(theatre: Theatre, name: str, whole: AblationRun, less: AblationRun) -> AblationRow:
+def _row(theatre: PatientSetup, name: str, whole: AblationRun, less: AblationRun) -> AblationRow:
     anatomy = theatre.anatomy
 
     def apart(nodes: np.ndarray) -> float:

@@ -23,8 +23,8 @@ from surrogate.locating.locator import Location, Locator
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import compute_middle
 
-from ..script.sight import Sight, StereoSight
-from ..script.site import HOLE, Site
+from ..script.sight import PointObservation, StereoObservation
+from ..script.site import HOLE, CraniotomyFrame
 from ..script.tool import build_sphere
 
 # A tool so near to the cortex touches it; it hides points that are so near to it [m].
@@ -159,9 +159,9 @@ class Sees(Protocol):
 class Observer:
     """Observer that samples the points of a `Sight`, with its errors, and calls a locator. Loads are not used."""
 
-    site: Site
+    site: CraniotomyFrame
     locator: Locator
-    sight: Sight
+    sight: PointObservation
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour position in frame `number`, for a body at `positions` (V, 3) [m].
@@ -206,7 +206,7 @@ class Observer:
         triangles = site.anatomy.open_surface
         corners = self._rest[triangles]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        area *= (site.across(corners.reshape(-1, 3)).reshape(-1, 3) < HOLE * site.clearance).all(axis=1)
+        area *= (site.compute_axis_distance(corners.reshape(-1, 3)).reshape(-1, 3) < HOLE * site.clearance).all(axis=1)
         some = random.choice(len(area), self.sight.points, p=area / area.sum())
         return triangles[some], random.dirichlet(np.ones(3), len(some))
 
@@ -233,7 +233,7 @@ class RigidError:
         return middle + Rotation.from_rotvec(self.turn).apply(points - middle) + self.shift
 
 
-def sample_rigid_error(sight: Sight | StereoSight, number: int) -> RigidError:
+def sample_rigid_error(sight: PointObservation | StereoObservation, number: int) -> RigidError:
     """One of the rigid errors of a sight, by number."""
     turn, shift = np.random.default_rng([sight.seed, 0, number]).standard_normal((2, 3))
     return RigidError(sight.turn * turn / np.linalg.norm(turn), sight.shift * shift / np.linalg.norm(shift))

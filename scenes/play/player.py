@@ -24,12 +24,12 @@ from sim.effects import remember
 from sim.geometry.ball_at_rest import find_resting_tip
 from sim.geometry.closest_point import find_closest_points
 from sim.geometry.surface import is_enclosing
-from sim.loads import Loads, stacked
+from sim.loads import Loads, stack
 from surrogate.model.guarded import find_first_model
 from surrogate.model.learned import Learned
 
 from ..script.scene import Scene
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, compute_lift
 from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
@@ -165,7 +165,7 @@ class Player:
         return self.stage.scene
 
     @property
-    def site(self) -> Site:
+    def site(self) -> CraniotomyFrame:
         """The open cortex that it is played on."""
         return self.stage.site
 
@@ -317,10 +317,10 @@ class Player:
         for first in range(0, len(numbers), together):
             some = numbers[first : first + together]
             begun, asked = clock.perf_counter(), [self.build_loads(number) for number in some]
-            answers = self.compute_deformation(stacked(asked))
+            answers = self.compute_deformation(stack(asked))
             seconds = (clock.perf_counter() - begun) / len(some)
             for row, (number, loads) in enumerate(zip(some, asked, strict=True)):
-                yield self.draw_frame(number, self.get_touch(number), loads, answers.rows(np.array([row])), seconds)
+                yield self.draw_frame(number, self.get_touch(number), loads, answers.select(np.array([row])), seconds)
 
     def compute_positions(self, deformation: Deformation, row: int = 0) -> np.ndarray:
         """Return positions (V, 3) [m] of all mesh vertices in one load case; vertices without result are undeformed."""
@@ -340,7 +340,7 @@ class Player:
         if self.scene.posed:
             return HeldTool(self.scene.compute_tip(self.site, touch), self.scene.compute_pose(self.site, touch), 0.0)
         inward = self.site.axis
-        carried = self.scene.find_contact(self.site, touch).carried(positions)
+        carried = self.scene.find_contact(self.site, touch).locate(positions)
         inside = self.site.clip_to_opening(carried, tool.radius)
         beyond = float(np.linalg.norm(inside - carried))
         tip = through = inside if beyond > CARRIED else carried

@@ -8,18 +8,18 @@ from dataclasses import replace
 from sim.accuracy import TRAIN
 from sim.deformation import Deformation, Deformer, join_deformations
 from sim.fem import Fem
-from sim.loads import Loads, stacked
+from sim.loads import Loads, stack
 from sim.resected_fem import OperatedFem
 from sim.runtime.device import find_device
 
 from ..script.scene import Scene
-from .deformers import Theatre
+from .deformers import PatientSetup
 
 # # Number of frames that are solved together: small enough for regular progress reports.
 TOGETHER = 16
 
 
-def build_reference_fem(theatre: Theatre, scene: Scene) -> Fem | OperatedFem:
+def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | OperatedFem:
     """Finite elements for the truth of many scenes alike: on a card of frames together, else frame after frame.
 
     A frame that starts from the last one takes a quarter of the time of one that is solved apart.
@@ -38,7 +38,7 @@ def is_history_dependent(fem: Deformer) -> bool:
 
 
 def solve_reference_frames(
-    theatre: Theatre,
+    theatre: PatientSetup,
     scene: Scene,
     loads: Sequence[Loads],
     progress: Callable[[int], object] = lambda more: None,
@@ -54,7 +54,7 @@ def solve_reference_frames(
     size = TOGETHER if apart else 1
     answers: list[Deformation] = []
     for first in range(0, len(loads), size):
-        some = stacked(loads[first : first + size])
+        some = stack(loads[first : first + size])
         answers.append(fem.deform(some, start=None if apart or not answers else answers[-1]))
         progress(len(some))
     return join_deformations([replace(answer, memory={}, warm={}) for answer in answers])

@@ -20,8 +20,8 @@ from sim.effects import SkullContact
 from sim.loads import Loads, Resected
 
 from ..script.scene import Scene
-from ..script.sight import StereoSight
-from ..script.site import HOLE, Site
+from ..script.sight import StereoObservation
+from ..script.site import HOLE, CraniotomyFrame
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
 from .observer import Sees
 
@@ -79,7 +79,7 @@ class Stage:
     """
 
     scene: Scene
-    site: Site
+    site: CraniotomyFrame
     intensity: Intensity | None = None
     left: RemainingBody | None = None
     device: str = "cpu"
@@ -92,7 +92,7 @@ class Stage:
 
     def select_stage(self, loads: Loads) -> Stage:
         """Return the stage as the first load case has it: after the steps of a resection that are done."""
-        cause = loads.of(Resected)
+        cause = loads.get(Resected)
         return self if cause is None else self._after[int(cause.done[0])]
 
     @cached_property
@@ -130,7 +130,7 @@ class Stage:
         layer = self._visible.build_layer(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
             return layer
-        beyond = self.site.across(layer.vertices) - HOLE * self.site.clearance
+        beyond = self.site.compute_axis_distance(layer.vertices) - HOLE * self.site.clearance
         below = np.minimum(DIP * beyond.clip(0.0), DRAPE_DEPTH)
         return replace(layer, vertices=layer.vertices + below[:, None] * self.site.axis)
 
@@ -230,7 +230,7 @@ class Stage:
     def scan(self) -> Solid | None:
         """The scan as a solid texture, with vessels where the scene has some; None where there is neither."""
         sight, seed = self.scene.sight, self.scene.look.vessels
-        if isinstance(sight, StereoSight) and sight.vessels:
+        if isinstance(sight, StereoObservation) and sight.vessels:
             seed = sight.seed
         if seed is not None:
             return add_vessels(self.intensity, self.site, seed, DARK, RELIEF)
@@ -247,7 +247,7 @@ class Stage:
         lifted = mesh.nodes + DRAPE_HEIGHT * normals
         # # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
         far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
-        outside = np.where(far, site.radius, site.across(mesh.nodes) - HOLE * site.clearance)
+        outside = np.where(far, site.radius, site.compute_axis_distance(mesh.nodes) - HOLE * site.clearance)
         points, triangles, rim = clip_surface(lifted, mesh.surface, outside)
         # The wall has its own vertices: normals shared with the drape would round its edge off.
         low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis

@@ -11,7 +11,7 @@ import numpy as np
 from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
 
-from ..script.sight import StereoSight
+from ..script.sight import StereoObservation
 from .observer import NOTHING, RigidError, TumourEstimate, find_touched, locate_tumour, sample_rigid_error
 from .stage import Stage
 from .stereo_update import First, StereoPair, observe_first, observe_point_cloud, observe_points
@@ -26,7 +26,7 @@ class StereoObserver:
 
     stage: Stage
     locator: Locator
-    sight: StereoSight
+    sight: StereoObservation
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""

@@ -17,7 +17,7 @@ from sim.geometry.closest_point import find_closest_points
 from surrogate.locating.evidence import SIGMA, WHITE
 from surrogate.locating.observation import Observation
 
-from ..script.site import HOLE, Site
+from ..script.site import HOLE, CraniotomyFrame
 
 # Pixels of a window to a metre of cortex, and how far it reaches from the middle of the opening, in its radii.
 FINENESS, WIDE = 6000.0, 1.05
@@ -57,7 +57,7 @@ class StereoPair:
     pictures: tuple[np.ndarray, np.ndarray]
     tool: tuple[np.ndarray, np.ndarray] | None = None
 
-    def rectify(self, site: Site) -> StereoView:
+    def rectify(self, site: CraniotomyFrame) -> StereoView:
         """Return the windows about an opening.
 
         Raises
@@ -96,7 +96,7 @@ class First:
     still: np.ndarray
 
 
-def observe_first(site: Site, shot: StereoPair, count: int, rigid: Rigid) -> First:
+def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Rigid) -> First:
     """Match the first pair, of an undeformed brain: `count` points, each at the nearest point of the scan.
 
     Raises
@@ -120,7 +120,9 @@ def observe_first(site: Site, shot: StereoPair, count: int, rigid: Rigid) -> Fir
     return First(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
 
 
-def observe_points(site: Site, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray) -> Observation:
+def observe_points(
+    site: CraniotomyFrame, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray
+) -> Observation:
     """Points of the first pair, where a later one shows them; `tips` (k, 3) [m], where a tool touches.
 
     Raises
@@ -144,7 +146,9 @@ def observe_points(site: Site, first: First, shot: StereoPair, rigid: Rigid, tip
     return Observation(now[good], rest[good], compute_deviations(found.sigma[good]), rigid(tips))
 
 
-def observe_point_cloud(site: Site, shot: StereoPair, count: int, rigid: Rigid, tips: np.ndarray) -> Observation:
+def observe_point_cloud(
+    site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Rigid, tips: np.ndarray
+) -> Observation:
     """Return `count` cortex points without correspondences, from one pair.
 
     Arguments and errors as of `observe_points`.
@@ -159,7 +163,7 @@ def observe_point_cloud(site: Site, shot: StereoPair, count: int, rigid: Rigid, 
     return Observation(points[good], None, compute_deviations(found.sigma[good]), rigid(tips))
 
 
-def build_pixel_grid(site: Site, view: StereoView, count: int) -> np.ndarray:
+def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.ndarray:
     """Build a regular grid of about `count` pixels (n, 2) of the left window, over the drape's hole."""
     reach = HOLE * site.clearance - OFF_DRAPE
     step = reach * np.sqrt(np.pi / count)
@@ -170,7 +174,7 @@ def build_pixel_grid(site: Site, view: StereoView, count: int) -> np.ndarray:
     return view.geometry.place(places)[0]
 
 
-def triangulate_seen_points(site: Site, view: StereoView, pixels: np.ndarray) -> Cloud:
+def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> Cloud:
     """Select the pixels (n, 2) with a depth inside the drape's hole.
 
     Raises
@@ -182,16 +186,16 @@ def triangulate_seen_points(site: Site, view: StereoView, pixels: np.ndarray) ->
         found = triangulate_cloud(view, pixels)
     except ValueError as error:
         raise InputError(str(error)) from error
-    inside = site.across(found.points) < HOLE * site.clearance - OFF_DRAPE
+    inside = site.compute_axis_distance(found.points) < HOLE * site.clearance - OFF_DRAPE
     return Cloud(found.which[inside], found.points[inside], found.sigma[inside])
 
 
-def find_surroundings(site: Site, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
+def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (m, 2) of the left window that show what lies round the opening, and where that is (m, 3) [m]."""
     ticks = np.linspace(0.0, view.geometry.size - 1.0, 40)
     pixels = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     found = triangulate_cloud(view, pixels)
-    outside = np.flatnonzero(site.across(found.points) > HOLE * site.clearance)
+    outside = np.flatnonzero(site.compute_axis_distance(found.points) > HOLE * site.clearance)
     some = outside[np.linspace(0, len(outside) - 1, min(AROUND, len(outside))).astype(int)]
     return pixels[found.which[some]], found.points[some]
 
@@ -214,7 +218,7 @@ def check_no_motion(first: First, view: StereoView, rigid: Rigid) -> None:
         )
 
 
-def find_on_cortex(site: Site, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the places of the scan's cortex nearest to points (n, 3) [m], and how far they are (n,) [m]."""
     if not len(points):
         return points, np.zeros(0)

@@ -78,11 +78,11 @@ def measure_tip_distance(
     ball = _ball(loads, tool)
     if ball is None:
         return None
-    found = build_tip_gauge(anatomy).distances(loads, answer.displacement, answer.nodes, ball.shape, lift)
+    found = build_tip_gauge(anatomy).compute_distances(loads, answer.displacement, answer.nodes, ball.shape, lift)
     return TipDistance(float(found[0]), None)
 
 
 def _ball(loads: Loads, tool: Instrument | None) -> Probe | None:
     """Return the tool where it is the only thing that pushes or is moved, and a ball; else None."""
-    alone = len(loads.every(Pushed)) + len(loads.every(Touching)) == 1
+    alone = len(loads.get_all(Pushed)) + len(loads.get_all(Touching)) == 1
     return tool if alone and isinstance(tool, Probe) else None

@@ -11,7 +11,7 @@ import numpy as np
 
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
-from sim.effects import NodalForce, pushed_effects
+from sim.effects import NodalForce, build_push_effects
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.runtime.partial_files import to_unfinished_path
@@ -54,7 +54,7 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
         return
     whole = not to_unfinished_path(path).exists()
     body, data = debulk_tumour(study.anatomy), study.dataset
-    effects = (*pushed_effects(body, study.get_tissue_on(body)), NodalForce())
+    effects = (*build_push_effects(body, study.get_tissue_on(body)), NodalForce())
     begun = clock.perf_counter()
     fem = Fem(body, effects, TRAIN, study.device, None, study.element)
     reported = [0]

@@ -10,11 +10,11 @@ import numpy as np
 from sim.accuracy import FLOOR, Accuracy, Precision
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy, write_anatomy
-from sim.bodies.refine import refined
+from sim.bodies.refine import refine
 from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, template_subject
+from sim.bodies.template import Tumour, build_template_subject
 from sim.discretisation.footprint import find_nearest_on
-from sim.effects import Elasticity, pushed_effects
+from sim.effects import Elasticity, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.locate import locate
@@ -65,10 +65,10 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
     fem, set_up = time_work(_fem, study, spec, body)
     loads = study.played if spec.mesh == OWN else move_pushes_onto(body, study.played)
     located = locate(body.mesh, own.mesh.nodes[own.tumour_nodes])
-    fem.deform(loads.rows(np.array([0])))  # kernels are compiled or loaded at their first launch
+    fem.deform(loads.select(np.array([0])))  # kernels are compiled or loaded at their first launch
     fields, good, seconds = [], [], []
     for row in range(len(loads)):
-        answer, spent = time_work(fem.deform, loads.rows(np.array([row])))
+        answer, spent = time_work(fem.deform, loads.select(np.array([row])))
         seconds.append(spent)
         fields.append(located.read(answer.displacement)[0])
         good.append(answer.outcome[0].good)
@@ -81,7 +81,7 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
         failed=good.count(False),
         set_up=set_up,
         plan=fem.plan.explain(),
-        adapt=_adapt(study, spec, loads.rows(np.array([0]))),
+        adapt=_adapt(study, spec, loads.select(np.array([0]))),
         **summarise_times(seconds),
     )
     return row, field
@@ -95,7 +95,7 @@ def _adapt(study: ReportStudy, spec: FemVariant, load: Loads) -> float:
 
 def _fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
     """Set up for single loads."""
-    effects = pushed_effects(body, change_law(study.get_tissue_on(body), spec.law))
+    effects = build_push_effects(body, change_law(study.get_tissue_on(body), spec.law))
     return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
 
 
@@ -112,7 +112,7 @@ def find_body(study: ReportStudy, mesh: str) -> Anatomy:
     if mesh == OWN:
         return study.anatomy
     if mesh == HALVED:
-        return refined(study.anatomy)
+        return refine(study.anatomy)
     return read_anatomy(build_template_mesh(study.folder / "meshes", int(mesh)))
 
 
@@ -120,7 +120,7 @@ def build_template_mesh(folder: Path, size: int) -> Path:
     """Return the template's brain of about `size` nodes; made if it is not there."""
     path = folder / f"template_{size}.vtu"
     if not path.exists():
-        write_anatomy(path, make_anatomy(template_subject(Tumour()), MeshPlan(size)))
+        write_anatomy(path, make_anatomy(build_template_subject(Tumour()), MeshPlan(size)))
     return path
 
 
@@ -151,7 +151,7 @@ def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
 
 def move_pushes_onto(body: Anatomy, loads: Loads) -> Loads:
     """Return the same pushes at the nearest points of another mesh's open cortex."""
-    (pushed,) = loads.every(Pushed)
+    (pushed,) = loads.get_all(Pushed)
     corners = body.mesh.nodes[body.open_surface]
     return Loads(
         (replace(pushed, point=np.array([find_nearest_on(corners, point) for point in pushed.point])),), loads.time

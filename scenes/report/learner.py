@@ -42,7 +42,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
     def judged(model: Deformer, split: DiscSplit) -> tuple[ErrorFigures | None, float]:
         """Return the errors relative to the data's own solutions of held-out loads."""
         rows = np.flatnonzero(split.test)
-        return _held(model, study.converged.rows(rows), truth[rows], nodes)
+        return _held(model, study.converged.select(rows), truth[rows], nodes)
 
     discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
     (model, solves), learning = time_work(_trained, study, spec, discs)
@@ -54,7 +54,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
         curve.append((count, judged(_trained(study, spec, fewer)[0], discs)[0]))
     of_discs, of_sectors = judged(model, discs), judged(_trained(study, spec, sectors)[0], sectors)
     beyond = get_solutions_beyond(study)
-    outside = study.outside.rows(np.flatnonzero(beyond.good))
+    outside = study.outside.select(np.flatnonzero(beyond.good))
     sets = {
         "discs": of_discs,
         "sectors": of_sectors,
@@ -63,7 +63,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
     field = model.deform(study.played, at=nodes).displacement
     covered = compute_coverage_beyond(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _adapted(study, spec)
-    held_out = study.converged.rows(np.flatnonzero(discs.test))
+    held_out = study.converged.select(np.flatnonzero(discs.test))
     bare = time_model_alone(model, held_out)
     row = ReportRow(
         spec.name,
@@ -113,7 +113,7 @@ def _adapted(study: ReportStudy, spec: LearnerSpec) -> tuple[float | None, Error
     (model, _), learning = time_work(_trained, after, spec, after.discs)
     rows = np.flatnonzero(after.discs.test)
     seconds += learning + measure_series_seconds(after, spec.name)
-    return seconds, _held(model, after.converged.rows(rows), after.answers[rows], after.anatomy.tumour_nodes)[0]
+    return seconds, _held(model, after.converged.select(rows), after.answers[rows], after.anatomy.tumour_nodes)[0]
 
 
 def _trained(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tuple[Deformer, SolveCounts]:

@@ -18,7 +18,7 @@ from sim.loads import Pushed
 from ..play.stage import TOOL, Stage
 from ..script.scene import find_scene
 from ..script.shipped_files import get_template_path
-from ..script.site import Site, build_site
+from ..script.site import CraniotomyFrame, build_craniotomy_frame
 from ..script.tool import Probe
 from ..script.viewpoint import Viewpoint
 from .reference import get_reference
@@ -42,8 +42,8 @@ def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     there[study.drawn] += truth.displacement[worst]
     predicted = there.copy()
     predicted[anatomy.tumour_nodes] = anatomy.mesh.nodes[anatomy.tumour_nodes] + answer[worst]
-    (pushed,) = study.played.every(Pushed)
-    site = build_site(anatomy)
+    (pushed,) = study.played.get_all(Pushed)
+    site = build_craniotomy_frame(anatomy)
     scan = read_intensity(to_intensity_path(get_template_path())) if study.of_template else None
     middle = there[anatomy.tumour_nodes].mean(axis=0)
     camera = look_at(VIEW.build_camera(site).centre, middle, site.up, VIEW.fov, VIEW.width, VIEW.height)
@@ -62,11 +62,11 @@ def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     return draw_text_panel(shown, lines)
 
 
-def find_rested_tip(site: Site, point: np.ndarray, positions: np.ndarray, radius: float) -> np.ndarray:
+def find_rested_tip(site: CraniotomyFrame, point: np.ndarray, positions: np.ndarray, radius: float) -> np.ndarray:
     """Return the tip (3,) [m] of a ball that pushes at a point: it touches the deformed cortex, and pierces it nowhere.
 
     point (3,): at rest [m]; positions (V, 3): of all mesh vertices now [m]; radius of the ball [m].
     """
     place = point - site.origin
-    carried = site.find_contact(float(place @ site.right), float(place @ site.up), radius).carried(positions)
+    carried = site.find_contact(float(place @ site.right), float(place @ site.up), radius).locate(positions)
     return find_resting_tip(positions, site.anatomy.open_surface, carried, site.axis, radius)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import REFERENCE, TRAIN, Accuracy
-from sim.bodies.refine import refined
-from sim.effects import pushed_effects
+from sim.bodies.refine import refine
+from sim.effects import build_push_effects
 from sim.fem import Fem
 from sim.geometry.locate import Located, locate
 from sim.loads import Loads
@@ -44,8 +44,8 @@ def solve_reference(study: ReportStudy, progress: Callable[[int], object], accur
     """
 
     def made() -> tuple[Fem, Located]:
-        body = refined(study.anatomy) if study.fine else study.anatomy
-        fem = Fem(body, pushed_effects(body, study.get_tissue_on(body)), accuracy, study.device, None, "p2")
+        body = refine(study.anatomy) if study.fine else study.anatomy
+        fem = Fem(body, build_push_effects(body, study.get_tissue_on(body)), accuracy, study.device, None, "p2")
         return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.drawn])
 
     _solve(study, "reference", study.played, made, progress)
@@ -56,7 +56,7 @@ def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
 
     def made() -> tuple[Fem, Located]:
         body = study.anatomy
-        fem = Fem(body, pushed_effects(body, study.get_tissue_on(body)), TRAIN, study.device, None, study.element)
+        fem = Fem(body, build_push_effects(body, study.get_tissue_on(body)), TRAIN, study.device, None, study.element)
         return fem, locate(body.mesh, body.mesh.nodes[body.tumour_nodes])
 
     _solve(study, "beyond", study.outside, made, progress)
@@ -85,7 +85,7 @@ def _solve(
         return
     fem, located = made()
     for rows in np.array_split(missing, -(-len(missing) // min(fem.batch, TOGETHER))):
-        answer = fem.deform(loads.rows(rows))
+        answer = fem.deform(loads.select(rows))
         for row, field, outcome in zip(rows, located.read(answer.displacement), answer.outcome, strict=True):
             with write_atomically(_path(study, kind, row), ".npz") as partial:
                 np.savez(partial, displacement=field, good=outcome.good, seconds=answer.cost.total / len(rows))

@@ -84,7 +84,7 @@ def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.
 
 def compute_figures(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> ErrorFigures | None:
     """Figures of `answer` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
-    (pushed,) = loads.every(Pushed)
+    (pushed,) = loads.get_all(Pushed)
     return compute_distance_figures(np.linalg.norm(answer - truth, axis=2), truth, split_forces(pushed)[0])
 
 
@@ -95,7 +95,7 @@ def compare_with_reference(
     truth = get_reference(study)
     rows = np.flatnonzero(good & truth.good)
     known = np.isin(study.drawn, nodes)
-    return compute_figures(answer[rows], truth.displacement[rows][:, known], study.played.rows(rows))
+    return compute_figures(answer[rows], truth.displacement[rows][:, known], study.played.select(rows))
 
 
 def summarise_times(seconds: Sequence[float]) -> dict[str, Any]:

@@ -90,7 +90,7 @@ class ReportStudy:
 
     def get_tissue_on(self, body: Anatomy) -> Elasticity:
         """Return the same for a body that may lack some of the regions."""
-        return self.tissue.on(np.unique(body.mesh.region).tolist())
+        return self.tissue.restrict(np.unique(body.mesh.region).tolist())
 
     @property
     def element(self) -> str:
@@ -110,7 +110,7 @@ class ReportStudy:
     @cached_property
     def converged(self) -> Loads:
         """The loads of the data that converged; a split has a row for each."""
-        return self.dataset.loads.rows(np.flatnonzero(self.dataset.good))
+        return self.dataset.loads.select(np.flatnonzero(self.dataset.good))
 
     @property
     def pushed(self) -> Pushed:
@@ -121,7 +121,7 @@ class ReportStudy:
         InputError
             Loads of another kind.
         """
-        pushed = self.converged.only(Pushed)
+        pushed = self.converged.get_only(Pushed)
         if pushed is None:
             raise InputError(f"{self.data}: holds other loads than pushes: simulate pushes.")
         return pushed
@@ -142,13 +142,13 @@ class ReportStudy:
         rows = np.flatnonzero(self.discs.test)
         rows = rows[np.argsort(split_forces(self.pushed)[0][rows], kind="stable")]
         chosen = np.unique(np.linspace(0, len(rows) - 1, min(self.loads, len(rows))).round().astype(int))
-        return self.converged.rows(rows[chosen])
+        return self.converged.select(rows[chosen])
 
     @cached_property
     def outside(self) -> Loads:
         """Loads beyond the training range: stronger, more oblique, nearer to the rim, in equal parts."""
-        pushed = self.converged.rows(np.flatnonzero(self.discs.test)).of(Pushed)
-        training = self.converged.rows(np.flatnonzero(self.discs.train)).of(Pushed)
+        pushed = self.converged.select(np.flatnonzero(self.discs.test)).get(Pushed)
+        training = self.converged.select(np.flatnonzero(self.discs.train)).get(Pushed)
         assert pushed is not None and training is not None
         return draw_loads_beyond(self.patch, training, pushed, self.beyond)
 

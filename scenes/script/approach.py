@@ -9,7 +9,7 @@ import numpy as np
 from sim.bodies.markups import Markup
 from sim.errors import InputError
 
-from .site import Site
+from .site import CraniotomyFrame
 from .tool import Instrument, Probe
 from .tool_paths import Path, Touch
 
@@ -53,7 +53,7 @@ class Approach:
         return replace(tool, lean=float(np.arctan(np.hypot(right, up))), turn=float(np.arctan2(up, right)))
 
 
-def approach_of(markup: Markup, site: Site) -> Approach:
+def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
     """Compute the approach of a line markup, or of a point, which is approached along the axis.
 
     Raises
@@ -64,7 +64,7 @@ def approach_of(markup: Markup, site: Site) -> Approach:
     """
     points, path = markup.points, markup.path
     if markup.kind == "Fiducial" and len(points) == 1:
-        entry = site.nearest(points[0]).point
+        entry = site.find_nearest(points[0]).point
         apart = float(np.linalg.norm(entry - points[0]))
         if apart > NEAR:
             raise InputError(
@@ -100,12 +100,12 @@ def approach_of(markup: Markup, site: Site) -> Approach:
     return replace(_approach(site, entry, way), line=True)
 
 
-def _approach(site: Site, entry: np.ndarray, way: np.ndarray) -> Approach:
+def _approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray) -> Approach:
     """Return the approach at a point (3,) [m] of the cortex, in a direction (3,)."""
     axes = np.stack([site.right, site.up])
     place = axes @ (entry - site.origin)
     for _ in range(CORRECTIONS):
-        place = place + axes @ (entry - site.nearest(site.origin + place @ axes).point)
+        place = place + axes @ (entry - site.find_nearest(site.origin + place @ axes).point)
     right, up = np.arctan(axes @ way / (way @ site.axis)).tolist()
     return Approach(float(place[0]), float(place[1]), (right, up))
 

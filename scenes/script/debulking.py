@@ -10,7 +10,7 @@ from sim.anatomy import Anatomy
 from sim.effects import Resection
 from sim.errors import InputError
 
-from .site import build_site
+from .site import build_craniotomy_frame
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Debulking:
         InputError
             No open cortex, or a tumour with too few tetrahedra for the shares.
         """
-        mesh, site = anatomy.mesh, build_site(anatomy)
+        mesh, site = anatomy.mesh, build_craniotomy_frame(anatomy)
         tumour = np.flatnonzero(anatomy.in_tumour)
         shares = len(self.times)
         if len(tumour) < shares:

@@ -16,7 +16,7 @@ SUPINE = (0.0, -1.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Lying:
+class HeadPose:
     """Head pose at one time, independent of head size.
 
     Parameters
@@ -36,18 +36,18 @@ class Lying:
         return Posture(down[None], np.array([compute_fluid_level(nodes, down, self.fluid)]), np.ones(1))
 
 
-Lie = Callable[[float], Lying]
+Lie = Callable[[float], HeadPose]
 """Time [s] -> Lying."""
 
 
-def get_supine_pose(time: float) -> Lying:
+def get_supine_pose(time: float) -> HeadPose:
     """Return the pose of the scan, at any time [s]: supine, under fluid."""
-    return Lying()
+    return HeadPose()
 
 
 def build_drainage(seconds: float, to: float = 0.0) -> Lie:
     """Return a supine pose whose fluid falls to a share of its height within `seconds`."""
-    return lambda time: Lying(fluid=1.0 - (1.0 - to) * smooth(time / seconds))
+    return lambda time: HeadPose(fluid=1.0 - (1.0 - to) * smooth(time / seconds))
 
 
 def build_drained_turn(drain: float, pause: float, turn: float, angle: float, to: float = 0.0) -> Lie:
@@ -57,8 +57,8 @@ def build_drained_turn(drain: float, pause: float, turn: float, angle: float, to
     """
     falling = build_drainage(drain, to)
 
-    def lie(time: float) -> Lying:
+    def lie(time: float) -> HeadPose:
         turned = angle * smooth((time - drain - pause) / turn)
-        return Lying((-float(np.sin(turned)), -float(np.cos(turned)), 0.0), falling(time).fluid)
+        return HeadPose((-float(np.sin(turned)), -float(np.cos(turned)), 0.0), falling(time).fluid)
 
     return lie

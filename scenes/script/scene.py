@@ -34,8 +34,8 @@ from sim.runtime.user_script import format_script_error, run_script
 
 from .debulking import Debulking
 from .head_posture import Lie, get_supine_pose
-from .sight import Sight, StereoSight
-from .site import Site
+from .sight import PointObservation, StereoObservation
+from .site import CraniotomyFrame
 from .tool import Instrument, Probe
 from .tool_paths import AIR, Path, Touch, keep_idle
 from .viewpoint import PLAIN, USUAL, Appearance, Viewpoint
@@ -112,7 +112,7 @@ class Scene:
     tool: Instrument | None = PALPATION
     lying: Lie = get_supine_pose
     surgery: Debulking | None = None
-    sight: Sight | StereoSight | None = None
+    sight: PointObservation | StereoObservation | None = None
     viewpoint: Viewpoint = USUAL
     look: Appearance = PLAIN
     element: str | None = None
@@ -181,7 +181,7 @@ class Scene:
         kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
         return kept if self.surgery is None else (*kept, _resection(self.surgery, anatomy))
 
-    def find_contact(self, site: Site, touch: Touch) -> Place:
+    def find_contact(self, site: CraniotomyFrame, touch: Touch) -> Place:
         """Return the material point that the tool touches."""
         assert self.tool is not None
         return site.find_contact(touch.x, touch.y, self.tool.radius)
@@ -191,33 +191,33 @@ class Scene:
         """True if the tool is moved by its pose, not by a force."""
         return any(isinstance(effect, ToolContact | Retraction) for effect in self.effects)
 
-    def compute_tip(self, site: Site, touch: Touch) -> np.ndarray:
+    def compute_tip(self, site: CraniotomyFrame, touch: Touch) -> np.ndarray:
         """Compute the contact point (3,) [m] of a moved tool, limited by the craniotomy edge."""
         assert self.tool is not None
         asked = self.find_contact(site, touch).point + touch.depth * site.compute_direction(touch)
         return site.clip_to_opening(asked, self.tool.radius)
 
-    def describe_stop(self, site: Site, touch: Touch) -> str:
+    def describe_stop(self, site: CraniotomyFrame, touch: Touch) -> str:
         """Say that the bone's edge stops the tool short of where a touch asks for it; empty where it does not."""
         if self.tool is None:
             return ""
         asked = site.origin + touch.x * site.right + touch.y * site.up
         if self.posed:
             asked = asked + touch.depth * site.compute_direction(touch)
-        beyond = float(site.across(asked[None])[0]) - site.compute_reach(self.tool.radius)
+        beyond = float(site.compute_axis_distance(asked[None])[0]) - site.compute_reach(self.tool.radius)
         return f"the bone's edge stops the tool {1e3 * beyond:.1f} mm short" if beyond > SHORT else ""
 
-    def compute_pose(self, site: Site, touch: Touch) -> np.ndarray:
+    def compute_pose(self, site: CraniotomyFrame, touch: Touch) -> np.ndarray:
         """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""
         assert self.tool is not None
         return self.tool.pose(self.compute_tip(site, touch), site.axis, site.right)
 
-    def build_loads(self, site: Site, touch: Touch, time: float) -> Loads:
+    def build_loads(self, site: CraniotomyFrame, touch: Touch, time: float) -> Loads:
         """Build one load case: the cause of every effect that has one; without causes, only time advances."""
         causes = (self._cause(effect, site, touch, time) for effect in self.get_effects_on(site.anatomy))
         return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
 
-    def _cause(self, effect: Effect, site: Site, touch: Touch, time: float) -> Cause | None:
+    def _cause(self, effect: Effect, site: CraniotomyFrame, touch: Touch, time: float) -> Cause | None:
         """Build the cause of an effect of the scene at a time."""
         match effect:
             case ToolForce():
@@ -235,7 +235,7 @@ class Scene:
             case _:
                 return None
 
-    def _pushed(self, site: Site, touch: Touch) -> Pushed:
+    def _pushed(self, site: CraniotomyFrame, touch: Touch) -> Pushed:
         assert self.tool is not None
         force = touch.force * site.compute_direction(touch)
         return Pushed(self.find_contact(site, touch).point[None], force[None], np.array([self.tool.radius]))

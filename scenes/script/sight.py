@@ -10,7 +10,7 @@ from sim.errors import InputError
 
 
 @dataclass(frozen=True)
-class Sight:
+class PointObservation:
     """Observation of moving points of the open cortex, with errors. Force and tissue are unknown.
 
     Points occluded by the tool are not observed. The contact point of its tip is observed too.
@@ -37,7 +37,7 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class StereoSight:
+class StereoObservation:
     """Observation of points of the open cortex by the stereo images of an operating microscope.
 
     The first stereo pair shows the undeformed brain. Points are detected in images: their depth by stereo, their motion

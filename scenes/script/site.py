@@ -16,7 +16,7 @@ HOLE = 0.98
 
 
 @dataclass(frozen=True, eq=False)
-class Site(OpenCortex):
+class CraniotomyFrame(OpenCortex):
     """The open cortex, and what a hand asks of it."""
 
     def compute_reach(self, radius: float) -> float:
@@ -35,7 +35,7 @@ class Site(OpenCortex):
 
         A tool of this `radius` [m] stays inside the opening: the place is brought back to where the bone stops it.
         """
-        return self.nearest(self.clip_to_opening(self.origin + x * self.right + y * self.up, radius))
+        return self.find_nearest(self.clip_to_opening(self.origin + x * self.right + y * self.up, radius))
 
     def compute_direction(self, touch: Touch) -> np.ndarray:
         """Return unit direction (3,) of a touch's force: inwards, tilted."""
@@ -43,7 +43,7 @@ class Site(OpenCortex):
         return along / np.linalg.norm(along)
 
 
-def build_site(anatomy: Anatomy) -> Site:
+def build_craniotomy_frame(anatomy: Anatomy) -> CraniotomyFrame:
     """Return the frame of an anatomy's open cortex.
 
     Raises
@@ -52,4 +52,4 @@ def build_site(anatomy: Anatomy) -> Site:
         An anatomy without open cortex.
     """
     frame = open_cortex(anatomy)
-    return Site(anatomy, frame.origin, frame.axis, frame.right, frame.up)
+    return CraniotomyFrame(anatomy, frame.origin, frame.axis, frame.right, frame.up)

@@ -16,7 +16,7 @@ from sim.runtime.outside_files import read_as
 
 from .priors import OF_REGISTRATION, PRIORS, REGISTRATION, SEGMENTATION
 from .scene import Scene
-from .site import Site
+from .site import CraniotomyFrame
 
 FORMAT = "sulcus uncertainty 1"
 LEVEL = 0.95
@@ -145,7 +145,7 @@ class Uncertainty:
         return float(np.interp(time, self.times, values))
 
 
-def mark_of(scene: Scene, site: Site, element: str) -> str:
+def mark_of(scene: Scene, site: CraniotomyFrame, element: str) -> str:
     """Compute the fingerprint of a scene: 16 hexadecimal digits of its loads, its anatomy and the priors."""
     times = np.linspace(0.0, scene.duration, 25).tolist()
     # Rounded, for sines differ from machine to machine in the last digit.

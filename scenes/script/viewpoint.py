@@ -12,7 +12,7 @@ from ar.optics.camera import Camera, build_stereo_pair, look_at
 from sim.errors import InputError
 
 from .camera_paths import CameraPath
-from .site import Site
+from .site import CraniotomyFrame
 
 
 @dataclass(frozen=True)
@@ -123,11 +123,11 @@ class Viewpoint:
         """Return this viewpoint with a calibrated camera and its image size."""
         return replace(self, calibration=calibration, width=calibration.width, height=calibration.height)
 
-    def find_target(self, site: Site) -> np.ndarray:
+    def find_target(self, site: CraniotomyFrame) -> np.ndarray:
         """Return the target point of the camera (3,) [m]."""
         return site.origin + UNDER * site.axis
 
-    def build_camera(self, site: Site, time: float = 0.0) -> Camera:
+    def build_camera(self, site: CraniotomyFrame, time: float = 0.0) -> Camera:
         """Return the camera that looks at a site at a time [s]."""
         outward = -np.cos(self.tilt) * site.axis + np.sin(self.tilt) * site.up
         target = self.find_target(site)

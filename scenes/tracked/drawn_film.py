@@ -14,12 +14,12 @@ from sim.deformation import Deformation, Deformer
 from sim.loads import Loads, Touching
 from surrogate.model.learned import build_prediction
 
-from ..play.deformers import Theatre
+from ..play.deformers import PatientSetup
 from ..play.player import Player
 from ..play.stage import Stage
 from ..script.camera_paths import HandHeld
 from ..script.scene import find_scene
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from .filming import (
     USUAL,
     VIEW,
@@ -49,16 +49,16 @@ class Dent:
     """A Deformer that solves nothing: tissue goes with the tool's tip, the less the farther it is from it."""
 
     anatomy: Anatomy
-    site: Site
+    site: CraniotomyFrame
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Compute the deformation under posed tools: the tissue is as deep as their tip is under the open cortex."""
         nodes = self.anatomy.mesh.nodes
-        cause = loads.of(Touching)
+        cause = loads.get(Touching)
         assert cause is not None
         moved = []
         for tip in cause.pose[:, 0, :3, 3]:
-            place = self.site.nearest(tip).point
+            place = self.site.find_nearest(tip).point
             depth = max(0.0, float((tip - place) @ self.site.axis))
             share = np.exp(-np.square(nodes - place).sum(axis=1) / (2.0 * ROUND**2))
             moved.append(depth * share[:, None] * self.site.axis)
@@ -66,7 +66,7 @@ class Dent:
         found = build_prediction(
             np.stack(moved), np.arange(len(nodes)), loads, [False] * len(loads), clock.perf_counter(), exact, ""
         )
-        return found if at is None else found.at(at)
+        return found if at is None else found.restrict(at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class DrawnFilm:
         return to_named_image(f"{shot.time:.1f} s", shot.colour, shot.time)
 
 
-def build_synthetic_video(theatre: Theatre) -> DrawnFilm:
+def build_synthetic_video(theatre: PatientSetup) -> DrawnFilm:
     """Render the video of a theatre's anatomy.
 
     Raises

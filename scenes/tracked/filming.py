@@ -24,7 +24,7 @@ from sim.tools import BuiltIn
 
 from ..play.player import Player
 from ..play.stage import TOOL, TOOL_COLOUR
-from ..script.site import Site
+from ..script.site import CraniotomyFrame
 from ..script.viewpoint import Viewpoint
 from .registration_file import describe_scan
 from .tracked_tool import TrackedTool
@@ -56,7 +56,7 @@ def from_where_it_sees_all(view: Viewpoint) -> Viewpoint:
     return replace(view, distance=longer * VIEW.distance)
 
 
-def place_reference(site: Site, camera: Camera) -> np.ndarray:
+def place_reference(site: CraniotomyFrame, camera: Camera) -> np.ndarray:
     """Return T_scan_patient (4, 4) of the reference near a site, facing `camera`."""
     right, up, outwards = BESIDE
     middle = site.origin + right * site.right + up * site.up - outwards * site.axis
@@ -156,7 +156,7 @@ def mount_targets(player: Player) -> Mounted:
     return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), place_reference(site, camera))
 
 
-def register_with_error(site: Site, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
+def register_with_error(site: CraniotomyFrame, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
     """Draw the reference's registration to the scan, with one random error of the given standard deviations.
 
     `shift` [mm] and `turn` [degree] are its standard deviations along and about each axis, about the opening's centre.

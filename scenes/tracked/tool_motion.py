@@ -84,7 +84,7 @@ class ToolMotion:
         except InputError:
             return BrainMotion(self.rest.positions, doubt=REFUSED)
         vertices, rest = self.stage.tumour_vertices, self.rest.positions
-        moved, beyond = (each.at(vertices).displacement[0] for each in (answer, further))
+        moved, beyond = (each.restrict(vertices).displacement[0] for each in (answer, further))
         positions, doubt = rest.copy(), describe_outcome(answer.outcome[0])
         positions[answer.nodes] += answer.displacement[0]
         model = find_first_model(self.deformer, answer)
@@ -108,6 +108,6 @@ class ToolMotion:
         assert self.deformer is not None
         if isinstance(self.deformer, Learned):
             both = self.deformer.deform(Loads((Touching(np.stack([pose, deeper])[:, None]),)), at=self.stage.nodes)
-            return both.rows(np.array([0])), both.rows(np.array([1]))
+            return both.select(np.array([0])), both.select(np.array([1]))
         first = self.deformer.deform(Loads((Touching(pose[None, None]),)), start=start)
         return first, self.deformer.deform(Loads((Touching(deeper[None, None]),)), start=first)

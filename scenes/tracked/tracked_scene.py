@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from sim.deformation import Deformer
     from sim.tools import BuiltIn
 
-    from ..play.deformers import Theatre
+    from ..play.deformers import PatientSetup
     from ..script.scene import Scene
 
 REST = "rest"
@@ -30,7 +30,9 @@ def build_tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scen
     return Scene(args.command, "A tracked tool.", effects=effects)
 
 
-def build_mover(args: argparse.Namespace, theatre: Theatre, scene: Scene, tooled: bool) -> tuple[Deformer | None, str]:
+def build_mover(
+    args: argparse.Namespace, theatre: PatientSetup, scene: Scene, tooled: bool
+) -> tuple[Deformer | None, str]:
     """Select the deformer of the brain under a tracked tool, if there is one, with its description.
 
     Raises

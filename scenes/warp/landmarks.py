@@ -53,7 +53,7 @@ def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, .
             found.append(Landmark(NEAREST, rest, rest + weights @ displacement[triangles[triangle]]))
     if len(body.open_surface):
         cortex = open_cortex(body)
-        place = cortex.nearest(cortex.origin)
+        place = cortex.find_nearest(cortex.origin)
         found.append(Landmark(CORTEX, place.point, place.point + place.weights @ displacement[place.vertices]))
     return tuple(found)
 

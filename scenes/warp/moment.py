@@ -21,7 +21,7 @@ from sim.loads import Loads, Pushed
 from sim.resected_fem import OperatedFem
 from surrogate.locating.calibration import RADIUS_SQUARED
 
-from ..play.deformers import AtRest, Theatre
+from ..play.deformers import AtRest, PatientSetup
 from ..play.player import Player
 from ..play.reference import is_history_dependent, solve_reference_frames
 from ..play.stage import Stage
@@ -54,7 +54,7 @@ def play_scene_cause(scene: Scene, number: int) -> Cause:
 
 def load_cause(loads: Loads) -> Cause:
     """Return the one push of a load case."""
-    (pushed,) = loads.every(Pushed)
+    (pushed,) = loads.get_all(Pushed)
     place, force = 1e3 * pushed.point[0], pushed.force[0]
     newton = float(np.linalg.norm(force))
     direction, radius = force / newton, 1e3 * float(pushed.footprint[0])
@@ -131,7 +131,7 @@ class DeformedAnatomy:
 class Played:
     """Scene on a body, or a `load` as a scene, with the FEM that solves it."""
 
-    theatre: Theatre
+    theatre: PatientSetup
     scene: Scene
     load: bool = False
 
@@ -145,7 +145,7 @@ class Played:
             self.theatre, self.scene, [self._loads(number) for number in needed], progress, fem
         )
         rows = {number: row for row, number in enumerate(needed)}
-        return [self._moment(number, answers.rows(np.array([rows[number]])), fem) for number in frames]
+        return [self._moment(number, answers.select(np.array([rows[number]])), fem) for number in frames]
 
     def _loads(self, number: int):
         scene, time = self.scene, float(self.scene.times[number])

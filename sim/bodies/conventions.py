@@ -59,7 +59,7 @@ class Convention:
         """All label numbers of the convention except `necrosis`, which is part of `tumour`."""
         return frozenset(self.brain + self.tumour + self.oedema + self.ventricles + self.csf)
 
-    def fits(self, present: Collection[int]) -> bool:
+    def is_compatible(self, present: Collection[int]) -> bool:
         """Return True if a file with these labels can follow the convention."""
         labels = set(present) - {0}
         if (self.tumour and not labels & set(self.tumour)) or (self.apart and labels >= set(self.apart)):
@@ -182,7 +182,7 @@ def check_labels_fit(
     """
     labels = set(present) - {0} - set(own)
     missing = [label for label in convention.needed if label not in labels]
-    kin = convention.fits(labels) or (own and not missing)
+    kin = convention.is_compatible(labels) or (own and not missing)
     if kin:
         why = against(convention)
         if not why:
@@ -199,7 +199,7 @@ def check_labels_fit(
     for one in CONVENTIONS.values():
         if kin and bool(one.tumour) != bool(convention.tumour):
             continue
-        if one is not convention and one.fits(labels) and not against(one):
+        if one is not convention and one.is_compatible(labels) and not against(one):
             meant = [labels.intersection(of) for of in (one.tumour, one.oedema, one.necrosis)]
             others.setdefault(str(meant) if one.tumour else one.name, one.name)
     looks = f"It looks like {' or '.join(others.values())}" if others else "Name its labels: --brain 1,2 --tumour 3"

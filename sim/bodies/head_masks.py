@@ -135,7 +135,7 @@ def read_head_masks(sources: Sources) -> HeadMasks:
         lacking, affine = widen_grid(shape, affine, other)
         marked = {name: np.pad(mask, lacking) for name, mask in marked.items()}
         shape = tuple((np.array(shape) + lacking.sum(axis=1)).tolist())
-    marked |= {name: other.onto(shape, affine) for name, other in others.items()}
+    marked |= {name: other.resample(shape, affine) for name, other in others.items()}
     notes = whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes)
     if convention is None and not sources.mask and not sources.tumour_in:
         notes += _unnamed(whole, (*brain, *tumour, *(label for labels in named.values() for label in labels)))
@@ -167,7 +167,7 @@ def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
     """Return a note on labels of the file that have no assigned meaning."""
     names = {(one.layer, one.value): one.name for one in whole.segments}
     found = {(layer, value) for layer, present in enumerate(whole.present) for value in present}
-    left = [names.get(place, place[1]) for place in sorted(found - set(whole.places(named)))]
+    left = [names.get(place, place[1]) for place in sorted(found - set(whole.find_layers(named)))]
     return (f"neither brain nor tumour: what is labelled {format_labels(left)}",) if left else ()
 
 
@@ -175,8 +175,8 @@ def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tupl
     """Return a note on the user's own labels if the anatomy contradicts them."""
     if whole.layers.shape[-1] > 1 or not {NECROSIS, "oedema"}.intersection(parts):
         return ()
-    own = {name: tuple(value for _, value in whole.places(labels)) for name, labels in parts.items()}
-    core, necrosis = tuple(value for _, value in whole.places(tumour)), own.get(NECROSIS, ())
+    own = {name: tuple(value for _, value in whole.find_layers(labels)) for name, labels in parts.items()}
+    core, necrosis = tuple(value for _, value in whole.find_layers(tumour)), own.get(NECROSIS, ())
     meant = Convention("own", "", tumour=core + necrosis, necrosis=necrosis, oedema=own.get("oedema", ()))
     found = find_contradiction(count_label_contacts(whole), meant)
     return (f"{found.reason}: see that the labels mean this",) if found else ()
@@ -235,7 +235,7 @@ def _meant(
         necrosis = sources.parts.get(NECROSIS, ())
         parts = tuple(label for name, labels in sources.parts.items() if name != NECROSIS for label in labels)
         given = brain + parts + (() if sources.tumour_in else tumour + necrosis)
-        named = {value for _, value in whole.places(given)}
+        named = {value for _, value in whole.find_layers(given)}
         checked = convention.deepest or (convention.tumour and not sources.tumour and not sources.parts)
         doubts = (build_contradiction_check(whole, convention),) if checked else ()
         check_labels_fit(sources.labels, convention, whole.labels, named, *doubts)
@@ -320,8 +320,8 @@ def _demand_one_meaning(whole: LabelMap, named: Mapping[str, tuple[str, Sequence
     for (one, (option, labels)), (two, (other, others)) in combinations(named.items(), 2):
         if one == _around(two):
             continue
-        places = whole.places(labels)
-        both = [label for label, place in zip(others, whole.places(others), strict=True) if place in places]
+        places = whole.find_layers(labels)
+        both = [label for label, place in zip(others, whole.find_layers(others), strict=True) if place in places]
         if both:
             raise InputError(
                 f"{whole.path}: label {format_labels(both)} is named by {option} and by {other}: "

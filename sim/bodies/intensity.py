@@ -54,13 +54,13 @@ class Intensity:
     values: np.ndarray
     affine: np.ndarray
 
-    def at(self, points: np.ndarray) -> np.ndarray:
+    def interpolate(self, points: np.ndarray) -> np.ndarray:
         """Return values (n,) in [0, 1] at points (n, 3) [m]: trilinear, 8-bit grey / 255, zero outside the volume."""
         inverse = np.linalg.inv(self.affine)
         index = inverse[:3, :3] @ points.T + inverse[:3, 3:]
         return ndimage.map_coordinates(self.values, index, order=1, mode="constant", output=np.float64) / 255.0
 
-    def around(self, points: np.ndarray, mesh: TetMesh, margin: float = 0.015) -> Intensity:
+    def crop(self, points: np.ndarray, mesh: TetMesh, margin: float = 0.015) -> Intensity:
         """Return the part around the box of points (n, 3) [m], with a margin [m], as 8-bit grey by `KEPT`.
 
         Raises

@@ -77,7 +77,7 @@ class Pieces:
     inside: np.ndarray
     surface: np.ndarray
 
-    def kept(self, keep: np.ndarray) -> Pieces:
+    def select(self, keep: np.ndarray) -> Pieces:
         """Return the tetrahedra marked in `keep` (T,) and their nodes, renumbered in order."""
         used = np.zeros(len(self.nodes), bool)
         used[self.tets[keep]] = True

@@ -36,7 +36,7 @@ class Contacts:
         surface = self.areas[inside][:, ~inside].sum()
         return float(self.areas[inside][:, there & ~inside].sum() / surface) if surface else 0.0
 
-    def volume(self, of: Collection[int]) -> float:
+    def compute_share(self, of: Collection[int]) -> float:
         """Return the voxels of some labels as a fraction of all labelled voxels."""
         return float(self.voxels[np.isin(self.labels, list(of))].sum() / self.voxels[self.labels != 0].sum())
 
@@ -80,7 +80,7 @@ def find_contradiction(contacts: Contacts, convention: Convention) -> Contradict
         found = contacts.share({label}, {0})
         if found > least + MARGIN:
             return Contradiction(f"label {label} lies outside of the others, {found:.0%} of its surface at no label")
-    if oedema and tumour and contacts.volume(oedema) >= SPECK:
+    if oedema and tumour and contacts.compute_share(oedema) >= SPECK:
         found = contacts.share(oedema, outside)
         if found < HIDDEN or found < min(SURE, contacts.share(necrosis, outside) - MARGIN):
             return Contradiction(
@@ -105,7 +105,7 @@ def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[
     if whole.layers.shape[-1] > 1:
         return lambda _: ""
     contacts = count_label_contacts(whole)
-    rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.fits(whole.labels)]
+    rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.is_compatible(whole.labels)]
 
     def reason(one: Convention) -> str:
         found = find_contradiction(contacts, one)

@@ -67,13 +67,13 @@ class LabelMap:
             See `places`.
         """
         found = np.asarray(self.layers.any(axis=-1)) if not labels else np.zeros(self.layers.shape[:3], bool, order="F")
-        places = self.places(labels)
+        places = self.find_layers(labels)
         for layer in {layer for layer, _ in places}:
             # Transposed: files have the first axis fastest, and NumPy would copy other memory layouts.
             found |= np.isin(self.layers[..., layer].T, [value for on, value in places if on == layer]).T
         return found
 
-    def places(self, labels: Sequence[Label]) -> list[tuple[int, int]]:
+    def find_layers(self, labels: Sequence[Label]) -> list[tuple[int, int]]:
         """Return layer and number of each label.
 
         Raises
@@ -188,7 +188,7 @@ class Mask:
         """Lowest and highest corner (2, 3) [m] of the bounding box (RAS) of the marked voxels' centres."""
         return np.stack([self.outline.min(axis=0), self.outline.max(axis=0)])
 
-    def onto(self, shape: tuple[int, ...], affine: np.ndarray) -> np.ndarray:
+    def resample(self, shape: tuple[int, ...], affine: np.ndarray) -> np.ndarray:
         """Return the mask (I, J, K) resampled to another grid by nearest neighbour."""
         if _alike(shape, affine, self):
             return self.marked

@@ -50,7 +50,7 @@ class Labelling:
     blur: Blur = field(default_factory=Blur)
 
 
-def volume_subject(
+def build_volume_subject(
     path: str | Path,
     brain: Sequence[Label],
     tumour: Sequence[Label],

@@ -36,7 +36,7 @@ class Markup:
     kind: str
     points: np.ndarray
 
-    def curve(self) -> np.ndarray:
+    def fit_curve(self) -> np.ndarray:
         """Sample points (256, 3) [m] of the smooth closed curve through the points of a `ClosedCurve`.
 
         Raises

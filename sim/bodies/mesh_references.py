@@ -47,7 +47,7 @@ def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
     """
     import h5py
 
-    most = limits.of(path.stat().st_size)
+    most = limits.limit_bytes(path.stat().st_size)
     left, seen = most, set()
 
     def look(group: h5py.Group, within: str) -> None:

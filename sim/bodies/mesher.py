@@ -188,8 +188,8 @@ def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
     body = cut(build_whole(lattice), solids.brain, settings=settings.stuffing)
     if not body.inside.any():
         raise InputError(TOO_COARSE)
-    body = body.kept(body.inside)
-    body = body.kept(clean(body.tets))
+    body = body.select(body.inside)
+    body = body.select(clean(body.tets))
     surface = np.zeros(len(body.nodes), bool)
     surface[find_single_faces(body.tets)] = True
     return cut(body, solids.tumour, surface, settings.stuffing)
@@ -230,7 +230,7 @@ def _improved(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
     """Remove flat tetrahedra on the surfaces and improve bad angles."""
     for slack in settings.slacks:
         bad = compute_smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
-        pieces = pieces.kept(~find_removable_tetrahedra(pieces.tets, bad))
+        pieces = pieces.select(~find_removable_tetrahedra(pieces.tets, bad))
         projection = _projection(solids, pieces, slack)
         pieces = replace(pieces, nodes=improve_mesh(pieces.nodes, pieces.tets, projection, settings.smoothing))
     return pieces

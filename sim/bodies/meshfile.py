@@ -85,7 +85,7 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
     if unit not in UNITS:
         raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
     with read_as(path, "a mesh", REMEDY):
-        most = limits.of(path.stat().st_size)
+        most = limits.limit_bytes(path.stat().st_size)
         counted = path.suffix.lower() == ".vtu" and check_vtu_size(path, most)
         with warnings.catch_warnings(), nullcontext() if counted else limit_memory(limits.largest):
             warnings.simplefilter("ignore")  # meshio warns about arrays that it skips

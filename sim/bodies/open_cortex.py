@@ -36,7 +36,7 @@ class Place:
     vertices: np.ndarray
     weights: np.ndarray
 
-    def carried(self, positions: np.ndarray) -> np.ndarray:
+    def locate(self, positions: np.ndarray) -> np.ndarray:
         """Return the deformed position (3,) [m], given vertex positions (V, 3) [m]."""
         return self.weights @ positions[self.vertices]
 
@@ -83,12 +83,12 @@ class OpenCortex:
     def _inward(self) -> np.ndarray:
         return -compute_vertex_normals(self.anatomy.mesh.nodes, self.anatomy.open_surface)
 
-    def across(self, points: np.ndarray) -> np.ndarray:
+    def compute_axis_distance(self, points: np.ndarray) -> np.ndarray:
         """Return distances (n,) [m] of points (n, 3) from the line through the origin along the axis."""
         arm = points - self.origin
         return np.linalg.norm(arm - np.outer(arm @ self.axis, self.axis), axis=1)
 
-    def nearest(self, point: np.ndarray) -> Place:
+    def find_nearest(self, point: np.ndarray) -> Place:
         """Return the place nearest to a point (3,) [m]."""
         at, triangle, weights = (found[0] for found in find_closest_points(point[None], self.corners))
         vertices = self.anatomy.open_surface[triangle]
@@ -106,7 +106,7 @@ class OpenCortex:
             given = check_numbers_array(name, value)
             if given.shape != ():
                 raise InputError(f"{name} has shape {given.shape}: give one number, in millimetres.")
-        found = self.nearest(self.origin + 1e-3 * (right_mm * self.right + up_mm * self.up))
+        found = self.find_nearest(self.origin + 1e-3 * (right_mm * self.right + up_mm * self.up))
         rim = find_border_edges(self.anatomy.mesh.nodes, self.anatomy.open_surface)
         if not compute_distances(rim, found.point[None])[0] > ON_RIM:
             raise InputError(

@@ -50,7 +50,7 @@ def _closed() -> np.ndarray:
 CLOSED = _closed()  # smallest pattern by the bit mask of halved edges
 
 
-def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
+def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
     """Return the anatomy with every edge halved, or those near the exposed cortex.
 
     Near: the midpoint is within a mean edge length of it. Original nodes come first and keep their numbers. Fixed
@@ -75,7 +75,7 @@ def refined(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
         halved[count:] = KDTree(nodes[np.unique(opening)]).query(nodes[count:])[0] <= reach
     halved = _conforming(table, halved)
     tets, parent = _children(nodes, table, halved[table[:, 4:]])
-    held, normal = space.held(anatomy.held), space.sliding(anatomy.slide_normal, anatomy.held)
+    held, normal = space.extend_held(anatomy.held), space.extend_normals(anatomy.slide_normal, anatomy.held)
     craniotomy = np.zeros(space.count, bool)
     craniotomy[opening] = True
     craniotomy[:count] = anatomy.craniotomy

@@ -17,7 +17,7 @@ from .dural_septa import Septum
 from .intensity import Intensity
 from .mesher import Meshing, Solids, build_mesh
 from .placement import Piece, Placement, find_within_outline
-from .refine import refined
+from .refine import refine
 from .signed_distance import Field
 
 FEWEST_NODES = 2_000  # minimum mesh nodes
@@ -136,7 +136,7 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     )
     mesh = _with_parts(build_mesh(solids, plan.nodes, plan.meshing), subject)
     made = add_boundary_conditions(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline, subject.septa)
-    return refined(made, near_opening=True) if plan.fine_opening else made
+    return refine(made, near_opening=True) if plan.fine_opening else made
 
 
 def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:

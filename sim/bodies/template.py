@@ -170,7 +170,7 @@ class Lobed:
     scale: float
     sharpness: float = Lobes.sharpness
 
-    def radius(self, directions: np.ndarray) -> np.ndarray:
+    def compute_radius(self, directions: np.ndarray) -> np.ndarray:
         """Return the distance (n,) [m] from the centre to the surface in unit directions (n, 3)."""
         lobes = np.exp(self.sharpness * (directions @ self.directions.T - 1.0))
         return self.scale * (1.0 + lobes @ self.heights)
@@ -179,10 +179,10 @@ class Lobed:
         """Return the signed distance (n,) [m] of points (n, 3) [m] from the surface along the ray from the centre."""
         arm = points - self.middle
         length = np.linalg.norm(arm, axis=1)
-        return length - self.radius(arm / np.maximum(length, 1e-12)[:, None])
+        return length - self.compute_radius(arm / np.maximum(length, 1e-12)[:, None])
 
 
-def template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
+def build_template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     """Return the template with a tumour, in the template's RAS coordinates, scaled about the brain's centroid.
 
     Raises
@@ -205,12 +205,12 @@ def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = H
     if tumour.middle is None:
         site, inward = _site(brain, cortex, healthy.middle, tumour.site, head.smooth)
         shape = _round(
-            tumour, lambda unit, scale: site + (tumour.cover + scale * unit.radius(-inward[None])[0]) * inward
+            tumour, lambda unit, scale: site + (tumour.cover + scale * unit.compute_radius(-inward[None])[0]) * inward
         )
     else:
         shape = _round(tumour, lambda unit, scale: np.array(tumour.middle))
         site = find_reachable_site(cortex, shape.middle)
-    interface = shape.middle + _sphere(400) * shape.radius(_sphere(400))[:, None]
+    interface = shape.middle + _sphere(400) * shape.compute_radius(_sphere(400))[:, None]
     if (brain(interface) > -head.clearance).any():
         raise InputError(
             f"a {tumour.shape} tumour of {tumour.radius * 1e3:g} mm radius {tumour.place} reaches out of the brain: "
@@ -271,7 +271,7 @@ def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobe
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     heights = rng.uniform(0.3, 1.0, len(directions)) * lobes.height
     unit = Lobed(np.zeros(3), directions, heights, 1.0, lobes.sharpness)
-    scale = tumour.radius / (unit.radius(_sphere(20_000)) ** 3).mean() ** (1.0 / 3.0)
+    scale = tumour.radius / (unit.compute_radius(_sphere(20_000)) ** 3).mean() ** (1.0 / 3.0)
     return Lobed(middle(unit, scale), directions, heights, scale, lobes.sharpness)
 
 

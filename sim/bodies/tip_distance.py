@@ -59,7 +59,7 @@ class TipGauge:
     def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
         return np.unique(self.anatomy.tumour_surface, return_inverse=True)
 
-    def distances(
+    def compute_distances(
         self,
         loads: Loads,
         displacement: np.ndarray,
@@ -108,10 +108,10 @@ class TipGauge:
         self, loads: Loads, displacement: np.ndarray, row: np.ndarray, tool: BuiltIn | None, lift: float
     ) -> np.ndarray:
         """Return the tool tips (B, 3) [m]; `row` (m,) are the rows of the exposed cortex in `displacement`."""
-        axis, touching = self.cortex.axis, loads.of(Touching)
+        axis, touching = self.cortex.axis, loads.get(Touching)
         if touching is not None and tool is not None:
             return find_foremost_points(tool, touching.pose[:, 0], axis)
-        pushed = loads.of(Pushed)
+        pushed = loads.get(Pushed)
         if pushed is None:
             raise InputError("the loads have no tip: give pushing tools, or poses and their tool.")
         nodes, triangles = self._open

@@ -68,18 +68,18 @@ class Bond:
         area = np.bincount(triangles[:, -3:].ravel(), share.ravel(), space.count)
         nodes = np.unique(triangles)
         near = KDTree(space.nodes[nodes]).query_ball_point(space.nodes[nodes], around)
-        normal = space.sliding(anatomy.slide_normal, anatomy.held)[nodes]
+        normal = space.extend_normals(anatomy.slide_normal, anatomy.held)[nodes]
         kept = np.flatnonzero(normal.any(axis=1) & np.array([area[nodes[patch]].any() for patch in near], bool))
         patches = [nodes[near[patch]] for patch in kept]
         self.nodes = nodes[kept]
         self._arrays = [
-            device.array(np.cumsum([0, *map(len, patches)]), wp.int32),
-            device.array(np.concatenate([np.zeros(0, np.int64), *patches]), wp.int32),
-            device.array(normal[kept], wp.vec3d),
-            device.array(np.array([area[patch].sum() for patch in patches]), wp.float64),
+            device.upload(np.cumsum([0, *map(len, patches)]), wp.int32),
+            device.upload(np.concatenate([np.zeros(0, np.int64), *patches]), wp.int32),
+            device.upload(normal[kept], wp.vec3d),
+            device.upload(np.array([area[patch].sum() for patch in patches]), wp.float64),
         ]
 
-    def shares(self, force: wp.array) -> np.ndarray:
+    def compute_shares(self, force: wp.array) -> np.ndarray:
         """Compute the relative traction (n, B) at `nodes` (n,) from the skull's forces (3N, B) [N] on the brain."""
         share = wp.zeros((len(self.nodes), force.shape[1]), dtype=wp.float64, device=self._device.name)
         self._largest(force, share)

@@ -33,16 +33,16 @@ class Diagnostics:
         """True if `fields` needs the forces at fixed nodes."""
         return self._bond is not None
 
-    def fields(self, u: wp.array, force: wp.array | None) -> dict[str, np.ndarray]:
+    def compute_fields(self, u: wp.array, force: wp.array | None) -> dict[str, np.ndarray]:
         """Compute `leaked`, `bond`, `stretch` and `strained` at u (3N, B) [m] with internal forces (3N, B) [N]."""
         bond = self._bond.share(force) if self._bond and force is not None else np.array(np.nan)
-        return {"leaked": self._leak.share(u), "bond": bond, **self.strains(u)}
+        return {"leaked": self._leak.share(u), "bond": bond, **self.compute_strains(u)}
 
-    def strains(self, u: wp.array) -> dict[str, np.ndarray]:
+    def compute_strains(self, u: wp.array) -> dict[str, np.ndarray]:
         """Compute `stretch` and `strained` at u (3N, B) [m]."""
         return self._stretch.measure(u)
 
-    def outcomes(self, outcome: np.ndarray, inverted: np.ndarray, strained: np.ndarray) -> np.ndarray:
+    def mark_outcomes(self, outcome: np.ndarray, inverted: np.ndarray, strained: np.ndarray) -> np.ndarray:
         """Return outcomes (B,), in which equilibria that real tissue cannot have are marked, if strains are limited.
 
         inverted (B,) counts tetrahedra; strained (B,) [m^3] as in `Deformation`.

@@ -103,10 +103,10 @@ class Leak:
         total = np.column_stack([np.bincount(place, lent[:, k]) for k in range(3)])
         self._device = device
         self._arrays = [
-            device.array(np.searchsorted(key, space.count * np.arange(len(size) + 1)), wp.int32),
-            device.array(key % space.count, wp.int32),
-            device.array(total, wp.vec3d),
-            device.array(covered.astype(np.int32), wp.int32),
+            device.upload(np.searchsorted(key, space.count * np.arange(len(size) + 1)), wp.int32),
+            device.upload(key % space.count, wp.int32),
+            device.upload(total, wp.vec3d),
+            device.upload(covered.astype(np.int32), wp.int32),
         ]
 
     def share(self, u: wp.array) -> np.ndarray:

@@ -68,20 +68,20 @@ class Stretch:
     """Stretch of the displacement gradients in a discretisation's material law: averages in smoothed elements."""
 
     def __init__(self, space: Discretisation, device: Device):
-        elements = space.parts(np.ones(len(space.mesh.tets), bool))[0].elements
+        elements = space.split_elements(np.ones(len(space.mesh.tets), bool))[0].elements
         count, most = elements.table.shape
         size = np.full(count, most, np.int32) if elements.size is None else elements.size
         self._device, self._limit = device, min(VOLUME, SHARE * float(elements.weight.sum()))
         self._shape = [
-            device.array(size, wp.int32),
-            device.array(elements.table, wp.int32),
-            device.array(elements.gradient, device.vector),
-            device.array(elements.weight, wp.float64),
+            device.upload(size, wp.int32),
+            device.upload(elements.table, wp.int32),
+            device.upload(elements.gradient, device.vector),
+            device.upload(elements.weight, wp.float64),
         ]
 
     def measure(self, u: wp.array) -> dict[str, np.ndarray]:
         """Compute `stretch` and `strained` of a `Deformation` at u (3N, B) [m] on the device."""
-        found = self._device.array(np.repeat([[1.0], [1.0], [0.0]], u.shape[1], axis=1), wp.float64)
+        found = self._device.upload(np.repeat([[1.0], [1.0], [0.0]], u.shape[1], axis=1), wp.float64)
         self._device.launch(build_kernel(self._device), (len(self._shape[1]), u.shape[1]), [u, *self._shape], [found])
         least, most, volume = found.numpy()
         return {"stretch": np.sqrt(np.stack([least.clip(0.0), most])), "strained": volume}

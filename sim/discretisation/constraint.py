@@ -134,9 +134,9 @@ class Constraint:
         self.held, self._freedom = held, freedom
         self.normal, drag = _within_free(held, normal, freedom.normal)
         self.device = device
-        self._held = device.array(held.astype(np.int8), wp.int8)
-        self._normal = device.array(self.normal, device.vector)
-        self._drag = device.array(drag, device.vector)
+        self._held = device.upload(held.astype(np.int8), wp.int8)
+        self._normal = device.upload(self.normal, device.vector)
+        self._drag = device.upload(drag, device.vector)
         self._value: wp.array | None = None
         self._weight: wp.array | None = None
         self._target, self._gram = np.zeros((3, 0)), np.zeros((0, 3, 3))
@@ -151,10 +151,10 @@ class Constraint:
         InputError
             A footprint that is too constrained to move.
         """
-        self._value = None if value is None else self.device.array(value)
+        self._value = None if value is None else self.device.upload(value)
         self._weight = None
         if weight is not None and target is not None:
-            self._weight, self._target = self.device.array(weight), target
+            self._weight, self._target = self.device.upload(weight), target
             square = weight**2
             free = np.eye(3) * ~self.held[:, None, :] - self.normal[:, :, None] * self.normal[:, None, :]
             self._gram = np.einsum("nb,nij->bij", square, free)
@@ -196,12 +196,12 @@ class Constraint:
 
     def close_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
         """Return the smallest motion (3N, b) from u (3N, b) to the constraints, and its largest component (b,) [m]."""
-        gap = self.device.zeros(*u.shape)
+        gap = self.device.allocate(*u.shape)
         value = self._value if self._value is not None else gap
         inputs = [self._held, self._normal, self._drag, value, u]
         self.device.launch(build_kernels(self.device).close, (len(self.held), u.shape[1]), inputs, [gap])
         if self._weight is not None:
-            rest = self.device.zeros(*u.shape)
+            rest = self.device.allocate(*u.shape)
             reached = self._average(u) + self._average(gap)
             self._spread(self._target - reached, rest)
             self.project_nodes(rest)
@@ -218,7 +218,7 @@ class Constraint:
         self.project_nodes(gradient)
         return self._solved(self._average(gradient))
 
-    def basis(self) -> sp.csc_array:
+    def build_basis(self) -> sp.csc_array:
         """Return a sparse orthonormal basis (3N, n) of the motions that fixed and sliding nodes admit."""
         sliding = (self.normal != 0.0).any(axis=1)
         rows = [np.flatnonzero(~self.held & ~sliding[:, None])]
@@ -239,7 +239,7 @@ class Constraint:
 
     def _average(self, v: wp.array) -> np.ndarray:
         assert self._weight is not None
-        out = self.device.zeros(3, v.shape[1])
+        out = self.device.allocate(3, v.shape[1])
         dim = (-(-len(self.held) // CHUNK), v.shape[1])
         self.device.launch(build_kernels(self.device).average, dim, [self._weight, v], [out])
         return out.numpy().astype(np.float64)
@@ -248,7 +248,7 @@ class Constraint:
         return np.linalg.solve(self._gram, mean.T[:, :, None])[:, :, 0].T
 
     def _spread(self, mean: np.ndarray, v: wp.array) -> None:
-        inputs = [self._weight, self.device.array(self._solved(mean))]
+        inputs = [self._weight, self.device.upload(self._solved(mean))]
         self.device.launch(build_kernels(self.device).spread, (len(self.held), v.shape[1]), inputs, [v])
 
 

@@ -35,7 +35,7 @@ class Elements:
     marks: np.ndarray
     size: np.ndarray | None = None
 
-    def on(self, nodes: np.ndarray) -> Elements:
+    def restrict(self, nodes: np.ndarray) -> Elements:
         """Return the elements renumbered to a subset of nodes (n,), ascending, that contains all of theirs."""
         return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), nodes=len(nodes))
 

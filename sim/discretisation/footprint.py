@@ -52,14 +52,14 @@ class Footprints:
     weight: wp.array
     sums: wp.array
 
-    def rows(self, count: int) -> sp.csr_array:
+    def to_matrix(self, count: int) -> sp.csr_array:
         """Return normalised weights (B, `count`) over all nodes of a mesh, each row with sum one, on the host."""
         weight, total = self.weight.numpy().T, self.sums.numpy().reshape(-1, 4)[:, 0]
         tool, place = np.nonzero(weight)
         share = weight[tool, place] / total[tool]
         return sp.csr_array((share, (tool, self.nodes[place])), shape=(len(weight), count))
 
-    def centres(self) -> np.ndarray:
+    def compute_centres(self) -> np.ndarray:
         """Return the centre (B, 3) [m] of each force, on the host."""
         sums = self.sums.numpy().reshape(-1, 4)
         return sums[:, 1:] / sums[:, :1]
@@ -106,21 +106,21 @@ class ContactSurface:
     ):
         self.device, self._name, self._division = device, name, division
         self.nodes, table = np.unique(triangles, return_inverse=True)
-        self.numbers = device.array(self.nodes, wp.int32)
+        self.numbers = device.upload(self.nodes, wp.int32)
         corners = nodes[triangles[:, :3]]
         centre = corners.mean(axis=1)
         reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
         edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0)
         self._least = edge / (division.fineness * division.most)
-        self._corners = device.array(corners, wp.vec3d)
-        self._ball = device.array(np.column_stack([centre, reach]), wp.vec4d)
-        self._table = device.array(table.reshape(triangles.shape), wp.int32)
-        self._position = device.array(nodes[self.nodes], wp.vec3d)
+        self._corners = device.upload(corners, wp.vec3d)
+        self._ball = device.upload(np.column_stack([centre, reach]), wp.vec4d)
+        self._table = device.upload(table.reshape(triangles.shape), wp.int32)
+        self._position = device.upload(nodes[self.nodes], wp.vec3d)
         self._last: tuple[bytes, Footprints] | None = None
 
-    def nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def find_nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the nearest points (B, 3) [m] to `points` (B, 3), and distances (B,), inf if > `within` (B,) [m]."""
-        imprint = self.imprint(self._tools(points, within))
+        imprint = self.build_footprints(self._tools(points, within))
         self._touch(imprint)
         touched = imprint.touched.numpy().reshape(-1, 4)
         return touched[:, :3], touched[:, 3]
@@ -141,7 +141,7 @@ class ContactSurface:
             last = self._last = key, self._pressed(points, radii)
         return last[1]  # another thread may have replaced self._last since
 
-    def imprint(self, tools: wp.array) -> FootprintArrays:
+    def build_footprints(self, tools: wp.array) -> FootprintArrays:
         """Allocate the footprint arrays of tools (B,)."""
         count, device = len(tools), self.device.name
         found, left = [], len(self._ball)
@@ -169,7 +169,7 @@ class ContactSurface:
         InputError
             With the first such tool.
         """
-        self._demand(points, radii, self.nearest(points, radii)[1])
+        self._demand(points, radii, self.find_nearest(points, radii)[1])
 
     def _pressed(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
         small = radii.min(initial=np.inf)
@@ -178,7 +178,7 @@ class ContactSurface:
                 f"a footprint of {1e3 * small:.3g} mm is too small for the triangles of this surface: give a radius of "
                 f"at least {1e3 * self._least:.3g} mm."
             )
-        imprint = self.imprint(self._tools(points, radii))
+        imprint = self.build_footprints(self._tools(points, radii))
         self.put(imprint)
         self._demand(points, radii, imprint.touched.numpy().reshape(-1, 4)[:, 3])
         return Footprints(self.nodes, imprint.weight, imprint.sums)
@@ -194,7 +194,7 @@ class ContactSurface:
             )
 
     def _tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
-        return self.device.array(np.column_stack([points, radii]), wp.vec4d)
+        return self.device.upload(np.column_stack([points, radii]), wp.vec4d)
 
     def _touch(self, imprint: FootprintArrays) -> None:
         """Find the first contact point of each tool and its distance; inf if larger than its radius."""
@@ -208,14 +208,14 @@ def compute_footprint_weights(
     nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray
 ) -> sp.csr_array:
     """Compute weights (B, N) of unit row sums on the host; arguments as `ContactSurface`, `ContactSurface.press`."""
-    return ContactSurface(nodes, triangles, find_device("cpu", "float64")).press(points, radii).rows(len(nodes))
+    return ContactSurface(nodes, triangles, find_device("cpu", "float64")).press(points, radii).to_matrix(len(nodes))
 
 
 def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Return the point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
     apart = np.arange(3 * len(corners)).reshape(-1, 3)
     skin = ContactSurface(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
-    return skin.nearest(point[None], np.array([np.inf]))[0][0]
+    return skin.find_nearest(point[None], np.array([np.inf]))[0][0]
 
 
 @wp.func

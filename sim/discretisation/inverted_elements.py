@@ -57,10 +57,10 @@ class Inversion:
         )
         self._telling = not (bounded and space.element == "smoothed")
         self._device, self._collapsed = device, collapsed
-        self._table = device.array(elements.table, wp.int32)
-        self._gradient = device.array(elements.gradient, device.vector)
+        self._table = device.upload(elements.table, wp.int32)
+        self._gradient = device.upload(elements.gradient, device.vector)
 
-    def doubtful(self, inverted: np.ndarray) -> np.ndarray:
+    def find_doubtful(self, inverted: np.ndarray) -> np.ndarray:
         """Return a mask (B,) of states with `inverted` (B,) > 0 tetrahedra that may be unphysical equilibria.
 
         All False if the law is `bounded` and sees averages only: then a descent cannot invert these, and a strong load

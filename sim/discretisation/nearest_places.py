@@ -36,7 +36,7 @@ class PlacedBox:
     axes: np.ndarray
     half: np.ndarray
 
-    def moved(self, way: np.ndarray) -> PlacedBox:
+    def move(self, way: np.ndarray) -> PlacedBox:
         """Return the box translated by (3,) [m]."""
         return replace(self, middle=self.middle + way)
 
@@ -46,7 +46,7 @@ class PlacedBox:
         signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
         return self.middle + (signs * self.half) @ self.axes.T
 
-    def nearest(self, corners: np.ndarray) -> NearestPlaces:
+    def find_nearest(self, corners: np.ndarray) -> NearestPlaces:
         """Return the points nearest to the box on triangles with `corners` (S, 3, 3) [m].
 
         Alternating projections with momentum (Beck, Teboulle 2009, "A fast iterative
@@ -54,7 +54,7 @@ class PlacedBox:
         """
         return Nearest(len(corners)).to(self, corners)
 
-    def distances(self, corners: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def compute_distances(self, corners: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return distances (n,) [m] and directions (n, 3) from the box to points of barycentric coordinates (n, 3)."""
         place = np.einsum("nc,nci->ni", share, corners) - self.middle
         local = place @ self.axes

@@ -76,10 +76,10 @@ class Problem:
         """True if the stiffness depends on the time step."""
         return any(isinstance(term, Paced) for term in self.terms)
 
-    def overlaps(self, u: wp.array) -> np.ndarray:
+    def find_overlaps(self, u: wp.array) -> np.ndarray:
         """Return a mask (2, b) of load cases with overlaps in any barrier, as `Barrier.overlaps`."""
         none = np.zeros((2, u.shape[1]), bool)
-        return np.logical_or.reduce([none, *(term.overlaps(u) for term in self.barriers)])
+        return np.logical_or.reduce([none, *(term.find_overlaps(u) for term in self.barriers)])
 
     def begin(self, cases: Cases) -> None:
         """Set the load cases of a batch."""
@@ -108,7 +108,7 @@ class Problem:
 
     def gradient(self, u: wp.array) -> wp.array:
         """Return the gradient (3N, b) [N] of the total potential energy."""
-        out = self.device.zeros(*u.shape)
+        out = self.device.allocate(*u.shape)
         for term in self.terms:
             term.add_gradient(u, out)
         return out
@@ -118,9 +118,9 @@ class Problem:
 
         The scale is the largest 2-norm among the gradients of the terms and the reaction at constrained nodes.
         """
-        total, scale = self.device.zeros(*u.shape), np.zeros(u.shape[1])
+        total, scale = self.device.allocate(*u.shape), np.zeros(u.shape[1])
         for term in self.terms:
-            own = self.device.zeros(*u.shape)
+            own = self.device.allocate(*u.shape)
             term.add_gradient(u, own)
             scale = np.maximum(scale, compute_norms(self.device, own))
             combine_columns(self.device, total, 1.0, own, total)
@@ -133,7 +133,7 @@ class Problem:
         # Report inf if constrained forces overflowed, which the free residual does not show.
         return total, np.where(np.isfinite(scale), free, np.inf), scale
 
-    def gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
+    def compute_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
         """Return the smallest motion (3N, b) [m] from u (3N, b) to the constraints, and a mask (b,) of open gaps.
 
         A gap of the order of round-off counts as closed and gives zero motion.
@@ -146,7 +146,7 @@ class Problem:
 
     def linearise(self, u: wp.array, definite: np.ndarray) -> None:
         """Set the linearisation point u; `definite` (b,) requests a positive semi-definite tangent stiffness."""
-        flags = self.device.array(definite.astype(np.int32), wp.int32)
+        flags = self.device.upload(definite.astype(np.int32), wp.int32)
         for term in self.terms:
             term.linearise(u, flags)
 
@@ -155,7 +155,7 @@ class Problem:
         for term in self.terms:
             term.add_curvature(p, out)
 
-    def diagonal(self, columns: int) -> wp.array:
+    def compute_diagonal(self, columns: int) -> wp.array:
         """Return the 3 x 3 diagonal blocks (N, b) of the tangent stiffness [N/m]."""
         out = wp.zeros((self.rows // 3, columns), dtype=self.device.matrix, device=self.device.name)
         for term in self.terms:

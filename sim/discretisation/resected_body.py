@@ -75,9 +75,11 @@ def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[Rema
         taken.update(step)
         gone = np.array(sorted(taken))
         try:
-            left = anatomy.without(gone)
+            left = anatomy.remove_elements(gone)
             kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), gone)
             loose = kept[find_loose_tetrahedra(left, slides)]
-            yield RemainingBody(done, anatomy.without(np.concatenate([gone, loose])) if len(loose) else left, loose)
+            yield RemainingBody(
+                done, anatomy.remove_elements(np.concatenate([gone, loose])) if len(loose) else left, loose
+            )
         except InputError as error:
             raise InputError(f"step {done} of Resection cannot be done: {error}") from error

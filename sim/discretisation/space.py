@@ -76,7 +76,7 @@ class Discretisation:
         middles = self.table[:, 4:].ravel()[first[np.searchsorted(key, asked)]]
         return np.column_stack([corners, middles.reshape(-1, 3)])
 
-    def parts(self, chosen: np.ndarray) -> tuple[ElementPart, ...]:
+    def split_elements(self, chosen: np.ndarray) -> tuple[ElementPart, ...]:
         """Build the elements over the `chosen` tetrahedra (T,) bool.
 
         Raises
@@ -91,7 +91,7 @@ class Discretisation:
         edges, nodes = _smoothed(self.mesh, chosen.tobytes())
         return ElementPart(edges, "shape"), ElementPart(nodes, "volume")
 
-    def held(self, held: np.ndarray) -> np.ndarray:
+    def extend_held(self, held: np.ndarray) -> np.ndarray:
         """Return the fixed components (N, 3) of all nodes from those of the mesh (V, 3).
 
         An added node is fixed if its edge lies on a surface triangle whose corners are all fixed.
@@ -103,7 +103,7 @@ class Discretisation:
             out[wall[wall >= len(held)], component] = True
         return out
 
-    def sliding(self, normal: np.ndarray, held: np.ndarray, facing: float = 0.75) -> np.ndarray:
+    def extend_normals(self, normal: np.ndarray, held: np.ndarray, facing: float = 0.75) -> np.ndarray:
         """Return the slide normals (N, 3) of all nodes from those of the mesh (V, 3); held (V, 3) bool.
 
         An added node slides if its edge lies on a surface triangle whose corners all slide or are fixed. Its normal

@@ -56,16 +56,16 @@ class Cases:
             )
         return steps
 
-    def rows(self, index: slice | np.ndarray) -> Cases:
+    def select(self, index: slice | np.ndarray) -> Cases:
         """Return a subset of the cases."""
         memory = {name: value[index] for name, value in self.memory.items()}
         displacement = None if self.displacement is None else self.displacement[index]
         share = None if self.share is None else self.share[index]
         anew = None if self.anew is None else self.anew[index]
         warm = {name: value[index] for name, value in self.warm.items()}
-        return Cases(self.loads.rows(index), self.start_time[index], memory, displacement, share, anew, warm)
+        return Cases(self.loads.select(index), self.start_time[index], memory, displacement, share, anew, warm)
 
-    def past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    def get_past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Return the memory of the term `name`, (B, *shape) float64; zeros without one.
 
         Raises
@@ -220,19 +220,19 @@ class Strained(Term, Protocol):
 class Barrier(Term, Protocol):
     """Term for contact with a gap, which a descent may widen at first; tools may move."""
 
-    def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
+    def compute_stride(self, cases: Cases, u: wp.array) -> np.ndarray:
         """Return the path fraction (B,), at most 1, that tools may move at once, with the body at u (3N, B) [m]."""
         ...
 
-    def gaps(self, cases: Cases) -> np.ndarray:
+    def count_gaps(self, cases: Cases) -> np.ndarray:
         """Return the motion (B,) of the tools on their whole path, or of the tissue, in units of the gap."""
         ...
 
-    def buried(self, u: wp.array) -> np.ndarray:
+    def find_buried(self, u: wp.array) -> np.ndarray:
         """Return a mask (b,) of load cases with a tool inside the body at u (3N, b) [m], even without contact."""
         ...
 
-    def overlaps(self, u: wp.array) -> np.ndarray:
+    def find_overlaps(self, u: wp.array) -> np.ndarray:
         """Return masks (2, b) of load cases where a tool overlaps touchable surface at u (3N, b) [m], or bone."""
         ...
 
@@ -240,7 +240,7 @@ class Barrier(Term, Protocol):
         """Widen the gap by a factor until the next batch begins."""
         ...
 
-    def reaction(self, u: wp.array) -> np.ndarray:
+    def compute_reaction(self, u: wp.array) -> np.ndarray:
         """Return force [N] and moment about its origin [N m] that each tool exerts at u (3N, b) [m]: (b, tools, 6)."""
         ...
 
@@ -280,7 +280,7 @@ class Reduction(Protocol):
         """Warp functions for kernels."""
         ...
 
-    def stage(self, columns: np.ndarray) -> tuple[Any, Any]:
+    def build_stage(self, columns: np.ndarray) -> tuple[Any, Any]:
         """Return the structs `stage` and `near` for some load cases (k,)."""
         ...
 
@@ -305,18 +305,18 @@ class Local(Barrier, Protocol):
         """Nodes (n,), ascending, on which it can act."""
         ...
 
-    def around(self, most: int) -> np.ndarray:
+    def select_nodes(self, most: int) -> np.ndarray:
         """Return the touchable nodes, followed by the nearest others up to `most` in total: (k,)."""
         ...
 
-    def reduced(self, columns: np.ndarray) -> Reduction | None:
+    def reduce(self, columns: np.ndarray) -> Reduction | None:
         """Return the barrier on these nodes, for some load cases (k,), in its current state; None without contact.
 
         The object is reused: it reflects the latest call.
         """
         ...
 
-    def pressed(self) -> tuple[np.ndarray, np.ndarray]:
+    def get_pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """Return active nodes (a,) of these n at the last linearisation, of one load case, and their tangent stiffness.
 
         The matrix (3a, 3a) [N/m] is positive semi-definite.

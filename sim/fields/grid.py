@@ -27,11 +27,11 @@ class Grid:
         """Return fractional indices (..., 3) of points (..., 3) [m]."""
         return (points - self.origin) / self.spacing
 
-    def points(self, numbers: np.ndarray) -> np.ndarray:
+    def compute_points(self, numbers: np.ndarray) -> np.ndarray:
         """Return the positions (n, 3) [m] of nodes by their numbers (n,) in the flat grid."""
         return self.origin + self.spacing * np.stack(np.unravel_index(numbers, self.shape), axis=-1)
 
-    def corners(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def find_corners(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return node numbers (n, 8) of the cells that contain points (n, 3) [m], and trilinear weights (n, 8)."""
         index = self.index(points)
         first = np.clip(np.floor(index).astype(int), 0, np.array(self.shape) - 2)

@@ -61,11 +61,11 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     flat = field.reshape(3, -1)
     bad = np.zeros(len(body.tets), bool)
     for some in _samples(grid, body, np.arange(len(body.tets)), LOOKED):
-        numbers, weights = grid.corners(some.points)
+        numbers, weights = grid.find_corners(some.points)
         bad[some.simplex[np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1) > ENOUGH]] = True
     free = np.zeros(flat.shape[1], bool)
     for some in _samples(grid, body, np.flatnonzero(bad), FITTED):
-        free[grid.corners(some.points)[0]] = True
+        free[grid.find_corners(some.points)[0]] = True
     free &= inside.reshape(-1) | (collar.reshape(-1) & flat.any(axis=0))
     nodes = np.flatnonzero(free)
     if not len(nodes):
@@ -77,7 +77,7 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     matrix, side = _penalties(grid, flat, nodes, column, inside.reshape(-1), collar.reshape(-1))
     within = _samples(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), FITTED)
     for some in chain(within, _on_surface(grid, body, touched)):
-        numbers, weights = grid.corners(some.points)
+        numbers, weights = grid.find_corners(some.points)
         rows = _rows(column, numbers, weights)
         weighted = rows.T.multiply(some.weights).tocsr()
         matrix = matrix + weighted @ rows

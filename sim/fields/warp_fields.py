@@ -108,7 +108,9 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
     field, inside = interpolate_in_tetrahedra(grid, nodes, tets, displacement)
     collar = find_collar(inside)
     numbers = np.flatnonzero(collar)
-    field.reshape(3, -1)[:, numbers] = extrapolate_beyond_surface(nodes, tets, displacement, grid.points(numbers)).T
+    field.reshape(3, -1)[:, numbers] = extrapolate_beyond_surface(
+        nodes, tets, displacement, grid.compute_points(numbers)
+    ).T
     project(grid, field, inside, collar, NodalField(nodes, tets, displacement))
     filled = extend_field(field, inside | collar, compute_reach(displacement) / grid.spacing)
     return filled, unfold(filled, inside, collar, grid.spacing)
@@ -126,7 +128,7 @@ def invert_on_grid(
     numbers = np.flatnonzero(~inside & (np.abs(forward).max(axis=0) > STILL))
     flat = field.reshape(3, -1)
     guess = -forward.reshape(3, -1)[:, numbers].T.astype(np.float64)
-    flat[:, numbers] = invert_field(grid, forward, grid.points(numbers), guess).T
+    flat[:, numbers] = invert_field(grid, forward, grid.compute_points(numbers), guess).T
     collar = find_collar(inside)
     project(grid, field, inside, collar, NodalField(now, tets, -displacement))
     return field, unfold(field, inside, collar, grid.spacing)

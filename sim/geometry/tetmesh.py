@@ -134,17 +134,17 @@ class TetMesh:
         """Outer triangles (S, 3), by their corners, with outward normals."""
         return find_single_faces(self.tets)
 
-    def within(self, *labels: int) -> np.ndarray:
+    def mark_elements(self, *labels: int) -> np.ndarray:
         """Mark (T,) bool the elements of these regions."""
         return np.isin(self.region, labels)
 
     def find_boundary(self, *labels: int) -> np.ndarray:
         """Return the boundary triangles (S, 3) of these regions together, by their corners, with outward normals."""
-        return find_single_faces(self.tets[self.within(*labels)])
+        return find_single_faces(self.tets[self.mark_elements(*labels)])
 
-    def nodes_of(self, *labels: int) -> np.ndarray:
+    def find_nodes(self, *labels: int) -> np.ndarray:
         """Return the node numbers (n,) of these regions' elements, ascending."""
-        return np.unique(self.table[self.within(*labels)])
+        return np.unique(self.table[self.mark_elements(*labels)])
 
     @cached_property
     def digest(self) -> str:

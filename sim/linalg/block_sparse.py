@@ -114,16 +114,16 @@ class Sparse:
         self._device = device
         self._size: tuple[int, int] = matrix.blocksize
         self.rows: int = self._size[0] * (len(matrix.indptr) - 1)
-        indices = [device.array(index, wp.int32) for index in (matrix.indptr, matrix.indices)]
+        indices = [device.upload(index, wp.int32) for index in (matrix.indptr, matrix.indices)]
         if device.on_cuda:
-            blocks = device.array(matrix.data, wp.types.matrix(self._size, device.scalar))
+            blocks = device.upload(matrix.data, wp.types.matrix(self._size, device.scalar))
         else:
-            blocks = device.array(np.append(matrix.data.transpose(0, 2, 1), np.zeros(LANES)))
+            blocks = device.upload(np.append(matrix.data.transpose(0, 2, 1), np.zeros(LANES)))
         self._entries = [*indices, blocks]
 
-    def times(self, x: wp.array) -> wp.array:
+    def multiply(self, x: wp.array) -> wp.array:
         """Compute A x (m, b) of x (n, b)."""
-        out = self._device.zeros(self.rows, x.shape[1])
+        out = self._device.allocate(self.rows, x.shape[1])
         self.add_to(out, 1.0, x)
         return out
 

@@ -56,16 +56,16 @@ class Compliance:
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
         self.places = to_library(device, self.rows)
         self._width = 3 * columns.block
-        self.columns = view(replace(device, precision="float64").zeros(len(self.rows), len(self.rows)))
+        self.columns = view(replace(device, precision="float64").allocate(len(self.rows), len(self.rows)))
         self.known = np.zeros(len(nodes), bool)
         size = self._width * problem.rows * np.dtype(device.precision).itemsize
         self._kept = max(columns.fewest_blocks, columns.most_bytes // size)
         self._block = lru_cache(self._kept)(self._columns)
 
-    def answered(self, force: Any) -> Any:
+    def apply(self, force: Any) -> Any:
         """Compute H force: displacements (3N, b) [m] under forces (3N, b) [N]."""
         device, constraint = self._problem.device, self._problem.constraint
-        pull, out = device.zeros(*force.shape), device.zeros(*force.shape)
+        pull, out = device.allocate(*force.shape), device.allocate(*force.shape)
         view(pull)[:] = force
         constraint.project_nodes(pull)
         self._preconditioner.apply(pull, np.ones(force.shape[1], bool), out)
@@ -75,7 +75,7 @@ class Compliance:
     def spread(self, force: Any) -> Any:
         """Compute the displacements (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n of `nodes`."""
         device, every = self._problem.device, -(-len(force) // self._width)
-        out = view(device.zeros(self._problem.rows, force.shape[1]))
+        out = view(device.allocate(self._problem.rows, force.shape[1]))
         force = cast_like(out, force)
         # On a GPU, multiplying by zeros is faster than asking where they are.
         at_hand = device.on_cuda and self.known[: len(force) // 3].all() and every <= self._kept
@@ -84,14 +84,14 @@ class Compliance:
             out += self._block(block)[:, : len(some)] @ some
         return out
 
-    def moved(self, force: Any) -> Any:
+    def compute_motion(self, force: Any) -> Any:
         """Compute the displacements (3n, b) [m] of `nodes` under forces (3m, b) [N] on the first m, all known."""
         if self._problem.device.on_cuda:
             return self.columns[: len(force)].T @ to_double(force)
         acting = np.flatnonzero(to_host((force != 0.0).any(1)))
         return self.columns[acting].T @ to_double(force[acting])
 
-    def between(self, acting: np.ndarray) -> Any:
+    def build_matrix(self, acting: np.ndarray) -> Any:
         """Return H (3n, 3n) [m/N] between `nodes`; the columns at `acting` (n,) bool nodes are valid."""
         self.ensure_known(acting)
         return self.columns.T
@@ -100,7 +100,7 @@ class Compliance:
         """Compute the missing `columns` (stored as rows) at `acting` (n,) nodes, and mark them in `known` (n,)."""
         missing = acting & ~self.known
         if missing.any() and isinstance(self._preconditioner, Factor):
-            self.columns[:], self.known[:] = self._preconditioner.compliance(self.rows).T, True
+            self.columns[:], self.known[:] = self._preconditioner.compute_compliance(self.rows).T, True
         for block in self._acting(np.repeat(acting & ~self.known, 3)):
             self._block(block)
 
@@ -116,7 +116,7 @@ class Compliance:
         own = self._rows(block)
         unit = np.zeros((self._problem.rows, self._width))
         unit[self.rows[own], np.arange(len(self.rows[own]))] = 1.0
-        whole = self.answered(to_library(self._problem.device, unit))[:, : len(self.rows[own])]
+        whole = self.apply(to_library(self._problem.device, unit))[:, : len(self.rows[own])]
         if not self.known[own.start // 3 : own.stop // 3].all():
             self.columns[own], self.known[own.start // 3 : own.stop // 3] = whole[self.places].T, True
         return whole

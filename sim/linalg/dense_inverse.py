@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..runtime.columns import add_dots, is_kept
+from ..runtime.columns import add_dots, is_workspace_width
 from ..runtime.device import Device, forward_kernel
 from . import block_inverse
 from .half_symv import add_product, list_tiles
@@ -124,7 +124,7 @@ class DenseInverse:
         self._size = -(-count // TILE) * TILE
         self._inverse = _scaled(rows, scale, self._size, wp.dtype_to_torch(LOW[device.precision]))
         block_inverse.release(where)
-        self._scale = device.array(scale.cpu().numpy())
+        self._scale = device.upload(scale.cpu().numpy())
         back = motions @ sp.diags_array(scale.cpu().numpy())
         self._into, self._back = (_compressed(sp.csr_array(matrix), device) for matrix in (motions.T, back))
         self._tiles = list_tiles(self._size, device.name)
@@ -159,7 +159,7 @@ class DenseInverse:
     def _room(self, count: int) -> Buffers:
         """Return the buffers for a batch width; those of workspace widths stay cached, and the latest other."""
         if count not in self._rooms:
-            self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
+            self._rooms = {width: room for width, room in self._rooms.items() if is_workspace_width(width)}
             low, name = LOW[self._device.precision], self._device.name
             if self._halves(count):
                 low = wp.float32
@@ -187,5 +187,5 @@ def _scaled(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torc
 
 
 def _compressed(matrix: sp.csr_array, device: Device) -> list[wp.array]:
-    indices = [device.array(index, wp.int32) for index in (matrix.indptr, matrix.indices)]
-    return [*indices, device.array(matrix.data)]
+    indices = [device.upload(index, wp.int32) for index in (matrix.indptr, matrix.indices)]
+    return [*indices, device.upload(matrix.data)]

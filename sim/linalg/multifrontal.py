@@ -113,7 +113,7 @@ class Factor:
         solved[:, live] = self._motions @ (self._solved((x / size).astype(self._precision)) * size)
         out.assign(solved)
 
-    def compliance(self, rows: np.ndarray) -> np.ndarray:
+    def compute_compliance(self, rows: np.ndarray) -> np.ndarray:
         """Compute the compliance (m, m) [m/N] at some of the 3N rows (m,), in the factor's precision.
 
         Only the fronts of these rows, and those that depend on them, are swept.
@@ -142,7 +142,7 @@ class Factor:
 
     def _solved(self, x: np.ndarray) -> np.ndarray:
         if x.shape[1] <= self._settings.few:
-            return self._sweep.solved(x)
+            return self._sweep.solve(x)
         # BLAS threads wait for one another at every front, very long where other processes use their cores.
         with limit_to_one_thread():
             return _swept(self._panels, x)
@@ -165,14 +165,14 @@ class FrontPanel:
     front: Front
     values: np.ndarray
 
-    def up(self, x: np.ndarray) -> None:
+    def substitute_forward(self, x: np.ndarray) -> None:
         """Eliminate: x_own = R^-1 x_own, x_border -= C S^-1 x_own, in x (n, b)."""
         own = slice(self.front.first, self.front.stop)
         product = self.values.T @ x[own]
         x[own] = product[: len(self.values)]
         x[self.front.border] += product[len(self.values) :]
 
-    def down(self, x: np.ndarray) -> None:
+    def substitute_backward(self, x: np.ndarray) -> None:
         """Substitute back: x_own = R^-T x_own - S^-1 C^T x_border, in x (n, b)."""
         x[self.front.first : self.front.stop] = self.values @ x[self.front.rows]
 
@@ -180,9 +180,9 @@ class FrontPanel:
 def _swept(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
     """Apply both sweeps through these panels to x (n, b), in place."""
     for panel in panels:
-        panel.up(x)
+        panel.substitute_forward(x)
     for panel in reversed(panels):
-        panel.down(x)
+        panel.substitute_backward(x)
     return x
 
 

@@ -109,7 +109,7 @@ class TwoLevel:
         self._stiffness = Sparse(stiffness, device)
         self._size = stiffness.blocksize[0]
         inverse = np.linalg.inv(_diagonal(stiffness))
-        self._inverse = device.array(inverse, wp.types.matrix((self._size, self._size), device.scalar))
+        self._inverse = device.upload(inverse, wp.types.matrix((self._size, self._size), device.scalar))
         self._largest = smoother.margin * self._power()
 
     def prepare(self, problem: Problem, columns: int) -> None:
@@ -124,7 +124,7 @@ class TwoLevel:
         scatter_columns(self._device, self._cycle(gather_columns(self._device, r, columns)), columns, out)
 
     def _cycle(self, r: wp.array) -> wp.array:
-        x, correction = self._device.zeros(*r.shape), self._device.zeros(*r.shape)
+        x, correction = self._device.allocate(*r.shape), self._device.allocate(*r.shape)
         every = np.ones(r.shape[1], bool)
         self._smooth(x, wp.clone(r))
         self._coarse.apply(self._residual(r, x), every, correction)
@@ -137,7 +137,7 @@ class TwoLevel:
         low = self._smoother.damped * self._largest
         centre, radius = (self._largest + low) / 2.0, (self._largest - low) / 2.0
         ratio = radius / centre
-        d = self._device.zeros(*r.shape)
+        d = self._device.allocate(*r.shape)
         self._step(0.0, 1.0 / centre, r, d, x)
         for _ in range(self._smoother.degree - 1):
             self._stiffness.add_to(r, -1.0, d)
@@ -158,14 +158,14 @@ class TwoLevel:
     def _power(self) -> float:
         """Estimate the largest eigenvalue of D^-1 K by power iteration."""
         device = self._device
-        x = device.array(np.random.default_rng(0).normal(size=(self._stiffness.rows, 1)))
+        x = device.upload(np.random.default_rng(0).normal(size=(self._stiffness.rows, 1)))
         largest = 1.0
         for _ in range(self._smoother.power_iterations):
-            new, sum_ = device.zeros(*x.shape), device.zeros(*x.shape)
-            self._step(0.0, 1.0, self._stiffness.times(x), new, sum_)
+            new, sum_ = device.allocate(*x.shape), device.allocate(*x.shape)
+            self._step(0.0, 1.0, self._stiffness.multiply(x), new, sum_)
             size = float(np.sqrt(compute_dots(device, new, new)[0]))
             largest = float(compute_dots(device, x, new)[0] / compute_dots(device, x, x)[0])
-            x = combine_columns(device, device.zeros(*x.shape), np.array([1.0 / size]), new, x)
+            x = combine_columns(device, device.allocate(*x.shape), np.array([1.0 / size]), new, x)
         return largest
 
 
@@ -183,15 +183,15 @@ class ReducedPreconditioner:
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """Restrict, apply the coarse preconditioner, and prolong."""
-        right = self._down.times(r)
-        solved = self._device.zeros(*right.shape)
+        right = self._down.multiply(r)
+        solved = self._device.allocate(*right.shape)
         self.coarse.apply(right, live, solved)
-        wp.copy(out, self._up.times(solved))
+        wp.copy(out, self._up.multiply(solved))
 
 
 def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_array:
     """Compute P K P (3N, 3N) in blocks of nodes, P the projection to free unknowns; regularised at the others."""
-    basis = constraint.basis()
+    basis = constraint.build_basis()
     projection = sp.csr_array(basis @ basis.T)
     blocked = sp.eye_array(constraint.held.size) - projection
     return make_regular(sp.csr_array(projection @ stiffness @ projection + stiffness.diagonal().mean() * blocked), 3)

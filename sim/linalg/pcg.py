@@ -85,7 +85,7 @@ class BlockJacobi:
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Invert the blocks at the last linearisation."""
-        blocks = problem.diagonal(columns)
+        blocks = problem.compute_diagonal(columns)
         self._device.launch(build_block_kernels(self._device)[0], blocks.shape, [], [blocks])
         self._blocks = blocks
 
@@ -132,7 +132,7 @@ def solve_conjugate_gradients(
     """
     device, columns = problem.device, r.shape[1]
     reach = np.full(columns, np.inf) if radius is None else radius
-    x, z, q = device.zeros(*r.shape), device.zeros(*r.shape), device.zeros(*r.shape)
+    x, z, q = device.allocate(*r.shape), device.allocate(*r.shape), device.allocate(*r.shape)
 
     def precondition() -> None:
         preconditioner.apply(r, live, z)

@@ -64,12 +64,12 @@ def choose_preconditioner(
         A free undeformed stiffness that is singular, or a device with too little memory.
     """
     device, constraint = problem.device, problem.constraint
-    if constraint.basis().nnz == 0:
+    if constraint.build_basis().nnz == 0:
         return BlockJacobi(device)
     try:
         if space.element == "p2":
             stiffness = problem.rest_curvature(step)
-            if device.on_cuda and _inverts(len(constraint.basis().indptr) - 1, device):
+            if device.on_cuda and _inverts(len(constraint.build_basis().indptr) - 1, device):
                 return _solver(stiffness, constraint, space.nodes, device, settings)
             lifted = _on_corners(stiffness, space, constraint, device, settings)
             name = f"p-multigrid on {name_of(lifted.coarse)}"
@@ -118,7 +118,7 @@ def build_rest_solver(problem: Problem) -> Preconditioner:
     RuntimeError
         The stiffness is singular.
     """
-    basis = problem.constraint.basis()
+    basis = problem.constraint.build_basis()
     device = problem.device
     return build_direct(problem.rest_curvature(), basis, find_moved_nodes(basis), device, device.precision)
 
@@ -127,7 +127,7 @@ def _on_corners(
     stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device, settings: Preconditioning
 ) -> ReducedPreconditioner:
     """Build the coarse preconditioner on linear tetrahedra with the same corners, as far as their motion is free."""
-    corner, free = np.unique(space.table[:, :4]), constraint.basis()
+    corner, free = np.unique(space.table[:, :4]), constraint.build_basis()
     every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
     own = Constraint(constraint.held[corner], constraint.normal[corner], device)
     coarse = _solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device, settings)
@@ -138,7 +138,7 @@ def _solver(
     stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray, device: Device, settings: Preconditioning
 ) -> Preconditioner:
     """Build the solver of K (3N, 3N) over free nodes at points (N, 3): direct if fast enough, else multigrid."""
-    basis = constraint.basis()
+    basis = constraint.build_basis()
     count = len(basis.indptr) - 1
     if _inverts(count, device) if device.on_cuda else count <= settings.largest_factor:
         return build_direct(stiffness, basis, find_moved_nodes(basis), device)

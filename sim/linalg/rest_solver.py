@@ -46,7 +46,7 @@ class RestStiffnessSolver:
         pays = not self.problem.device.on_cuda and self.problem.rows <= self.largest_factor
         return build_rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
 
-    def answer(self, force: wp.array) -> wp.array:
+    def solve(self, force: wp.array) -> wp.array:
         """Solve for the displacements (3N, b) [m] under forces (3N, b) [N]; the forces are overwritten.
 
         Raises
@@ -56,11 +56,11 @@ class RestStiffnessSolver:
         """
         problem, columns = self.problem, force.shape[1]
         if self.exact is not None:
-            out = problem.device.zeros(*force.shape)
+            out = problem.device.allocate(*force.shape)
             self.exact.apply(force, np.ones(columns, bool), out)
             problem.constraint.project(out)
             return out
-        problem.linearise(problem.device.zeros(*force.shape), np.zeros(columns, bool))
+        problem.linearise(problem.device.allocate(*force.shape), np.zeros(columns, bool))
         self.preconditioner.prepare(problem, columns)
         wanted = self.tolerance * compute_norms(problem.device, force)
         found = solve_conjugate_gradients(problem, self.preconditioner, force, wanted, self.inner)

@@ -57,7 +57,7 @@ def condense_exterior(
         The exterior is not fixed even if the part is.
     """
     part = (3 * nodes[:, None] + np.arange(3)).ravel()
-    whole, basis = sp.csr_array(problem.rest_curvature()), problem.constraint.basis()
+    whole, basis = sp.csr_array(problem.rest_curvature()), problem.constraint.build_basis()
     beyond = sp.csr_array(whole[part][:, part] - own)
     rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > settings.round_off * abs(whole).max())
     stiffness = beyond[rows][:, rows].toarray()
@@ -89,8 +89,8 @@ def _followed(
     follow, taken = np.zeros((len(whole.indptr) - 1, count), device.precision), np.zeros((count, count))
     for first in range(0, count, strip):
         some = coupling[:, first : first + strip].toarray()
-        out = fine.zeros(*some.shape)
-        solver.apply(fine.array(some), np.ones(some.shape[1], bool), out)
+        out = fine.allocate(*some.shape)
+        solver.apply(fine.upload(some), np.ones(some.shape[1], bool), out)
         moved = out.numpy()
         follow[:, first : first + strip] = -moved
         taken[:, first : first + strip] = coupling.T @ moved

@@ -145,20 +145,20 @@ class Sweep:
         entries = size * (size + border)
         table = np.column_stack([first, size, border, np.cumsum(border) - border, np.cumsum(entries) - entries])
         ends = np.cumsum([0, *(len(part) for part in fronts)])
-        self._fronts = [self._device.array(part, wp.int64) for part in np.split(table, ends[1:-1])]
-        self._border = self._device.array(np.concatenate(borders), wp.int32)
+        self._fronts = [self._device.upload(part, wp.int64) for part in np.split(table, ends[1:-1])]
+        self._border = self._device.upload(np.concatenate(borders), wp.int32)
         self._panel = wp.array(values, dtype=self._device.scalar, device=self._device.name, copy=False)
         self._longest = int((size + border).max(initial=0))
         unknowns = np.cumsum([0, *size])[ends].tolist()
         self._lower, self._upper = [slice(a, b) for a, b in pairwise(unknowns[:-1])], slice(*unknowns[-2:])
 
-    def solved(self, x: np.ndarray) -> np.ndarray:
+    def solve(self, x: np.ndarray) -> np.ndarray:
         """Solve for x (n, b) by both sweeps, column by column."""
         if not x.size:
             return x
         columns, parts = x.shape[1], len(self._lower)
-        rows = self._device.zeros(parts, columns, len(x))
-        work = self._device.zeros(parts, columns, self._longest)
+        rows = self._device.allocate(parts, columns, len(x))
+        work = self._device.allocate(parts, columns, self._longest)
         values, (up, down) = rows.numpy(), (build_kernel(self._device, code) for code in (UP, DOWN))
 
         def sweep(kernel: wp.Kernel, fronts: wp.array, part: int) -> None:

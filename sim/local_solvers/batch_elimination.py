@@ -30,7 +30,7 @@ from ..linalg.pcg import Preconditioner
 from ..linalg.preconditioner import build_rest_solver
 from ..linalg.schur import condense_exterior
 from ..minimisers.lbfgs import Descended, Lbfgs
-from ..minimisers.residual import Judge, ResidualState
+from ..minimisers.residual import ResidualEvaluator, ResidualState
 from ..runtime.columns import combine_columns, put_rows, take_rows
 from ..runtime.dense_product import build_product
 from .outer_loop import USUAL, CycleLimits, run_cycles
@@ -89,7 +89,7 @@ class BatchElimination:
     ) -> Descended:
         """Solve as `Lbfgs.descend`, in at most `most` cycles; returns no L-BFGS history."""
 
-        def cycle(judge: Judge, now: ResidualState, force: np.ndarray) -> ResidualState:
+        def cycle(judge: ResidualEvaluator, now: ResidualState, force: np.ndarray) -> ResidualState:
             return judge(self._corrected(now.u, now.g, force))
 
         return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
@@ -101,13 +101,13 @@ class BatchElimination:
         """
         device, count = self.problem.device, u.shape[1]
         every = np.ones(count, bool)
-        e = device.zeros(*u.shape)
+        e = device.allocate(*u.shape)
         self.preconditioner.apply(g, every, e)
         self.problem.constraint.project_nodes(e)
         out = combine_columns(device, u, -1.0, e, e)
         near, aim = take_rows(device, u, self.rows), take_rows(device, out, self.rows)
         back, part = combine_columns(device, near, -1.0, aim, wp.empty_like(aim)), self.part.problem
-        g = device.zeros(*near.shape)
+        g = device.allocate(*near.shape)
         part.linearise(near, every)  # `definite`: the undeformed curvature
         part.add_curvature(back, g)
         self.part.put(None)
@@ -164,9 +164,9 @@ def build_batch_elimination(
     return BatchElimination(
         problem=problem,
         preconditioner=preconditioner,
-        rows=device.array((3 * nodes[:, None] + np.arange(3)).ravel(), wp.int32),
+        rows=device.upload((3 * nodes[:, None] + np.arange(3)).ravel(), wp.int32),
         part=part,
         lbfgs=Lbfgs(part.problem, solver),
-        shared=device.array(around.rows, wp.int32),
+        shared=device.upload(around.rows, wp.int32),
         follow=build_product(around.follow, device, rough=True),
     )

@@ -22,7 +22,7 @@ from ..linalg.pcg import Preconditioner
 from ..minimisers.compact_lbfgs import build_empty_history
 from ..minimisers.lbfgs import Descended
 from ..minimisers.line_search import backtrack_by_slopes, is_step_too_long
-from ..minimisers.residual import Judge, ResidualState
+from ..minimisers.residual import ResidualEvaluator, ResidualState
 from ..runtime.columns import combine_columns
 from .clamped_part import ClampedPart
 from .outer_loop import CycleLimits, run_cycles
@@ -85,7 +85,7 @@ class ClampedElimination:
         )
         z = np.zeros(0)
 
-        def cycle(judge: Judge, now: ResidualState, force: np.ndarray) -> ResidualState:
+        def cycle(judge: ResidualEvaluator, now: ResidualState, force: np.ndarray) -> ResidualState:
             nonlocal chosen, part, pairs, z
             if part is None:
                 z = self._solved(now.g)
@@ -93,10 +93,12 @@ class ClampedElimination:
                 if not chosen.any():
                     return replace(now, free=np.full(1, np.inf))
                 part = ClampedPart(self.problem, self.effects, self.space, chosen, judge.constant, now.u)
-                new = judge(part.settled(now.u, force[0]))
+                new = judge(part.settle(now.u, force[0]))
                 z = self._solved(new.g)
                 return new
-            new = self._lower(judge, now, part, -z - pairs.motion(pairs.weights(_host(now.g))), force[0])
+            new = self._lower(
+                judge, now, part, -z - pairs.compute_motion(pairs.compute_weights(_host(now.g))), force[0]
+            )
             if not new.finite[0]:
                 return new
             after = self._solved(new.g)
@@ -113,16 +115,18 @@ class ClampedElimination:
 
         return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
 
-    def _lower(self, judge: Judge, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float) -> ResidualState:
+    def _lower(
+        self, judge: ResidualEvaluator, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float
+    ) -> ResidualState:
         """Search along d (3N,) with the part solved to `force` [N] at each trial; return the accepted state.
 
         Its residual is not finite if no trial step is accepted.
         """
         promised, device = -float(_host(now.g) @ d), self.problem.device
-        way = device.array(d[:, None])
+        way = device.upload(d[:, None])
         length = float(self.problem.longest_step(now.u, way)[0])
         for _ in range(self.size.cuts if promised > 0.0 else 0):
-            new = judge(part.settled(combine_columns(device, now.u, length, way, wp.empty_like(way)), force))
+            new = judge(part.settle(combine_columns(device, now.u, length, way, wp.empty_like(way)), force))
             slope = float(_host(new.g) @ d)
             if new.finite[0] and not is_step_too_long(slope, promised):
                 return new

@@ -16,7 +16,7 @@ from ..discretisation.space import Discretisation
 from ..effects import Effect
 from ..linalg.multifrontal import Factor, find_moved_nodes
 from ..minimisers.lbfgs import Lbfgs
-from ..minimisers.lbfgs_kernels import BROKEN, DONE
+from ..minimisers.lbfgs_kernels import DONE, NOT_FINITE
 from ..minimisers.newton import find_equilibrium
 from ..minimisers.newton_cg import NewtonCG
 
@@ -73,22 +73,22 @@ class ClampedPart:
         self._rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
         part, self._curvature = compile_clamped_part(effects, space, problem, chosen, self.nodes)
         self._part = part.problem
-        part.put(device.array(-constant.numpy()[self._rows]))
+        part.put(device.upload(-constant.numpy()[self._rows]))
         values = u.numpy()[self._rows]
-        if not (values.any() and self._begin_at(device.array(values))):
+        if not (values.any() and self._begin_at(device.upload(values))):
             self._begin_with(self._part.rest_curvature())
 
-    def settled(self, u: wp.array, force: float) -> wp.array:
+    def settle(self, u: wp.array, force: float) -> wp.array:
         """Return u (3N, 1) with the part in equilibrium, to a residual of about `force` [N].
 
         Return u unchanged if the part's forces are not finite.
         """
         part, device, values, limits = self._part, self._part.device, u.numpy().copy(), self._limits
         part.constraint.begin(values[self._rows], None, None)
-        begun = device.array(values[self._rows])
+        begun = device.upload(values[self._rows])
         found = self._lbfgs.descend(begun, np.zeros(1), limits.iterations, None, np.array([force]))
         end = found.u
-        if found.status[0] == BROKEN:
+        if found.status[0] == NOT_FINITE:
             return u
         if found.status[0] != DONE:
             _, _, scale = part.residual(end)
@@ -98,7 +98,7 @@ class ClampedPart:
         if found.steps[0] > limits.stale:
             self._begin_at(end)
         values[self._rows] = end.numpy()
-        return device.array(values)
+        return device.upload(values)
 
     def _begin_at(self, u: wp.array) -> bool:
         """Use the tangent stiffness at u (3n, 1) as initial Hessian of L-BFGS; False if it is not positive definite."""
@@ -111,6 +111,6 @@ class ClampedPart:
 
     def _begin_with(self, stiffness: sp.csc_array) -> None:
         """Use a stiffness (3n, 3n) [N/m] as initial Hessian of L-BFGS."""
-        basis = self._part.constraint.basis()
+        basis = self._part.constraint.build_basis()
         self._factor = Factor(stiffness, basis, find_moved_nodes(basis), self._part.device)
         self._lbfgs = Lbfgs(self._part, self._factor)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..minimisers.compact_lbfgs import PairsOfColumns
-from ..minimisers.residual import Judge, compute_relative
+from ..minimisers.compact_lbfgs import BatchHistory
+from ..minimisers.residual import ResidualEvaluator, compute_relative
 from .strained_part import StrainedModel
 
 
@@ -32,7 +32,7 @@ class ContactState:
         """True (b,) where residual and scale are finite; forces may overflow."""
         return np.isfinite(self.free) & np.isfinite(self.scale)
 
-    def rows(self, stay: np.ndarray) -> ContactState:
+    def select(self, stay: np.ndarray) -> ContactState:
         """Return the state of some load cases (k,)."""
         parts = (self.u[:, stay], self.smooth[:, stay], self.whole[:, stay])
         return ContactState(*parts, self.free[stay], self.scale[stay])
@@ -65,9 +65,9 @@ class Batch:
         the arrays.
     """
 
-    judge: Judge
+    judge: ResidualEvaluator
     now: ContactState
-    pairs: PairsOfColumns
+    pairs: BatchHistory
     model: StrainedModel | None
     stale: np.ndarray
     force: Any
@@ -85,11 +85,11 @@ class Batch:
 
     def keep(self, stay: np.ndarray) -> None:
         """Keep these load cases (k,)."""
-        self.judge, self.now = self.judge.rows(stay), self.now.rows(stay)
+        self.judge, self.now = self.judge.select(stay), self.now.select(stay)
         if self.model is None:
             self.pairs.keep(stay)
         else:
-            self.model = self.model.rows(stay)
+            self.model = self.model.select(stay)
         self.force, self.aimed = self.force[:, stay], self.aimed[:, stay]
         self.rest, self.x = self.rest[:, stay], self.x[:, stay]
         for name in ("stale", "length", "promised", "drag", "slow", "steps", "failed", "waiting", "gone"):

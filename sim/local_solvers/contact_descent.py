@@ -25,11 +25,11 @@ from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
 from ..linalg.preconditioner import is_exact
-from ..minimisers.compact_lbfgs import PairsOfColumns
+from ..minimisers.compact_lbfgs import BatchHistory
 from ..minimisers.lbfgs import Descended
-from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
+from ..minimisers.lbfgs_kernels import DONE, LIVE, NOT_FINITE
 from ..minimisers.line_search import backtrack_by_slopes, is_step_too_long
-from ..minimisers.residual import Judge, build_judge
+from ..minimisers.residual import ResidualEvaluator, build_evaluator
 from ..runtime.device import Device
 from ..runtime.views import cast_like, from_view, run_in_order, select_columns, to_double, to_host, to_library, view
 from .contact_batch import Batch, ContactState
@@ -70,7 +70,7 @@ class ContactDescent:
         """Compliance at the touchable nodes, followed by those that a model of strained tissue may include."""
         exact = is_exact(self.preconditioner)
         own = self.barrier.touchable
-        nodes = self.barrier.around(self.strains.near) if exact else own
+        nodes = self.barrier.select_nodes(self.strains.near) if exact else own
         compliance = Compliance(self.problem, self.preconditioner, nodes)
         if exact and self.problem.device.on_cuda:  # all columns take as long as one
             compliance.ensure_known(np.arange(len(nodes)) < len(own))
@@ -126,7 +126,7 @@ class ContactDescent:
                     leave = np.flatnonzero(over)
                     there = live[leave]
                     view(result)[:, there] = batch.now.u[:, leave]
-                    status[there] = np.where(done, DONE, np.where(batch.now.finite, LIVE, BROKEN))[leave]
+                    status[there] = np.where(done, DONE, np.where(batch.now.finite, LIVE, NOT_FINITE))[leave]
                     steps[there], residual[there] = batch.steps[leave], batch.now.relative[leave]
                     batch.gone |= over
                     if batch.gone.all():
@@ -138,14 +138,14 @@ class ContactDescent:
                 ready = self._tried(batch)
 
     def _begun(self, start: wp.array) -> Batch:
-        judge, count = build_judge(self.problem, start), start.shape[1]
+        judge, count = build_evaluator(self.problem, start), start.shape[1]
         now = self._judged(judge, view(start) + 0.0)
         force, none = self._felt(now), np.zeros(count)
         rest = self._answered(now.smooth, force)
         model = None
         if self._strained is not None and count <= self.strains.columns:
-            model = self._strained.model(start, np.arange(count))
-        pairs = PairsOfColumns(self.problem.device, self.problem.rows, count if model is None else 0)
+            model = self._strained.build_model(start, np.arange(count))
+        pairs = BatchHistory(self.problem.device, self.problem.rows, count if model is None else 0)
         slow, steps, failed = np.zeros((3, count), int)
         stale, waiting, gone = np.zeros((3, count), bool)
         return Batch(
@@ -168,7 +168,9 @@ class ContactDescent:
             if batch.model is not known:
                 known = batch.model
                 steps.load(known)
-            said = steps.aim(self._exactly(batch, tolerance)[0], batch.drag[0], bool(self._bends(batch)[0]))
+            said = steps.compute_direction(
+                self._exactly(batch, tolerance)[0], batch.drag[0], bool(self._bends(batch)[0])
+            )
             if said[STATUS] == CROWDED:
                 return
             if self._waits(batch, said[[STATUS]] != FOUND).any():
@@ -183,7 +185,7 @@ class ContactDescent:
                 there, misled = self._decided(batch, t, ahead, free)
                 if there.any() or misled.any():
                     break
-                said = steps.again(batch.length[0])
+                said = steps.shorten_step(batch.length[0])
             if there.any():
                 steps.move_to_last_step()
                 batch.now.free[:], batch.now.scale[:] = free, scale
@@ -199,7 +201,7 @@ class ContactDescent:
         """Recompute the stale models of the load cases `wanted` (b,) bool."""
         renewed = np.flatnonzero(wanted & batch.stale)
         if batch.model is not None and self._strained is not None and len(renewed):
-            fresh = self._strained.model(from_view(self.problem.device, batch.now.u), renewed)
+            fresh = self._strained.build_model(from_view(self.problem.device, batch.now.u), renewed)
             batch.stale &= ~wanted
             if fresh is not None:
                 batch.model = batch.model.merge_columns(renewed, fresh)
@@ -252,10 +254,10 @@ class ContactDescent:
             batch.x[:, on] = -batch.rest[:, on]
         else:
             batch.aimed[:, on] = force[:, on]
-            batch.x[:, on] = -batch.rest[:, on] - self.compliance.answered(self._bent(batch, force)[0])[:, on]
+            batch.x[:, on] = -batch.rest[:, on] - self.compliance.apply(self._bent(batch, force)[0])[:, on]
         if batch.pairs.most:
-            learnt = batch.pairs.of(some)
-            batch.x[:, on] -= learnt.motion(learnt.weights(self._pull(now.smooth, force)[:, on]))
+            learnt = batch.pairs.get_history(some)
+            batch.x[:, on] -= learnt.compute_motion(learnt.compute_weights(self._pull(now.smooth, force)[:, on]))
         longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.x))
         batch.length[some] = longest[some]
         batch.promised[some] = -_dots(now.whole[:, on], batch.x[:, on])
@@ -266,7 +268,7 @@ class ContactDescent:
         """Solve for the tools' forces (3n, k) on the model for load cases (k,); return which (k,) are solved."""
         rows, now = self._rows, batch.now
         on = select_columns(self.problem.device, some, len(batch.drag))
-        barrier, known = self.barrier.reduced(some), batch.force[:, on]
+        barrier, known = self.barrier.reduce(some), batch.force[:, on]
         if barrier is None:
             return known, np.ones(len(some), bool)
         exact = self._exactly(batch, tolerance)[some]
@@ -276,10 +278,10 @@ class ContactDescent:
             soft = replace(soft, own=batch.model.own[on])
         free, here = free[:, on], to_double(now.u[rows][:, on])
         if batch.pairs.most:
-            learnt = batch.pairs.of(some)
+            learnt = batch.pairs.get_history(some)
             own = to_double(learnt.sw[:, :, rows])
             soft = replace(soft, learnt=own, middle=to_double(learnt.middle))
-            weights = learnt.weights(self._pull(now.smooth, batch.force)[:, on])
+            weights = learnt.compute_weights(self._pull(now.smooth, batch.force)[:, on])
             free = free - (to_double(weights).mT @ own)[:, 0].T
         return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.drag[some], most)
 
@@ -290,12 +292,12 @@ class ContactDescent:
         """
         assert batch.model is not None
         device, compliance = self.problem.device, self.compliance
-        out, change = view(device.zeros(*batch.rest.shape)), force - batch.force
-        near = batch.rest[compliance.places] + cast_like(batch.rest, compliance.moved(change))
-        own = view(batch.model.pressed(device, from_view(device, near)))
+        out, change = view(device.allocate(*batch.rest.shape)), force - batch.force
+        near = batch.rest[compliance.places] + cast_like(batch.rest, compliance.compute_motion(change))
+        own = view(batch.model.apply_stiffness(device, from_view(device, near)))
         out[self._rows] = cast_like(out, change)
         out[compliance.places] += own
-        return out, cast_like(batch.rest, compliance.moved(own)[: len(self._rows)])
+        return out, cast_like(batch.rest, compliance.compute_motion(own)[: len(self._rows)])
 
     def _harder(self, drag: np.ndarray) -> np.ndarray:
         return np.maximum(self.limits.drag, self.limits.growth * drag)
@@ -361,7 +363,7 @@ class ContactDescent:
 
     def _felt(self, now: ContactState) -> Any:
         """Return the forces (3n, b) at touched nodes that balance the smooth terms."""
-        barrier, rows = self.barrier.reduced(np.arange(len(now.free))), self._rows
+        barrier, rows = self.barrier.reduce(np.arange(len(now.free))), self._rows
         own = to_double(now.smooth[rows])
         if barrier is None:
             return 0.0 * own
@@ -376,10 +378,10 @@ class ContactDescent:
         out[self._rows] += force
         return out
 
-    def _judged(self, judge: Judge, u: Any) -> ContactState:
+    def _judged(self, judge: ResidualEvaluator, u: Any) -> ContactState:
         """Evaluate the states u (3N, b) as `Problem.residual` does."""
         problem, device = self.problem, self.problem.device
-        place, pressed = device.zeros(*u.shape), device.zeros(*u.shape)
+        place, pressed = device.allocate(*u.shape), device.allocate(*u.shape)
         view(place)[:] = u
         found = judge(place)
         self.barrier.add_gradient(place, pressed)
@@ -389,7 +391,7 @@ class ContactDescent:
 
     def _answered(self, smooth: Any, force: Any) -> Any:
         """Compute the linear response (3N, b) [m] of the undeformed mesh to the residual."""
-        return self.compliance.answered(self._pull(smooth, force))
+        return self.compliance.apply(self._pull(smooth, force))
 
 
 def _dots(x: Any, y: Any) -> np.ndarray:

@@ -84,12 +84,16 @@ class ContactCompliance:
             every[: len(force) // 3] = to_host((force != 0.0).any(1)).reshape(-1, 3).any(axis=1)
             self.rest.ensure_known(every)
 
-    def model(self, columns: np.ndarray, rounded: float) -> ComplianceModel:
+    def build_model(self, columns: np.ndarray, rounded: float) -> ComplianceModel:
         """Return the compliance of some load cases (k,) for kernels."""
         out, n, count = ComplianceModel(), len(self.rest.rows), len(columns)
-        out.rest, out.known = from_view(self.device, self.rest.columns), self.device.array(self.rest.known, wp.int32)
+        out.rest, out.known = from_view(self.device, self.rest.columns), self.device.upload(self.rest.known, wp.int32)
         none = wp.zeros((count, 0, 0), dtype=wp.float32, device=self.device.name)
-        kinds = ("learnt", self.device.zeros(count, 0, n)), ("middle", self.device.zeros(count, 0, 0)), ("own", none)
+        kinds = (
+            ("learnt", self.device.allocate(count, 0, n)),
+            ("middle", self.device.allocate(count, 0, 0)),
+            ("own", none),
+        )
         for name, nothing in kinds:
             known = getattr(self, name)
             some = None if known is None else known[select_columns(self.device, columns, len(known))]
@@ -152,12 +156,12 @@ def _solved(
     device, count = soft.device, len(columns)
     nodes, functions = len(own[0]) // 3, barrier.functions
     scratch = soft.room(nodes, 1 << (count - 1).bit_length(), room)
-    out, status = device.zeros(3 * nodes, count), wp.zeros(count, dtype=wp.int32, device=device.name)
-    arrays = [from_view(device, x) for x in own] + [device.array(x) for x in asked]
-    touching = barrier.stage(columns)
+    out, status = device.allocate(3 * nodes, count), wp.zeros(count, dtype=wp.int32, device=device.name)
+    arrays = [from_view(device, x) for x in own] + [device.upload(x) for x in asked]
+    touching = barrier.build_stage(columns)
     kernel, model, ends = (
         build_kernel(device, functions),
-        soft.model(columns, limits.rounded),
+        soft.build_model(columns, limits.rounded),
         allocate_ends(limits, room),
     )
 

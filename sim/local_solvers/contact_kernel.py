@@ -6,7 +6,7 @@ import warp as wp
 
 from ..discretisation.term import BlockFunctions
 from ..linalg.block_factor import build_functions
-from ..minimisers.lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
+from ..minimisers.lbfgs_kernels import DEFAULT_BACKTRACK, MAX_BACKTRACK, MIN_BACKTRACK, OVERSHOOT
 from ..runtime.blocks import before, get_block_shape, total, wait
 from ..runtime.device import Device, forward_kernel
 from .contact_structs import CROWDED, FOUND, NONE, OPEN, UNKNOWN, ComplianceModel, Ends, Scratch
@@ -23,7 +23,9 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     threads, dense, Stage, Near = down * across, build_functions(device), barrier.stage, barrier.near
     wide = wp.constant(NARROW if device.on_cuda else WIDE)
     Strip = wp.types.vector(length=wide, dtype=wp.float64)
-    overshoot, least, middle, most = (wp.constant(wp.float64(x)) for x in (OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT))
+    overshoot, least, middle, most = (
+        wp.constant(wp.float64(x)) for x in (OVERSHOOT, MIN_BACKTRACK, DEFAULT_BACKTRACK, MAX_BACKTRACK)
+    )
     factor, solve = dense.factor, dense.solve
     add_force, add_matrix, longest = barrier.add_force, barrier.add_matrix, barrier.longest
 

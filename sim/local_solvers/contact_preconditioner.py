@@ -45,12 +45,12 @@ class ContactPreconditioner:
         self._rest.prepare(problem, columns)
         self._felt = None
         if columns == 1:
-            nodes, curvature = self._barrier.pressed()
+            nodes, curvature = self._barrier.get_pressed()
             if 0 < len(nodes) <= FORCES.most:
                 # BLAS threads wait for one another, very long where other processes use their cores.
                 with limit_to_one_thread():
                     rows = (3 * nodes[:, None] + np.arange(3)).ravel()
-                    own = self._compliance.between(np.isin(np.arange(len(self._compliance.rows) // 3), nodes))
+                    own = self._compliance.build_matrix(np.isin(np.arange(len(self._compliance.rows) // 3), nodes))
                     whole = np.eye(len(curvature)) + curvature @ own[np.ix_(rows, rows)]
                     self._felt = nodes, curvature, lu_factor(whole)
 

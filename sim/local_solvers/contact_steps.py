@@ -16,7 +16,7 @@ from ..discretisation.term import Local
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs_kernels import FREE, WHOLE
-from ..minimisers.residual import allocate_balance, compute_balance
+from ..minimisers.residual import allocate_balance, compute_residual_arrays
 from ..runtime import blocks
 from ..runtime.columns import add_dots, combine_columns, put_rows, take_rows
 from ..runtime.columns import build_kernels as columns_kernels_of
@@ -27,7 +27,7 @@ from .contact_forces import BENT, FORCES, allocate_ends, allocate_scratch
 from .contact_kernel import build_kernel
 from .contact_structs import ComplianceModel as Softness
 from .contact_structs import Ends
-from .press_kernel import press_of
+from .press_kernel import build_press_kernel
 from .strained_part import StrainedModel
 
 # Threads that share one row of a matrix product.
@@ -161,23 +161,23 @@ class ContactSteps:
         self._problem, self._preconditioner, self._barrier, self._device = problem, preconditioner, barrier, device
 
         def numbers(rows: int) -> wp.array:
-            return device.zeros(rows, 1)
+            return device.allocate(rows, 1)
 
         self._u, self._smooth, self._whole, self._rest, self._x = (numbers(problem.rows) for _ in range(5))
         self._new_u, self._new_smooth, self._new_rest = (numbers(problem.rows) for _ in range(3))
         self._constant, self._pull, self._answer, self._pressed = (numbers(problem.rows) for _ in range(4))
-        self._force, self._found, self._here, self._there = (exact.zeros(count, 1) for _ in range(4))
+        self._force, self._found, self._here, self._there = (exact.allocate(count, 1) for _ in range(4))
         self._balance = allocate_balance(problem, 1)
         self._near, self._own, self._more, self._change = (numbers(len(compliance.rows)) for _ in range(4))
-        self._rows = device.array(compliance.rows, wp.int32)
+        self._rows = device.upload(compliance.rows, wp.int32)
         self._touched = self._rows[:count]
         self._nodes = wp.zeros((1, size // 3), dtype=wp.int32, device=name)
         self._matrix = wp.zeros((1, size, size), dtype=wp.float64, device=name)
         self._compliance = from_view(exact, compliance.columns).reshape((1, *compliance.columns.shape))
-        self._every = device.array(np.arange(len(compliance.nodes))[None], wp.int32)
+        self._every = device.upload(np.arange(len(compliance.nodes))[None], wp.int32)
         self._model = Softness()
-        self._model.rest, self._model.known = self._compliance[0], device.array(compliance.known, wp.int32)
-        self._model.learnt, self._model.middle = exact.zeros(1, 0, len(compliance.rows)), exact.zeros(1, 0, 0)
+        self._model.rest, self._model.known = self._compliance[0], device.upload(compliance.known, wp.int32)
+        self._model.learnt, self._model.middle = exact.allocate(1, 0, len(compliance.rows)), exact.allocate(1, 0, 0)
         self._model.own = wp.zeros((1, count + 1, count + 1), dtype=wp.float32, device=name)
         self._model.rounded = FORCES.rounded
         self._scratch = allocate_scratch(exact, count // 3, 1, FORCES.few)
@@ -200,7 +200,7 @@ class ContactSteps:
             view(self._matrix)[:, : 3 * count, : 3 * count] = model.matrix
             view(self._model.own)[:] = model.own
 
-    def aim(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
+    def compute_direction(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
         """Solve for the tools' forces with a proximal term, their direction and longest step: (`SAID`,) results.
 
         With `bent` the model need not be convex. If the status is not `FOUND`, the other results are invalid. The
@@ -210,7 +210,7 @@ class ContactSteps:
         ends = allocate_ends(BENT if bent else FORCES, FORCES.few)
         return self._run("bent" if bent else "aim", lambda: self._aim(ends))
 
-    def again(self, length: float) -> np.ndarray:
+    def shorten_step(self, length: float) -> np.ndarray:
         """Evaluate a shorter step; return its results."""
         self._up.numpy()[LENGTH] = length
         return self._run("again", self._again)
@@ -221,11 +221,11 @@ class ContactSteps:
 
     def set_tools(self, constant: wp.array) -> bool:
         """Load the tools' poses from the problem, and constant gradients (3N, 1) [N]; False if there are no tools."""
-        reduction = self._barrier.reduced(np.zeros(1, int))
+        reduction = self._barrier.reduce(np.zeros(1, int))
         if reduction is None:
             return False
         if self._touch is None:
-            self._touch = build_kernel(self._exact, reduction.functions), reduction.stage(np.zeros(1, int))
+            self._touch = build_kernel(self._exact, reduction.functions), reduction.build_stage(np.zeros(1, int))
         wp.copy(self._constant, constant)
         return True
 
@@ -294,7 +294,7 @@ class ContactSteps:
         device, problem, k = self._device, self._problem, build_kernels(self._device)
         inputs = [self._u, self._length, self._x]
         device.launch(columns_kernels_of(device).combine, self._u.shape, inputs, [self._new_u])
-        found = compute_balance(problem, self._new_u, self._constant, self._x, self._balance)
+        found = compute_residual_arrays(problem, self._new_u, self._constant, self._x, self._balance)
         self._pressed.zero_()
         self._barrier.add_gradient(self._new_u, self._pressed)
         problem.constraint.project_nodes(self._pressed)
@@ -323,12 +323,14 @@ class ContactSteps:
         self._own.zero_()
         inputs = [self._matrix, self._nodes, self._near]
         dim = (PARTS, 1, self._matrix.shape[2])
-        self._device.launch(press_of(self._device, wp.float64, wp.float64, PARTS), dim, inputs, [self._own])
+        self._device.launch(build_press_kernel(self._device, wp.float64, wp.float64, PARTS), dim, inputs, [self._own])
 
     def _give(self, force: wp.array, out: wp.array, rows: int) -> None:
         """Add the motion under forces to the first `rows` of `out`."""
         inputs = [self._compliance, self._every, force]
-        self._device.launch(press_of(self._device, wp.float64, wp.float64, PARTS), (PARTS, 1, rows), inputs, [out])
+        self._device.launch(
+            build_press_kernel(self._device, wp.float64, wp.float64, PARTS), (PARTS, 1, rows), inputs, [out]
+        )
 
     def _answered(self, out: wp.array) -> None:
         """Compute the linear response of the undeformed mesh to the forces in `_pull`."""

@@ -14,8 +14,8 @@ import warp as wp
 
 from ..discretisation.problem import Problem
 from ..minimisers.lbfgs import Descended
-from ..minimisers.lbfgs_kernels import BROKEN, DONE, LIVE
-from ..minimisers.residual import Judge, ResidualState, build_judge
+from ..minimisers.lbfgs_kernels import DONE, LIVE, NOT_FINITE
+from ..minimisers.residual import ResidualEvaluator, ResidualState, build_evaluator
 from ..runtime.columns import scatter_columns
 
 
@@ -43,7 +43,7 @@ class CycleLimits:
 
 
 USUAL = CycleLimits()  # Default.
-Cycle = Callable[[Judge, ResidualState, np.ndarray], ResidualState]
+Cycle = Callable[[ResidualEvaluator, ResidualState, np.ndarray], ResidualState]
 """Function that returns the next states of b load cases; the local solution may keep residuals (b,) [N]. A load case
 without an accepted step gets a residual that is not finite."""
 
@@ -56,9 +56,9 @@ def run_cycles(
     Each load case ends in the state with its smallest residual, or within its tolerance (b,).
     """
     device, count = problem.device, start.shape[1]
-    judge = build_judge(problem, start)
+    judge = build_evaluator(problem, start)
     now, result, live = judge(start), wp.clone(start), np.arange(count)
-    status, steps, residual = np.where(now.finite, LIVE, BROKEN), np.zeros(count, int), np.full(count, np.inf)
+    status, steps, residual = np.where(now.finite, LIVE, NOT_FINITE), np.zeros(count, int), np.full(count, np.inf)
     first, least, mark, idle = now.free, np.full(count, np.inf), np.full(count, np.inf), np.zeros(count, int)
     last = min(limits.cycles, most)
     for number in range(last + 1):
@@ -76,6 +76,6 @@ def run_cycles(
         if number == last or len(stay) == 0:
             break
         if len(stay) < len(live):
-            judge, now, live = judge.rows(stay), now.rows(device, stay), live[stay]
+            judge, now, live = judge.select(stay), now.select(device, stay), live[stay]
         now = cycle(judge, now, np.fmax(limits.forcing * now.free, limits.enough * tolerance[live] * now.scale))
     return Descended(result, status, steps, residual, {})

@@ -9,7 +9,7 @@ from ..runtime.device import Device, forward_kernel
 
 
 @cache
-def press_of(device: Device, entry: Any, number: Any, parts: int = 1) -> wp.Kernel:
+def build_press_kernel(device: Device, entry: Any, number: Any, parts: int = 1) -> wp.Kernel:
     """Build the kernel that multiplies by each load case's matrix, over (part, load case, row).
 
     `entry` and `number` are the types of the matrix and of its products; `parts` threads share a row.

@@ -127,7 +127,7 @@ class StrainedDescent:
         """Solve as `Lbfgs.descend`, for one load case; `learnt` is the model. The first call takes 0.5 s to prepare."""
         self._part.prepare()
         u, left, steps = start, most, 0
-        self._preconditioner.stiffening = self.known(learnt) or self._stiffening(u)
+        self._preconditioner.stiffening = self.get_warm_start(learnt) or self._stiffening(u)
         while True:
             some = min(left, self._renewal.evaluations)
             found = self._lbfgs.descend(u, tolerance, some)
@@ -142,7 +142,7 @@ class StrainedDescent:
 
     def _stiffening(self, u: wp.array) -> StiffnessUpdate | None:
         """Compute the update at u (3N, 1) [m]; None if no tissue is strained."""
-        found = self._part.stiffening(u, np.arange(1))
+        found = self._part.find_stiffening(u, np.arange(1))
         if found is None or not found[0].shape[1]:
             return None
         compliance = self._part.compliance
@@ -156,7 +156,7 @@ class StrainedDescent:
                 return None
             return StiffnessUpdate(compliance.rows[place], added, *lu_factor(system, True, check_finite=False))
 
-    def known(self, learnt: Mapping[str, np.ndarray] | None) -> StiffnessUpdate | None:
+    def get_warm_start(self, learnt: Mapping[str, np.ndarray] | None) -> StiffnessUpdate | None:
         """Read the update of an earlier descent of this problem from warm-start data; None if it does not fit."""
         if learnt is None or any(name not in learnt for name in LEARNT.values()):
             return None

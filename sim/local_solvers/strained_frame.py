@@ -17,7 +17,7 @@ from ..linalg.pcg import Preconditioner
 from ..runtime.columns import combine_columns
 from ..runtime.device import Device
 from ..runtime.views import cast_like, get_library, run_in_order, solve_dense, to_library, view
-from .press_kernel import press_of
+from .press_kernel import build_press_kernel
 from .strained_part import StrainedPart
 
 # Keys of warm-start data.
@@ -48,7 +48,7 @@ def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedM
     None if strained tissue does not fit. The host does not wait for the GPU.
     """
     with run_in_order(device):
-        found = part.stiffening(u, np.arange(1), full=True)
+        found = part.find_stiffening(u, np.arange(1), full=True)
         if found is None:
             return None
         lib, (places, added) = get_library(device), found
@@ -59,7 +59,7 @@ def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedM
         )
         bent, nodes = view(own), view(of)
         added = cast_like(bent, added)
-        system = added @ cast_like(bent, part.soft(rows))
+        system = added @ cast_like(bent, part.build_compliance(rows))
         diagonal = range(rows.shape[1])
         system[:, diagonal, diagonal] += 1.0
         matrix = -solve_dense(system, added)
@@ -77,7 +77,7 @@ def restore_updated_model(warm: Mapping[str, np.ndarray], device: Device, count:
         return None
     if matrix.dtype != np.float32 or not is_all_finite(matrix) or (nodes < 0).any() or (nodes >= count).any():
         return None
-    return UpdatedModel(device.array(nodes, wp.int32), device.array(matrix, wp.float32))
+    return UpdatedModel(device.upload(nodes, wp.int32), device.upload(matrix, wp.float32))
 
 
 class UpdatedPreconditioner:
@@ -98,7 +98,7 @@ class UpdatedPreconditioner:
         name = problem.device.name
         self._nodes = wp.zeros((1, size // 3), dtype=wp.int32, device=name)
         self._matrix = wp.zeros((1, size, size), dtype=wp.float32, device=name)
-        self._pull, self._more = (problem.device.zeros(problem.rows, 1) for _ in range(2))
+        self._pull, self._more = (problem.device.allocate(problem.rows, 1) for _ in range(2))
 
     def load(self, bent: UpdatedModel | None) -> None:
         """Load another model, or none."""
@@ -117,7 +117,7 @@ class UpdatedPreconditioner:
         device = self._problem.device
         self._rest.apply(r, live, out)
         self._pull.zero_()
-        kernel, shape = press_of(device, wp.float32, device.scalar, PARTS), (PARTS, *self._matrix.shape[:2])
+        kernel, shape = build_press_kernel(device, wp.float32, device.scalar, PARTS), (PARTS, *self._matrix.shape[:2])
         device.launch(kernel, shape, [self._matrix, self._nodes, out], [self._pull])
         self._problem.constraint.project_nodes(self._pull)
         self._rest.apply(self._pull, live, self._more)

@@ -29,7 +29,7 @@ from ..runtime.views import (
     to_library,
     view,
 )
-from .press_kernel import press_of
+from .press_kernel import build_press_kernel
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class StrainedModel:
         """True (b,) where a load case has strained nodes."""
         return to_host((self.matrix != 0.0).any(-1).any(-1))
 
-    def rows(self, columns: np.ndarray) -> StrainedModel:
+    def select(self, columns: np.ndarray) -> StrainedModel:
         """Return the models of some load cases (k,)."""
         return StrainedModel(self.nodes[columns], self.matrix[columns], self.own[columns])
 
@@ -111,11 +111,11 @@ class StrainedModel:
         nodes, matrix = pad_zeros(self.nodes, (missing,)), pad_zeros(self.matrix, (3 * missing, 3 * missing))
         return StrainedModel(nodes, matrix, self.own)
 
-    def pressed(self, device: Device, motion: wp.array) -> wp.array:
+    def apply_stiffness(self, device: Device, motion: wp.array) -> wp.array:
         """Compute E M E' motion (3n, b) [N] of motions (3n, b) [m] of the compliance's nodes."""
         out, (count, size) = wp.zeros_like(motion), self.matrix.shape[:2]
         inputs = [from_view(device, self.matrix), from_view(device, self.nodes), motion]
-        device.launch(press_of(device, wp.float64, wp.float64), (1, count, size), inputs, [out])
+        device.launch(build_press_kernel(device, wp.float64, wp.float64), (1, count, size), inputs, [out])
         return out
 
 
@@ -153,30 +153,30 @@ class StrainedPart:
         self._problem, self.compliance, self._touchable, self._strains = problem, compliance, touchable, strains
         self.size = 3 * min(strains.nodes, len(nodes))
         """Rows of the largest model."""
-        self._near = device.array(nodes, wp.int32)
+        self._near = device.upload(nodes, wp.int32)
         near = np.zeros(problem.rows // 3, bool)
         near[nodes] = True
         found = [(term, term.elements_on(near)) for term in problem.terms if isinstance(term, Strained)]
-        self._elements = [(term, device.array(some, wp.int32)) for term, some in found]
+        self._elements = [(term, device.upload(some, wp.int32)) for term, some in found]
 
-    def model(self, u: wp.array, columns: np.ndarray) -> StrainedModel | None:
+    def build_model(self, u: wp.array, columns: np.ndarray) -> StrainedModel | None:
         """Build models of load cases (k,) of the begun batch at u (3N, b) [m]; None if strained tissue does not fit."""
-        found = self.stiffening(u, columns)
+        found = self.find_stiffening(u, columns)
         return None if found is None else self._bent(*found)
 
     def prepare(self) -> None:
         """Compute the compliance at all nodes, unless that is done."""
         self.compliance.ensure_known(np.ones(len(self.compliance.nodes), bool))
 
-    def stiffening(self, u: wp.array, columns: np.ndarray, full: bool = False) -> tuple[Any, Any] | None:
+    def find_stiffening(self, u: wp.array, columns: np.ndarray, full: bool = False) -> tuple[Any, Any] | None:
         """Select the most strained nodes, as indices into the compliance (k, n); assemble their D (k, 3n, 3n) [N/m].
 
         D is zero where a load case has fewer nodes. With `full`, n is the maximum, and the host does not wait for the
         GPU. None if tissue that does not fit is strained more than `cut`.
         """
         device, count, strains = self._problem.device, len(columns), self._strains
-        picked = device.array(columns, wp.int32)
-        strain = device.zeros(self._problem.rows // 3, count)
+        picked = device.upload(columns, wp.int32)
+        strain = device.allocate(self._problem.rows // 3, count)
         for term, some in self._elements:
             term.raise_strain(some, u, picked, strain)
         nodes, limit, numbers = choose_strained(device, view(strain)[view(self._near)], strains.least, strains.nodes)
@@ -194,7 +194,7 @@ class StrainedPart:
                 term.add_stiffening(some, u, picked, from_view(device, limit), place, stiffer)
         return cast_like(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
 
-    def soft(self, rows: Any) -> Any:
+    def build_compliance(self, rows: Any) -> Any:
         """Return C (b, n, n) [m/N] between some computed rows (b, n) of the compliance, symmetrised."""
         between = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
         return 0.5 * (between + between.mT)
@@ -211,7 +211,7 @@ class StrainedPart:
         for first in range(0, count if size else 0, each):
             some = slice(first, first + each)
             rows = (3 * nodes[some][:, :, None] + axes).reshape(-1, size)
-            soft = self.soft(rows)
+            soft = self.build_compliance(rows)
             system = stiffer[some] @ soft
             diagonal = range(size)
             system[:, diagonal, diagonal] += 1.0

@@ -34,12 +34,12 @@ class CurvaturePairs:
         """Middle matrix M (2m, 2m) of the compact representation."""
         return compute_middle(self.sy, self.yw)
 
-    def weights(self, force: np.ndarray) -> np.ndarray:
+    def compute_weights(self, force: np.ndarray) -> np.ndarray:
         """Compute the coefficients M [S, W]' force (2m,) for a force (3N,)."""
         force = force.astype(self.s.dtype)
         return self.middle @ np.concatenate([self.s @ force, self.w @ force])
 
-    def motion(self, weights: np.ndarray) -> np.ndarray:
+    def compute_motion(self, weights: np.ndarray) -> np.ndarray:
         """Compute the displacement [S, W] weights (3N,)."""
         some, others = np.split(weights.astype(self.s.dtype), 2)
         return some @ self.s + others @ self.w
@@ -70,7 +70,7 @@ def compute_middle(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
     return np.block([[corner, -inverse.mT], [-inverse, np.zeros_like(inverse)]])
 
 
-class PairsOfColumns:
+class BatchHistory:
     """L-BFGS histories of the b load cases of a batch, on the device of the batch.
 
     Parameters
@@ -84,7 +84,7 @@ class PairsOfColumns:
     def __init__(self, device: Device, rows: int, columns: int):
         self._device = device
         # s and w on the device, their products on the host in float64; pair i of a load case is in slot i modulo PAIRS.
-        self._sw = view(device.zeros(columns * 2 * PAIRS, rows)).reshape(columns, 2 * PAIRS, rows)
+        self._sw = view(device.allocate(columns * 2 * PAIRS, rows)).reshape(columns, 2 * PAIRS, rows)
         self._sy, self._yw = np.zeros((2, columns, PAIRS, PAIRS))
         self.count = np.zeros(columns, int)
         self._asked: tuple[np.ndarray, LbfgsHistory] | None = None
@@ -105,7 +105,7 @@ class PairsOfColumns:
         """Largest number of pairs of any load case."""
         return min(int(self.count.max(initial=0)), PAIRS)
 
-    def of(self, columns: np.ndarray) -> LbfgsHistory:
+    def get_history(self, columns: np.ndarray) -> LbfgsHistory:
         """Return the history of some load cases (k,); a repeated call with the same ones returns the cached result."""
         if self._asked is not None and np.array_equal(self._asked[0], columns):
             return self._asked[1]
@@ -142,10 +142,10 @@ class LbfgsHistory:
     sw: Any
     middle: Any
 
-    def weights(self, force: Any) -> Any:
+    def compute_weights(self, force: Any) -> Any:
         """Compute the coefficients M [S, W]' force (k, 2m, 1) for forces (3N, k) [N]."""
         return self.middle @ (self.sw @ force.T[:, :, None])
 
-    def motion(self, weights: Any) -> Any:
+    def compute_motion(self, weights: Any) -> Any:
         """Compute the displacements [S, W] weights (3N, k) [m]."""
         return (weights.mT @ self.sw)[:, 0].T

@@ -18,8 +18,8 @@ from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from ..linalg.pcg import Preconditioner
 from ..runtime.columns import EXACT, find_workspace_width, scatter_columns
-from .lbfgs_kernels import LEFT, LIVE, PAIRS
-from .lbfgs_state import Workspace, allocate_ground
+from .lbfgs_kernels import LIVE, PAIRS, STOPPED
+from .lbfgs_state import Workspace, allocate_memory
 
 # L-BFGS history of a descent on the host, load cases first: s and w (b, m, 3N), products (b, m, m), slot of the newest
 # pair and number of pairs (b,).
@@ -59,7 +59,7 @@ class Descended:
     @property
     def left(self) -> np.ndarray:
         """Load cases (k,) that did not end, so that another method can continue them."""
-        return np.flatnonzero((self.status == LIVE) | (self.status == LEFT))
+        return np.flatnonzero((self.status == LIVE) | (self.status == STOPPED))
 
 
 class Lbfgs:
@@ -117,10 +117,10 @@ class Lbfgs:
             start, tolerance, np.zeros(count) if force is None else force, (learnt or {}) if count <= CARRIED else {}
         )
         if ahead is not None:
-            workspace.aim(*ahead)
+            workspace.set_direction(*ahead)
         while True:
             more = min(self._schedule.between, most - tried)
-            workspace.turn(more)
+            workspace.iterate(more)
             tried += more
             now = workspace.columns["status"].numpy()[: len(place)]
             left = int((now == LIVE).sum())
@@ -144,7 +144,7 @@ class Lbfgs:
         width = self._width(count)
         if width > max(self._workspaces, default=0):
             self._workspaces, self._ground = {}, {}  # free the old memory before more is allocated
-            self._ground = allocate_ground(self._problem, width)
+            self._ground = allocate_memory(self._problem, width)
         if width not in self._workspaces:
             self._workspaces[width] = Workspace(self._problem, self._preconditioner, width, self._ground)
         return self._workspaces[width]

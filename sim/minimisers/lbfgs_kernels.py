@@ -13,15 +13,15 @@ import warp as wp
 from ..runtime.columns import CHUNK
 from ..runtime.device import Device, forward_kernel
 
-LIVE, DONE, LEFT, BROKEN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+LIVE, DONE, STOPPED, NOT_FINITE = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 """Status of a load case: iterating; converged; stopped without convergence; start not finite."""
 PAIRS = 8  # Curvature pairs (s, y) that each load case keeps.
 OVERSHOOT = 0.5  # A step is accepted if phi'(t) <= OVERSHOOT |phi'(0)|, with phi the energy along the direction.
-LEAST_KEPT = 0.1  # Backtracking factor: lower bound.
-KEPT = 0.25  # Backtracking factor where the trial is not finite.
-MOST_KEPT = 0.7  # Backtracking factor: upper bound.
-CUTS = 12  # Maximum number of backtracking steps in a row.
-SOME = 16  # Rows, or nodes, per thread, so that the data of their load case are read once.
+MIN_BACKTRACK = 0.1  # Backtracking factor: lower bound.
+DEFAULT_BACKTRACK = 0.25  # Backtracking factor where the trial is not finite.
+MAX_BACKTRACK = 0.7  # Backtracking factor: upper bound.
+MAX_BACKTRACKS = 12  # Maximum number of backtracking steps in a row.
+ROWS_PER_THREAD = 16  # Rows, or nodes, per thread, so that the data of their load case are read once.
 # Smallest change of the slope along a step, relative to |phi'(0)|, for a pair of positive curvature to be stored.
 LEAST_CURVATURE = 1e-3
 # Rows of `sums`: |g - constant|^2, |g|^2, |residual|^2, residual . d, with g the gradient.
@@ -54,13 +54,13 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
     """Build the kernels for a device's scalar type and the number of pairs of a load case."""
     scalar = device.scalar
     several, few_scalars = (
-        wp.types.vector(length=length, dtype=scalar) for length in (SOME, get_rows_per_thread(device))
+        wp.types.vector(length=length, dtype=scalar) for length in (ROWS_PER_THREAD, get_rows_per_thread(device))
     )
     weights = wp.types.vector(length=pairs, dtype=wp.float64)
     products_of_pairs = wp.types.matrix(shape=(pairs, pairs), dtype=wp.float64)
-    m, chunk, some, few = pairs, CHUNK, SOME, get_rows_per_thread(device)
-    overshoot, least_kept, kept, most_kept = OVERSHOOT, LEAST_KEPT, KEPT, MOST_KEPT
-    cuts, least_curvature = CUTS, LEAST_CURVATURE
+    m, chunk, some, few = pairs, CHUNK, ROWS_PER_THREAD, get_rows_per_thread(device)
+    overshoot, least_kept, kept, most_kept = OVERSHOOT, MIN_BACKTRACK, DEFAULT_BACKTRACK, MAX_BACKTRACK
+    cuts, least_curvature = MAX_BACKTRACKS, LEAST_CURVATURE
     whole_row, free_row, slope_row = WHOLE, FREE, SLOPE
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
 
@@ -165,7 +165,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             if not first:
                 steps[c] = steps[c] + 1
         elif first:
-            status[c] = BROKEN
+            status[c] = NOT_FINITE
         else:
             share = wp.float64(kept)
             if finite:
@@ -173,7 +173,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             t[c] = share * t[c]
             cut[c] = cut[c] + 1
             if cut[c] > cuts:
-                status[c] = LEFT
+                status[c] = STOPPED
         if done:
             status[c] = DONE
         if status[c] != LIVE:
@@ -278,7 +278,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         promised[c] = decrease
         t[c] = length
         if not (decrease > zero and wp.isfinite(decrease)):
-            status[c] = LEFT
+            status[c] = STOPPED
             t[c] = zero
 
     @forward_kernel(module="unique")

@@ -14,9 +14,9 @@ from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..runtime.columns import add_dots, combine_columns, gather_columns
 from . import lbfgs_trial_kernels
-from .lbfgs_kernels import DONE, PAIRS, PRODUCTS, SOME, SUMS, build_kernels, get_rows_per_thread
-from .lbfgs_trial_kernels import multiply_of
-from .residual import Balance, compute_balance, compute_constant_gradients
+from .lbfgs_kernels import DONE, PAIRS, PRODUCTS, ROWS_PER_THREAD, SUMS, build_kernels, get_rows_per_thread
+from .lbfgs_trial_kernels import build_multiply_kernel
+from .residual import ResidualArrays, compute_constant_gradients, compute_residual_arrays
 
 Shapes = Mapping[str, tuple[int, ...]]  # Array shapes by name, without the axis of load cases.
 
@@ -52,7 +52,7 @@ def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
     }
 
 
-def allocate_ground(problem: Problem, width: int) -> dict[str, wp.array]:
+def allocate_memory(problem: Problem, width: int) -> dict[str, wp.array]:
     """Allocate memory, by number type, that workspaces of at most this width share: only one is in use at a time."""
     return {
         kind: wp.zeros((_rows(moved) + _rows(written), width), dtype=dtype, device=problem.device.name)
@@ -103,7 +103,7 @@ class Workspace:
         self._graph: wp.Graph | None = None
         self.state = allocate_state(problem, width, ground)
         self.columns = a = self.state.columns
-        self._trial = Balance(a["new_g"], a["part"], a["sums"], a["own"])
+        self._trial = ResidualArrays(a["new_g"], a["part"], a["sums"], a["own"])
 
     def begin(
         self, start: wp.array, tolerance: np.ndarray, force: np.ndarray, learnt: Mapping[str, np.ndarray]
@@ -130,10 +130,10 @@ class Workspace:
             a[name].assign(np.moveaxis(rows_first, 0, -1).reshape(a[name].shape))
         self.prepare()
 
-    def aim(self, g: wp.array, z: wp.array) -> None:
+    def set_direction(self, g: wp.array, z: wp.array) -> None:
         """Set the first direction to -z (3N, b), from a start with residual g (3N, b)."""
         a, device, count = self.columns, self._problem.device, g.shape[1]
-        index = device.array(self._padded(np.arange(count)), wp.int32)
+        index = device.upload(self._padded(np.arange(count)), wp.int32)
         gather_columns(device, g, index, a["g"])
         gather_columns(device, z, index, a["z"])
         combine_columns(device, a["d"], -1.0, a["z"], a["d"])
@@ -146,7 +146,7 @@ class Workspace:
         """Continue with these load cases (k,) of another workspace's batch."""
         index = self._padded(stay)
         self._problem.keep(index)
-        there = self._problem.device.array(index, wp.int32)
+        there = self._problem.device.upload(index, wp.int32)
         for kind, own in self.state.moved.items():
             wp.copy(own, gather_columns(self._problem.device, other.state.moved[kind], there))
         if len(stay) < self.width:
@@ -167,33 +167,33 @@ class Workspace:
         self._problem.linearise(u, np.zeros(u.shape[1], bool))
         self._preconditioner.prepare(self._problem, u.shape[1])
 
-    def turn(self, times: int) -> None:
+    def iterate(self, times: int) -> None:
         """Run this number of L-BFGS iterations."""
         device = self._problem.device
         if not (device.on_cuda and self._preconditioner.on_device):
             for _ in range(times):
-                self.once()
+                self.run_iteration()
             return
         if self._graph is None:
-            self.once()  # loads modules, which a capture cannot
+            self.run_iteration()  # loads modules, which a capture cannot
             if not self.columns["aiming"].numpy().any():
                 self._aim()  # loads those that no load case has used
             with wp.ScopedCapture(device.name, force_module_load=False) as capture:
-                self.once()
+                self.run_iteration()
             self._graph = capture.graph
             times -= 1
         for _ in range(times):
             wp.capture_launch(self._graph)
 
-    def once(self) -> None:
+    def run_iteration(self) -> None:
         """Run one iteration; a GPU captures it unless the preconditioner runs on the host."""
         a, k = self.columns, self._kernels
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
         spread, one = lbfgs_trial_kernels.spread_of(device, count), (count,)
         step = lbfgs_trial_kernels.build_kernels(device, spread).step
-        device.launch(step, (spread.threads(rows), count), [a["u"], a["t"], a["d"]], [a["v"]])
-        found = compute_balance(problem, a["v"], a["constant"], a["d"], self._trial)
+        device.launch(step, (spread.count_threads(rows), count), [a["u"], a["t"], a["d"]], [a["v"]])
+        found = compute_residual_arrays(problem, a["v"], a["constant"], a["d"], self._trial)
         inputs = [a["loud"], found.own, a["tolerance"], a["force"], found.sums, a["promised"]]
         names = ("status", "accepted", "steps", "cut", "t", "gone", "residual", "slot", "aiming")
         device.launch(k.judge, one, inputs, [a[name] for name in names])
@@ -220,10 +220,10 @@ class Workspace:
         a["products"].zero_()
         inputs, outputs = [a["known"], a["s"], a["w"], a["g"], a["z"], g, a["new_z"]], [a["products"]]
         if count == 1 and device.on_cuda:
-            dim = (len(a["products"]), lbfgs_trial_kernels.spread_of(device, 1).threads(rows))
-            device.launch(multiply_of(device, PAIRS), dim, inputs, outputs)
+            dim = (len(a["products"]), lbfgs_trial_kernels.spread_of(device, 1).count_threads(rows))
+            device.launch(build_multiply_kernel(device, PAIRS), dim, inputs, outputs)
         else:
-            device.launch(k.multiply, (-(-rows // SOME), count), inputs, outputs)
+            device.launch(k.multiply, (-(-rows // ROWS_PER_THREAD), count), inputs, outputs)
         inputs = [a["aiming"], a["gone"], self._trial.sums, a["products"]]
         outputs = [a["status"], a["head"], a["known"], a["slot"], a["t"], a["promised"]]
         outputs += [a["sg"], a["wg"], a["sy"], a["yw"], a["along_s"], a["along_w"]]

@@ -12,7 +12,7 @@ import warp as wp
 
 from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
-from .lbfgs_kernels import FREE, GOLD, GZ, OWN, SLOPE, SOME, WHOLE, YW
+from .lbfgs_kernels import FREE, GOLD, GZ, OWN, ROWS_PER_THREAD, SLOPE, WHOLE, YW
 
 EACH = 2  # Rows, or nodes, of a single load case per thread on CUDA.
 EACH_ON_CPU = 1024  # The same on the CPU.
@@ -25,7 +25,7 @@ class ThreadSpread:
     lanes: int
     each: int
 
-    def threads(self, count: int) -> int:
+    def count_threads(self, count: int) -> int:
         """Return the number of threads for `count` rows, or nodes."""
         return -(-count // (self.lanes * self.each)) * self.lanes
 
@@ -33,12 +33,12 @@ class ThreadSpread:
 def spread_of(device: Device, columns: int) -> ThreadSpread:
     """Choose how the threads of a device share the rows of a batch of this many load cases."""
     if columns > 1:
-        return ThreadSpread(1, SOME)
+        return ThreadSpread(1, ROWS_PER_THREAD)
     return ThreadSpread(get_warp_width(device), EACH if device.on_cuda else EACH_ON_CPU)
 
 
 @wp.func
-def first_of(thread: int, lanes: int, each: int):
+def first_row(thread: int, lanes: int, each: int):
     """Return the first row of a thread; its next rows follow at intervals of `lanes`."""
     return thread // lanes * lanes * each + thread % lanes
 
@@ -75,7 +75,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
     ):
         """Compute the trial point v = u + t_c d."""
         thread, c = wp.tid()
-        length, first = scalar(t[c]), first_of(thread, lanes, each)
+        length, first = scalar(t[c]), first_row(thread, lanes, each)
         for k in range(each):
             r = first + lanes * k
             if r < u.shape[0]:
@@ -94,7 +94,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
         """Project the gradient; add to sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
         thread, c = wp.tid()
         own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-        first = first_of(thread, lanes, each)
+        first = first_row(thread, lanes, each)
         for i in range(first, wp.min(first + lanes * each, held.shape[0]), lanes):
             x = vec(total[3 * i, c], total[3 * i + 1, c], total[3 * i + 2, c])
             y = x - vec(constant[3 * i, c], constant[3 * i + 1, c], constant[3 * i + 2, c])
@@ -118,7 +118,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
 
 
 @cache
-def multiply_of(device: Device, pairs: int) -> wp.Kernel:
+def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
     """Build the kernel `multiply` for a single load case, launched over (products, threads of rows)."""
     scalar, m, spread = device.scalar, pairs, spread_of(device, 1)
     lanes, each = spread.lanes, spread.each
@@ -141,7 +141,7 @@ def multiply_of(device: Device, pairs: int) -> wp.Kernel:
         pair = product % m
         if product < 2 * m and pair >= known[0]:
             return  # uniform over the warp, so `summed` below stays valid
-        total, first = wp.float64(0.0), first_of(thread, lanes, each)
+        total, first = wp.float64(0.0), first_row(thread, lanes, each)
         for k in range(each):
             r = first + lanes * k
             if r < g.shape[0]:

@@ -13,7 +13,7 @@ import warp as wp
 
 from ..discretisation.problem import Problem
 from ..runtime.columns import combine_columns, compute_dots
-from .lbfgs_kernels import KEPT, LEAST_KEPT, MOST_KEPT, OVERSHOOT
+from .lbfgs_kernels import DEFAULT_BACKTRACK, MAX_BACKTRACK, MIN_BACKTRACK, OVERSHOOT
 from .newton_cg import Direction
 
 
@@ -48,7 +48,7 @@ def backtrack_by_slopes(ahead: Any, promised: Any) -> Any:
     with np.errstate(invalid="ignore", divide="ignore"):
         kept = np.divide(promised, np.add(promised, ahead))
     known = np.greater(promised, 0.0) & np.isfinite(ahead)
-    return np.clip(np.where(known, kept, KEPT), LEAST_KEPT, MOST_KEPT)
+    return np.clip(np.where(known, kept, DEFAULT_BACKTRACK), MIN_BACKTRACK, MAX_BACKTRACK)
 
 
 def search(problem: Problem, u: wp.array, direction: Direction, settings: Search = Search()) -> np.ndarray:
@@ -63,7 +63,7 @@ def search(problem: Problem, u: wp.array, direction: Direction, settings: Search
     low, high = np.zeros(len(t)), np.full(len(t), np.inf)
     slope_low, slope_high = -promised, np.full(len(t), np.inf)
     found, refinements = np.zeros(len(t), bool), np.zeros(len(t), int)
-    trial = problem.device.zeros(*u.shape)
+    trial = problem.device.allocate(*u.shape)
     for _ in range(settings.trials):
         g = problem.gradient(combine_columns(problem.device, u, t, direction.d, trial))
         problem.constraint.project(g)
@@ -79,6 +79,6 @@ def search(problem: Problem, u: wp.array, direction: Direction, settings: Search
         if found.all():
             break
         with np.errstate(invalid="ignore"):
-            share = np.clip(slope_low / (slope_low - slope_high), LEAST_KEPT, MOST_KEPT)
+            share = np.clip(slope_low / (slope_low - slope_high), MIN_BACKTRACK, MAX_BACKTRACK)
             t = np.where(found, low, low + share * (high - low))
     return np.where(low >= settings.shortest, low, 0.0)

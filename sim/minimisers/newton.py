@@ -70,7 +70,7 @@ def find_equilibrium(
     outcome = np.full(count, Outcome.BUDGET, object)
     iterations, residual = np.zeros(count, int), np.full(count, np.inf)
     result, u, before, live = wp.clone(start), wp.clone(start), start, np.arange(count)
-    gap, open_gap = problem.gap(u)
+    gap, open_gap = problem.compute_gap(u)
     taken, failed = np.ones(count), np.zeros(count, bool)
     first, best, (idle, still) = np.zeros(count), np.full(count, np.inf), np.zeros((2, count), int)
     last_digit = np.finfo(device.precision).eps
@@ -80,7 +80,7 @@ def find_equilibrium(
         g, free, scale = problem.residual(u)
         first[live] = scale if step == 0 else first[live]
         if step and open_gap.any():  # projected directions keep closed constraints closed
-            gap, open_gap = problem.gap(u)
+            gap, open_gap = problem.compute_gap(u)
         vanished = scale <= last_digit**2 * first[live]
         share = compute_relative(free, np.where(vanished, 0.0, scale))
         bad = ~np.isfinite(share)
@@ -165,4 +165,4 @@ def _nearest(device: Device, u: wp.array) -> wp.array:
     """Return displacements u (3N, b) with the last digit of each changed, up or down at random."""
     values = u.numpy()
     sign = np.random.default_rng(0).choice([-1.0, 1.0], (len(values), 1))
-    return device.array(values * (1.0 + sign * np.finfo(device.precision).eps))
+    return device.upload(values * (1.0 + sign * np.finfo(device.precision).eps))

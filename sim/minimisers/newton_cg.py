@@ -98,10 +98,10 @@ class NewtonCG:
 def compute_right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None) -> tuple[wp.array, np.ndarray]:
     """Compute -P (g + K gap) (3N, b) [N] at the last linearisation, and which load cases (b,) have a gap to close."""
     device, columns = problem.device, g.shape[1]
-    rhs = combine_columns(device, device.zeros(*g.shape), -1.0, g, wp.empty_like(g))
+    rhs = combine_columns(device, device.allocate(*g.shape), -1.0, g, wp.empty_like(g))
     if gap is None:
         return rhs, np.zeros(columns, bool)
-    pull = device.zeros(*g.shape)
+    pull = device.allocate(*g.shape)
     problem.add_curvature(gap, pull)
     problem.constraint.project(pull)
     return combine_columns(device, rhs, -1.0, pull, rhs), compute_norms(device, gap) > 0.0

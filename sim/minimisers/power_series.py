@@ -54,7 +54,7 @@ def mix_columns(device: Device, x: wp.array, weight: np.ndarray) -> wp.array:
     groups = x.shape[1] // many
     out = wp.empty((x.shape[0], groups * wanted), dtype=x.dtype, device=device.name)
     if device.on_cuda:
-        device.launch(build_mixing_kernel(device), (x.shape[0], groups), [x, device.array(weight)], [out])
+        device.launch(build_mixing_kernel(device), (x.shape[0], groups), [x, device.upload(weight)], [out])
     else:  # Warp's single CPU thread takes four times as long
         np.matmul(x.numpy().reshape(-1, many), weight, out=out.numpy().reshape(-1, wanted))
     return out
@@ -109,9 +109,9 @@ class SeriesReading:
     def _times(self) -> Callable[[wp.array, wp.array], None]:
         return build_product(self.answers, self.device)
 
-    def of(self, force: wp.array) -> np.ndarray:
+    def read(self, force: wp.array) -> np.ndarray:
         """Compute the functionals (b, r) of the linear response to forces (3N, b) [N]."""
-        out = self.device.zeros(self.count, force.shape[1])
+        out = self.device.allocate(self.count, force.shape[1])
         self._times(force, out)
         return out.numpy().T
 
@@ -136,7 +136,7 @@ def expand_taylor(
         Length of an element's edges [m].
     """
     device = problem.device
-    unbalanced = problem.gradient(device.zeros(problem.rows, loads))
+    unbalanced = problem.gradient(device.allocate(problem.rows, loads))
     problem.constraint.project(unbalanced)
     force = _times(device, -1.0, unbalanced)
     yield force
@@ -148,7 +148,7 @@ def expand_taylor(
     found = [moved]
     for order in range(2, orders + 1):
         direction = choose_unit_directions(sizes, order)
-        sums = [device.zeros(problem.rows, len(size) * len(direction)) for _ in range(2)]
+        sums = [device.allocate(problem.rows, len(size) * len(direction)) for _ in range(2)]
         for k, term in enumerate(found, start=1):
             combine_columns(
                 device, sums[k % 2], 1.0, mix_columns(device, term, compute_products(direction, k)), sums[k % 2]
@@ -170,7 +170,7 @@ def expand_taylor(
 
 def _resisting(problem: Problem, u: wp.array) -> wp.array:
     """Compute the internal forces (3N, b) [N] at displacements (3N, b) [m], without loads, on the free unknowns."""
-    out = problem.device.zeros(*u.shape)
+    out = problem.device.allocate(*u.shape)
     for term in problem.terms:
         if not term.constant:
             term.add_gradient(u, out)

@@ -15,7 +15,7 @@ from .lbfgs_kernels import FREE, OWN, PAIRS, SUMS, WHOLE, build_kernels
 
 
 @dataclass(frozen=True, eq=False)
-class Balance:
+class ResidualArrays:
     """Residual g (3N, b) [N] on the device, and the `sums` (SUMS, b) that L-BFGS decides by.
 
     `own` holds square norms (terms, b) of the gradients of the terms that are not constant. `part` (3N, b) is
@@ -28,16 +28,20 @@ class Balance:
     own: wp.array
 
 
-def allocate_balance(problem: Problem, count: int) -> Balance:
+def allocate_balance(problem: Problem, count: int) -> ResidualArrays:
     """Allocate the arrays of a `Balance` for `count` load cases."""
     device = problem.device
     sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
-    return Balance(device.zeros(problem.rows, count), device.zeros(problem.rows, count), sums, own)
+    return ResidualArrays(device.allocate(problem.rows, count), device.allocate(problem.rows, count), sums, own)
 
 
-def compute_balance(
-    problem: Problem, v: wp.array, constant: wp.array, d: wp.array | None = None, workspace: Balance | None = None
-) -> Balance:
+def compute_residual_arrays(
+    problem: Problem,
+    v: wp.array,
+    constant: wp.array,
+    d: wp.array | None = None,
+    workspace: ResidualArrays | None = None,
+) -> ResidualArrays:
     """Compute the residual at v (3N, b) [m] of a batch with `constant` gradients (3N, b) [N], and its product with d.
 
     The result is written to `workspace`, if it is given.
@@ -60,7 +64,7 @@ def compute_balance(
     spread = lbfgs_trial_kernels.spread_of(device, count)
     device.launch(
         lbfgs_trial_kernels.build_kernels(device, spread).finish,
-        (spread.threads(rows // 3), count),
+        (spread.count_threads(rows // 3), count),
         inputs,
         [workspace.g, workspace.sums],
     )
@@ -70,11 +74,11 @@ def compute_balance(
 def compute_constant_gradients(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
     """Sum the gradients (3N, b) [N] of the constant terms, and compute the square norm (terms, b) of each."""
     device = problem.device
-    total = device.zeros(*u.shape)
+    total = device.allocate(*u.shape)
     square = wp.zeros((len(problem.terms), u.shape[1]), dtype=wp.float64, device=device.name)
     for number, term in enumerate(problem.terms):
         if term.constant:
-            own = device.zeros(*u.shape)
+            own = device.allocate(*u.shape)
             term.add_gradient(u, own)
             add_dots(device, own, own, square[number])
             combine_columns(device, total, 1.0, own, total)
@@ -103,14 +107,14 @@ class ResidualState:
         """True (b,) where residual and scale are finite; forces may overflow."""
         return np.isfinite(self.free) & np.isfinite(self.scale)
 
-    def rows(self, device: Device, stay: np.ndarray) -> ResidualState:
+    def select(self, device: Device, stay: np.ndarray) -> ResidualState:
         """Return the state of some load cases (k,)."""
         u, g = (gather_columns(device, array, stay) for array in (self.u, self.g))
         return ResidualState(u, g, self.free[stay], self.scale[stay])
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class ResidualEvaluator:
     """Callable that evaluates the residuals of the batch that a problem has begun.
 
     `constant` (3N, b) [N] is the summed gradient of the constant terms, `square` (b,) the largest square norm of one.
@@ -122,23 +126,25 @@ class Judge:
 
     def __call__(self, u: wp.array) -> ResidualState:
         """Return the residuals of states u (3N, b) [m]."""
-        found = compute_balance(self.problem, u, self.constant)
+        found = compute_residual_arrays(self.problem, u, self.constant)
         sums = found.sums.numpy()
         with np.errstate(invalid="ignore", over="ignore"):
             largest = np.maximum(self.square, found.own.numpy().max(axis=0, initial=0.0))
             largest = np.maximum(largest, sums[WHOLE] - sums[FREE])
             return ResidualState(u, found.g, np.sqrt(sums[FREE]), np.sqrt(largest))
 
-    def rows(self, stay: np.ndarray) -> Judge:
+    def select(self, stay: np.ndarray) -> ResidualEvaluator:
         """Keep only some load cases (k,), in the problem too, and return their judge."""
         self.problem.keep(stay)
-        return Judge(self.problem, gather_columns(self.problem.device, self.constant, stay), self.square[stay])
+        return ResidualEvaluator(
+            self.problem, gather_columns(self.problem.device, self.constant, stay), self.square[stay]
+        )
 
 
-def build_judge(problem: Problem, u: wp.array) -> Judge:
+def build_evaluator(problem: Problem, u: wp.array) -> ResidualEvaluator:
     """Build the judge of the batch that the problem has begun, with start u (3N, b) [m]."""
     constant, loud = compute_constant_gradients(problem, u)
-    return Judge(problem, constant, loud.numpy().max(axis=0, initial=0.0))
+    return ResidualEvaluator(problem, constant, loud.numpy().max(axis=0, initial=0.0))
 
 
 def compute_relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ class _Some:
     tensor: np.ndarray
 
 
-def second_order(
+def compute_second_order(
     problem: Problem,
     moved: np.ndarray,
     answers: np.ndarray,

@@ -19,7 +19,7 @@ def wait():
     ...
 
 
-def folded(fold: str) -> str:
+def write_fold(fold: str) -> str:
     """Return C++ code of a reduction over the threads, bitwise equal in each: `fold` combines `value` and `other`."""
     return f"""
 #if defined(__CUDA_ARCH__)
@@ -41,13 +41,13 @@ def folded(fold: str) -> str:
 """
 
 
-@wp.func_native(snippet=folded("value + other"))
+@wp.func_native(snippet=write_fold("value + other"))
 def total(value: wp.float64) -> wp.float64:
     """Return the sum over the threads."""
     ...
 
 
-@wp.func_native(snippet=folded("fmax(value, other)"))
+@wp.func_native(snippet=write_fold("fmax(value, other)"))
 def largest(value: wp.float64) -> wp.float64:
     """Return the largest of the threads' values."""
     ...

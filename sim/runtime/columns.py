@@ -182,7 +182,7 @@ def find_widest_workspace(device: Device, count: int) -> int:
     return max(count // WIDTHS[-1] * WIDTHS[-1], *(width for width in WIDTHS if width <= count))
 
 
-def is_kept(width: int) -> bool:
+def is_workspace_width(width: int) -> bool:
     """Return True if a workspace may have this width."""
     return width in WIDTHS or width % WIDTHS[-1] == 0
 
@@ -194,11 +194,13 @@ class Workspaces:
         self._make, self._device = make, device
         self._arrays: dict[int, wp.array] = {}
 
-    def of(self, columns: int) -> wp.array:
+    def get_array(self, columns: int) -> wp.array:
         """Return the array of this width, to be overwritten by the caller. On the CPU only the last one is kept."""
         if columns not in self._arrays:
             graphs = self._device.on_cuda
-            self._arrays = {width: array for width, array in self._arrays.items() if graphs and is_kept(width)}
+            self._arrays = {
+                width: array for width, array in self._arrays.items() if graphs and is_workspace_width(width)
+            }
             self._arrays[columns] = self._make(columns)
         return self._arrays[columns]
 
@@ -231,7 +233,7 @@ def combine_columns(device: Device, x: wp.array, factor: np.ndarray | float, y: 
     if isinstance(factor, (int, float)):
         device.launch(kernels.add_multiple, x.shape, [x, factor, y], [out])
     else:
-        device.launch(kernels.combine, x.shape, [x, device.array(factor), y], [out])
+        device.launch(kernels.combine, x.shape, [x, device.upload(factor), y], [out])
     return out
 
 
@@ -260,12 +262,12 @@ def scatter_columns(
 def unstack_columns(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
     """Return the vectors (b, n, 3) at nodes (n,) of x (3N, b), in double precision on the host."""
     out = wp.empty((x.shape[1], len(nodes), 3), dtype=wp.float64, device=device.name)
-    device.launch(build_kernels(device).unstack, out.shape[:2], [x, device.array(nodes, wp.int32)], [out])
+    device.launch(build_kernels(device).unstack, out.shape[:2], [x, device.upload(nodes, wp.int32)], [out])
     return out.numpy()
 
 
 def _index(device: Device, columns: np.ndarray | wp.array) -> wp.array:
-    return columns if isinstance(columns, wp.array) else device.array(columns, wp.int32)
+    return columns if isinstance(columns, wp.array) else device.upload(columns, wp.int32)
 
 
 def _flat(x: wp.array) -> wp.array:

@@ -50,11 +50,11 @@ class Device:
         """True if arrays are on a GPU."""
         return self.name.startswith("cuda")
 
-    def zeros(self, *shape: int) -> wp.array:
+    def allocate(self, *shape: int) -> wp.array:
         """Return a zeroed array of the scalar type."""
         return wp.zeros(shape, dtype=self.scalar, device=self.name)
 
-    def array(self, values: np.ndarray, dtype: Any = None) -> wp.array:
+    def upload(self, values: np.ndarray, dtype: Any = None) -> wp.array:
         """Return a copy of `values` on the device, of the scalar type unless `dtype` is given."""
         return wp.array(np.ascontiguousarray(values), dtype=dtype or self.scalar, device=self.name)
 

@@ -44,7 +44,7 @@ class MeshBytes:
     inflation: int = 100
     small: int = 2**28
 
-    def of(self, size: int) -> int:
+    def limit_bytes(self, size: int) -> int:
         """Return the inflated size [bytes] that is allowed for a file of `size` bytes.
 
         Raises

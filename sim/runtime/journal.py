@@ -92,7 +92,7 @@ class Journal:
         _, last = next(reversed(self._places), ("row", -1))
         self.add(("row", last + 1), json.dumps(asdict(row)).encode())
 
-    def rows(self, kind: type[R]) -> list[R]:
+    def read_rows(self, kind: type[R]) -> list[R]:
         """Return the appended rows, as dataclasses of one kind; InputError as `read`."""
         return [kind(**json.loads(self.read(batch))) for batch in sorted(self._places)]
 

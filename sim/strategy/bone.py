@@ -22,15 +22,15 @@ def solve_off_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Seq
     if isinstance(strategy, NoMotionStep) or not problem.barriers:
         return strategy.solve(cases, guesses)
     problem.begin(cases)
-    on_bone = problem.overlaps(device.zeros(problem.rows, count))[1]
+    on_bone = problem.find_overlaps(device.allocate(problem.rows, count))[1]
     if not on_bone.any():
         return strategy.solve(cases, guesses)
-    u = device.array(guesses[-1]) if guesses else device.zeros(problem.rows, count)
+    u = device.upload(guesses[-1]) if guesses else device.allocate(problem.rows, count)
     none, outcome = np.zeros(count, int), np.full(count, Outcome.ON_BONE, object)
     answer = SolverResult(u, outcome, none, np.full(count, np.inf), np.zeros(count), strategy.inversion.count(u), 0)
     anew, clear = np.zeros(count, bool), np.flatnonzero(~on_bone)
     if len(clear):
-        found = strategy.solve(cases.rows(clear), [guess[:, clear] for guess in guesses])
+        found = strategy.solve(cases.select(clear), [guess[:, clear] for guess in guesses])
         answer.put(clear, found, device)
         anew[clear] = found.anew
     return replace(answer, gone=answer.reached, anew=anew)

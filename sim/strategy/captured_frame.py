@@ -18,7 +18,7 @@ from ..linalg.pcg import Preconditioner
 from ..local_solvers.strained_frame import UpdatedModel, UpdatedPreconditioner, update_model_at
 from ..local_solvers.strained_part import StrainedPart
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
-from ..minimisers.lbfgs_state import LbfgsState, Workspace, allocate_ground, allocate_state
+from ..minimisers.lbfgs_state import LbfgsState, Workspace, allocate_memory, allocate_state
 from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
 
@@ -189,16 +189,16 @@ class CapturedFrame:
         if part is not None:
             part.prepare()
             self._knowing = UpdatedPreconditioner(preconditioner, problem, part.size)
-        self._workspace = Workspace(problem, self._knowing or preconditioner, 1, allocate_ground(problem, 1))
+        self._workspace = Workspace(problem, self._knowing or preconditioner, 1, allocate_memory(problem, 1))
         self._workspace.columns["tolerance"].fill_(tolerance)
         self._workspace.prepare()
-        self._before = allocate_state(problem, 1, allocate_ground(problem, 1))
-        self._past = problem.device.zeros(problem.rows, 1)
+        self._before = allocate_state(problem, 1, allocate_memory(problem, 1))
+        self._past = problem.device.allocate(problem.rows, 1)
         name = problem.device.name
         self._tried, self._going, self._inverted = (wp.zeros(1, dtype=wp.int32, device=name) for _ in range(3))
         self._given, self._up = self._both_sides(GIVEN)
         self._out, self._down = self._both_sides(HEAD + problem.rows)
-        self._imprint = skin.imprint(wp.array(ptr=self._given.ptr, dtype=wp.vec4d, shape=(1,), device=name))
+        self._imprint = skin.build_footprints(wp.array(ptr=self._given.ptr, dtype=wp.vec4d, shape=(1,), device=name))
         self._graph: wp.Graph | None = None
 
     @property
@@ -283,7 +283,7 @@ class CapturedFrame:
         wp.copy(self._down, self._out)
 
     def _iterate(self) -> None:
-        self._workspace.once()
+        self._workspace.run_iteration()
         inputs = [self._workspace.columns["status"]]
         self._device.launch(build_kernels(self._device).look, (1,), inputs, [self._tried, self._going])
 

@@ -23,7 +23,7 @@ ON = 2.0  # Upper bound of a: twice the last step.
 
 def as_pushes(loads: Loads) -> np.ndarray | None:
     """Return point [m], force [N] and footprint [m] (B, 7) of each load; None if anything but a push acts."""
-    push = loads.only(Pushed)
+    push = loads.get_only(Pushed)
     if push is None:
         return None
     return np.column_stack([push.point, push.force, push.footprint])

@@ -105,7 +105,7 @@ class FrameSequence:
         self._here: Callable[[], Kept | None] = _gone
         self._there: Callable[[], Kept | None] = _gone
 
-    def answer(self, loads: Loads, start: Deformation, guess: Callable[[], np.ndarray]) -> Deformation | None:
+    def solve_frame(self, loads: Loads, start: Deformation, guess: Callable[[], np.ndarray]) -> Deformation | None:
         """Solve for a push from a start.
 
         `guess` checks the start and returns its displacements (3N, 1) [m].
@@ -133,15 +133,15 @@ class FrameSequence:
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
         self._last = self._here = _gone
         found = self._frame.push(point, radius, force, share)
-        if found[STATUS] != DONE or self._inversion.doubtful(found[INVERTED]):
+        if found[STATUS] != DONE or self._inversion.find_doubtful(found[INVERTED]):
             return None
         self._frame.update_model(found[STEPS])
         warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEAD:].reshape(1, -1, 3).copy()
         displacement.setflags(write=False)  # a later start uses the copy on the device
-        inverted, fields = found[INVERTED : INVERTED + 1].astype(int), self._diagnostics.strains(self._frame.u)
-        outcome = self._diagnostics.outcomes(np.array([Outcome.CONVERGED]), inverted, fields["strained"])
+        inverted, fields = found[INVERTED : INVERTED + 1].astype(int), self._diagnostics.compute_strains(self._frame.u)
+        outcome = self._diagnostics.mark_outcomes(np.array([Outcome.CONVERGED]), inverted, fields["strained"])
         answer = Deformation(
             displacement=displacement,
             nodes=self._nodes,
@@ -165,8 +165,8 @@ class FrameSequence:
         """Load a start onto the device; return False if it is not usable."""
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
-        u = self._problem.device.array(last)
-        if self._problem.gap(u)[1].any() or self._inversion.doubtful(self._inversion.count(u)).any():
+        u = self._problem.device.upload(last)
+        if self._problem.compute_gap(u)[1].any() or self._inversion.find_doubtful(self._inversion.count(u)).any():
             return False
         here = self._here()
         if here is not None:

@@ -68,7 +68,7 @@ class Needed:
         taken, free = format_gigabytes(self.peak), format_gigabytes(self.free)
         return f"{self.nodes:,} nodes ({self.element}), {loads}: about {taken} of {self.device.name}, {free} free"
 
-    def demand(self, budget: MemoryBudget = BUDGET) -> Needed:
+    def check_fits(self, budget: MemoryBudget = BUDGET) -> Needed:
         """Return itself if it fits.
 
         Raises
@@ -135,7 +135,7 @@ def compute_needed(
 def _unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
     """List the numbers of unknowns that a preconditioner may invert, largest first: of all nodes, or of the corners."""
     corners = int((~anatomy.held).sum())
-    return (int((~space.held(anatomy.held)).sum()), corners) if space.element == "p2" else (corners,)
+    return (int((~space.extend_held(anatomy.held)).sum()), corners) if space.element == "p2" else (corners,)
 
 
 def _inverted(unknowns: tuple[int, ...], device: Device) -> int:

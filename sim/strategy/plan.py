@@ -79,15 +79,15 @@ class SolverPlan:
     load_steps: int
     batch: int
 
-    def local(self, count: int) -> SolverStep | None:
+    def choose_local(self, count: int) -> SolverStep | None:
         """Return the local solver that is tried first for `count` loads together, if any."""
         return self.many if count >= WORTH else self.single if count == 1 else None
 
-    def steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
+    def list_steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
         """List the solvers for `count` loads together, in order; `imposed` if the loads prescribe motion."""
         if imposed or not self.quick:
             return (SolverStep.NEWTON,)
-        first = self.local(count)
+        first = self.choose_local(count)
         return (*([] if first is None else [first]), SolverStep.LBFGS, SolverStep.NEWTON)
 
     def explain(self) -> tuple[str, ...]:

@@ -78,7 +78,7 @@ class Shares:
     gaps: np.ndarray
 
     @classmethod
-    def at_rest(cls, first: float, gaps: np.ndarray) -> Self:
+    def start(cls, first: float, gaps: np.ndarray) -> Self:
         """Return cases at the fraction 0, with a `first` step of this length."""
         return cls(np.zeros(len(gaps)), np.full(len(gaps), first), gaps)
 

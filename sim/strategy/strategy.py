@@ -21,7 +21,7 @@ from ..local_solvers.contact_descent import ContactDescent
 from ..local_solvers.contact_preconditioner import build_contact_preconditioner
 from ..local_solvers.strained_part import ON_CARD
 from ..minimisers.lbfgs import Lbfgs, restore_history
-from ..minimisers.lbfgs_kernels import BROKEN, DONE
+from ..minimisers.lbfgs_kernels import DONE, NOT_FINITE
 from ..minimisers.newton import find_equilibrium
 from ..minimisers.newton_cg import NewtonCG
 from ..minimisers.residual import measure_residual
@@ -113,9 +113,9 @@ class Strategy:
         found = ContactDescent(self.problem, self.preconditioner, barrier)
         return replace(found, strains=ON_CARD, replays=True) if self.problem.device.on_cuda else found
 
-    def local(self, count: int) -> BatchElimination | Alone | None:
+    def get_local_solver(self, count: int) -> BatchElimination | Alone | None:
         """Return the local solver for `count` loads, if there is one."""
-        step = self.plan.local(count)
+        step = self.plan.choose_local(count)
         return None if step is None else self.near() if step is SolverStep.NEAR else self.alone
 
     @cached_property
@@ -149,25 +149,25 @@ class Strategy:
             if problem.barriers and astray.any():
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
-            answer = self._whole(cases, device.array(np.where(astray, 0.0, guess)), learnt)
-            lost = np.where(answer.good, self.inversion.doubtful(answer.inverted), self._lost(answer))
+            answer = self._whole(cases, device.upload(np.where(astray, 0.0, guess)), learnt)
+            lost = np.where(answer.good, self.inversion.find_doubtful(answer.inverted), self._lost(answer))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
-                some = replace(cases.rows(again), anew=np.ones(len(again), bool))
+                some = replace(cases.select(again), anew=np.ones(len(again), bool))
                 problem.begin(some)
                 answer.put(again, self._whole(some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
         lost = np.flatnonzero(self._lost(answer))
         if len(lost):
-            found = self._in_steps(cases.rows(lost), answer, lost)
+            found = self._in_steps(cases.select(lost), answer, lost)
             astray[lost] |= found.reached > answer.reached[lost]
             answer.put(lost, found, device)
         return replace(answer, gone=answer.reached, anew=astray) if problem.barriers else answer
 
     def _acts(self, count: int) -> np.ndarray:
         """Return the cases (b,) of the begun batch on which a force or imposed motion acts in the undeformed state."""
-        rest = self.problem.device.zeros(self.problem.rows, count)
+        rest = self.problem.device.allocate(self.problem.rows, count)
         loud = wp.zeros_like(rest)
         for term in self.problem.terms:
             if not term.passive:
@@ -175,8 +175,8 @@ class Strategy:
         with run_in_order(self.problem.device):
             acts = to_host((view(loud) != 0.0).any(0))
         if not acts.all():
-            acts = np.logical_or.reduce([acts, *(term.buried(rest) for term in self.problem.barriers)])
-        return acts | self.problem.gap(rest)[1] if self.problem.constraint.imposes else acts
+            acts = np.logical_or.reduce([acts, *(term.find_buried(rest) for term in self.problem.barriers)])
+        return acts | self.problem.compute_gap(rest)[1] if self.problem.constraint.imposes else acts
 
     def _rested(self, start: wp.array) -> wp.array:
         """Return the start (3N, b) [m], zero where no load acts: a float32 descent would not reach zero."""
@@ -189,12 +189,12 @@ class Strategy:
     def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Select each case's first guess (3N, B) [m] with the fewest inverted elements; which cases (B,) have none."""
         device = self.problem.device
-        guess, inverted = guesses[0], self.inversion.count(device.array(guesses[0]))
+        guess, inverted = guesses[0], self.inversion.count(device.upload(guesses[0]))
         for other in guesses[1:]:
             if inverted.any():
-                fewer = self.inversion.count(device.array(other))
+                fewer = self.inversion.count(device.upload(other))
                 guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
-        return guess, self.inversion.doubtful(inverted)
+        return guess, self.inversion.find_doubtful(inverted)
 
     def _lost(self, answer: SolverResult) -> np.ndarray:
         """Return the cases (B,) that another solver may solve; at round-off none comes closer to equilibrium."""
@@ -210,15 +210,15 @@ class Strategy:
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         # The undeformed state satisfies the constraints, unless the batch imposes motion.
-        imposed = problem.constraint.imposes or (start is not None and bool(problem.gap(start)[1].any()))
-        start = device.zeros(problem.rows, count) if start is None else start
+        imposed = problem.constraint.imposes or (start is not None and bool(problem.compute_gap(start)[1].any()))
+        start = device.allocate(problem.rows, count) if start is None else start
         if problem.barriers:
             return self._moved(cases, start)
         if problem.paced:  # history would not help the next frame
             learnt = None
-        if SolverStep.LBFGS not in self.plan.steps(count, imposed):
+        if SolverStep.LBFGS not in self.plan.list_steps(count, imposed):
             return self._thorough(start, self.accuracy.outer)
-        near = self.local(count)
+        near = self.get_local_solver(count)
         descents = [(self.lbfgs, learnt)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
         answer = SolverResult(
@@ -230,13 +230,13 @@ class Strategy:
             found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), left, known)
             left -= int(found.steps.max(initial=0))
             outcome = np.full(len(index), Outcome.BUDGET, object)
-            outcome[found.status == DONE], outcome[found.status == BROKEN] = Outcome.CONVERGED, Outcome.NOT_FINITE
+            outcome[found.status == DONE], outcome[found.status == NOT_FINITE] = Outcome.CONVERGED, Outcome.NOT_FINITE
             answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
             gained = found.learnt
             index = index[found.left]
             if len(index) == 0:
                 break
-            problem.begin(cases.rows(index))
+            problem.begin(cases.select(index))
             start = gather_columns(device, found.u, found.left)
         else:
             answer.put(index, self._thorough(start, self.accuracy.outer), device)
@@ -249,7 +249,7 @@ class Strategy:
         """
         problem, touch, device = self.problem, self.contact, self.problem.device
         problem.begin(cases)
-        if touch is None or problem.constraint.imposes or problem.gap(start)[1].any():
+        if touch is None or problem.constraint.imposes or problem.compute_gap(start)[1].any():
             return self._closed(cases, start, outer, gaps)
         start, count, few = self._rested(start), len(cases.loads), min(self.gaps.alone, outer)
         found = touch.descend(start, np.full(count, self.accuracy.tolerance), few)
@@ -262,11 +262,11 @@ class Strategy:
 
         near = np.flatnonzero(~answer.good & (found.residual <= self.gaps.nearly))
         for some in batched(near):
-            problem.begin(cases.rows(some))
+            problem.begin(cases.select(some))
             answer.put(some, self._thorough(gather_columns(device, found.u, some), few), device)
         left = np.flatnonzero(~answer.good)
         for some in batched(left):
-            answer.put(some, self._closed(cases.rows(some), gather_columns(device, start, some), outer, gaps), device)
+            answer.put(some, self._closed(cases.select(some), gather_columns(device, start, some), outer, gaps), device)
         return answer
 
     def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
@@ -309,9 +309,9 @@ class Strategy:
         cases = replace(cases, anew=np.ones(len(index), bool))
 
         def raised(part: Cases, share: np.ndarray) -> Cases:
-            return replace(part, loads=part.loads.scaled(share), share=share)
+            return replace(part, loads=part.loads.scale(share), share=share)
 
-        start = device.zeros(problem.rows, len(index))
+        start = device.allocate(problem.rows, len(index))
         found = self._by_steps(cases, start, raised, self.stepping.first, self.accuracy.steps)
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
@@ -334,10 +334,12 @@ class Strategy:
         if len(acting) == count:
             return self._by_steps(cases, start, moved, 1.0, most)
         none, every = np.zeros(count, int), np.full(count, Outcome.CONVERGED, object)
-        answer = SolverResult(device.zeros(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0)
+        answer = SolverResult(
+            device.allocate(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0
+        )
         if len(acting):
             part = gather_columns(device, start, acting)
-            answer.put(acting, self._by_steps(cases.rows(acting), part, moved, 1.0, most), device)
+            answer.put(acting, self._by_steps(cases.select(acting), part, moved, 1.0, most), device)
         return answer
 
     def _by_steps(
@@ -355,15 +357,15 @@ class Strategy:
         the way round-off is accepted as well.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
-        gaps = np.maximum.reduce([np.zeros(count), *(term.gaps(cases) for term in problem.barriers)])
-        shares = Shares.at_rest(first, gaps)
+        gaps = np.maximum.reduce([np.zeros(count), *(term.count_gaps(cases) for term in problem.barriers)])
+        shares = Shares.start(first, gaps)
         u, left, done = wp.clone(start), most, 1
         none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
         answer = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
         outer = self.accuracy.outer
         wanted, outer = (outer, outer) if problem.barriers else (self.stepping.aimed, min(self.stepping.most, outer))
         while left >= 0:
-            strides = [term.stride(aimed(cases, shares.reached), u) for term in problem.barriers]
+            strides = [term.compute_stride(aimed(cases, shares.reached), u) for term in problem.barriers]
             shorter, going = shares.limit(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
             rows = np.flatnonzero(going & (answer.iterations < self.accuracy.most))
             patience = self.stepping.patience * self.accuracy.inner * done
@@ -371,7 +373,7 @@ class Strategy:
                 break
             aim, gone = shares.propose_shares(rows)
             left -= int(shorter[rows].any())
-            found = self._touching(aimed(cases.rows(rows), aim), gather_columns(device, u, rows), outer, gone)
+            found = self._touching(aimed(cases.select(rows), aim), gather_columns(device, u, rows), outer, gone)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
             shares.take(rows, aim, good)
@@ -390,10 +392,10 @@ class Strategy:
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if problem.barriers and len(short) < len(reached):
             problem.begin(aimed(cases, np.ones(len(reached))))
-            buried = np.logical_or.reduce([term.buried(u) for term in problem.barriers])
-            pierced = (problem.overlaps(u)[0] | buried) & (reached == 1.0)
+            buried = np.logical_or.reduce([term.find_buried(u) for term in problem.barriers])
+            pierced = (problem.find_overlaps(u)[0] | buried) & (reached == 1.0)
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
-            problem.begin(cases.rows(short))
+            problem.begin(cases.select(short))
             answer.residual[short] = measure_residual(problem, gather_columns(problem.device, u, short))
         return replace(answer, inverted=self.inversion.count(u))

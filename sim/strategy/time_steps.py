@@ -24,7 +24,7 @@ class NoMotionStep:
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
         """Return the last of the guesses (3N, B) [m] unchanged; undeformed without guesses."""
         device, count = self.problem.device, len(cases.loads)
-        u = device.array(guesses[-1]) if guesses else device.zeros(self.problem.rows, count)
+        u = device.upload(guesses[-1]) if guesses else device.allocate(self.problem.rows, count)
         outcome, none = np.full(count, Outcome.CONVERGED, object), np.zeros(count, int)
         return SolverResult(
             u, outcome, none, np.zeros(count), np.ones(count), self.inversion.count(u), 0, gone=np.zeros(count)

@@ -89,13 +89,13 @@ def build_pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> F
     InputError
         A footprint that does not touch the surface.
     """
-    causes = loads.every(Pushed)
+    causes = loads.get_all(Pushed)
     if not causes:
         return None
-    force = device.zeros(3 * len(skin.nodes), len(loads))
+    force = device.allocate(3 * len(skin.nodes), len(loads))
     for cause in causes:
         footprints = skin.press(cause.point, cause.footprint)
-        inputs = [footprints.weight, footprints.sums, device.array(cause.force, wp.float64)]
+        inputs = [footprints.weight, footprints.sums, device.upload(cause.force, wp.float64)]
         device.launch(build_kernels(device).spread, footprints.weight.shape, inputs, [force])
     return Forces(skin.numbers, force)
 
@@ -108,13 +108,13 @@ def build_nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | 
     InputError
         Forces of another mesh.
     """
-    cause = loads.of(Nodal)
+    cause = loads.get(Nodal)
     if cause is None:
         return None
     check_field("Nodal.force", cause.force, vertices)
     nodes = np.flatnonzero(cause.force.any(axis=(0, 2)))
     force = cause.force[:, nodes].reshape(len(loads), 3 * len(nodes)).T
-    return Forces(device.array(nodes, wp.int32), device.array(force))
+    return Forces(device.upload(nodes, wp.int32), device.upload(force))
 
 
 class DeadForce:

@@ -78,19 +78,19 @@ class ElasticTerm:
         sizes = np.zeros(0, np.int32) if elements.size is None else elements.size
         self._rest, self._tissue = (elements, *lame.T), (law, coefficients)
         for source in sources:
-            law, count = source.law(law, count), count + source.count
+            law, count = source.build_law(law, count), count + source.count
         self._kernels = build_kernels(law, device, size, count)
         self._of = law, device, size, count
         shape = self._shape = [
-            device.array(sizes, wp.int32),
-            device.array(elements.table, wp.int32),
-            device.array(elements.gradient, device.vector),
+            device.upload(sizes, wp.int32),
+            device.upload(elements.table, wp.int32),
+            device.upload(elements.gradient, device.vector),
         ]
-        weight = self._weight = device.array(elements.weight)
-        constants = device.array(coefficients, wp.types.vector(length=own, dtype=device.scalar))
-        self._constants = device.array(coefficients) if sources else constants
+        weight = self._weight = device.upload(elements.weight)
+        constants = device.upload(coefficients, wp.types.vector(length=own, dtype=device.scalar))
+        self._constants = device.upload(coefficients) if sources else constants
         points = elements.weight.shape
-        self._numbers = Workspaces(lambda columns: device.zeros(*points, count, columns), device)
+        self._numbers = Workspaces(lambda columns: device.allocate(*points, count, columns), device)
         self._strains = Workspaces(lambda columns: wp.empty((*points, columns), device.matrix, device.name), device)
         every = len(elements.table)
         ends = np.linspace(0, every, (1 if device.on_cuda else choose_threads(every)) + 1).astype(int).tolist()
@@ -127,7 +127,7 @@ class ElasticTerm:
     def begin(self, cases: Cases) -> None:
         """Compute the varying coefficients, if there are any sources."""
         if self._sources:
-            self._cases, numbers = cases, self._numbers.of(len(cases.loads))
+            self._cases, numbers = cases, self._numbers.get_array(len(cases.loads))
             points, own = numbers.shape[:2], self._tissue[1].shape[1]
             dim = (*points, own, len(cases.loads))
             self._device.launch(build_spreading_kernel(self._device), dim, [self._constants], [numbers])
@@ -138,7 +138,7 @@ class ElasticTerm:
     def keep(self, columns: np.ndarray) -> None:
         """Keep the varying coefficients of these load cases only."""
         if self._cases is not None:
-            self.begin(self._cases.rows(columns))
+            self.begin(self._cases.select(columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """Add the elastic energy: E += sum of w psi(H)."""
@@ -170,10 +170,10 @@ class ElasticTerm:
         elements = self._rest[0]
         count, size = len(elements.table), 3 * elements.table.shape[1]
         dof = (3 * elements.table[:, :, None] + np.arange(3)).reshape(count, size)
-        u = self._device.array(np.repeat(self._at.numpy()[dof.ravel()], size, axis=1))
-        self._apart.linearise(u, self._device.array(np.zeros(size), wp.int32))
-        out = self._device.zeros(count * size, size)
-        self._apart.add_curvature(self._device.array(np.tile(np.eye(size), (count, 1))), out)
+        u = self._device.upload(np.repeat(self._at.numpy()[dof.ravel()], size, axis=1))
+        self._apart.linearise(u, self._device.upload(np.zeros(size), wp.int32))
+        out = self._device.allocate(count * size, size)
+        self._apart.add_curvature(self._device.upload(np.tile(np.eye(size), (count, 1))), out)
         place = np.repeat(dof, size, axis=1).ravel(), np.tile(dof, size).ravel()
         entries = out.numpy().ravel().astype(np.float64)
         return sp.csc_array(sp.coo_array((entries, place), shape=(3 * elements.nodes,) * 2))
@@ -200,8 +200,8 @@ class ElasticTerm:
         tensors = []
         for each in tissues:
             term = ElasticTerm(self.name, law, one, each[None], np.zeros((1, 2)), self._device)
-            out = self._device.zeros(*u.shape)
-            term.add_gradient(self._device.array(u), out)
+            out = self._device.allocate(*u.shape)
+            term.add_gradient(self._device.upload(u), out)
             stress = out.numpy()[3:12].reshape(3, 3, -1).transpose(2, 1, 0).reshape(-1, 9)
             up, down, above, below = np.split(stress[:-1], 4)
             whole = (16.0 * (up + down) - (above + below) - 30.0 * stress[-1]) / (24.0 * BEND**2)
@@ -232,7 +232,7 @@ class ElasticTerm:
         self, some: wp.array, u: wp.array, columns: wp.array, least: wp.array, place: wp.array, out: wp.array
     ) -> None:
         """Add the elements' stiffness increments, as `Strained.add_stiffening`."""
-        coefficients = self._numbers.of(u.shape[1]) if self._sources else self._constants
+        coefficients = self._numbers.get_array(u.shape[1]) if self._sources else self._constants
         inputs = [u, columns, least, place, *self._shape, self._weight, coefficients]
         self._of_some(self._strain_kernels.stiffen, some, inputs, out, np.add)
 
@@ -266,7 +266,7 @@ class ElasticTerm:
         """Return the new memory of a source; elasticity alone has none."""
         if self._cases is None or not self.width:
             return None
-        strains = self._strains.of(u.shape[1])
+        strains = self._strains.get_array(u.shape[1])
         outputs = [strains[part.first : part.first + part.count] for part in self._parts]
         self._each(self._kernels.measure, lambda part: [u, *part.shape], outputs, u.shape[1])
         kept = [source.end(self._cases, strains) for source in reversed(self._sources)]
@@ -275,7 +275,7 @@ class ElasticTerm:
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array, columns: int) -> None:
         """Launch a kernel on all blocks and add the results to `out`."""
         sums = [out, *(wp.zeros_like(out) for _ in self._parts[1:])]
-        numbers = self._numbers.of(columns) if self._sources else None
+        numbers = self._numbers.get_array(columns) if self._sources else None
 
         def all_inputs(part: _Part) -> list:
             own = part.coefficients if numbers is None else numbers[part.first : part.first + part.count]

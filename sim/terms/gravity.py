@@ -55,13 +55,13 @@ def build_weight_change(
         return STANDARD_GRAVITY * mass[:, None] * direction
 
     def forces(loads: Loads) -> Forces | None:
-        cause = loads.of(Posture)
+        cause = loads.get(Posture)
         if cause is None:
             return None
         scan = weights(*normalise_gravity(np.array([effect.direction]))[0], effect.csf_level)
         now = [weights(*row) for row in np.column_stack([normalise_gravity(cause.direction), cause.csf_level]).tolist()]
         change = cause.share[:, None, None] * (np.reshape(now, (-1, count, 3)) - scan)
-        return Forces(device.array(np.arange(count), wp.int32), device.array(change.reshape(-1, 3 * count).T))
+        return Forces(device.upload(np.arange(count), wp.int32), device.upload(change.reshape(-1, 3 * count).T))
 
     return forces
 

@@ -122,9 +122,9 @@ class InertiaTerm:
     def __init__(self, mass: np.ndarray, damping: float, marks: np.ndarray, device: Device):
         self._device, self._kernels = device, build_kernels(device)
         self._damping, self._masses, self.marks = damping, mass, marks
-        self._mass = device.array(mass)
-        self._weight = Workspaces(lambda columns: device.zeros(columns), device)
-        self._aim = Workspaces(lambda columns: device.zeros(3 * len(mass), columns), device)
+        self._mass = device.upload(mass)
+        self._weight = Workspaces(lambda columns: device.allocate(columns), device)
+        self._aim = Workspaces(lambda columns: device.allocate(3 * len(mass), columns), device)
         self._cases: Cases | None = None
 
     def begin(self, cases: Cases) -> None:
@@ -140,22 +140,22 @@ class InertiaTerm:
         drift = steps / (1.0 + self._damping * steps)
         aim = self._start(cases) + drift[:, None, None] * self._velocity(cases)
         passes = np.where(steps > 0.0, steps, np.inf)
-        self._weight.of(count).assign(1.0 / passes**2 + self._damping / passes)
-        self._aim.of(count).assign(np.ascontiguousarray(aim.reshape(count, 3 * len(self._masses)).T))
+        self._weight.get_array(count).assign(1.0 / passes**2 + self._damping / passes)
+        self._aim.get_array(count).assign(np.ascontiguousarray(aim.reshape(count, 3 * len(self._masses)).T))
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep the weights and positions of these load cases only."""
         assert self._cases is not None
-        self.begin(self._cases.rows(columns))
+        self.begin(self._cases.select(columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """Add the energy: E += w/2 |u - a|^2_M."""
-        inputs = [self._mass, self._weight.of(u.shape[1]), self._aim.of(u.shape[1]), u]
+        inputs = [self._mass, self._weight.get_array(u.shape[1]), self._aim.get_array(u.shape[1]), u]
         self._device.launch(self._kernels.add_energy, (-(-len(self._mass) // CHUNK), u.shape[1]), inputs, [out])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """Add the gradient: f += w M (u - a)."""
-        self._add_force(u, self._aim.of(u.shape[1]), 1.0, out)
+        self._add_force(u, self._aim.get_array(u.shape[1]), 1.0, out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
         """Do nothing: the tangent is constant."""
@@ -166,7 +166,9 @@ class InertiaTerm:
 
     def add_diagonal(self, out: wp.array) -> None:
         """Add the diagonal blocks of w M."""
-        self._device.launch(self._kernels.add_blocks, out.shape, [self._mass, self._weight.of(out.shape[1])], [out])
+        self._device.launch(
+            self._kernels.add_blocks, out.shape, [self._mass, self._weight.get_array(out.shape[1])], [out]
+        )
 
     def rest_curvature(self) -> None:
         """Return None, the limit of an infinite step; see `curvature_at_pace` for finite ones."""
@@ -194,8 +196,8 @@ class InertiaTerm:
 
     def _velocity(self, cases: Cases) -> np.ndarray:
         """Return the velocities (B, N, 3) [m/s] at the start of the step."""
-        return cases.past(self.name, (len(self._masses), 3))
+        return cases.get_past(self.name, (len(self._masses), 3))
 
     def _add_force(self, x: wp.array, aim: wp.array, aimed: float, out: wp.array) -> None:
-        inputs = [self._mass, self._weight.of(x.shape[1]), x, aim, aimed]
+        inputs = [self._mass, self._weight.get_array(x.shape[1]), x, aim, aimed]
         self._device.launch(self._kernels.add_force, (len(self._mass), x.shape[1]), inputs, [out])

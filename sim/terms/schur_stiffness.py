@@ -7,7 +7,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..discretisation.term import Cases
-from ..runtime.columns import add_dots, add_rows, combine_columns, is_kept, take_rows
+from ..runtime.columns import add_dots, add_rows, combine_columns, is_workspace_width, take_rows
 from ..runtime.dense_product import build_product
 from ..runtime.device import Device
 
@@ -33,7 +33,7 @@ class Exterior:
     def __init__(self, rows: np.ndarray, stiffness: np.ndarray, count: int, device: Device):
         self._device = device
         self._rest = rows, stiffness, count
-        self._rows = device.array(rows, wp.int32)
+        self._rows = device.upload(rows, wp.int32)
         self._product = build_product(stiffness, device)
         self._rooms: dict[int, tuple[wp.array, wp.array]] = {}
 
@@ -85,8 +85,8 @@ class Exterior:
         """Return rows (m, b) of u and F times them, in a workspace reused for batches of the same width."""
         shape = (len(self._rows), u.shape[1])
         if u.shape[1] not in self._rooms:
-            self._rooms = {width: room for width, room in self._rooms.items() if is_kept(width)}
-            self._rooms[u.shape[1]] = self._device.zeros(*shape), self._device.zeros(*shape)
+            self._rooms = {width: room for width, room in self._rooms.items() if is_workspace_width(width)}
+            self._rooms[u.shape[1]] = self._device.allocate(*shape), self._device.allocate(*shape)
         x, force = self._rooms[u.shape[1]]
         self._product(take_rows(self._device, u, self._rows, x), force)
         return x, force

@@ -27,7 +27,7 @@ class StateSource(Protocol):
         """Number of values per point in the memory that `end` returns."""
         ...
 
-    def law(self, inner: Law, count: int) -> Law:
+    def build_law(self, inner: Law, count: int) -> Law:
         """Wrap `inner`, a law of `count` coefficients, in a law that takes these first and then the source's."""
         ...
 

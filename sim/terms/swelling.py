@@ -128,9 +128,9 @@ class Swelling:
 
     def __init__(self, theta: Callable[[np.ndarray], np.ndarray], swells: np.ndarray, device: Device):
         self._theta, self._device = theta, device
-        self._swells = device.array(swells.astype(np.float64))
+        self._swells = device.upload(swells.astype(np.float64))
 
-    def law(self, inner: Law, count: int) -> Law:
+    def build_law(self, inner: Law, count: int) -> Law:
         """Return the law of the elastic part of the deformation."""
         return build_swollen_law(inner, self._device, count)
 
@@ -146,4 +146,4 @@ class Swelling:
 
     def _wider(self, cases: Cases) -> wp.array:
         """Return r (b,), accurate for small theta too."""
-        return self._device.array(np.expm1(np.log1p(self._theta(cases.loads.times)) / 3.0))
+        return self._device.upload(np.expm1(np.log1p(self._theta(cases.loads.times)) / 3.0))

@@ -180,16 +180,16 @@ class Prony:
     ):
         self._name, self._device = name, device
         self._kernels = build_kernels(law, device, coefficients.shape[1])
-        self._coefficients = device.array(
+        self._coefficients = device.upload(
             coefficients, wp.types.vector(length=coefficients.shape[1], dtype=device.scalar)
         )
         most = max(map(len, pairs))
         filled = np.array([(*row, *[(0.0, 1.0)] * (most - len(row))) for row in pairs]).reshape(-1, most, 2)
-        self._series = [device.array(filled[:, :, 0]), device.array(filled[:, :, 1])]
+        self._series = [device.upload(filled[:, :, 0]), device.upload(filled[:, :, 1])]
         self.width = SIX * (most + 1)
         self._shape = len(coefficients) * points, self.width
 
-    def law(self, inner: Law, count: int) -> Law:
+    def build_law(self, inner: Law, count: int) -> Law:
         """Return the law with a relaxing deviatoric part."""
         return build_relaxing_law(inner, self._device, count)
 
@@ -201,11 +201,11 @@ class Prony:
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray:
         """Return the updated S and H_i."""
-        out = self._device.zeros(len(cases.loads), *self._shape)
+        out = self._device.allocate(len(cases.loads), *self._shape)
         inputs = [*self._series, *self._since(cases), self._coefficients, strains]
         self._device.launch(self._kernels.advance, strains.shape, inputs, [out])
         return out.numpy()
 
     def _since(self, cases: Cases) -> list[wp.array]:
         """Return time steps (b,) [s] and the previous history (b, points, 6 (n + 1))."""
-        return [self._device.array(cases.steps), self._device.array(cases.past(self._name, self._shape))]
+        return [self._device.upload(cases.steps), self._device.upload(cases.get_past(self._name, self._shape))]

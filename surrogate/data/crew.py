@@ -60,9 +60,9 @@ class LazyFem:
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Solve as `Fem.deform`; poses in relaxing tissue are histories, as in `solve_histories`."""
-        if start is None and get_relaxation_series(self.effects) and loads.of(Touching) is not None:
+        if start is None and get_relaxation_series(self.effects) and loads.get(Touching) is not None:
             answer = solve_histories(self.fem, loads)
-            return answer if at is None else answer.at(at)
+            return answer if at is None else answer.restrict(at)
         return self.fem.deform(loads, start, at)
 
 
@@ -134,4 +134,4 @@ def _demand(needed: Sequence[Needed | None], said: Callable[[str], object]) -> N
     for each in dict.fromkeys(map(str, filter(None, needed))):
         said(f"{each}.")
     for each in filter(None, needed):
-        each.demand()
+        each.check_fits()

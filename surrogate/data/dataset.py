@@ -222,7 +222,7 @@ def read_dataset(path: str | Path) -> Dataset:
                 "`sulcus simulate`."
             )
         anatomy, loads = read_embedded(file), read_loads(file)
-        nodes = open_patch(anatomy).nodes if loads.of(Touching) is None else np.zeros(0, int)
+        nodes = open_patch(anatomy).nodes if loads.get(Touching) is None else np.zeros(0, int)
         if not np.array_equal(read_stored(file, "unit/node", "iu", (3 * len(nodes),))[:], np.repeat(nodes, 3)):
             raise InputError(f"{path}: `unit/node` are not the open cortex's nodes: it is damaged. Simulate again.")
         for group, rows in (("answers", len(loads)), ("unit", 3 * len(nodes))):
@@ -318,7 +318,7 @@ def write_loads(file: h5py.File, loads: Loads) -> None:
     """
     group = file.create_group("loads")
     for cause in loads.causes:
-        if not isinstance(cause, tuple(CAUSES.values())) or len(loads.every(type(cause))) > 1:
+        if not isinstance(cause, tuple(CAUSES.values())) or len(loads.get_all(type(cause))) > 1:
             names = ", ".join(type(cause).__name__ for cause in loads.causes)
             raise InputError(f"the loads have the causes {names}: a data set holds each of {', '.join(CAUSES)} once.")
         arrays = group.create_group(type(cause).__name__)

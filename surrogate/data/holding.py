@@ -49,10 +49,10 @@ def solve_histories(deformer: Deformer, loads: Loads) -> Deformation:
     stay = np.flatnonzero([good.good for good in first.outcome] & (loads.times > BROUGHT))
     if not len(stay):
         return replace(first, time=loads.times)
-    last = deformer.deform(loads.rows(stay), start=first.rows(stay))
+    last = deformer.deform(loads.select(stay), start=first.select(stay))
     row = np.arange(len(loads))
     row[stay] = len(loads) + np.arange(len(stay))
-    return replace(join_deformations([first, last]).rows(row), time=loads.times)
+    return replace(join_deformations([first, last]).select(row), time=loads.times)
 
 
 def compute_unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:

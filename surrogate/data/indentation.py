@@ -68,7 +68,7 @@ def get_poses(loads: Loads, tool: BuiltIn) -> np.ndarray:
     InputError
         Loads of another kind.
     """
-    touching, retracted = loads.only(Touching), loads.only(Retracted)
+    touching, retracted = loads.get_only(Touching), loads.get_only(Retracted)
     if touching is not None and touching.pose.shape[1] == 1:
         return touching.pose[:, 0]
     if retracted is None:
@@ -115,7 +115,7 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
 
 def _off(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the nearest places (n, 3) on the undeformed cortex to points (n, 3), and their signed distances (n,) [m]."""
-    near = patch.skin.nearest(points, np.full(len(points), np.inf))[0]
+    near = patch.skin.find_nearest(points, np.full(len(points), np.inf))[0]
     away = near - points
     return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.find_normals(near)))
 

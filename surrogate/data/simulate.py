@@ -112,7 +112,7 @@ class SimulationWork:
     def build_task(self, batch: Batch) -> LoadBatch:
         """Build the task that solves a batch."""
         rows = self.list_rows(batch)
-        return LoadBatch(batch, rows, None if batch[0] == "unit" else self.loads.rows(rows))
+        return LoadBatch(batch, rows, None if batch[0] == "unit" else self.loads.select(rows))
 
 
 def simulate(
@@ -293,7 +293,7 @@ def _kept(path: Path, work: SimulationWork, batch: Batch) -> np.ndarray:
 
 def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
     """Describe the tool or force in a sentence."""
-    if loads.of(Touching) is None:
+    if loads.get(Touching) is None:
         return "a force on a round footprint that stays with the tissue: see loads/Pushed"
     return f"the rigid tool {stated.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
@@ -313,7 +313,7 @@ def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
         check_same_description(path, recorded, stated, "made", "")
         before = read_loads(file)
     shared = np.arange(min(len(before), len(loads)))
-    if compute_loads_digest(before.rows(shared)) != compute_loads_digest(loads.rows(shared)):
+    if compute_loads_digest(before.select(shared)) != compute_loads_digest(loads.select(shared)):
         raise InputError(f"{path}: holds other loads than these: choose another --out.")
     return before
 

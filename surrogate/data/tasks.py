@@ -52,13 +52,13 @@ def solve_batch(deformer: Deformer, task: LoadBatch) -> bytes:
     anatomy = deformer.anatomy
     unit = task.loads is None
     loads = build_unit_loads(anatomy, task.rows) if task.loads is None else task.loads
-    answer = deformer.deform(loads).at(np.arange(len(anatomy.mesh.nodes)))
+    answer = deformer.deform(loads).restrict(np.arange(len(anatomy.mesh.nodes)))
     return to_rows(answer, UNIT_FORCE if unit else 1.0, 0 if unit else count_posed_tools(loads)).tobytes()
 
 
 def count_posed_tools(loads: Loads) -> int:
     """Return the number of tools that the loads move by pose, whose reactions are stored; 0 for pushes."""
-    touching = loads.of(Touching)
+    touching = loads.get(Touching)
     return 0 if touching is None else touching.pose.shape[1]
 
 

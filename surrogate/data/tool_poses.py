@@ -64,7 +64,7 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: Built
     tool, patch = choose_ball(preset) if tool is None else tool, open_patch(anatomy)
     source = np.random.Generator(np.random.Philox(key=seed))
     if isinstance(tool, Ball):
-        (pushed,) = draw(preset, anatomy, count, seed).every(Pushed)
+        (pushed,) = draw(preset, anatomy, count, seed).get_all(Pushed)
         direction = pushed.force / np.linalg.norm(pushed.force, axis=1, keepdims=True)
         depth = interpolate_ends(
             (SHALLOW * tool.radius, min(DEEP * tool.radius, TOOLS[preset].depth)), source.random(count)

@@ -201,7 +201,7 @@ def time_model_alone(deformer: Deformer, loads: Loads) -> float | None:
     """Measure the median wall time [us] of a trained model alone, of one load at a time; None for other deformers."""
     if not isinstance(deformer, Learned):
         return None
-    single = [deformer.to_input(loads.rows(slice(row, row + 1))) for row in np.arange(WARM_UP + TIMED) % len(loads)]
+    single = [deformer.to_input(loads.select(slice(row, row + 1))) for row in np.arange(WARM_UP + TIMED) % len(loads)]
     nodes = deformer.anatomy.tumour_nodes
     with limit_to_one_thread():
         return 1e6 * float(np.median(_timed(lambda one: deformer.predict_motion(one, nodes), single)))
@@ -209,7 +209,7 @@ def time_model_alone(deformer: Deformer, loads: Loads) -> float | None:
 
 def time_single_loads(deformer: Deformer, loads: Loads, nodes: np.ndarray, count: int) -> list[float]:
     """Measure wall times [s] of `count` solves of one load at a time, cycling through the loads, warm-up excluded."""
-    single = [loads.rows(slice(row, row + 1)) for row in np.arange(WARM_UP + count) % len(loads)]
+    single = [loads.select(slice(row, row + 1)) for row in np.arange(WARM_UP + count) % len(loads)]
     return _timed(lambda one: deformer.deform(one, at=nodes), single)
 
 

@@ -23,7 +23,7 @@ from ..locating.evidence import Evidence
 from ..locating.locator import Locator
 from ..locating.observation import to_evidence
 from ..locating.regions import Region
-from .frame import FORCE_SIGMA, Frame, Tool, check_frames, find_foot
+from .frame import FORCE_SIGMA, ObservedFrame, Tool, check_frames, find_foot
 from .responses import FORCE, POISSONS, RATIOS, Responses, build_drained_loads, build_force_loads, solve_responses
 from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 from .weighing import (
@@ -55,7 +55,7 @@ READINGS, SAMPLES = np.array([-1.4, -0.7, 0.0, 0.7, 1.4]), 101
 
 def estimate_young_moduli(
     anatomy: Anatomy,
-    frames: Sequence[Frame],
+    frames: Sequence[ObservedFrame],
     tissue: FittedTissue,
     pressed: Responses | None,
     device: str = "auto",
@@ -134,7 +134,7 @@ def _dents(
 
 def fit_tissue(
     locator: Locator,
-    frames: Sequence[Frame],
+    frames: Sequence[ObservedFrame],
     device: str = "auto",
     folder: Path | None = None,
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
@@ -181,7 +181,7 @@ def fit_tissue(
 
 def fit_from_evidence(
     locator: Locator,
-    frames: Sequence[Frame],
+    frames: Sequence[ObservedFrame],
     drained: Responses | None,
     pressed: Responses | None,
     device: str = "auto",
@@ -200,7 +200,7 @@ def list_fitted_regions(locator: Locator) -> tuple[Region, ...]:
 
 
 def weigh_tissues(
-    locator: Locator, frames: Sequence[Frame], drained: Responses | None, pressed: Responses | None
+    locator: Locator, frames: Sequence[ObservedFrame], drained: Responses | None, pressed: Responses | None
 ) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of all frames in the solved tissues."""
     total, first = np.zeros((1, len(POISSONS), len(RATIOS))), 0

@@ -52,14 +52,14 @@ class Tool:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ObservedFrame:
     """Observation, and the tools that pressed during it; without tools, fluid has drained."""
 
     observation: Observation
     tools: tuple[Tool, ...] = ()
 
 
-def check_frames(anatomy: Anatomy, frames: Sequence[Frame]) -> None:
+def check_frames(anatomy: Anatomy, frames: Sequence[ObservedFrame]) -> None:
     """Check that frames are usable for an anatomy.
 
     Raises

@@ -17,7 +17,7 @@ from ..locating.causes import DRAINAGE
 from ..locating.evidence import Evidence, compute_correlation
 from ..locating.locator import Locator
 from ..locating.prior import MotionPrior
-from .frame import Frame
+from .frame import ObservedFrame
 from .responses import LINEAR, Responses
 
 LACK, LACK_LENGTH = 0.05, 10e-3
@@ -113,7 +113,7 @@ def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: floa
     return logsumexp(logs, axis=0) - np.log(len(SIZES))
 
 
-def find_unsupported(locator: Locator, frames: Sequence[Frame]) -> tuple[np.ndarray, ...]:
+def find_unsupported(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple[np.ndarray, ...]:
     """Return the point numbers (k,), from 0, that `Locator.locate` rejects in each frame.
 
     Raises
@@ -130,14 +130,14 @@ def find_unsupported(locator: Locator, frames: Sequence[Frame]) -> tuple[np.ndar
     return tuple(found)
 
 
-def remove_points(frames: Sequence[Frame], left_out: Sequence[np.ndarray]) -> list[Frame]:
+def remove_points(frames: Sequence[ObservedFrame], left_out: Sequence[np.ndarray]) -> list[ObservedFrame]:
     """Remove points of given numbers (k,) from each frame of points with correspondences."""
     return [
         _without(frame, numbers) if len(numbers) else frame for frame, numbers in zip(frames, left_out, strict=True)
     ]
 
 
-def _without(frame: Frame, numbers: np.ndarray) -> Frame:
+def _without(frame: ObservedFrame, numbers: np.ndarray) -> ObservedFrame:
     seen = frame.observation
     assert seen.rest is not None
     kept = np.delete(np.arange(len(seen.now)), numbers)

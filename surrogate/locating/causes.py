@@ -158,7 +158,7 @@ def _all_over(random: np.random.Generator, count: int, limits: tuple[float, floa
 def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> Loads:
     """Sample the tool loads of a group."""
     count = causes.tools[group.skull == LETS_GO]
-    pushed = draw("mixed", anatomy, count, seed * 1000 + group.number).of(Pushed)
+    pushed = draw("mixed", anatomy, count, seed * 1000 + group.number).get(Pushed)
     assert pushed is not None
     return Loads((pushed, _posture(anatomy, np.tile(SUPINE, (count, 1)), 1.0)), np.zeros(count))
 

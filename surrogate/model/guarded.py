@@ -73,12 +73,12 @@ class Guarded:
         if not len(unsure):
             return predicted
         whole = start is not None and len(start.nodes) == len(self.anatomy.mesh.nodes)
-        solved = self.fem.deform(loads.rows(unsure), start.rows(unsure) if start is not None and whole else None)
+        solved = self.fem.deform(loads.select(unsure), start.select(unsure) if start is not None and whole else None)
         good = np.array([outcome.good for outcome in solved.outcome])
         if at is None and good.all() and len(unsure) == len(loads):
             return solved
         pushed = self.model.tool is None
-        return _replaced(predicted, unsure[good], solved.rows(np.flatnonzero(good)), pushed)
+        return _replaced(predicted, unsure[good], solved.select(np.flatnonzero(good)), pushed)
 
     def find_unreliable(self, predicted: Deformation) -> np.ndarray:
         """Return the mask (B,) of predictions that need FEM."""
@@ -118,14 +118,14 @@ def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation, pus
     pick = np.arange(len(predicted))
     pick[rows] = len(predicted) + np.arange(len(rows))
     ours = replace(predicted, cost=Cost({"predict": predicted.cost.total, "solve": 0.0}))
-    theirs = solved.at(predicted.nodes)
+    theirs = solved.restrict(predicted.nodes)
     cost = Cost({"predict": 0.0, "solve": solved.cost.total})
     known = solved.reaction.shape[1] == predicted.reaction.shape[1] and not pushed
     theirs = replace(theirs, reaction=theirs.reaction if known else predicted.reaction[rows], cost=cost)
     source = predicted.source
     if len(rows):
         source += f"; for {len(rows)} of {len(predicted)} loads {solved.source}"
-    return replace(join_deformations([ours, theirs]).rows(pick), source=source)
+    return replace(join_deformations([ours, theirs]).select(pick), source=source)
 
 
 def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarray:

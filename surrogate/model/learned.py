@@ -323,7 +323,7 @@ class Learned:
         if apart is None:
             if answer is None:
                 answer = self.deform(loads, at=self.nodes)
-            apart = build_tip_gauge(self.anatomy).distances(loads, answer.displacement, answer.nodes, self.tool)
+            apart = build_tip_gauge(self.anatomy).compute_distances(loads, answer.displacement, answer.nodes, self.tool)
         tip = self.tip or TipModel()
         magnitude, within = self.clip_to_range(pushed)
         found = tip.apply_correction(apart, self._patch, within, magnitude)
@@ -367,7 +367,7 @@ def build_prediction(
     displacement (B, n, 3) [m] of `nodes` (n,); bound and source as in `Deformation`.
     """
     count = len(loads)
-    pushed, unknown = loads.of(Pushed), np.full(count, np.nan)
+    pushed, unknown = loads.get(Pushed), np.full(count, np.nan)
     reaction = np.zeros((count, 0 if pushed is None else 1, 6))  # for a pose, the caller adds it
     if pushed is not None:
         reaction[:, 0, :3] = pushed.force
@@ -395,7 +395,7 @@ def get_only_pushes(loads: Loads) -> Pushed:
     InputError
         Loads of another kind.
     """
-    pushed = loads.only(Pushed)
+    pushed = loads.get_only(Pushed)
     if pushed is None:
         names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
         raise InputError(

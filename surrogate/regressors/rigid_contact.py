@@ -213,10 +213,10 @@ class RigidContact:
             far = np.linalg.norm(there.corners - begun.corners, axis=1).max()
             if (few := int(np.ceil(far / stride))) < steps:
                 back = begun.middle - there.middle
-                ways = [there.moved((1.0 - k / few) * back) for k in range(1, few + 1)] or [there]
+                ways = [there.move((1.0 - k / few) * back) for k in range(1, few + 1)] or [there]
                 return [begun, *ways], self.core[3] + THICKER, last[self._width :]
         ways = [(k / steps - 1.0) * depth * direction for k in range(1, steps + 1)]
-        return [there.moved(way) for way in ways], self.core[3] + THICKER, None
+        return [there.move(way) for way in ways], self.core[3] + THICKER, None
 
     def _standing(self, x: np.ndarray) -> PlacedBox:
         from sim.discretisation.nearest_places import PlacedBox
@@ -257,7 +257,7 @@ class RigidContact:
                 if settled and not len(entered):
                     break
                 facet, share = np.concatenate([facet, entered]), np.concatenate([share, near.share[entered]])
-                distance, normal = station.distances(corners[facet], share)
+                distance, normal = station.compute_distances(corners[facet], share)
                 lever = np.zeros((len(facet), len(nodes), 3))
                 lever[np.arange(len(facet))[:, None], table[facet]] = share[:, :, None] * normal[:, None]
                 lever = lever.reshape(len(facet), -1)
@@ -283,7 +283,7 @@ class RigidContact:
         ends = [stations[k] for k in sorted({0, len(stations) // 2, len(stations) - 1})]
         some = np.flatnonzero(np.any([np.linalg.norm(around - each.middle, axis=1) < far for each in ends], axis=0))
         corners = self.points[self.triangles[some]]
-        near = np.any([each.nearest(corners).distance < reach for each in ends], axis=0)
+        near = np.any([each.find_nearest(corners).distance < reach for each in ends], axis=0)
         nodes, table = np.unique(self.triangles[some[near]], return_inverse=True)
         return some[near], nodes, table, (3 * nodes[:, None] + np.arange(3)).ravel()
 

@@ -37,7 +37,7 @@ class KnownDistances:
 
     def select(self, index: np.ndarray | slice) -> KnownDistances:
         """Select loads by numbers, a slice, or (B,) bool."""
-        return KnownDistances(self.loads.rows(index), self.distance[index])
+        return KnownDistances(self.loads.select(index), self.distance[index])
 
 
 def compute_distance_errors(model: Learned, known: KnownDistances) -> np.ndarray:
@@ -229,7 +229,7 @@ class TrainingSolutions:
 
     def compute_vertex_errors(self, model: Learned, rows: np.ndarray) -> np.ndarray:
         """Compute errors (k, n) [m] of a model at the tumour's vertices, on selected rows (B,) bool."""
-        return compute_point_errors(model, self.loads.rows(np.flatnonzero(rows)), self.tumour[rows], self.nodes)
+        return compute_point_errors(model, self.loads.select(np.flatnonzero(rows)), self.tumour[rows], self.nodes)
 
     def compute_errors(
         self, model: Learned, rows: np.ndarray, tumour: np.ndarray | None = None, tip: np.ndarray | None = None
@@ -261,14 +261,14 @@ def read_solutions(data: Dataset, shared: Expansion) -> TrainingSolutions:
             f"{data.path}: {int((~data.unit_good).sum())} unit responses did not converge, so there is no compliance "
             "table: simulate again with a looser --tolerance."
         )
-    loads = data.loads.rows(np.flatnonzero(data.good))
+    loads = data.loads.select(np.flatnonzero(data.good))
     pushed, nodes = _asked(data, loads, shared.patch), shared.tumour
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
     tumour = data.read_displacement(nodes)[data.good]
     cortex = data.read_displacement(shared.cortex)[data.good]
     at, both = np.concatenate([nodes, shared.cortex]), np.concatenate([tumour, cortex], axis=1)
-    distances = KnownDistances(loads, build_tip_gauge(data.anatomy).distances(loads, both, at, data.tool))
+    distances = KnownDistances(loads, build_tip_gauge(data.anatomy).compute_distances(loads, both, at, data.tool))
     reaction = None if data.tool is None else data.read_reaction()
     force = None if reaction is None else reaction[data.good, 0, :3]
     return TrainingSolutions(loads, pushed, shared.patch, nodes, tumour, cortex, distances, force)
@@ -281,7 +281,7 @@ def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
         if not series:
             return pushed
         return add_relaxation(pushed, follow_relaxation(series, pushed, loads.times, None, 0.0).share)
-    if loads.only(Pushed) is None:
+    if loads.get_only(Pushed) is None:
         raise InputError(
             "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one tool's "
             "poses."

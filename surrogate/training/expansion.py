@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from sim.accuracy import REFERENCE
-from sim.effects import pushed_effects
+from sim.effects import build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.tetmesh import compute_digest
 from sim.loads import Pushed
-from sim.minimisers.second_order import second_order
+from sim.minimisers.second_order import compute_second_order
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.journal import open_journal
 from sim.runtime.outside_files import read_as
@@ -251,10 +251,10 @@ class Expansion:
         near = find_disc_nodes(self.patch, float(self.radii[-1]))
         if 4.5 * near.sum() > self.most_pairs:
             return np.zeros((0, 2), int), np.zeros((0, 0), np.float32), Basis(basis.nodes, basis.modes[:0])
-        reading = fem.reading(basis.nodes, basis.modes.reshape(len(basis.modes), -1, 3))
+        reading = fem.build_reading(basis.nodes, basis.modes.reshape(len(basis.modes), -1, 3))
         nodes = self.patch.nodes
-        units = fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
-        pairs, table = second_order(fem.problem, units.answers, reading.answers, near)
+        units = fem.build_reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
+        pairs, table = compute_second_order(fem.problem, units.answers, reading.answers, near)
         turn = reduce(basis.nodes, table, SECOND, len(basis.modes)).modes
         return pairs, table @ turn.T, Basis(basis.nodes, round_to_half(turn @ basis.modes))
 
@@ -268,7 +268,7 @@ class Expansion:
         every, motions = np.concatenate(self._known), []
         for first in range(0, 3 * len(every), STRIP):
             components = np.eye(3 * len(every))[first : first + STRIP].reshape(-1, len(every), 3)
-            reading = fem.reading(every, components)
+            reading = fem.build_reading(every, components)
             motions.append(tabulate(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
         cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
         parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
@@ -276,7 +276,7 @@ class Expansion:
         orders = (SPANS, SPANS[1:])
         bases = [_spanned(*each) for each in zip(self._known, parts, orders, strict=False)]
         whole = join_bases(bases)
-        reading = fem.reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
+        reading = fem.build_reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
         table = np.empty((count, *parts[0].shape[1:3], reading.count), np.float32)
         others = np.setdiff1d(np.arange(count), few)
         table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
@@ -316,7 +316,7 @@ class Expansion:
                 f"{self.data.path}: does not state its tissue, so series and contact are not available: "
                 "choose other learners, or simulate again."
             )
-        effects = pushed_effects(self.data.anatomy, read_tissue_statement(stated), read_trained_skull(stated))
+        effects = build_push_effects(self.data.anatomy, read_tissue_statement(stated), read_trained_skull(stated))
         return Fem(self.data.anatomy, effects, REFERENCE, self.device, self.batch, stated.get("element"))
 
 

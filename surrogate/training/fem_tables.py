@@ -69,7 +69,7 @@ def compute_unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.nd
     found = []
     for first in range(0, len(nodes), STRIP):
         some = nodes[first : first + STRIP]
-        answers = fem.reading(some, np.eye(3 * len(some)).reshape(-1, len(some), 3)).answers
+        answers = fem.build_reading(some, np.eye(3 * len(some)).reshape(-1, len(some), 3)).answers
         found.append(answers.reshape(len(answers), -1, 3)[:, at].astype(np.float32))
     return np.concatenate(found)
 
@@ -113,7 +113,7 @@ def tabulate(
         point = np.repeat(here, 3 * len(radii), axis=0)
         force = np.tile(np.eye(3), (len(here) * len(radii), 1))
         loads = Loads((Pushed(point, force, np.tile(np.repeat(radii, 3), len(here))),))
-        table[rows] = fem.series(loads, ORDERS, reading, 3).reshape(len(here), *table.shape[1:])
+        table[rows] = fem.compute_series(loads, ORDERS, reading, 3).reshape(len(here), *table.shape[1:])
         if journal is not None:
             for number in rows:
                 journal.add(("row", number), table[number].tobytes())

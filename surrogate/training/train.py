@@ -205,7 +205,7 @@ def _learn(
     training = {"learner": name, **data.provenance}
     model = Learned(data.anatomy, parts, outside.envelope, training=training, tool=data.tool, force=force)
     with time_stage("score"):
-        test = answers.loads.rows(np.flatnonzero(split.test))
+        test = answers.loads.select(np.flatnonzero(split.test))
         solves = outside.inputs.solve_counts(name, outside.examples)
         scored = score(name, model, test, answers.tumour[split.test], answers.nodes, solves)
         distance = answers.compute_vertex_errors(model, split.test)

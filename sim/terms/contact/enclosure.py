@@ -48,6 +48,6 @@ def find_enclosing_columns(
     """Return a mask (b,) of load cases with a point (b, p, 3) [m] inside the outward surface displaced by u (3N, b)."""
     points = np.ascontiguousarray(points.swapaxes(0, 1))
     angle = wp.zeros(points.shape[:2], dtype=wp.float64, device=device.name)
-    inputs = [device.array(points, wp.vec3d), rest, triangles, u]
+    inputs = [device.upload(points, wp.vec3d), rest, triangles, u]
     device.launch(build_kernel(device), (len(triangles), points.shape[1]), inputs, [angle])
     return (angle.numpy() > np.pi).any(axis=0)

@@ -17,7 +17,7 @@ from .tool_blocks import ContactStage, NearPairs, build_functions
 class DenseTerm(Term, Protocol):
     """Term on few nodes, whose tangent stiffness is a small dense matrix."""
 
-    def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
+    def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
         """Return surface and tools of some load cases (k,), and the workspace for near pairs."""
         ...
 
@@ -49,9 +49,9 @@ class Reduced:
         """Warp functions as `Reduction.functions`."""
         return build_functions(self._device, self._nodes)
 
-    def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
+    def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
         """Return the structs as `Reduction.stage`."""
-        return self._term.stage(columns)
+        return self._term.build_stage(columns)
 
     def slope(self, w: Any) -> Any:
         """Return the gradient as `Reduction.slope`."""
@@ -66,10 +66,10 @@ class Reduced:
         at, _, numbers = self._arrays(w.shape[1])
         view(at)[:], view(numbers)[:] = w, place
         out = wp.zeros((w.shape[1], 3 * size, 3 * size), dtype=wp.float64, device=self._device.name)
-        self._term.add_matrix(at, self._device.array(definite.astype(np.int32), wp.int32), numbers, out)
+        self._term.add_matrix(at, self._device.upload(definite.astype(np.int32), wp.int32), numbers, out)
         return view(out)
 
     def _made(self, columns: int) -> tuple[wp.array, wp.array, wp.array]:
         """Allocate displacements and forces (3n, b), and node indices (n, b)."""
-        at, force = (self._device.zeros(3 * self._count, columns) for _ in range(2))
+        at, force = (self._device.allocate(3 * self._count, columns) for _ in range(2))
         return at, force, wp.zeros((self._count, columns), dtype=wp.int32, device=self._device.name)

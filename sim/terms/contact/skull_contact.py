@@ -257,12 +257,12 @@ class Skull:
     def __init__(self, bone: Bone, count: int, shear: float, device: Device, settings: SkullBarrier = SkullBarrier()):
         self._device, self._kernels, self._bone, self._settings = device, build_kernels(device), bone, settings
         self._wall = Wall()
-        self._wall.nodes = device.array(bone.nodes, wp.int32)
-        self._wall.bend = device.array(bone.bend, wp.mat33d)
+        self._wall.nodes = device.upload(bone.nodes, wp.int32)
+        self._wall.bend = device.upload(bone.bend, wp.mat33d)
         for name in ("normal", "way"):
-            setattr(self._wall, name, device.array(getattr(bone, name), wp.vec3d))
+            setattr(self._wall, name, device.upload(getattr(bone, name), wp.vec3d))
         for name in ("inside", "felt", "area"):
-            setattr(self._wall, name, device.array(getattr(bone, name), wp.float64))
+            setattr(self._wall, name, device.upload(getattr(bone, name), wp.float64))
         self._wall.gap, self._wall.edge, self._wall.shear = bone.gap, bone.edge, shear
         self.widen(1.0)
         covered = bone.inside < 0.0
@@ -272,11 +272,11 @@ class Skull:
         place = row.ravel(), row.swapaxes(1, 2).ravel()
         self._rest = sp.csc_array(sp.coo_array((blocks.ravel(), place), shape=(3 * count, 3 * count)))
 
-    def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
+    def compute_stride(self, cases: Cases, u: wp.array) -> np.ndarray:
         """Return 1 for every load case: the skull does not move."""
         return np.ones(len(cases.loads))
 
-    def gaps(self, cases: Cases) -> np.ndarray:
+    def count_gaps(self, cases: Cases) -> np.ndarray:
         """Return the initial barrier width in units of its normal width (b,): larger if the start is undeformed."""
         known = np.zeros(len(cases.loads), bool)
         if cases.displacement is not None:
@@ -285,11 +285,11 @@ class Skull:
             known &= ~cases.anew
         return np.where(known, self._settings.again, self._settings.at_first) / self._bone.felt.min()
 
-    def buried(self, u: wp.array) -> np.ndarray:
+    def find_buried(self, u: wp.array) -> np.ndarray:
         """Return False for every load case: the skull never penetrates the body."""
         return np.zeros(u.shape[1], bool)
 
-    def overlaps(self, u: wp.array) -> np.ndarray:
+    def find_overlaps(self, u: wp.array) -> np.ndarray:
         """Return False for every load case: the skull is not a tool."""
         return np.zeros((2, u.shape[1]), bool)
 
@@ -297,7 +297,7 @@ class Skull:
         """Widen the barrier by a factor and soften it by the same factor; the bone recedes by the added width."""
         self._wall.times = times
 
-    def reaction(self, u: wp.array) -> np.ndarray:
+    def compute_reaction(self, u: wp.array) -> np.ndarray:
         """Return an empty array (b, 0, 6): there are no tools."""
         return np.zeros((u.shape[1], 0, 6))
 

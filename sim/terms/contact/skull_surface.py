@@ -98,8 +98,8 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
     InputError
         An anatomy without nodes that can touch the skull.
     """
-    held = space.held(anatomy.held).all(axis=1)
-    normal = space.sliding(anatomy.slide_normal, anatomy.held)
+    held = space.extend_held(anatomy.held).all(axis=1)
+    normal = space.extend_normals(anatomy.slide_normal, anatomy.held)
     slides = (normal != 0.0).any(axis=1) & ~held
     if not slides.any():
         raise InputError("SkullContact finds no node that can touch: all slide normals are zero, or their nodes fixed.")

@@ -76,16 +76,16 @@ class ToolContactTerm:
         self._owner = np.repeat(np.arange(len(tools)), [len(list_cores(tool)) for tool in tools])
         self._first, self._sag = np.unique(self._owner, return_index=True)[1], touch.sag * gap
         self._nodes, self._corners = nodes, [core.corners for core in cores]
-        self._triangles, self._closed = triangles, device.array(whole, wp.int32)
+        self._triangles, self._closed = triangles, device.upload(whole, wp.int32)
         self._shapes, self._way, self._device, self._touch = tools, way, device, touch
         self._kernels = build_kernels(device, triangles.shape[1])
         fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.sag * gap) / FARTHEST
         self._surface, self._rows = _sampled(nodes, triangles, fine / touch.stretch, device)
         self._bone, _ = _sampled(nodes, bone, fine, device)
         self._cores = [
-            device.array(np.array([core.centre for core in cores]), wp.vec3d),
-            device.array(np.array([core.half for core in cores]), wp.vec3d),
-            device.array(np.array([core.radius + self._sag for core in cores]), wp.float64),
+            device.upload(np.array([core.centre for core in cores]), wp.vec3d),
+            device.upload(np.array([core.half for core in cores]), wp.vec3d),
+            device.upload(np.array([core.radius + self._sag for core in cores]), wp.float64),
         ]
         self._asked, self._gap, self._shear = gap, (1.0 - touch.sag) * gap, shear
         self.widen(1.0)
@@ -94,23 +94,23 @@ class ToolContactTerm:
         self._stood = lru_cache(4)(self._brought)
         self._single: list[Tools] = []
 
-    def stride(self, cases: Cases, u: wp.array) -> np.ndarray:
+    def compute_stride(self, cases: Cases, u: wp.array) -> np.ndarray:
         """Return the path fraction as `ToolPath.stride`, given each tool's clearance from the surface."""
         way = self._way(cases)
         if way is None:
             return np.ones(len(cases.loads))
         clear = wp.full((len(self._owner), u.shape[1]), np.inf, dtype=wp.float64, device=self._device.name)
-        inputs = [u, self._surface, self._standing(way.at(cases.gone))]
+        inputs = [u, self._surface, self._standing(way.interpolate(cases.gone))]
         self._device.launch(self._kernels.clearance, (len(self._triangles), u.shape[1]), inputs, [clear])
         of_tools = np.minimum.reduceat(clear.numpy(), self._first, axis=0).T + self._sag
-        return way.stride(self._shapes, of_tools.clip(0.0), self._touch)
+        return way.compute_stride(self._shapes, of_tools.clip(0.0), self._touch)
 
-    def gaps(self, cases: Cases) -> np.ndarray:
+    def count_gaps(self, cases: Cases) -> np.ndarray:
         """Return the travel of the farthest-moved tool in units of the gap (B,)."""
         way = self._way(cases)
         return np.zeros(len(cases.loads)) if way is None else way.travel(self._shapes).max(axis=1) / self._gap
 
-    def buried(self, u: wp.array) -> np.ndarray:
+    def find_buried(self, u: wp.array) -> np.ndarray:
         """Return a mask (b,) of load cases with a tool's centre, or a corner of its cores, inside the body."""
         if self._pose is None:
             return np.zeros(u.shape[1], bool)
@@ -120,7 +120,7 @@ class ToolContactTerm:
         ]
         return find_enclosing_columns(self._device, np.concatenate(points, axis=1), self._surface.rest, self._closed, u)
 
-    def overlaps(self, u: wp.array) -> np.ndarray:
+    def find_overlaps(self, u: wp.array) -> np.ndarray:
         """Return overlaps as `Barrier.overlaps`, for penetration deeper than the gap."""
         if self._pose is None:
             return np.zeros((2, u.shape[1]), bool)
@@ -140,7 +140,7 @@ class ToolContactTerm:
     def begin(self, cases: Cases) -> None:
         """Place the tools at their fraction of the path, and reset the gap."""
         way = self._way(cases)
-        self._stand(None if way is None else way.at(cases.gone))
+        self._stand(None if way is None else way.interpolate(cases.gone))
         self.widen(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
@@ -183,7 +183,7 @@ class ToolContactTerm:
         """Nodes (n,), ascending, of the surface that tools can touch."""
         return np.unique(self._triangles)
 
-    def around(self, most: int) -> np.ndarray:
+    def select_nodes(self, most: int) -> np.ndarray:
         """Return nodes as `Local.around`."""
         own = self.touchable
         far, _ = KDTree(self._nodes[own]).query(self._nodes)
@@ -202,7 +202,7 @@ class ToolContactTerm:
         )  # fmt: skip
         return term, Reduced(term, len(nodes), own.shape[1], exact)
 
-    def reduced(self, columns: np.ndarray) -> Reduced | None:
+    def reduce(self, columns: np.ndarray) -> Reduced | None:
         """Return the reduced barrier as `Local.reduced`."""
         if self._pose is None:
             return None
@@ -211,9 +211,9 @@ class ToolContactTerm:
         term._scale = self._scale
         return reduced
 
-    def pressed(self) -> tuple[np.ndarray, np.ndarray]:
+    def get_pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """Return active nodes and their tangent stiffness as `Local.pressed`."""
-        barrier = self.reduced(np.zeros(1, int))
+        barrier = self.reduce(np.zeros(1, int))
         if barrier is None:
             return np.zeros(0, int), np.zeros((0, 0))
         w = self._at[0].numpy().reshape(-1, 3)[self.touchable].reshape(-1, 1).astype(np.float64)
@@ -221,7 +221,7 @@ class ToolContactTerm:
         place = np.where(felt, felt.cumsum() - 1, -1)[:, None]
         return np.flatnonzero(felt), barrier.curvature(w, place, int(felt.sum()), np.ones(1, bool))[0]
 
-    def reaction(self, u: wp.array) -> np.ndarray:
+    def compute_reaction(self, u: wp.array) -> np.ndarray:
         """Return force [N] and moment about its origin [N m] that each tool exerts at u (3N, b): (b, tools, 6)."""
         out = wp.zeros((u.shape[1], len(self._owner), 6), dtype=wp.float64, device=self._device.name)
         self._launch(self._kernels.add_reaction, [u], out, u.shape[1])
@@ -254,11 +254,11 @@ class ToolContactTerm:
         of_cores = np.frombuffer(pose).reshape(-1, len(self._shapes), 4, 4)[:, self._owner].swapaxes(0, 1)
         out = Tools()
         out.centre, out.half, out.radius = self._cores
-        out.rotation = self._device.array(of_cores[:, :, :3, :3], wp.mat33d)
-        out.origin = self._device.array(of_cores[:, :, :3, 3], wp.vec3d)
+        out.rotation = self._device.upload(of_cores[:, :, :3, :3], wp.mat33d)
+        out.origin = self._device.upload(of_cores[:, :, :3, 3], wp.vec3d)
         return out
 
-    def stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
+    def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
         """Return the structs as `DenseTerm.stage`."""
         if self._pose is None:
             raise ValueError("no tool is there")
@@ -305,9 +305,9 @@ def build_tool_contact(
         return np.reshape(begin, pose.shape)
 
     def way(cases: Cases) -> ToolPath | None:
-        last = cases.past(name, (len(tools), 4, 4)) if name in cases.memory else None
+        last = cases.get_past(name, (len(tools), 4, 4)) if name in cases.memory else None
         if contact:
-            cause = cases.loads.of(Touching)
+            cause = cases.loads.get(Touching)
             if cause is None:
                 return None
             if cause.pose.shape[1] != len(tools):
@@ -315,7 +315,7 @@ def build_tool_contact(
                     f"Touching has poses of {cause.pose.shape[1]} tools, but ToolContact has {len(tools)}."
                 )
             return ToolPath(_begun(last, cases.anew, clear, cause.pose), cause.pose)
-        cause = cases.loads.of(Retracted)
+        cause = cases.loads.get(Retracted)
         if cause is None:
             return None
         laid = cause.pose[:, None]
@@ -337,10 +337,10 @@ def _sampled(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Devi
     corners = nodes[triangles[:, :3]]
     pieces = np.ceil(compute_edge_lengths(corners).max(axis=1) / fine).astype(np.int32)
     out = Surface()
-    out.rest = device.array(nodes, wp.vec3d)
-    out.table = device.array(triangles, wp.int32)
-    out.pieces = device.array(pieces, wp.int32)
-    out.area = device.array(compute_areas(corners), wp.float64)
+    out.rest = device.upload(nodes, wp.vec3d)
+    out.table = device.upload(triangles, wp.int32)
+    out.pieces = device.upload(pieces, wp.int32)
+    out.area = device.upload(compute_areas(corners), wp.float64)
     return out, int(pieces.max(initial=0))
 
 

@@ -57,7 +57,7 @@ class ToolDistance:
 
 
 @wp.func
-def touch_of(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
+def distance_to_core(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
     """Return distance d = |v| - r to a core, v from its nearest point to p; n = v / |v|; dn = (M - n (x) n) / |v|.
 
     M selects the components in which p lies outside the core.
@@ -220,7 +220,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
     def least_distance(at: forces, times: wp.float64, half: wp.vec3d, radius: wp.float64) -> wp.float64:
         """Return a lower bound of a core's distance from a triangle scaled by `times` about its centroid."""
         arms = around(at)
-        return touch_of(at[0] - arms[0], half, radius).distance - times * reach_of(arms)
+        return distance_to_core(at[0] - arms[0], half, radius).distance - times * reach_of(arms)
 
     @wp.func
     def is_near(at: forces, reach: wp.float64, half: wp.vec3d, radius: wp.float64) -> bool:
@@ -232,7 +232,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         """Return the sum over points of a row of b(d)."""
         total, pace, most, j = wp.float64(0.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
-            d = touch_of(shape_of(i, j, n) * at, half, radius).distance
+            d = distance_to_core(shape_of(i, j, n) * at, half, radius).distance
             total += barrier(d, gap)
             j += clear(d - gap, pace, most)
         return total
@@ -243,7 +243,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         total, pace, most, j = forces(), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             N = shape_of(i, j, n)
-            touch = touch_of(N * at, half, radius)
+            touch = distance_to_core(N * at, half, radius)
             if touch.distance < gap:
                 total += wp.outer(N, barrier_slope(touch.distance, gap) * touch.normal)
             j += clear(touch.distance - gap, pace, most)
@@ -268,7 +268,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         total, felt, pace, most, j = blocks(), wp.bool(False), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             N = shape_of(i, j, n)
-            touch = touch_of(N * at, half, radius)
+            touch = distance_to_core(N * at, half, radius)
             if touch.distance < scale.gap:
                 felt = True
                 H = curvature_at(touch, scale.gap, definite)
@@ -300,7 +300,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         farthest = reach_of(along)
         while j < most:
             N = shape_of(i, j, n)
-            room = touch_of(N * at, half, radius).distance + radius
+            room = distance_to_core(N * at, half, radius).distance + radius
             far = wp.length(N * along)
             if far > kept * room:
                 out = wp.min(out, kept * room / far)

@@ -7,7 +7,17 @@ import warp as wp
 
 from ...runtime.device import Device, forward_kernel
 from .barrier import barrier_slope
-from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools, build_functions, clear, curvature_at, touch_of
+from .tool_functions import (
+    BULGE,
+    ROOM_KEPT,
+    Scale,
+    Surface,
+    Tools,
+    build_functions,
+    clear,
+    curvature_at,
+    distance_to_core,
+)
 
 
 @dataclass(frozen=True)
@@ -105,7 +115,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
                     most, j = 2 * (n - i) - 1, wp.int32(0)
                     while j < most:
                         N = shape_of(i, j, n)
-                        touch = touch_of(N * own, half, radius)
+                        touch = distance_to_core(N * own, half, radius)
                         if touch.distance < scale.gap:
                             total += wp.outer(N, curvature_at(touch, scale.gap, definite[c]) * (N * along))
                         j += clear(touch.distance - scale.gap, pace, most)
@@ -132,7 +142,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
                     most, j = 2 * (n - i) - 1, wp.int32(0)
                     while j < most:
                         N = shape_of(i, j, n)
-                        touch = touch_of(N * own, half, radius)
+                        touch = distance_to_core(N * own, half, radius)
                         if touch.distance < scale.gap:
                             H = weight * (R * curvature_at(touch, scale.gap, definite[c]) * wp.transpose(R))
                             for a in range(size):
@@ -183,7 +193,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
                     most, j = 2 * (n - i) - 1, wp.int32(0)
                     while j < most:
                         x = shape_of(i, j, n) * own
-                        touch = touch_of(x, half, radius)
+                        touch = distance_to_core(x, half, radius)
                         push = -weight * barrier_slope(touch.distance, scale.gap) * touch.normal
                         force += push
                         moment += wp.cross(x + tools.centre[k], push)
@@ -242,7 +252,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
             if is_near(own, wp.float64(0.0), half, radius):
                 for i in range(n):
                     for j in range(2 * (n - i) - 1):
-                        wp.atomic_min(out, k, c, touch_of(shape_of(i, j, n) * own, half, radius).distance)
+                        wp.atomic_min(out, k, c, distance_to_core(shape_of(i, j, n) * own, half, radius).distance)
 
     return ToolKernels(
         add_energy=add_energy,

@@ -49,7 +49,7 @@ class ToolPath:
     begin: np.ndarray
     end: np.ndarray
 
-    def at(self, share: np.ndarray) -> np.ndarray:
+    def interpolate(self, share: np.ndarray) -> np.ndarray:
         """Return poses (B, tools, 4, 4) at path fractions (B,), with spherical interpolation of rotations."""
         count, tools = self.end.shape[:2]
         share = np.repeat(share, tools)
@@ -71,7 +71,7 @@ class ToolPath:
         extent = np.array([compute_extent(tool) for tool in tools])
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
-    def stride(self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = TOUCH) -> np.ndarray:
+    def compute_stride(self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = TOUCH) -> np.ndarray:
         """Return the path fraction (B,), at most 1, that tools with clearance `clear` (B, tools) [m] may move."""
         most = clear + touch.stride * np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)

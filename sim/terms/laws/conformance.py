@@ -53,14 +53,14 @@ class Evaluator:
 
     def __call__(self, H: np.ndarray, D: np.ndarray | None = None, of: Tissue | None = None) -> Evaluated:
         """Evaluate at gradients H (n, 3, 3), with increments D (n, 3, 3)."""
-        return self.at(H, D, (of or self.of).coefficients)
+        return self.replace(H, D, (of or self.of).coefficients)
 
-    def at(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
+    def replace(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
         """Evaluate with other coefficients."""
         count, device = len(H), self.device
-        energy = device.zeros(count)
+        energy = device.allocate(count)
         stress, change = (wp.zeros(count, dtype=device.matrix, device=device.name) for _ in range(2))
-        given = device.array(H, device.matrix), device.array(H if D is None else D, device.matrix)
+        given = device.upload(H, device.matrix), device.upload(H if D is None else D, device.matrix)
         constants = wp.types.vector(len(coefficients), device.scalar)(*coefficients)
         device.launch(self.kernel, (count,), [*given, constants], [energy, stress, change])
         return Evaluated(*(array.numpy().astype(np.float64) for array in (energy, stress, change)))
@@ -157,10 +157,12 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
     small = random.normal(0.0, strains.small, (count, 3, 3))
     for carries in ("whole", "shape", "volume"):
         share = get_portion(tissue, carries)
-        stress = double.at(small, None, tissue.coefficients_at(*share)).stress
+        stress = double.replace(small, None, tissue.coefficients_at(*share)).stress
         name = "" if carries == "whole" else f" where elements carry {carries} alone"
         yield Finding(f"Hooke's law at small strain{name}", _off(stress, compute_hooke_stress(small, *share)), 1e-4)
-    parts = [double.at(H, D, tissue.coefficients_at(*get_portion(tissue, carries))) for carries in ("shape", "volume")]
+    parts = [
+        double.replace(H, D, tissue.coefficients_at(*get_portion(tissue, carries))) for carries in ("shape", "volume")
+    ]
     for name in ("energy", "stress", "change"):
         shape, volume = (getattr(part, name) for part in parts)
         yield Finding(f"shape and volume make the whole {name}", _off(shape + volume, getattr(here, name)), 1e-8)
