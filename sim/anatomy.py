@@ -148,3 +148,5 @@ class Anatomy:
     def digest(self) -> str:
         """Hash of the mesh and its boundary conditions."""
         return compute_digest(*self.mesh.arrays, self.held, self.slide_normal, self.craniotomy)
+
+    without = remove_elements  # Former names, for one release.

@@ -363,6 +363,8 @@ class Fem:
                 rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
         return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))
 
+    reading, series = build_reading, compute_series  # Former names, for one release.
+
 
 def _joined(parts: list[Deformation]) -> Deformation:
     """Concatenate batches to one deformation; their warm-start data are dropped, as they may differ."""

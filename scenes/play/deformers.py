@@ -240,6 +240,11 @@ class PatientSetup:
         found = self.uncertainties.get(scene.name)
         return found if found and found.mark == mark_of(scene, self.site, self.choose_element(scene)) else None
 
+    # Former names, for one release.
+    stage, knowing, names, best = build_stage, select_models, list_deformers, select_best
+    usual, described, fem, deformer = select_default, describe_deformer, build_fem, build_deformer
+    player, uncertainty = build_player, estimate_uncertainty
+
 
 @dataclass(frozen=True, eq=False)
 class AtRest:

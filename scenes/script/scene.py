@@ -240,6 +240,10 @@ class Scene:
         force = touch.force * site.compute_direction(touch)
         return Pushed(self.find_contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
 
+    # Former names, for one release.
+    made_of, contact, tip, stopped = replace_tissue, find_contact, compute_tip, describe_stop
+    pose, loads = compute_pose, build_loads
+
 
 @lru_cache(8)
 def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:

@@ -82,6 +82,8 @@ class Cases:
             )
         return np.zeros(whole) if found is None else np.asarray(found, np.float64)
 
+    rows, past = select, get_past  # Former names, for one release.
+
 
 @runtime_checkable
 class Term(Protocol):

@@ -188,6 +188,9 @@ class Dataset:
             )
         return np.concatenate(chosen)
 
+    # Former names, for one release.
+    seconds, displacement, reaction = estimate_seconds, read_displacement, read_reaction
+
 
 def _damaged(path: Path, lost: np.ndarray, group: str) -> str:
     return (

@@ -217,6 +217,8 @@ class Location:
             return "none, as what was seen is within its errors"
         return ", ".join(map(str, self.cause_shares))
 
+    at, covariance = compute_motion, compute_covariance  # Former names, for one release.
+
 
 @dataclass(frozen=True, eq=False)
 class Locator:
@@ -282,6 +284,8 @@ class Locator:
             calibrated=not slipped and is_within_trials(self.tried, found.evidence),
             seconds=time.perf_counter() - begun,
         )
+
+    small = restrict  # Former names, for one release.
 
 
 def find_observed_nodes(anatomy: Anatomy) -> np.ndarray:

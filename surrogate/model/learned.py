@@ -352,6 +352,10 @@ class Learned:
         past = follow_relaxation(self.series, pushed, loads.times, start, self.envelope.force[0])
         return add_relaxation(pushed, past.share), past
 
+    # Former names, for one release.
+    motion, within, exerted, promised = predict_motion, clip_to_range, predict_force, compute_bounds
+    distance, asked = predict_distance, to_input
+
 
 def build_prediction(
     displacement: np.ndarray,
