@@ -136,7 +136,7 @@ def test_intermediate_frames_show_and_slider_stays(demo, gated, monkeypatch):
             assert wait_for(lambda number=number: said[-1] == f"on the way to frame 12: frame {number} is solved")
         assert page.frame.value == 12 and page.shown[3] == 12
         gated.let(9)
-        assert wait_for(lambda: shows(page, 12)) and "solved to its tolerance" in page.shown[2]
+        assert wait_for(lambda: shows(page, 12)) and "converged" in page.shown[2]
         assert "Result pending" not in page.shown[2]
         visitor.wire.close()
 

@@ -33,7 +33,7 @@ def demo(box):
 
         loop = threading.Thread(target=play)
         loop.start()
-        assert wait_for(lambda: "Error of the tumour" in demo.browser.shown[2])
+        assert wait_for(lambda: "Tumour position error" in demo.browser.shown[2])
         yield demo
         done.set()
         loop.join()
@@ -54,8 +54,8 @@ def test_the_page_fits_and_is_in_register(demo, window, size):
     """Nothing is cut off or complained of, and both errors are in sight; the picture is the server's to a pixel."""
     window.size(*size)
     said = f"document.getElementById('{SAID}')"
-    assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('Error of the tumour')")
-    assert_fits(window, size, ("Error of the model", "Error of the tumour"))
+    assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('Tumour position error')")
+    assert_fits(window, size, ("Surrogate error", "Tumour position error"))
     assert_in_register(window, demo.browser.shown[1])
     track = box_of(window, f"{FRAME}?.closest('.mantine-Slider-root')")
     assert track[2] - track[0] > 150.0 and track[2] <= size[0]

@@ -1,4 +1,4 @@
-"""An ensemble of few draws, or of loads beyond the tissue's law, is called a guess wherever its figure is shown."""
+"""An ensemble of few draws, or of loads beyond the tissue's law, is shown as a rough estimate."""
 
 from dataclasses import replace
 
@@ -28,13 +28,13 @@ def test_what_few_draws_or_folded_tissue_say_is_a_guess(counts, guess):
 
 def test_a_guess_is_called_so_and_blames_no_part():
     alone, seen = TumourError(4.11e-3, "E", guess=True), TumourError(4.11e-3, "E", 1e-3, guess=True)
-    assert format_errors(None, alone, False)[-1] == "tumour: within 4.2 mm of where it is (95 %), a guess"
+    assert format_errors(None, alone, False)[-1] == "tumour position error <= 4.2 mm (95 %), rough estimate"
     assert format_tumour_error(seen).endswith(
-        "within 1.0 mm of where it is (95 %); without observation 4.2 mm, a guess"
+        "position error <= 1.0 mm (95 %); without observation 4.2 mm, rough estimate"
     )
     for error in (alone, seen):
         named = replace(error, registration=1.56e-3)
         for words in (format_errors(None, named, False)[-1], format_tumour_trust(named)):
             assert "registration 1.6 mm" in words
-    assert format_tumour_error(alone, brief=True) == "tumour: within 4.2 mm, a guess"
-    assert format_tumour_error(seen, brief=True) == "tumour: within 1.0 mm"
+    assert format_tumour_error(alone, brief=True) == "position error <= 4.2 mm, rough estimate"
+    assert format_tumour_error(seen, brief=True) == "position error <= 1.0 mm"

@@ -67,14 +67,14 @@ def seek(page, number):
 def test_each_state_is_said_with_both_errors(page, number, state, words):
     assert seek(page, number)
     said = page.browser.shown[2]
-    assert page.newest.known.state is state and words in said and "Error of the tumour: not known" in said
+    assert page.newest.known.state is state and words in said and "Tumour position error: not known" in said
     if state is TumourState.GOOD:
         assert re.search(r'"number">tip to tumour \d+\.\d&nbsp;±&nbsp;\d\.\d&nbsp;mm<', said)
-        assert "within 0.2 mm of where it is drawn" in said and "not given:" in said
+        assert "Overlay error (95 %): at most 0.2 mm" in said and "not given:" in said
         assert "What the camera's calibration adds is not known." in said
         assert "reference seen; tool seen; tumour moved 0.5&nbsp;±&nbsp;0.1&nbsp;mm (error of model and tool)" in said
     else:
-        assert "tip to tumour: not known" in said and "Error of the overlay: not known" in said
+        assert "tip to tumour: not known" in said and "Overlay error: not known" in said
         sample = page.history.samples[-1]
         assert sample.values == sample.errors[:1] + (None,) == (None, None)
 
@@ -148,7 +148,7 @@ def test_camera_image_dims_when_stale_and_recovers(follower, stage):
         assert re.search("no image for [1-9][0-9]* s: what is shown is old", unplugged[2])
         assert "Is film.mp4 plugged in?" in unplugged[2]
         assert back[1].mean() > 0.8 * first.colour.mean() and "live from film.mp4" in back[2]
-        assert "paused: what is shown is old" in paused[2] and "Error of the overlay: not known" in paused[2]
+        assert "paused: what is shown is old" in paused[2] and "Overlay error: not known" in paused[2]
         with pytest.raises(ValueError, match="calibrate it at this size"):
             page.plays = True
             page.watch(iter([replace(first, grey=first.grey[::2])]), 0.1)
@@ -184,7 +184,7 @@ def test_the_page_fits_and_is_in_register(page, window, size):
     window.size(*size)
     said = f"document.getElementById('{SAID}').innerText"
     assert window.wait(f"innerWidth == {size[0]} && {said}.includes('picture\\u00a06')")
-    assert_fits(window, size, ("Error of the overlay", "Error of the tumour"))
+    assert_fits(window, size, ("Overlay error", "Tumour position error"))
     assert_in_register(window, page.browser.shown[1])
     for number, place in ((1, SLICES), (2, HISTORY)):
         window.value(f"document.getElementById('{TABS[number][1]}').click()")

@@ -43,8 +43,8 @@ def test_the_page_reads_what_the_frame_holds(theatre):
         ">tip to tumour 12.3&nbsp;mm<",
         "<p>frame 3 of 6; 0.10 s; force 0.25 N; tumour moved 1.23 mm (error of the model 0.02 mm, "
         "error of the tumour not known); ",
-        "; tip to tumour within 2.5 mm of the model&#x27;s finite elements (95 %)</p>",
-        "<p>Error of the tumour: not known.",
+        "; error of the distance &lt;= 2.5 mm (95 %, relative to FEM)</p>",
+        "<p>Tumour position error: not known.",
         "milliseconds: deformation 12.3, rendering 4.5, overlay 0.7<",
     ):
         assert line in said
@@ -54,11 +54,11 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     assert ">tip inside the tumour, its edge 12.3&nbsp;mm<" in within and ">tip to tumour" not in within
     known = TumourError(4.61e-3, "E"), TumourError(4.61e-3, "E", 1.11e-3)
     prior, seen = (report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
-    where = "95 of 100 times no point of it is more than"
-    assert f"<p>Error of the tumour: {where} 4.7 mm from where it is; the largest part is E.</p>" in prior
-    assert f"<p>Error of the tumour: {where} 1.2 mm from where it is; without cortex observation 4.7 mm.</p>" in seen
+    where, whole = "at most", "at any point of its surface"
+    assert f"<p>Tumour position error (95 %): {where} 4.7 mm {whole}; the largest part is E.</p>" in prior
+    assert f"<p>Tumour position error (95 %): {where} 1.2 mm {whole}; without cortex observation 4.7 mm.</p>" in seen
     guess = report(replace(frame, tumour_error=replace(known[0], guess=True)), player.stage, "linear", "", (), 7)
-    assert f"{where} 4.7 mm from where it is: rough estimate (few samples or" in guess and "largest part" not in guess
+    assert f"{where} 4.7 mm {whole}: rough estimate (few samples or" in guess and "largest part" not in guess
     for said, off in ((prior, "4.7"), (seen, "1.2")):
         assert f"tip to tumour 12.3&nbsp;±&nbsp;{off}&nbsp;mm<" in said
     surely = report(replace(frame, moved_error=5.31e-3, model_error=None), player.stage, "fem", "", (), 7)

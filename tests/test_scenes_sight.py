@@ -135,7 +135,7 @@ def test_where_nothing_moves_that_is_said(play, frames):
     assert "No significant motion detected." in " ".join(describe_estimate(found))
     tried, guess = (replace(found, location=replace(found.location, calibrated=known)) for known in (True, False))
     assert "guess" not in tried.words + " ".join(describe_estimate(tried))
-    assert "; a guess; " in guess.words and "It is a guess" in " ".join(describe_estimate(guess))
+    assert "; rough estimate; " in guess.words and "It is a guess" in " ".join(describe_estimate(guess))
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +218,7 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
 
 def test_numbers_and_errors_come_before_explanations(play, frames):
     words = report(frames[1], play.stage, "fem", "", (), 100)
-    order = "by the estimate (truly", "solved to its tolerance", "Error of the tumour", "<b>estimate</b> from", "frame "
+    order = "by the estimate (truly", "converged", "Tumour position error", "<b>estimate</b> from", "frame "
     places = [words.index(each) for each in order]
     assert places == sorted(places)
 

@@ -30,9 +30,7 @@ from sim.material import Material
 class TestTrust:
     def test_a_bound_is_reported_of_a_load_inside_the_range(self):
         said = format_trust(answer(Outcome.PREDICTED), "svr")
-        assert (
-            "in 95 of 100 loads" in said and "Error of the model" in said and "1.00 mm" in said and "warn" not in said
-        )
+        assert "Surrogate error (95 %): at most" in said and "1.00 mm" in said and "warn" not in said
 
     @pytest.mark.parametrize(
         "outcome", [Outcome.EXTRAPOLATED, Outcome.BUDGET, Outcome.STALLED, Outcome.NOT_FINITE, Outcome.PIERCED]
@@ -40,7 +38,7 @@ class TestTrust:
     def test_nothing_is_promised_of_an_answer_that_is_not_good(self, outcome):
         """It stands in another colour, with the reason."""
         said = format_trust(answer(outcome), "svr")
-        assert "95 of 100" not in said and 'class="warn"' in said and "Do not rely on this result" in said
+        assert "Surrogate error" not in said and 'class="warn"' in said and "Do not rely on this result" in said
 
     def test_a_guarded_model_says_which_of_the_two_answered(self):
         assert format_trust(answer(Outcome.PREDICTED), GUARDED).startswith(
@@ -72,7 +70,7 @@ class TestTrust:
         still = answer(Outcome.PREDICTED)
         still = replace(still, displacement=0.0 * still.displacement)
         said = format_trust(still, "svr")
-        assert "Nothing moves the tumour." in said and "95 of 100" not in said
+        assert "Nothing moves the tumour." in said and "Surrogate error" not in said
 
 
 class TestWords:

@@ -234,21 +234,21 @@ class TestSaid:
             (
                 True, 2.21e-4, TumourError(4.11e-3, "E"),
                 [
-                    "model: within 0.23 mm of its finite elements (95 %)",
-                    "tumour: within 4.2 mm of where it is (95 %), mainly E",
+                    "surrogate error <= 0.23 mm (95 %, relative to FEM)",
+                    "tumour position error <= 4.2 mm (95 %), mainly E",
                 ],
             ),
-            (False, None, NOT_KNOWN, ["model: finite elements themselves", NOT_KNOWN_WORDS]),
+            (False, None, NOT_KNOWN, ["FEM reference: no surrogate error", NOT_KNOWN_WORDS]),
             (
                 True, None, TumourError(4.11e-3, "E"),
                 [
-                    "model: error against its finite elements not known",
-                    "tumour: within 4.2 mm of where it is (95 %), mainly E",
+                    "surrogate error relative to FEM: not known",
+                    "tumour position error <= 4.2 mm (95 %), mainly E",
                 ],
             ),
             (
                 False, None, TumourError(4.11e-3, "E", 1e-3),
-                ["tumour: within 1.0 mm of where it is (95 %); without observation 4.2 mm"],
+                ["tumour position error <= 1.0 mm (95 %); without observation 4.2 mm"],
             ),
         ],
     )  # fmt: skip
@@ -259,10 +259,10 @@ class TestSaid:
     @pytest.mark.parametrize(
         ("trained", "promised", "error", "said"),
         [
-            (True, 2.21e-4, TumourError(4.11e-3, "E"), ["model: within 0.23 mm", "tumour: within 4.2 mm"]),
-            (True, None, NOT_KNOWN, ["model: not known", "tumour: not known"]),
-            (False, None, TumourError(4.11e-3, "E"), ["model: FEM itself", "tumour: within 4.2 mm"]),
-            (False, None, TumourError(4.11e-3, "E", 1e-3), ["tumour: within 1.0 mm"]),
+            (True, 2.21e-4, TumourError(4.11e-3, "E"), ["surrogate error <= 0.23 mm", "position error <= 4.2 mm"]),
+            (True, None, NOT_KNOWN, ["surrogate error: not known", "position error: not known"]),
+            (False, None, TumourError(4.11e-3, "E"), ["FEM reference", "position error <= 4.2 mm"]),
+            (False, None, TumourError(4.11e-3, "E", 1e-3), ["position error <= 1.0 mm"]),
         ],
     )
     def test_small_pictures_say_them_in_few_words(self, trained, promised, error, said):
@@ -332,7 +332,7 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     assert checked["tumour_error_mm"] == pytest.approx(1e3 * max(stored.evaluate(0.1 * one).prior for one in range(3)))
     assert main(["check", *words, "--deformer", "linear", "--every", "3"]) == 0
     said = capsys.readouterr().out
-    assert "model: within " in said and "tumour: within " in said
+    assert "surrogate error <= " in said and "position error <= " in said
     assert main(["collect", *words, "--deformer", "linear", "--out", str(tmp_path / "one.h5")]) == 0
     with h5py.File(tmp_path / "one.h5") as file:
         assert np.isfinite(file["tumour_error"][:]).all() and file["tumour_error"][0] > file["model_error"][0] >= 0.0

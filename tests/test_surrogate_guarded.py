@@ -101,7 +101,7 @@ def test_a_frame_says_who_answered(theatre, limit):
     frame = play.draw(0, 0.0, Touch(force=0.1))
     by_model = find_first_model(play.deformer, frame.deformation) is not None
     assert by_model == (limit == 1.0) == (frame.model_error is not None) == (frame.distance_error is not None)
-    assert ("finite elements themselves" in " ".join(frame.head) or "FEM itself" in " ".join(frame.head)) != by_model
+    assert ("FEM reference" in " ".join(frame.head)) != by_model
     moved = player(theatre, small(), "fem" if not by_model else theatre.select_best(small())).draw(
         0, 0.0, Touch(force=0.1)
     )

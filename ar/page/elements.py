@@ -80,8 +80,8 @@ ASIDE, HELP = "sulcus-aside", "sulcus-keys"
 TABS = (("3-D view", "sulcus-tab-view"), ("slices", "sulcus-tab-slices"), ("last 20 s", "sulcus-tab-history"))
 """Labels of the tabs, and ids of their buttons."""
 CAPTION = (
-    "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: where its outline is, 95 of 100 times "
-    "by the error that is named (none: not known). White: the tool; a ring: its tip, outside the slice."
+    "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: 95 % error of its "
+    "outline, by the named source (none: not known). White: tool in the slice; ring: tip outside the slice."
 )
 # Image of one pixel: loading it runs the script, which an element's HTML alone would not.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="

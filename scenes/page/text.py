@@ -174,15 +174,15 @@ def format_trust(answer: Deformation, name: str) -> str:
         )
     if not outcome.good:
         return f'<p>{who}</p><p class="warn">Do not rely on this result: {escape(outcome.value)}.</p>'
-    how = "inside the range that it was trained on" if outcome is Outcome.PREDICTED else "solved to its tolerance"
+    how = "inside the range that it was trained on" if outcome is Outcome.PREDICTED else "converged"
     if is_undeformed(answer):
         return f"<p>{who}: {how}. Nothing moves the tumour.</p>"
     bound = float(answer.bound[0, 0])
     if not np.isfinite(bound):
         return f"<p>{who}: {how}.</p>"
     return (
-        f"<p>{who}: {how}. Error of the model: in 95 of 100 loads no point of the tumour is more than "
-        f"{hud.bound_words(bound, 2)} from where its finite elements have it.</p>"
+        f"<p>{who}: {how}. Surrogate error (95 %): at most {hud.bound_words(bound, 2)} at any point of the tumour, "
+        "relative to FEM.</p>"
     )
 
 
@@ -196,11 +196,11 @@ def format_tumour_trust(error: TumourError) -> str:
     """Describe the error of the tumour position relative to the patient, which includes more than the model."""
     if error.bound is None:
         return (
-            "<p>Error of the tumour: not known. It is known of scripted scenes alone, after "
-            "<code>sulcus uncertainty SCENE</code>.</p>"
+            "<p>Tumour position error: not known. <code>sulcus uncertainty SCENE</code> estimates it for a scripted "
+            "scene.</p>"
         )
     within = hud.bound_words(error.bound, 1)
-    said = f"Error of the tumour: 95 of 100 times no point of it is more than {within} from where it is"
+    said = f"Tumour position error (95 %): at most {within} at any point of its surface"
     guess = ": rough estimate (few samples or load outside the tissue model)" if error.guess else ""
     if error.registration_words:
         said += f" ({error.registration_words} along each axis, as a standard deviation)"
@@ -225,9 +225,7 @@ def report(
     if frame.estimate is not None or not is_undeformed(frame.deformation):
         facts += [format_motion(frame)]
     if frame.distance_error is not None and frame.distance_error < np.inf:
-        facts += [
-            f"tip to tumour within {hud.bound_words(frame.distance_error, 1)} of the model's finite elements (95 %)"
-        ]
+        facts += [f"error of the distance <= {hud.bound_words(frame.distance_error, 1)} (95 %, relative to FEM)"]
     off = None if frame.doubt else frame.tumour_error.bound
     parts = [] if frame.distance is None else [format_tip_distance(frame.distance, off, frame.inside)]
     number, *found = [""] if frame.estimate is None else describe_estimate(frame.estimate)

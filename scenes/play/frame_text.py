@@ -85,7 +85,7 @@ def shorten_source(source: str) -> str:
     return OWN_TISSUES.sub(lambda found: f"; own tissue: {', '.join(OWN.findall(found[0]))}", source)
 
 
-NOT_KNOWN_WORDS = "error of the tumour: not known"
+NOT_KNOWN_WORDS = "tumour position error: not known"
 
 
 def format_errors(
@@ -111,21 +111,21 @@ def format_errors(
 def format_model_error(promised: float | None, trained: bool, brief: bool = False) -> str:
     """Describe the error of the model relative to its FEM."""
     if not trained:
-        return "model: FEM itself" if brief else "model: finite elements themselves"
+        return "FEM reference" if brief else "FEM reference: no surrogate error"
     if promised is None:
-        return "model: not known" if brief else "model: error against its finite elements not known"
-    within = f"model: within {bound_words(promised, 2)}"
-    return within if brief else f"{within} of its finite elements (95 %)"
+        return "surrogate error: not known" if brief else "surrogate error relative to FEM: not known"
+    within = f"surrogate error <= {bound_words(promised, 2)}"
+    return within if brief else f"{within} (95 %, relative to FEM)"
 
 
 def format_tumour_error(error: TumourError, brief: bool = False) -> str:
     """Describe the error of the drawn tumour position relative to the patient."""
     if error.bound is None:
-        return "tumour: not known" if brief else NOT_KNOWN_WORDS
-    within, guess = f"tumour: within {bound_words(error.bound, 1)}", ", a guess" if error.guess else ""
+        return "position error: not known" if brief else NOT_KNOWN_WORDS
+    within, guess = f"position error <= {bound_words(error.bound, 1)}", ", rough estimate" if error.guess else ""
     if brief:
         return within if error.observed is not None else f"{within}{guess}"
-    said = f"{within} of where it is (95 %)"
+    said = f"tumour {within} (95 %)"
     of = error.registration_words
     if error.observed is None:
         if of and not guess and error.largest == REGISTRATION:

@@ -114,7 +114,7 @@ class TumourEstimate:
         if self.location is None:
             return ""
         still = "" if self.noticed else "no significant motion detected; "
-        guess = "" if self.location.calibrated else "a guess; "
+        guess = "" if self.location.calibrated else "rough estimate; "
         return (
             f"{still}{guess}truth moved {format_millimetres(self.truly)}; estimate error {format_millimetres(self.off)}"
         )

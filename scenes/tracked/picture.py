@@ -134,7 +134,7 @@ def format_head_lines(known: TrackingResult) -> Sequence[str]:
     largest = max(known.parts, key=lambda name: known.parts[name])
     lines = [ABOVE] if known.state is TumourState.REST else []
     if known.relied:
-        lines.append(f"tumour: within {bound_words(known.band, 1)} across the view (95 %), mainly {largest}")
+        lines.append(f"overlay error <= {bound_words(known.band, 1)} across the view (95 %), mainly {largest}")
     motion = "; of motion: not known" if not known.motion.known else ""
     camera = "" if "camera" in known.parts else ", camera"
     return (*lines, f"error by tissue{camera} and segmentation: not known{motion}")

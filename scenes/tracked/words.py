@@ -13,7 +13,7 @@ from ..play.stage import TUMOUR_COLOUR
 from .follower import TrackingResult, TumourState
 from .run import Shown
 
-PATIENT_ERROR = "<p>Error of the tumour: not known. Tissue and segmentation add to the error of the overlay.</p>"
+PATIENT_ERROR = "<p>Tumour position error: not known. Tissue and segmentation add to the overlay error.</p>"
 DRAWN = {
     TumourState.GOOD: "The tumour is drawn where it is now.",
     TumourState.REST: "The tumour is drawn as in the scan, for the tool does not touch.",
@@ -74,14 +74,11 @@ def format_distance(gauge: Gauge | None, relied: bool) -> str:
 def overlay_error(known: TrackingResult) -> str:
     """Describe the error of the outline across the view, by source."""
     if not known.relied or known.band is None:
-        return "<p>Error of the overlay: not known.</p>"
+        return "<p>Overlay error: not known.</p>"
     stated = [f"{name} {bound_words(length, 2)}" for name, length in known.parts.items() if length > 0.0]
     none = ", ".join(name for name, length in known.parts.items() if not length > 0.0 and name != "camera")
     off = known.parts.get("camera")
     camera = " What the camera's calibration adds is not known." if off is None else ""
     camera = " The camera is reported to be exactly known." if off == 0.0 else camera
     parts = ", ".join([*stated, *([f"not given: {none}"] if none else [])])
-    return (
-        f"<p>Error of the overlay: 95 of 100 times the tumour is within {bound_words(known.band, 1)} of where it is "
-        f"drawn, across the view ({parts}).{camera}</p>"
-    )
+    return f"<p>Overlay error (95 %): at most {bound_words(known.band, 1)} across the view ({parts}).{camera}</p>"
