@@ -13,8 +13,9 @@ from ..play.stage import TUMOUR_COLOUR
 from .follower import TrackingResult, TumourState
 from .run import Shown
 
+# Note on the page.
 PATIENT_ERROR = "<p>Error of the tumour: not known. Tissue and segmentation add to the error of the overlay.</p>"
-DRAWN = {
+DRAWN = {  # Texts on the page, by the state of the tumour.
     TumourState.GOOD: "The tumour is drawn where it is now.",
     TumourState.REST: "The tumour is drawn as in the scan, for the tool does not touch.",
 }
