@@ -116,8 +116,8 @@ def check_size(colour: np.ndarray, size: tuple[int, ...] | None) -> None:
         raise ValueError(f"images of {size} and {colour.shape}: all images of a video must have one size.")
 
 
-PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-PNG_END, JPEG_END = b"IEND\xaeB`\x82", b"\xff\xd9"
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"  # First bytes of a PNG and of a JPEG.
+PNG_END, JPEG_END = b"IEND\xaeB`\x82", b"\xff\xd9"  # Last bytes of a PNG and of a JPEG.
 # Markers of a JPEG's frame header, which holds its size; the markers of coding tables in that range are excluded.
 SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION

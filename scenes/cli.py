@@ -19,7 +19,8 @@ from .commands.guidance import format_guidance
 from .commands.interrupt import INTERRUPTED
 from .options.help import CommandParser, replace_former
 
-# A command's module is imported only when it is called: `sulcus solve` does not wait for torch.
+# Commands with their descriptions, by section. A command's module is imported only when it is called: `sulcus solve`
+# does not wait for torch.
 GROUPS = {
     "Start": {
         "demo": "play a scene in the browser",
@@ -69,18 +70,18 @@ GROUPS = {
         "export": "write a trained model as an ONNX file",
     },
 }
+# Descriptions of all commands, by name.
 COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}
 
-# Commands that make or read models, whose learners may be a user's own.
-MAKING = ("train", "patient")
+MAKING = ("train", "patient")  # Commands that make models; their learners may be user-defined.
+# Commands that read models; their learners may be user-defined.
 READING = (
     "judge", "export", "scenes", "effects", "demo", "render", "film", "overlay", "link", "collect", "sensitivity",
     "uncertainty", "budget", "check",
 )  # fmt: skip
 
 
-# More threads of a library's wait for one another: products here are small.
-MOST_THREADS = 4
+MOST_THREADS = 4  # Maximum number of threads of a library: BLAS does not scale on these small products.
 
 POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+(?:,[^,]+)?")
 """A point, or a load there, whose first coordinate is negative: argparse would take it for an option."""

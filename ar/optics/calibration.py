@@ -15,14 +15,11 @@ import numpy as np
 from .camera import Camera
 from .lens import Lens
 
-# Largest image side [pixel].
-LARGEST_SIDE = 16384
+LARGEST_SIDE = 16384  # Largest image side [pixel].
 READOUT = "readout_time"
 """Key of a rolling shutter's readout time [s]: neither OpenCV nor ROS has one, and both ignore it."""
-# Maximum length of a camera's name.
-LONGEST = 256
-# Largest readout time, from the first row of an image to the last [s].
-LONGEST_READOUT = 1.0
+LONGEST = 256  # Maximum length of a camera's name [characters].
+LONGEST_READOUT = 1.0  # Largest readout time, from the first row of an image to the last [s].
 
 
 @dataclass(frozen=True)
@@ -151,26 +148,26 @@ def _matrix(name: str, values: np.ndarray) -> list[str]:
     return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{numbers}]"]
 
 
-# Maximum number of characters: a calibration has about a thousand.
-LONGEST_TEXT = 64 * 1024
-# Maximum depth of brackets and of dashes in a line: OpenCV's parser is recursive, and a calibration needs two.
-DEEPEST = 4
-# Minimum number of coefficients of the models named by ROS.
+LONGEST_TEXT = 64 * 1024  # Maximum length of a calibration file [characters]: a calibration has about a thousand.
+DEEPEST = 4  # Maximum nesting depth of brackets: OpenCV's parser is recursive, and a calibration needs two.
+# Minimum number of coefficients of the distortion models named by ROS.
 MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
-# Numbers of coefficients in OpenCV; those after the eighth are of thin prisms and tilted sensors.
+# Allowed numbers of distortion coefficients in OpenCV; those after the eighth are of thin prisms and tilted sensors.
 COUNTS = (4, 5, 8, 12, 14)
 KEYS = (
     "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model", "distortion_coefficients",
     "rectification_matrix", "projection_matrix", "fisheye_model", READOUT,
 )  # fmt: skip
 """Keys of a calibration that are read."""
+# Pattern of a YAML list of numbers, one on each line.
 BLOCK_LIST = re.compile(r"^(( *)data: *)\n((?:\2 *- *[-+.\w]+ *\n)+)", re.MULTILINE)
 ITEM = re.compile(r"^ *- *([-+.\w]+)", re.MULTILINE)
-"""Patterns of a list of numbers, one on a line, and of one of them."""
+"""Pattern of one number of such a list."""
+# Pattern of a camera name without quotes.
 NAME_LINE = re.compile(r"^(camera_name:[ \t]+)([^\s\"'\[{][^\n\"#]*?)[ \t]*$", re.MULTILINE)
 OTHER_LINE = re.compile(rf"^(?!(?:{'|'.join(KEYS)})\b)\w+:[ \t]+[^\s\[{{|>&!][^\n]*\n", re.MULTILINE)
-"""Patterns of a name without quotes, and of a value on one line whose key is not read."""
-WANTED = (
+"""Pattern of a one-line entry whose key is not read."""
+WANTED = (  # Required content of the file, in error messages.
     "Give YAML with image_width, image_height, camera_matrix and distortion_coefficients, as OpenCV or ROS writes it."
 )
 

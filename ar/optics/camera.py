@@ -261,10 +261,10 @@ def build_stereo_pair(
     return camera.move(-half).perturb(-inwards), camera.move(half).perturb(inwards)
 
 
-# Largest motion of points during a band of rows [pixel]: the error of a row is then at most half of it.
-STEP = 0.4
-# Number of times at which motion is sampled; fewest rows of a band; iterations to the row in which a point is seen.
-MOMENTS, FEWEST, STEPS = 33, 4, 6
+STEP = 0.4  # Largest motion of points during a band of rows [pixel]: the error of a row is then at most half of it.
+MOMENTS = 33  # Number of times at which motion during the readout is sampled.
+FEWEST = 4  # Minimum height of a band [rows].
+STEPS = 6  # Number of fixed-point iterations for the row in which a point is seen.
 
 
 def compute_row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:

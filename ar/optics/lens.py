@@ -10,14 +10,13 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-# Largest angle from the axis that is tried [rad]; number of angles from the axis; number of angles round the axis.
-WIDEST = np.radians(88.0)
-STEPS, ROUND = 4096, 32
-# Maximum Newton steps, and the residual that ends them, in normalised coordinates: 1e-9 pixel at a focal length of
-# 1000.
-NEWTON, EXACT = 20, 1e-12
-# Chunk size: its arrays fit in the CPU cache. All at once take half as long again.
-TOGETHER = 8192
+WIDEST = np.radians(88.0)  # Largest angle from the optical axis that is tried [rad].
+STEPS = 4096  # Number of radii, from the axis outwards, at which the mapping is sampled.
+ROUND = 32  # Number of directions round the axis at which the mapping is sampled.
+NEWTON = 20  # Maximum number of Newton iterations of the inverse mapping.
+# Residual that ends the Newton iterations, in normalised coordinates: 1e-9 pixel at a focal length of 1000 pixels.
+EXACT = 1e-12
+TOGETHER = 8192  # Chunk size [points]: its arrays fit in the CPU cache. All at once take half as long again.
 
 
 @dataclass(frozen=True)

@@ -35,26 +35,21 @@ from .places import CLEAR, PAD
 from .styles import STYLES, Opening, Style
 from .window import DARK, FRONT, SHUT, Lines, Roles, draw_overlay
 
-# Unreliable overlays are amber and broken; their text has a paler colour, so that pixels of the outline's colour are
-# the outline's alone.
-DOUBTFUL = (0.92, 0.50, 0.05)
+DOUBTFUL = (0.92, 0.50, 0.05)  # Outline colour (RGB, 0 to 1) of an unreliable overlay; its outline is broken as well.
+# Text colour of an unreliable overlay: pixels of the outline's colour belong to the outline alone.
 WARNING = (1.0, 0.84, 0.5)
 SEEN = (255.0, 245.0, 190.0)
 """Colour of observed points."""
-# Brightness of the margin line relative to the outline, as the margin is not the surface itself.
-FAINT = 0.75
-# Stroke and gap lengths of an unreliable outline, of a margin, and of an outline under closed ground [pixel].
-BROKEN, DASHED, HIDDEN = (9, 6), (12, 7), (9, 6)
-# Line width of an outline under closed ground [pixel].
-BOLD = 2
-# Width of text lines within the silhouette [pixel].
-SHORT = 96
-# Rows by which text at the top may be lower, to leave a line visible.
-LOWER = 2
-# Widths of text at the top, as shares of the image width; the first that covers no tool is used.
+FAINT = 0.75  # Brightness of the margin line relative to the outline, as the margin is not the surface itself.
+BROKEN = (9, 6)  # Stroke and gap lengths of an unreliable outline [pixel].
+DASHED = (12, 7)  # Stroke and gap lengths of a margin [pixel].
+HIDDEN = (9, 6)  # Stroke and gap lengths of an outline under closed ground [pixel].
+BOLD = 2  # Line width of an outline under closed ground [pixel].
+SHORT = 96  # Width of text lines within the silhouette [pixel].
+LOWER = 2  # Number of text rows by which text at the top may be lower, to leave a line visible.
+# Widths of text at the top as shares of the image width; the first that covers no tool is used.
 HEAD_WIDTHS = 0.62, 0.5, 0.4, 0.32, 0.25
-# Distance of a style's text from the number next to the tip [pixel].
-APART = 2 * ROW
+APART = 2 * ROW  # Distance of a style's text from the number next to the tip [pixel].
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,25 +18,26 @@ from .hud import WHITE, write_haloed
 from .outlines import draw_dashes, find_outlines
 from .window import FRONT, SHUT
 
-# Smallest distance of a tip from the line of sight that gives a direction; below, the image's right is used [m].
+# Smallest distance of a tip from the line of sight that gives a direction [m]; below, the image's right is used.
 ASTRAY = 1e-3
-# Margin of the inset round the hidden surface, and above the visible surface [m]; largest measured distance [m].
-ROUND, OVER, FAR = 12e-3, 4e-3, 60e-3
-# Tissue is toned by its distance to the surface: width of a tone [m].
-BAND = 5e-3
+ROUND = 12e-3  # Margin of the inset round the hidden surface [m].
+OVER = 4e-3  # Margin of the inset above the visible surface, and round the tip [m].
+FAR = 60e-3  # Largest measured distance to the hidden surface [m].
+BAND = 5e-3  # Width of a tone [m]: tissue is toned by its distance to the surface.
+# Colours of the tones (RGB), the closest to the surface first.
 TONES = np.array([(222, 206, 192), (184, 168, 156), (146, 132, 124), (112, 100, 94), (82, 74, 70)], np.float64)
 EMPTY = (20.0, 24.0, 27.0)
 """Colour of the inset above the visible surface."""
 CLOSED = (120.0, 165.0, 180.0)
 """Colour of the visible surface where the hidden one does not shine through."""
-# Letter size, line spacing, strokes of the margin [pixel].
-SMALL, LEADING, STROKES = 0.38, 14, (5, 4)
+SMALL = 0.38  # Font scale of the inset's text.
+LEADING = 14  # Line spacing of the inset's text [pixel].
+STROKES = (5, 4)  # Stroke and gap lengths of the margin [pixel].
 SCALE = 10e-3
 """Length of the scale bar [m]."""
 ENDS = ("a", "b")
 """Letters at the ends of the cutting line in the image, and at the inset's sides."""
-# Half the width of a number [pixel].
-WIDE = 10
+WIDE = 10  # Half the width of a number [pixel].
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ from .hud import FINE, FONT
 from .outlines import OPAQUE, clip_to_sheet, cut_outlines, find_outlines
 from .window import DARK
 
-# Rays of the inside test: an odd number, so that there is always a majority.
-RAYS = wp.constant(3)
+RAYS = wp.constant(3)  # Number of rays of the inside test: odd, so that there is always a majority.
 
 
 def build_tree(vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> wp.Mesh:
@@ -115,18 +114,15 @@ def measure_seen(
                 distance[row, column] = wp.length(point - nearest)
 
 
-# Distances of the rings [m]; the first stands for contact.
-RINGS = (1e-3, 5e-3, 10e-3, 15e-3)
+RINGS = (1e-3, 5e-3, 10e-3, 15e-3)  # Distances of the rings from the surface [m]; the first stands for contact.
 RING = (232.0, 228.0, 204.0)
 """Colour of rings."""
-# Smallest length of a ring; distance of rings from the edge of the ground [pixel].
-SHORTEST, OFF = 24, 3
-# Gap on both sides of a ring's number [pixel].
-ROOM = 3
-# Thickness above every line and below every number [pixel].
+SHORTEST = 24  # Smallest length of a drawn ring [pixel].
+OFF = 3  # Distance of rings from the edge of the ground [pixel].
+ROOM = 3  # Gap on all sides of a ring's number [pixel].
+# Side of the square opening that separates numbers from lines [pixel]: thicker than lines, thinner than numbers.
 THICK = 9
-# Smallest length of a piece with a number of its own [pixel].
-LONG = 80
+LONG = 80  # Smallest length of a piece of a ring with a number of its own [pixel].
 
 
 def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels: Sequence[float] = RINGS) -> list[str]:

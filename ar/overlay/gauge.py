@@ -11,10 +11,9 @@ from ..optics.camera import Camera
 from .hud import Below, format_millimetres, lay
 from .outlines import OPAQUE
 
-# Scale of the number; its distance from the tip [pixel].
-GAUGE, BESIDE = 0.6, 10
-# Number of points of a straight line, to draw it under lens distortion.
-BENDS = 33
+GAUGE = 0.6  # Font scale of the number at the tip.
+BESIDE = 10  # Horizontal and vertical distance of the number from the tip [pixel].
+BENDS = 33  # Number of points of a straight line, to draw it under lens distortion.
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,22 +15,19 @@ import numpy as np
 from .places import PAD, find_free_place
 
 Corner = Literal["top left", "top right", "bottom left", "bottom right"]
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-WHITE = (244, 244, 240)
-# Scale of text at the bottom of an image; line spacing [pixel]; its largest width as a share of the image width.
-FINE, ROW, NARROW = 0.45, 18, 0.25
-# Distance from the desired place beyond which text covers thin lines instead [pixel].
-NEAR = 48
-# Widths of a panel's lines as shares of the image width, the first that fits is used; scale of the second, smaller try.
-PANEL_WIDTHS, SMALLER = (0.9, 0.5, 0.36, 0.27, 0.2), 0.85
-# Top of the lines at the top, under the orientation letter [pixel].
-HEAD = 34
-# Scale of the orientation letters.
-SIGN = 0.6
-# Orientation letters along the axes of RAS, and against them.
-SIDES = ("RL", "AP", "SI")
-# Smallest component of a direction for which its second letter is shown.
-OBLIQUE = 0.38
+FONT = cv2.FONT_HERSHEY_SIMPLEX  # OpenCV font of all text in images.
+WHITE = (244, 244, 240)  # Default text colour (RGB).
+FINE = 0.45  # Default font scale of text in images.
+ROW = 18  # Line spacing of text [pixel].
+NARROW = 0.25  # Largest width of text at the bottom, as a share of the image width.
+NEAR = 48  # Distance from the desired place beyond which text covers thin lines instead [pixel].
+# Widths of a panel's lines as shares of the image width; the first that fits is used.
+PANEL_WIDTHS = (0.9, 0.5, 0.36, 0.27, 0.2)
+SMALLER = 0.85  # Factor on the font scale of a panel in the second try.
+HEAD = 34  # Top row of the text at the top, below the orientation letter [pixel].
+SIGN = 0.6  # Font scale of the orientation letters.
+SIDES = ("RL", "AP", "SI")  # Orientation letters of the positive and negative direction of each RAS axis.
+OBLIQUE = 0.38  # Smallest component of a unit direction for which a second letter is shown.
 # Allowed line breaks: not after a colon, nor between a name, its number, that number's error and their unit.
 BREAK = re.compile(
     r"\s+(?!(?:moved |reads )?[-+]?\d|\(\d\.|\+- )(?<![:-] )(?<!\d (?=%))(?<!\d (?=(?:mm|s|ms|N|kPa|ml|points)\b))"
@@ -87,7 +84,7 @@ class Below:
     thin: np.ndarray | None = None
 
 
-NOTHING = Below()
+NOTHING = Below()  # Default: text may cover no part of the image.
 
 
 def lay(

@@ -13,12 +13,13 @@ from .outlines import OPAQUE
 from .places import CLEAR, PAD
 from .window import DARK, FAINTEST, STEP, STEPS, STRONGEST
 
-# Letter scale; length of a line's sample, and of the gap after it [pixel].
-SMALL, SAMPLE, AFTER = 0.4, 26, 6
-# Heights of a line of text and of a step of the tint's scale; smallest image width with a legend [pixel].
-LEADING, TALL, LEAST = 16, 12, 480
-# Ground colour under the tint's scale.
-GROUND = (200.0, 150.0, 135.0)
+SMALL = 0.4  # Font scale of a legend.
+SAMPLE = 26  # Length of a line's sample [pixel].
+AFTER = 6  # Gap after a line's sample [pixel].
+LEADING = 16  # Height of a line of text [pixel].
+TALL = 12  # Height of a step of the tint's scale [pixel].
+LEAST = 480  # Smallest image width with a legend [pixel].
+GROUND = (200.0, 150.0, 135.0)  # Ground colour under the tint's scale (RGB).
 SHEET = 255
 """Value of `taken` at a legend, a scale or an inset: no panel goes there."""
 

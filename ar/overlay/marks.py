@@ -25,11 +25,10 @@ from .outlines import (
 from .styles import Opening
 from .window import DARK
 
-# The position before is grey and dotted: colour, lengths of strokes and gaps [pixel].
-BEFORE, DOTTED = (0.86, 0.88, 0.90), (2, 5)
-# Smallest motion with an arrow [pixel].
-LEAST_ARROW = 4.0
-UNNAMED = LegendNames()
+BEFORE = (0.86, 0.88, 0.90)  # Colour of the previous position (RGB, 0 to 1): grey.
+DOTTED = (2, 5)  # Stroke and gap lengths of the outline at the previous position [pixel].
+LEAST_ARROW = 4.0  # Smallest motion with an arrow [pixel].
+UNNAMED = LegendNames()  # Default legend names.
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,4 +163,4 @@ class Words:
     error: float | None = None
 
 
-NO_COVER, NO_MARKS, NO_WORDS = Cover(), Marks(), Words()
+NO_COVER, NO_MARKS, NO_WORDS = Cover(), Marks(), Words()  # Defaults: no occluders, no marks, no text.

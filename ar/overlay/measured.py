@@ -21,18 +21,16 @@ from .places import PAD, find_free_place
 from .styles import Style
 from .window import FRONT, Roles
 
-# Search margin beyond the last ring [m].
-BEYOND = 3e-3
-# Widths of a cut's inset as shares of the image width, the first that fits is used; its aspect ratio; strokes of the
-# cutting line in the image [pixel].
-WIDTHS, ASPECT, CUT_STROKES = (0.34, 0.27, 0.21), 0.75, (3, 5)
-# Search half-width of the surface over a cut, in radii of the hidden surface.
+BEYOND = 3e-3  # Search margin beyond the last ring [m].
+WIDTHS = (0.34, 0.27, 0.21)  # Widths of a cut's inset as shares of the image width; the first that fits is used.
+ASPECT = 0.75  # Height of the inset over its width.
+CUT_STROKES = (3, 5)  # Stroke and gap lengths of the cutting line in the image [pixel].
+# Half-width of the search for the visible surface over a cut [half-widths of the hidden surface in the cut].
 ACROSS = 4.0
-# Distance of the cut's letters from a sheet's edge [pixel].
-EDGE = 12
-# Distance of a letter from the line; half the size of a letter [pixel].
-ASIDE, HALF = 10, 6
-NO_ROOM = "no room for the cut"
+EDGE = 12  # Distance of the cut's letters from the image border and from tools [pixel].
+ASIDE = 10  # Distance of a letter from the cutting line [pixel].
+HALF = 6  # Half the size of a letter [pixel].
+NO_ROOM = "no room for the cut"  # Text in the image where no place for the inset is free.
 
 
 @dataclass(frozen=True, eq=False)

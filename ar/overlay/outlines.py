@@ -13,10 +13,8 @@ from ..rendering.rasteriser import rasterise_surface
 from .hud import FONT, WHITE
 from .window import DARK, NEAR_EDGE, SURROUND
 
-# Value of a sheet's fourth channel that covers what is under it.
-OPAQUE = 255
-# Grid spacing of the coarse search under lens distortion [pixel].
-COARSE = 16
+OPAQUE = 255  # Value of a sheet's fourth channel that covers what is under it.
+COARSE = 16  # Grid spacing of the coarse search under lens distortion [pixel].
 
 
 def compute_ink(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
@@ -139,16 +137,13 @@ def to_key(ink: Sequence[float]) -> tuple[float, ...]:
     return tuple(share + 8.0 if share < 128.0 else share - 8.0 for share in ink)
 
 
-# Tolerance of a colour in each channel: centres of lines have the exact colour, within rounding.
-SAME = 2
-# Percentile of an outline's pixels that counts: corners and crossings of lines are excluded [%].
+SAME = 2  # Colour tolerance in each channel: centres of lines have the exact colour, within rounding.
+# Percentile of the outline pixels' distances that is reported [%]: corners and crossings of lines are excluded.
 SHARE = 95.0
-# Distance from occluders or the image border within which an outline may be cut [pixel].
-CUT = 5
-# Distance from a mask's edge within which lines may run; minimum number of pixels of a share [pixel].
-BESIDE, FEW = 6, 60
-# Margin round a line of text without its colour: else "1.5" would be found in "11.5" [pixel].
-APART = 8
+CUT = 5  # Distance from occluders or the image border within which an outline may be cut [pixel].
+BESIDE = 6  # Distance from a mask's edge within which lines may be drawn [pixel].
+FEW = 60  # Minimum number of pixels for a share.
+APART = 8  # Margin round a line of text without its colour: else "1.5" would be found in "11.5" [pixel].
 
 
 def measure_outline_gap(

@@ -5,14 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-# Distance of text from the border; distance from lines and other text [pixel].
-PAD, CLEAR = 8, 6
-# Grid spacing of candidate places [pixel].
-STEP = 4
-# Search radii around the desired place, tried in order before the whole image [pixel].
-REACHES = 64, 256
-# Weight of a sideways distance relative to a vertical one: lines of text go below each other.
-ASIDE = 2
+PAD = 8  # Distance of text from the image border [pixel].
+CLEAR = 6  # Distance of text from lines and other text [pixel].
+STEP = 4  # Grid spacing of candidate places [pixel].
+REACHES = 64, 256  # Search radii around the desired place [pixel], tried in order before the whole image.
+ASIDE = 2  # Weight of a sideways distance relative to a vertical one: lines of text go below each other.
 
 
 def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) -> tuple[int, int] | None:

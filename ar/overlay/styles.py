@@ -20,8 +20,8 @@ STYLES: Mapping[Style, str] = MappingProxyType(
     }
 )
 """Display names of the styles."""
-# Shares of the visible silhouette from which its ground is reported, and from which it counts as all of it.
-NOTICED, WHOLE = 0.1, 0.9
+NOTICED = 0.1  # Share of the visible silhouette from which the closed ground over it is reported.
+WHOLE = 0.9  # Share of the visible silhouette from which closed ground is reported without "partly".
 
 
 @dataclass(frozen=True)

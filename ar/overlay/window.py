@@ -17,27 +17,26 @@ from ..rendering.rasteriser import NOTHING, RasterisedSurface, depth_of, face_of
 from ..rendering.renderer import Pictures
 from ..rendering.triangle import weights_of
 
-# Depth under the surface over which light falls to 1 / e [m].
-FADE = wp.constant(0.03)
-# Width of the window's soft edge round the silhouette [pixel].
-SURROUND = wp.constant(24)
-# Lengths of OpenCV's chamfer steps, straight and diagonal [pixel]; radius that covers the soft edge [pixel].
-STRAIGHT, SLANTED = wp.constant(0.955), wp.constant(1.3693)
-REACH = wp.constant(26)
-# Half the widths of the outline and of its dark border; distance from the edge where neither is drawn [pixel].
-LINE, RIM, NEAR_EDGE = wp.constant(1.7), wp.constant(2.7), wp.constant(5.0)
-# Depth style: step of depth [m], number of steps; below, tint at the surface and smallest tint.
-STEP, STEPS = wp.constant(0.005), wp.constant(6)
-STRONGEST, FAINTEST = wp.constant(0.85), wp.constant(0.1)
-# Roles of a layer: in front of the overlay, or ground that nothing shines through.
+FADE = wp.constant(0.03)  # Depth under the surface over which light falls to 1 / e [m].
+SURROUND = wp.constant(24)  # Width of the window's soft edge round the silhouette [pixel].
+STRAIGHT = wp.constant(0.955)  # Length of a straight chamfer step, as in OpenCV [pixel].
+SLANTED = wp.constant(1.3693)  # Length of a diagonal chamfer step, as in OpenCV [pixel].
+REACH = wp.constant(26)  # Search radius of the chamfer distance [pixel]: covers the soft edge.
+LINE = wp.constant(1.7)  # Half the width of the outline [pixel].
+RIM = wp.constant(2.7)  # Half the width of the outline with its dark border [pixel].
+NEAR_EDGE = wp.constant(5.0)  # Distance from the silhouette's edge within which outline and border are drawn [pixel].
+STEP = wp.constant(0.005)  # Width of a depth step of the style `depth` [m].
+STEPS = wp.constant(6)  # Number of depth steps of the style `depth`.
+STRONGEST = wp.constant(0.85)  # Opacity of the tint at the surface.
+FAINTEST = wp.constant(0.1)  # Opacity of the tint at the last depth step.
+# Roles of a layer: in front of the overlay; ground that nothing shines through.
 FRONT, SHUT = wp.constant(1), wp.constant(2)
-# Shading of the ground inside of the silhouette.
+# Shading of the ground inside the silhouette.
 SHINES, TINTED, DEEPENED = wp.constant(1), wp.constant(2), wp.constant(3)
 SHADES = {"window": SHINES, "fill": TINTED, "depth": DEEPENED}
 """Shading by style; none in other styles."""
-# Colour of the dark border of lines.
-DARK = (10.0, 12.0, 12.0)
-DARK_INK = wp.constant(wp.vec3f(*DARK))
+DARK = (10.0, 12.0, 12.0)  # Colour of the dark border of lines (RGB).
+DARK_INK = wp.constant(wp.vec3f(*DARK))  # Colour of the dark border for kernels.
 
 
 @dataclass(frozen=True, eq=False)

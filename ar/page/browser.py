@@ -37,10 +37,8 @@ from .recording import Recorder
 from .scene import add_body, set_up_scene
 from .style import PAGE, STATUS, build_style
 
-# Sort order after all elements that are added later.
-LAST = 1e9
-# Addresses that this machine reaches by the name localhost.
-EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")
+LAST = 1e9  # Sort order of the element after all that are added later.
+EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")  # Addresses that this machine reaches by the name localhost.
 
 
 Shown = tuple[int, np.ndarray, str, int]

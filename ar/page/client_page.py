@@ -11,8 +11,8 @@ import re
 from functools import lru_cache
 from urllib.parse import quote
 
-TITLE = "sulcus"
-ICON = (
+TITLE = "sulcus"  # Title of the page.
+ICON = (  # Icon of the page (SVG).
     "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#141414'/>"
     "<circle cx='16' cy='16' r='9' fill='#1f6f3a' stroke='#37e36b' stroke-width='3'/>"
     "<path d='M4 10 Q16 3 28 10' fill='none' stroke='#eee' stroke-width='2' stroke-dasharray='2 2'/></svg>"

@@ -20,7 +20,7 @@ import numpy as np
 from ..overlay.hud import BREAK
 from .parts import Key
 
-QUALITY = 88
+QUALITY = 88  # JPEG quality of images on the page, 0 to 100.
 PICTURE, SAID, NEXT = "sulcus-picture", "sulcus-said", "sulcus-next"
 """Ids of the elements that hold the image, the words next to it, and the hidden next ones."""
 SLICES, HISTORY = "sulcus-slices", "sulcus-history"
@@ -37,9 +37,10 @@ class Spot:
     alt: str
 
 
-MAIN = Spot(PICTURE, SAID, NEXT, "what the camera sees")
+MAIN = Spot(PICTURE, SAID, NEXT, "what the camera sees")  # Place of the camera image.
+# Place of the slices.
 ASIDE_SPOT = Spot(SLICES, HISTORY, "sulcus-next-aside", "axial, coronal and sagittal slices of the scan")
-# If images are loaded out of order, older ones are dropped.
+# Script that shows the next image. If images are loaded out of order, older ones are dropped.
 SWAP = """
 const words = this.parentNode.querySelector('template').content, number = Number(this.dataset.number);
 const picture = document.getElementById('PICTURE'), said = document.getElementById('SAID');
@@ -79,7 +80,7 @@ ASIDE, HELP = "sulcus-aside", "sulcus-keys"
 """Ids of the elements that hold the tabs with their content, and the list of keys."""
 TABS = (("3-D view", "sulcus-tab-view"), ("slices", "sulcus-tab-slices"), ("last 20 s", "sulcus-tab-history"))
 """Labels of the tabs, and ids of their buttons."""
-CAPTION = (
+CAPTION = (  # Text under the slices.
     "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: 95 % error of its "
     "outline, by the named source (none: not known). White: tool in the slice; ring: tip outside the slice."
 )
@@ -87,14 +88,14 @@ CAPTION = (
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 
 
-SPACE = Key(" ", "space", "space", "play or pause")
-BACK, ON = (
+SPACE = Key(" ", "space", "space", "play or pause")  # Key that plays or pauses.
+BACK, ON = (  # Keys that move one frame back and one frame on.
     Key("ArrowLeft", "arrowleft", "\N{LEFTWARDS ARROW}", "one frame back"),
     Key("ArrowRight", "arrowright", "\N{RIGHTWARDS ARROW}", "one frame on"),
 )
-STYLE = Key("s", "S", "s", "next overlay")
-RECORD = Key("r", "R", "r", "start or stop recording")
-LIVE_KEYS = (SPACE, STYLE, RECORD)
+STYLE = Key("s", "S", "s", "next overlay")  # Key that selects the next overlay.
+RECORD = Key("r", "R", "r", "start or stop recording")  # Key that starts or stops a recording.
+LIVE_KEYS = (SPACE, STYLE, RECORD)  # Keys of a page without frames to seek.
 KEYS = (SPACE, BACK, ON, STYLE, RECORD)
 """Keys that the server receives: of a page with frames to seek (`LIVE_KEYS`: of one without)."""
 # In the 3-D view arrows and letters move the camera: our keys go to viser's own commands alone, which listen on the

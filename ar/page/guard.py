@@ -31,12 +31,10 @@ from websockets.http11 import Request, Response
 from .client_page import build_document
 from .messages import LARGEST, MessageError, check_message
 
-# The guard relies on internals of this viser release line: others are rejected.
-KNOWN = "1.1."
-# Default ports; valid host names; headers so that another page can neither frame this one (clickjacking) nor learn its
-# address.
-PORTS = {"http": 80, "https": 443}
-NAME = re.compile(r"[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?")
+KNOWN = "1.1."  # Supported viser release line: the guard relies on internals of it.
+PORTS = {"http": 80, "https": 443}  # Default ports by scheme.
+NAME = re.compile(r"[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?")  # Pattern of a valid host name.
+# HTTP headers so that another page can neither frame this one (clickjacking) nor learn its address.
 HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "Referrer-Policy": "no-referrer"}
 
 
@@ -64,7 +62,7 @@ class ConnectionLimits:
     asides: float = 2.0
 
 
-LIMITS = ConnectionLimits()
+LIMITS = ConnectionLimits()  # Default limits of connections.
 
 
 class UnguardedError(RuntimeError):
@@ -243,7 +241,7 @@ def open_server(
     return server, door.token
 
 
-PATCHING = threading.Lock()
+PATCHING = threading.Lock()  # Lock while websockets' `serve` is replaced.
 
 
 @contextmanager

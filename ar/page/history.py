@@ -10,12 +10,15 @@ from html import escape
 
 SPAN = 20.0
 """Time span of a chart [s]."""
-# Layout of a chart [SVG units]: width, height of a line, margins at the left, above and below.
-WIDE, HIGH, LEFT, ABOVE, BELOW = 600.0, 105.0, 44.0, 20.0, 16.0
-# Samples that are kept; samples that are drawn: a pixel or two apart.
-MOST, DRAWN = 1200, 240
-# Time gap beyond which samples are not joined [s]; half the width of an isolated sample [s].
-PAUSE, DOT = 2.0, 0.06
+WIDE = 600.0  # Width of the charts [SVG units].
+HIGH = 105.0  # Height of one chart [SVG units].
+LEFT = 44.0  # Left margin of a chart [SVG units].
+ABOVE = 20.0  # Margin above the curve of a chart [SVG units].
+BELOW = 16.0  # Margin below the curve of a chart [SVG units].
+MOST = 1200  # Maximum number of samples that are kept.
+DRAWN = 240  # Maximum number of samples that are drawn: a pixel or two apart.
+PAUSE = 2.0  # Time gap beyond which samples are not joined [s].
+DOT = 0.06  # Half the width of an isolated sample [s].
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,8 @@ from typing import Annotated
 import msgspec
 import viser
 
-# Maximum size of a client's message [bytes]: camera and value take some 300.
-LARGEST = 65536
-# Tolerance for a browser's rounding, as a share of a slider's range.
-ROUNDING = 1e-6
+LARGEST = 65536  # Maximum size of a client's message [bytes]: camera and value take some 300.
+ROUNDING = 1e-6  # Tolerance for a browser's rounding, as a share of a slider's range.
 
 Pixels = Annotated[float, msgspec.Meta(ge=0.0, le=65536.0)]
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
@@ -68,7 +66,7 @@ class Command(msgspec.Struct, tag_field="type", tag="CommandTriggerMessage", for
     uuid: str
 
 
-DECODER = msgspec.msgpack.Decoder(PageCamera | ControlSetting | Command)
+DECODER = msgspec.msgpack.Decoder(PageCamera | ControlSetting | Command)  # Decoder of the messages of a client.
 
 
 def check_message(message: str | bytes, control: Callable[[str], object]) -> bytes:

@@ -16,12 +16,12 @@ import viser
 
 from ..screen import write_film
 
-LONGEST, LARGEST = 60.0, 64_000_000
-"""Maximum duration [s] and size [characters of coded images] of a recording; it then ends automatically."""
+LONGEST = 60.0  # Maximum duration of a recording [s]; it then ends automatically.
+LARGEST = 64_000_000  # Maximum size of a recording [characters of coded images]; it then ends automatically.
 RATE = 15.0
 """Frame rate of a video [1/s]."""
 RECORDS, STOPS, MAKES = "Record", "Stop recording", "Encoding the video ..."
-"""Labels of the button."""
+"""Labels of the button: start, stop, encoding in progress."""
 
 
 @dataclass

@@ -9,8 +9,7 @@ import viser
 
 from .parts import SceneSurface, SceneViewpoint, Sign
 
-# Width of the docked panel in browsers that do not support the page's rules [CSS pixel].
-PANEL = 676.0
+PANEL = 676.0  # Width of the docked panel in browsers that do not support the page's rules [CSS pixel].
 
 
 def set_up_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Sequence[Sign]) -> None:

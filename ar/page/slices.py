@@ -17,20 +17,18 @@ from ..overlay.marks import BEFORE, DOTTED
 from ..overlay.outlines import compute_ink, draw_dashes
 from ..rendering.layer import Layer, Solid
 
-# Half the side of a view [m], its side [pixel], sampling distance of the scan [m]: finer adds nothing.
-REACH, SIDE, GRAIN = 40e-3, 280, 0.8e-3
-# Grey level outside the scan; maximum grey level of the scan, so that lines stand out; opacity of the band.
-NOWHERE, BRIGHT, TINT = 26, 190.0, 0.22
-# Grey between two views.
-EDGE = 90
-# Grid spacing of distances for the band [pixel]; linear interpolation between.
-COARSE = 7
-# Length of the scale bar [m]; maximum distance of a tip that counts as in the plane [m].
-BAR, BESIDE = 20e-3, 1e-3
-# Distance of letters, names and the bar from the edge [pixel].
-PAD = 8
-# Binary digits of subpixel positions of outlines.
-DIGITS = 4
+REACH = 40e-3  # Half the side of a view [m].
+SIDE = 280  # Side of a view [pixel].
+GRAIN = 0.8e-3  # Sampling distance of the scan [m]: finer adds nothing.
+NOWHERE = 26  # Grey level outside the scan.
+BRIGHT = 190.0  # Maximum grey level of the scan, so that lines stand out.
+TINT = 0.22  # Opacity of the error band.
+EDGE = 90  # Grey level of the line between two views.
+COARSE = 7  # Grid spacing of the distances for the band [pixel]; linear interpolation between.
+BAR = 20e-3  # Length of the scale bar [m].
+BESIDE = 1e-3  # Maximum distance of a tip that counts as in the plane [m].
+PAD = 8  # Distance of letters, names and the bar from the edge [pixel].
+DIGITS = 4  # Number of binary digits of subpixel positions of outlines.
 
 
 @dataclass(frozen=True)

@@ -11,22 +11,22 @@ from .client_page import WITHOUT
 from .elements import ASIDE, HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 
 PAGE, STATUS = "sulcus", "sulcus-status"
-"""Ids of the elements that hold the words under the image, and the line over it."""
+"""Ids of the elements that hold the words under the image, and the status line over it."""
 NOTE = "sulcus-note"
 """Class of the words of a note."""
-PANEL = f"div:has(canvas) ~ div:has(#{PAGE})"
-VIEW = f"div:has(canvas):has(~ div #{PAGE})"
-PARTS = f"div:has(> div > #{SAID})"
-NOTES = ".mantine-Notifications-root"
+PANEL = f"div:has(canvas) ~ div:has(#{PAGE})"  # Selector of the panel with the controls.
+VIEW = f"div:has(canvas):has(~ div #{PAGE})"  # Selector of the 3-D view.
+PARTS = f"div:has(> div > #{SAID})"  # Selector of the list of the panel's parts.
+NOTES = ".mantine-Notifications-root"  # Selector of viser's notifications.
 
-# For a client without control: controls are dimmed and do not receive pointer events.
-DIMMED = (
+DIMMED = (  # Selectors of controls that are dimmed and receive no pointer events for a client without control.
     ".mantine-Slider-root, .mantine-InputWrapper-root, .mantine-NumberInput-root, .mantine-Checkbox-root, "
     "div:has(> button):has(+ div .mantine-Slider-root) > button, div:has(> button) + div:has(> button) > button"
 )
 LOOKS_ON = f"<style>{PARTS} :is({DIMMED}) {{ opacity: 0.45; pointer-events: none }}</style>"
 """Rules for a client without control."""
 
+# Style sheet of the page; names in capitals are replaced by selectors.
 RULES = """
 :root { --w: min(62vw, calc((100vh - 10.5rem) * var(--aspect))); --low: max(29vh, 9rem); }
 #PAGE { font-size: 0.8rem; line-height: 1.32; box-sizing: border-box; padding: 0.45rem 0.8rem;

@@ -12,8 +12,7 @@ from ..optics.camera import Camera
 from .parallel import forward_kernel, load, run_length
 from .triangle import box_of, edge, first_row
 
-# Average number of pixels in a cell of the lookup table.
-CELL = 64
+CELL = 64  # Average number of pixels in a cell of the lookup table.
 
 
 @wp.struct

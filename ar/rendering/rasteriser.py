@@ -27,7 +27,7 @@ NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Value of an empty z-buffer entry."""
 NEAR = 1e-3
 """Near plane [m]: nothing closer to a camera is drawn."""
-PARTS = 8
+PARTS = 8  # Number of threads that share the rows of a triangle on a GPU.
 
 
 @dataclass(frozen=True, eq=False)

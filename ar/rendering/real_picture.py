@@ -13,8 +13,7 @@ from .parallel import forward_kernel, launch_in_bands, load
 from .rasteriser import rasterise
 from .renderer import Picture, Pictures
 
-# Width of the field's soft edge as a share of its radius.
-SOFT = wp.constant(0.12)
+SOFT = wp.constant(0.12)  # Width of the field's soft edge as a share of its radius.
 
 
 def add_vignette(picture: Picture, field: float) -> Picture:

@@ -17,8 +17,8 @@ from .rasteriser import NEAR, allocate_z_buffer, draw, find_rows_reached
 from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
 from .surfaces import Light, PlacedSurface, Shadow, Stack, place
 
-DRAPE = (0.13, 0.30, 0.36)
-SHADOW_PIXELS = 384
+DRAPE = (0.13, 0.30, 0.36)  # Colour of the drape (RGB, scene-linear).
+SHADOW_PIXELS = 384  # Side of the shadow map [pixel].
 
 
 @dataclass(frozen=True, eq=False)

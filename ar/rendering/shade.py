@@ -10,16 +10,13 @@ from .rasteriser import NOTHING, depth_of, face_of
 from .surfaces import FaceCorners, LayerShading, Light, PlacedSurface, Point, Shadow, Surfaces
 from .triangle import weights_at
 
-# Minimum depth of a caster in front of a point that it shades [m].
-BIAS = wp.constant(0.0002)
-# Half the width of the shadow's soft edge [shadow-map pixel].
-SOFT = wp.constant(3)
-TAPS = wp.constant(7)
+BIAS = wp.constant(0.0002)  # Minimum depth of an occluder in front of a point that it shades [m].
+SOFT = wp.constant(3)  # Half the width of the shadow's soft edge [shadow-map pixel].
+TAPS = wp.constant(7)  # Width of the shadow filter [shadow-map pixel]: 2 SOFT + 1.
 Taps = wp.types.vector(length=7, dtype=wp.float32)
-# Side of the tiles of the shadow map's depth bounds [pixel]: the filter overlaps at most four.
+# Side of the tiles of the shadow map's depth bounds [shadow-map pixel]: the filter overlaps at most four.
 TILE = wp.constant(8)
-# Scene-linear light displayed as white.
-BRIGHTEST = wp.constant(4.0)
+BRIGHTEST = wp.constant(4.0)  # Scene-linear light displayed as white.
 
 
 @wp.func

@@ -20,31 +20,29 @@ from .rectified import Rectified
 
 # Side of the square for local normalisation of grey levels [m]: lamps differ between eyes and positions.
 SQUARE = 2.5e-3
-# Normalised contrast [grey level]; contrast of a square at which normalisation is halved [grey level].
-STEEP, FLAT = 60.0, 6.0
-# Matching: block, penalties of small and large steps of disparity, uniqueness ratio [%].
-BLOCK, SMALL_STEP, LARGE_STEP, BETTER = 5, 200, 800, 5
-# Search range of depths, in front of and behind the target [m].
-DEEP = 12e-3
-# Side of the square of the subpixel match [pixel]; its maximum iterations and final step [pixel].
-SIDE, MOVES = 15, (15, 0.01)
-# Largest difference of the subpixel match from the whole pixel, and from its row [pixel].
-AWAY, OFF_ROW = 2.0, 1.0
-# Median row difference of the eyes above which the calibration is of other cameras [pixel].
-ROWS_APART = 0.7
-# Lower bound of the disparity's standard deviation [pixel], as light differs between eyes; factor for correlated errors
-# within a square. Both are measured on rendered images.
-LEAST_SIGMA, ALIKE = 0.12, 2.0
+STEEP = 60.0  # Contrast after normalisation [grey level].
+FLAT = 6.0  # Contrast of a square at which normalisation is halved [grey level].
+BLOCK = 5  # Side of a block of semi-global matching [pixel].
+SMALL_STEP = 200  # Penalty of a change of disparity by one pixel between neighbours (OpenCV's P1).
+LARGE_STEP = 800  # Penalty of a larger change (OpenCV's P2).
+BETTER = 5  # Margin by which the best match must beat the second [%].
+DEEP = 12e-3  # Search range of depths, in front of and behind the target [m].
+SIDE = 15  # Side of the square of the subpixel match [pixel].
+MOVES = (15, 0.01)  # Subpixel match: maximum number of iterations, final step [pixel].
+AWAY = 2.0  # Largest difference of the subpixel match from the whole pixel [pixel].
+OFF_ROW = 1.0  # Largest difference of the subpixel match from its row [pixel].
+ROWS_APART = 0.7  # Median row difference of the eyes above which the calibration is of other cameras [pixel].
+# Lower bound of the disparity's standard deviation [pixel], measured on rendered images: light differs between eyes.
+LEAST_SIGMA = 0.12
+ALIKE = 2.0  # Factor on the matching error for correlated errors within a square, measured on rendered images.
 # Standard deviation over mean absolute value of a Gaussian: converts the mean difference of two windows.
 MEAN_SIZE = float(np.sqrt(0.5 * np.pi))
-# Glare: smallest brightness [grey level], largest saturation [share of the maximum], margin that is also hidden
-# [pixel].
-BRIGHT, COLOURLESS, RIM = 200, 0.12, 3
-# Smallest standard deviation in a square, noise included [grey level]: below, highlights that move over it would be
-# matched.
+BRIGHT = 200  # Glare: smallest brightness [grey level].
+COLOURLESS = 0.12  # Glare: largest saturation [share of the maximum channel].
+RIM = 3  # Glare and covered parts: margin that is also hidden [pixel].
+# Smallest standard deviation in a square, noise included [grey level]: below, highlights that move over it would match.
 TEXTURE = 5.0
-# Mean grey level of a window below which an eye is dark.
-BLACK = 12.0
+BLACK = 12.0  # Mean grey level of an eye's window below which the eye is dark.
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,17 +201,18 @@ def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
     return Cloud(which[matched], points[matched], deviation[matched])
 
 
-# Pixel size of the coarse search [m]; half a side of the template, and search radius, in these pixels.
-COARSE, HALF, REACH = 1.0 / 3000.0, 10, 27
-# Smallest normalised cross-correlation of a match.
-FLOW_ALIKE = 0.5
-# Subpixel match: side of the square [pixel], pyramid levels, termination.
-FLOW_SIDE, FLOW_LEVELS, FLOW_MOVES = 21, 1, (20, 0.01)
-# Largest distance from the start after tracking back [pixel].
-BACK = 1.0
-# Number of neighbours of a point, and largest deviation of its motion from their median: in standard deviations, or
-# [m].
-NEIGHBOURS, DEVIATIONS, FREE = 8, 4.0, 0.5e-3
+COARSE = 1.0 / 3000.0  # Pixel size of the coarse search [m].
+HALF = 10  # Half the side of the template of the coarse search [coarse pixels].
+REACH = 27  # Search radius of the coarse search [coarse pixels].
+FLOW_ALIKE = 0.5  # Smallest normalised cross-correlation of a match.
+FLOW_SIDE = 21  # Side of the square of the optical flow [pixel].
+FLOW_LEVELS = 1  # Highest pyramid level of the optical flow.
+FLOW_MOVES = (20, 0.01)  # Optical flow: maximum number of iterations, final step [pixel].
+BACK = 1.0  # Largest distance from the start after tracking forward and back [pixel].
+NEIGHBOURS = 8  # Number of neighbours whose median motion a point is compared with.
+# Largest deviation from the neighbours' median [standard deviations]; the larger of DEVIATIONS and FREE applies.
+DEVIATIONS = 4.0
+FREE = 0.5e-3  # Largest deviation from the neighbours' median motion [m].
 
 
 def follow_pixels(before: StereoView, now: StereoView, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,12 +12,10 @@ import numpy as np
 from ..optics.camera import Camera
 from .targets import BORDER, Face, Target, find_window, is_seen_from_front
 
-# Texture pixels along a square; samples of the image along a pixel.
-TEXTURE, SAMPLES = 48, 4
-# Margin round a face [pixel]: its edges are straight only without a lens.
-MARGIN = 3.0
-# Grey values of black ink and white paper.
-INK, PAPER = 25.0, 225.0
+TEXTURE = 48  # Texture pixels along a square's side.
+SAMPLES = 4  # Rays along a pixel's side.
+MARGIN = 3.0  # Margin round a face [pixel]: its edges are straight only without a lens.
+INK, PAPER = 25.0, 225.0  # Grey levels of black ink and white paper.
 
 
 def render_targets(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
@@ -107,15 +105,16 @@ def _grey(face: Face, printed: np.ndarray, on_face: np.ndarray) -> np.ndarray:
     return np.where(inside, INK + (PAPER - INK) / 255.0 * paper, np.nan)
 
 
-# Side of a cell [pixel]; border of a cell that is not read [pixel]; cells that begin every strip.
-CELL, INNER, BEGIN = 8, 2, (1, 0, 1, 0)
-# Bits of the time, its unit [s], bits of its checksum.
-TIME_BITS, UNIT, CHECK_BITS = 32, 1e-4, 8
-CELLS = len(BEGIN) + TIME_BITS + CHECK_BITS
+CELL = 8  # Side of a cell [pixel].
+INNER = 2  # Border of a cell that is not read [pixel].
+BEGIN = (1, 0, 1, 0)  # Cells that begin every strip (1: white).
+TIME_BITS = 32  # Number of bits of the time.
+UNIT = 1e-4  # Unit of the time [s].
+CHECK_BITS = 8  # Number of bits of the time's checksum.
+CELLS = len(BEGIN) + TIME_BITS + CHECK_BITS  # Number of cells of a strip.
 WIDTH = CELL * CELLS
 """Width of a strip [pixel]."""
-# Grey values below which a cell is black, and above which it is white.
-BLACK, WHITE = 90.0, 165.0
+BLACK, WHITE = 90.0, 165.0  # Grey levels below which a cell is black, and above which it is white.
 
 
 def stamp_time(colour: np.ndarray, time: float) -> np.ndarray:

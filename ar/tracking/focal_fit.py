@@ -12,12 +12,12 @@ from ..optics.camera import Camera
 from .pose import LEAST, fit_least_squares
 from .targets import DetectedCorners, Target
 
-# Minimum number of corners in a view; search range and tolerance of the factor on the focal length.
-FEWEST, BOUNDS, EXACT = 12, (0.5, 2.0), 1e-3
-# Step of the factor for the curvature of the sum of squares.
-STEP = 0.02
-# Relative error, and error in standard deviations, above which a focal length differs.
-TOLERATED, SURE = 0.05, 6.0
+FEWEST = 12  # Minimum number of corners in a view.
+BOUNDS = (0.5, 2.0)  # Search range of the factor on the focal length.
+EXACT = 1e-3  # Tolerance of the factor.
+STEP = 0.02  # Step of the factor in the finite difference for the curvature of the sum of squares.
+TOLERATED = 0.05  # Relative error above which a focal length differs.
+SURE = 6.0  # Error above which a focal length differs [standard deviations], if it exceeds TOLERATED as well.
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ from ..optics.camera import Camera
 from ..optics.lens import Lens
 from .targets import Detector, Face
 
-# Minimum number of corners in a view, and of rows and columns of the board that they cover.
-FEWEST_CORNERS, FEWEST_LINES = 8, 3
-# Sharpness below which a view is left out, as a share of the median.
-BLURRED = 0.6
+FEWEST_CORNERS = 8  # Minimum number of corners in a view.
+FEWEST_LINES = 3  # Minimum number of the board's rows and of its columns with corners in a view.
+BLURRED = 0.6  # Sharpness below which a view is left out, as a share of the median.
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,16 +120,16 @@ def measure_covered_share(views: Sequence[BoardView], width: int, height: int) -
     return float(mask.mean())
 
 
-# Columns of OpenCV's derivatives: rotation and translation of a pose; focal lengths, principal point and five of the
-# lens.
-POSE, INTRINSIC = slice(0, 6), slice(6, 15)
+POSE = slice(0, 6)  # Columns of OpenCV's derivatives: rotation and translation of a pose.
+# Columns of OpenCV's derivatives: focal lengths, principal point and five coefficients of the lens.
+INTRINSIC = slice(6, 15)
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Parameters in the order of the covariance; focal lengths and principal point [pixel]."""
-FEWEST_VIEWS = 8
-# Ratio of a view's error to the median's above which it is left out.
-OUTLIER = 3.0
-# Smallest angle between planes [rad]; largest relative deviation of the focal length.
-SMALLEST_ANGLE, UNSURE = np.radians(12.0), 0.02
+FEWEST_VIEWS = 8  # Minimum number of views for a calibration.
+OUTLIER = 3.0  # Ratio of a view's error to the median error above which it is left out.
+SMALLEST_ANGLE = np.radians(12.0)  # Smallest angle between the planes of the board [rad].
+UNSURE = 0.02  # Largest relative standard deviation of the focal length.
+# Remedy in error messages.
 TILT = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the image's corners."
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from .pictures import Named, to_named_image
 
-# Consecutive failed images before the camera is opened again; pause between tries [s].
-FAILURES, PAUSE = 10, 0.05
+FAILURES = 10  # Number of consecutive failed images before the camera is opened again.
+PAUSE = 0.05  # Pause between two tries [s].
 
 
 class FrameSource(Protocol):

@@ -13,18 +13,19 @@ from PIL.PngImagePlugin import PngInfo
 
 from .targets import BORDER, MARKER, MARKERS, TIP, Face, Target, build_tool_cube, list_targets
 
-# Pixels per millimetre: each module of each marker takes a whole number of them.
-PER_MM = 20
-DPI = 25.4 * PER_MM
-A4 = (210.0, 297.0)
-RULER = 100.0
+PER_MM = 20  # Resolution of a page [pixel/mm]: each module of each marker takes a whole number of pixels.
+DPI = 25.4 * PER_MM  # Resolution of a page [pixel/inch].
+A4 = (210.0, 297.0)  # Width and height of the page [mm].
+RULER = 100.0  # Length of the printed rulers [mm].
 MAKER = "sulcus markers"
 """Program name in the metadata of PDF and PNG."""
-# Line width; sizes of the text, of titles and of the names of faces [mm].
-THIN, SMALL, LARGE, TINY = 0.2, 3.4, 6.0, 2.6
+THIN = 0.2  # Line width [mm].
+SMALL = 3.4  # Height of the text [mm].
+LARGE = 6.0  # Height of titles [mm].
+TINY = 2.6  # Height of the names of faces [mm].
 LINE = 4.8
 """Line spacing of text [mm]."""
-PRINTING = (
+PRINTING = (  # Instructions on each page.
     "Print at 100 % on A4 ('actual size', not 'fit to page'), then measure both rulers.",
     f"If a ruler is not {RULER:.0f} mm long to 0.2 mm, do not use this page: correct the scale, and print it again.",
 )

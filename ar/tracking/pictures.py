@@ -17,18 +17,16 @@ from PIL import Image
 
 from ..optics.calibration import LARGEST_SIDE
 
-# Maximum number of images used, spread evenly over all.
-MOST_PICTURES = 300
-# Maximum number of pixels of an image, and of bytes of its file.
-MOST_PIXELS, MOST_BYTES = 64_000_000, 256_000_000
-NUMBER = re.compile(r"([0-9]+)")
-SUFFIXES = (".png", ".jpg", ".jpeg")
-# Frame step of a video of unknown length.
-STEP = 5
-GIVE = "Give a video, or a folder of PNG or JPEG images."
+MOST_PICTURES = 300  # Maximum number of images used, spread evenly over all.
+MOST_PIXELS = 64_000_000  # Maximum number of pixels of an image.
+MOST_BYTES = 256_000_000  # Maximum size of an image file [bytes].
+NUMBER = re.compile(r"([0-9]+)")  # Pattern of a number in a file name, to sort by.
+SUFFIXES = (".png", ".jpg", ".jpeg")  # Endings of image files.
+STEP = 5  # Stride of the frames read from a video of unknown length.
+GIVE = "Give a video, or a folder of PNG or JPEG images."  # Remedy in error messages.
 # Signatures of video files: MP4 and MOV (after four bytes), AVI, Matroska and WebM.
 BEGINNINGS = (b"ftyp", b"RIFF", b"\x1aE\xdf\xa3")
-TOO_LARGE = "has more pixels than a camera gives. Write it smaller."
+TOO_LARGE = "has more pixels than a camera gives. Write it smaller."  # Error message of an image with too many pixels.
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,13 @@ from ..optics.camera import Camera
 from .rigid import build_cross_matrices, compute_angles
 from .targets import DetectedCorners, Detector, Target, find_window, is_seen_from_front
 
-# Minimum number of corners of a pose; lower bound of the residual's deviation, and largest residual [pixel].
-FEWEST, LEAST, MOST = 6, 0.1, 1.0
-# Excess of chi^2 that rules out another pose; rotation [rad] and distance [m] within which poses count as equal.
-CLEARLY, ALIKE_TURN, ALIKE_SHIFT = 30.0, np.radians(2.0), 1e-3
-# Largest rotation [rad] from the previous pose with which it selects one of two; the other must be twice as far.
+FEWEST = 6  # Minimum number of corners of a pose.
+LEAST = 0.1  # Lower bound of the residual's standard deviation [pixel].
+MOST = 1.0  # Largest rms residual of a pose [pixel].
+CLEARLY = 30.0  # Excess of chi^2 over the best pose that excludes another pose.
+ALIKE_TURN = np.radians(2.0)  # Rotation within which two poses count as equal [rad].
+ALIKE_SHIFT = 1e-3  # Distance within which two poses count as equal [m].
+# Largest rotation from the previous pose that selects one of two poses [rad]; the other must be twice as far.
 NEAR = np.radians(15.0)
 
 
@@ -172,10 +174,10 @@ def _alike(one: np.ndarray, other: np.ndarray) -> bool:
     return _turn(one, other) < ALIKE_TURN and float(np.linalg.norm(one[:3, 3] - other[:3, 3])) < ALIKE_SHIFT
 
 
-# Search margin round a target's last outline: share of its size; minimum [pixel].
-AROUND, MARGIN = 0.4, 32.0
-# Age in images after which a pose is not used; interval in images of searches for lost targets.
-STALE, SEARCHED = 5, 3
+AROUND = 0.4  # Search margin round a target's last outline, as a share of its size.
+MARGIN = 32.0  # Minimum search margin round a target's last outline [pixel].
+STALE = 5  # Age after which a pose is not used as the start [images].
+SEARCHED = 3  # Interval of searches for lost targets [images].
 
 
 @dataclass(frozen=True, eq=False)

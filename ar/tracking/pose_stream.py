@@ -10,17 +10,20 @@ from scipy.spatial.transform import Rotation
 from .pose import Pose
 from .rigid import turn_vectors
 
-# Largest gap between samples with interpolation [s]; largest extrapolation after the last sample [s].
-LONGEST, AHEAD = 0.1, 0.05
-# Difference below which times count as equal [s]: files round them.
-ROUNDING = 1e-3
+LONGEST = 0.1  # Largest gap between samples with interpolation [s].
+AHEAD = 0.05  # Largest extrapolation after the last sample [s].
+ROUNDING = 1e-3  # Difference below which times count as equal [s]: files round them.
 DAY = 86_400.0
 """Period of a 24-hour clock [s]."""
-# Step of tried time offsets [s]; minimum number of images; largest range of offsets [s].
-STEP, FEWEST, MOST_SECONDS = 0.01, 8, 900.0
-# Smallest motion of a body [m]; distance to another offset [s], ratio by which it must fit worse, noise level [m].
-LEAST_MOVED, ANOTHER, CLEARLY, NOISE = 1e-3, 0.15, 2.0, 0.1e-3
-ROUNDS = 20
+STEP = 0.01  # Step of tried time offsets [s].
+FEWEST = 8  # Minimum number of images for an estimate of the time offset.
+MOST_SECONDS = 900.0  # Largest range of tried offsets [s].
+LEAST_MOVED = 1e-3  # Smallest motion of the tool that determines the offset [m].
+ANOTHER = 0.15  # Time difference beyond which a second minimum is another offset [s].
+CLEARLY = 2.0  # Smallest ratio of the sum of squares at another offset to that of the best fit.
+NOISE = 0.1e-3  # Noise level of positions [m]: lower bound of the best fit's error in the comparison of offsets.
+ROUNDS = 20  # Maximum number of Gauss-Newton iterations of the offset.
+# Remedy in error messages.
 MOVE = "Move the tool to and fro by centimetres, quickly and unevenly, while markers and poses are both seen."
 
 

@@ -11,18 +11,17 @@ from scipy.stats import chi2, f
 
 from .rigid import build_cross_matrices, move_about
 
-FEWEST_PAIRS, FEWEST_SURFACE = 3, 20
-# Lower bound of the error of a touched point [m]; largest rms residual of pairs [m].
-LEAST, MOST = 0.1e-3, 5e-3
-# Smallest ratio of the second to the largest spread of points; largest log-ratio of the sizes of two point sets.
-FLATTEST, RESIZED = 0.05, 0.1
-# Smallest spread of points on a head [m].
-SMALLEST = 5e-3
-# Ratio of residuals above which one wrong pair, a swap or a mirrored frame is reported.
-CLEARLY = 4.0
-# Maximum Gauss-Newton iterations on a surface, and the step at which they end [m], [rad].
-ROUNDS, SMALL = 50, 1e-9
-LEVEL = 0.95
+FEWEST_PAIRS = 3  # Minimum number of pairs of points.
+FEWEST_SURFACE = 20  # Minimum number of points on the surface.
+LEAST = 0.1e-3  # Lower bound of rms residuals in ratios [m]: error of a touched point.
+MOST = 5e-3  # Largest rms residual of pairs and of surface points [m].
+FLATTEST = 0.05  # Smallest ratio of the second to the largest spread of points: below, the points are on a line.
+RESIZED = 0.1  # Largest absolute log-ratio of the sizes of two point sets.
+SMALLEST = 5e-3  # Smallest spread of points on a head [m].
+CLEARLY = 4.0  # Ratio of residuals above which one wrong pair, a swap or a mirrored coordinate system is reported.
+ROUNDS = 50  # Maximum number of Gauss-Newton iterations on a surface.
+SMALL = 1e-9  # Step below which the iterations on a surface end [m], [rad].
+LEVEL = 0.95  # Confidence level of the registration's error.
 
 Nearest = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Map from scan points (n, 3) [m] to the closest surface points (n, 3) [m] and unit normals (n, 3) there."""
@@ -236,8 +235,7 @@ def _rms(off: np.ndarray) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-# False-alarm rate: share of valid sets in which a pair is reported as suspect.
-FALSE_ALARM = 0.05
+FALSE_ALARM = 0.05  # False-alarm rate: share of valid sets in which a pair is reported as suspect.
 
 
 @dataclass(frozen=True, eq=False)

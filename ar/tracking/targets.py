@@ -15,15 +15,13 @@ import numpy as np
 
 from ..optics.camera import Camera
 
-MARKERS = cv2.aruco.DICT_4X4_250
-# Side of a marker as a share of its square.
-MARKER = 0.75
+MARKERS = cv2.aruco.DICT_4X4_250  # ArUco dictionary of the targets.
+MARKER = 0.75  # Side of a marker as a share of its square.
 Window = tuple[slice, slice]
 """Rows and columns of an image, with start and stop."""
-# Window widths [pixel] of the adaptive threshold.
+# Smallest and largest width of the adaptive threshold's window [pixel], for all and for known targets.
 THOROUGH, QUICK = (5, 25), (15, 15)
-# Smallest side of an image part that can hold a marker [pixel].
-SMALLEST = 16
+SMALLEST = 16  # Smallest side of an image part that can hold a marker [pixel].
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +107,9 @@ def is_seen_from_front(T_camera_face: np.ndarray) -> bool:
     return bool(T_camera_face[:3, 2] @ T_camera_face[:3, 3] > 0.0)
 
 
-# Side of a square of the cube's faces; width of the white border round them [m].
-CUBE_SQUARE, BORDER = 8e-3, 4e-3
-# Distance of the tool's tip from the centre of its cube along the shaft [m].
-TIP = 150e-3
+CUBE_SQUARE = 8e-3  # Side of a square of the cube's faces [m].
+BORDER = 4e-3  # Width of the white border round the squares of a face [m].
+TIP = 150e-3  # Distance of the tool's tip from the centre of its cube along the shaft [m].
 
 
 @lru_cache

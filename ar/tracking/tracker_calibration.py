@@ -8,21 +8,20 @@ import numpy as np
 
 from .rigid import build_cross_matrices, compute_angles
 
-FEWEST_POSES = 4
-# Smallest and largest rotation of a motion [rad]: the axis of smaller ones is uncertain; near pi, its sign is.
-LEAST_TURN, MOST_TURN = np.radians(8.0), np.radians(170.0)
-# Smallest root mean square angle [rad] of the axes from their closest common axis.
-LEAST_SPREAD = np.radians(8.0)
-# Maximum number of motions, the largest first.
-MOST_MOTIONS = 2000
-# Maximum number of poses whose pairs are all examined, spread evenly over all.
-MOST_POSES = 300
+FEWEST_POSES = 4  # Minimum number of pairs of poses.
+# Smallest rotation of a motion that is used [rad]: the axis of a smaller one is uncertain.
+LEAST_TURN = np.radians(8.0)
+# Largest rotation of a motion that is used [rad]: near pi, the sign of its axis is uncertain.
+MOST_TURN = np.radians(170.0)
+LEAST_SPREAD = np.radians(8.0)  # Smallest root mean square angle of the axes from their closest common axis [rad].
+MOST_MOTIONS = 2000  # Maximum number of motions, the largest first.
+MOST_POSES = 300  # Maximum number of poses whose pairs are all examined, spread evenly over all.
 # Largest root mean square residual angle of motions [rad]: two trackers with noise of 0.5 degrees give 1 degree.
 LARGEST_TURN = np.radians(2.0)
 # Largest root mean square residual distance of motions [m]: two trackers with noise of 0.5 degrees give 7 mm over 0.7
 # m.
 LARGEST_SHIFT = 10e-3
-TURN = "Turn the bodies by 30 degrees or more, about at least two different axes."
+TURN = "Turn the bodies by 30 degrees or more, about at least two different axes."  # Remedy in error messages.
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +162,8 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.square(values).mean()))
 
 
-FEWEST_PIVOT_POSES = 10
-# Smallest root mean square rotation angle [rad] of any direction in the tool.
-LEAST_TILT = np.radians(5.0)
+FEWEST_PIVOT_POSES = 10  # Minimum number of poses of a pivot calibration.
+LEAST_TILT = np.radians(5.0)  # Smallest root mean square rotation angle of any direction in the tool [rad].
 # Largest root mean square distance [m]: tracker noise of 0.5 mm and 0.5 degrees, at a tip 300 mm away, gives 2.7 mm.
 LARGEST_RMS = 3e-3
 

@@ -13,10 +13,8 @@ from ..play.deformers import PatientSetup
 from ..script.scene import Scene
 from .measurement import time_work
 
-# Frames that are timed, after one that is not.
-TIMED = 24
-# Largest distance of a node from the converged solution that LIVE promises [m].
-PROMISED = 5e-5
+TIMED = 24  # Number of frames that are timed, after one that is not.
+PROMISED = 5e-5  # Largest distance of a node from the converged solution at the accuracy LIVE [m].
 
 
 def time_offers(theatre: PatientSetup, scene: Scene) -> list[Offer]:

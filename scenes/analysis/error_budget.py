@@ -25,14 +25,14 @@ from ..script.viewpoint import Viewpoint
 from .tracking_errors import CORNER, change_calibration, compute_row_delay, project_by_rows, project_corners
 from .uncertainty import SurfaceMotions, compute_error
 
+# Names of contributors to the overlay error.
 CALIBRATION, MARKERS, LATENCY, SHUTTER = "calibration", "markers", "latency x motion", "rolling shutter"
-PARAMETERS = "tissue, skull, tool's place"
+PARAMETERS = "tissue, skull, tool's place"  # Name of the contributor of unknown tissue, skull and tool position.
 TECHNICAL = (CALIBRATION, MARKERS, LATENCY, SHUTTER, SURROGATE, MESH)
 """Contributors of the system itself."""
 CLINICAL = (*TECHNICAL, REGISTRATION, SEGMENTATION, PARAMETERS)
 """Contributors including unmeasured properties of the patient."""
-# Number of sampled calibrations.
-CALIBRATIONS = 100
+CALIBRATIONS = 100  # Number of sampled calibrations.
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,9 +28,11 @@ LEVELS: Levels = {
     "tumour's stiffness": (1.0, 3.0),
 }
 """Combined factors: depth of the top of the tumour below the cortex, stiffness relative to the brain, and others."""
-DEFAULT = {"skull": "bonded", "nu": 0.49, "tumour's stiffness": 1.0}
-FORCE, FOOTPRINT = 0.2, 7e-3  # [N], [m]
-PLACES = ((0.0, 0.0), (6.0, 0.0), (0.0, 6.0))  # [mm] right and up from the middle of the opening
+DEFAULT = {"skull": "bonded", "nu": 0.49, "tumour's stiffness": 1.0}  # Default values of a body's factors.
+FORCE = 0.2  # Force of the tool [N].
+FOOTPRINT = 7e-3  # Radius of the tool [m].
+# Positions of the tool, to the right of and above the centre of the craniotomy [mm].
+PLACES = ((0.0, 0.0), (6.0, 0.0), (0.0, 6.0))
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,15 @@ with require_extra("report", "a chart needs"):
     from matplotlib.ticker import LogLocator, NullLocator
     from matplotlib.transforms import Bbox
 
-WIDTH, HEIGHT = 640, 480
-DPI = 100
-PALE = 0.35  # opacity
-FAINT = "0.45"  # grey level
-DOT = 7.0  # diameter [pt]
-GAP = 6.0  # distance of a name from the centre of its dot [pt]
+WIDTH, HEIGHT = 640, 480  # Default size of a chart [pixel].
+DPI = 100  # Resolution of a chart [pixel/inch].
+PALE = 0.35  # Opacity of pale dots.
+FAINT = "0.45"  # Grey level of pale names, 0 to 1.
+DOT = 7.0  # Diameter of a dot [pt].
+GAP = 6.0  # Distance of a name from the centre of its dot [pt].
 SIDES = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, -1), (-1, 1))
 """Sides of a dot where its name may be (right, up), the best first."""
+# Matplotlib's text alignment, horizontal and vertical, by the side of the dot.
 ACROSS, UP = {-1: "right", 0: "center", 1: "left"}, {-1: "top", 0: "center", 1: "bottom"}
 
 

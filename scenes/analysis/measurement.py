@@ -84,8 +84,8 @@ def watch_gpu_memory(device: str) -> Iterator[list[int]]:
         watcher.join()
 
 
-P = ParamSpec("P")
-T = TypeVar("T")
+P = ParamSpec("P")  # Parameters of the timed function.
+T = TypeVar("T")  # Result of the timed function.
 
 
 def time_work(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> tuple[T, float]:

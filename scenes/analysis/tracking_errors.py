@@ -16,8 +16,9 @@ from ar.tracking.targets import DetectedCorners, Target, build_calibration_board
 
 CORNER = 0.1
 """Standard deviation of a corner per axis [pixel]: by default twice that of sharp images (`benchmarks track`)."""
-# Usual calibration: number of views, tilt of the board, and range of its width relative to the image.
-VIEWS, TILT, WIDE = 24, np.radians(35.0), (0.45, 0.8)
+VIEWS = 24  # Number of views of a typical calibration.
+TILT = np.radians(35.0)  # Largest tilt of the board in its views [rad].
+WIDE = (0.45, 0.8)  # Range of the board's width relative to the image width.
 
 
 def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:

@@ -42,17 +42,12 @@ from ..script.scene import Scene
 from ..script.tool_paths import Path, Touch
 from ..script.uncertainty import LEVEL, Uncertainty, mark_of
 
-# Thousandths of the motion, as in a locator's ensemble. Draws with inverted tetrahedra are counted, and not left out.
-ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)
-# Times of a scene that are solved; share of the draws that must have an equilibrium.
-MOMENTS, LEAST = 5, 0.8
-# Number of load steps for a time that is not reached at once.
-PARTS = 4
-# Errors of registration and segmentation to each body.
-SHIFTS = 200
-
-
-SKULL_EFFECTS = Bonded | Slide | SkullContact
+ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)  # Samples with inverted tetrahedra are counted, not left out.
+MOMENTS = 5  # Number of times of a scene that are solved.
+LEAST = 0.8  # Minimum share of the samples with an equilibrium.
+PARTS = 4  # Number of load steps for a time that is not reached in one step.
+SHIFTS = 200  # Number of sampled errors of registration and segmentation for each body.
+SKULL_EFFECTS = Bonded | Slide | SkullContact  # Effects of the skull on the brain.
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,7 @@ from sim.material import MATERIALS
 from ..script.head_posture import build_drained_turn
 from ..script.scene import Scene
 
-# Minutes go by, and fluid leaves the tissue.
-SLOW = MATERIALS["drained"].tissue
+SLOW = MATERIALS["drained"].tissue  # Drained tissue: fluid leaves it in minutes.
 
 SCENE = Scene(
     "brain_shift",

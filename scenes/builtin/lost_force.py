@@ -12,9 +12,8 @@ from ..script.tool import Probe
 from ..script.tool_paths import press
 from ..script.viewpoint import Viewpoint
 
-# Softer than usual, with a stiffer tumour: the estimate is given neither.
-BRAIN = Material("linear", young=1800.0, poisson=0.49)
-TUMOUR = Material("linear", young=3200.0, poisson=0.49)
+BRAIN = Material("linear", young=1800.0, poisson=0.49)  # Softer than the default, unknown to the estimate.
+TUMOUR = Material("linear", young=3200.0, poisson=0.49)  # Stiffer than the brain, unknown to the estimate.
 
 SCENE = Scene(
     "lost_force",

@@ -13,11 +13,10 @@ from ..script.tool import Probe
 from ..script.tool_paths import Touch, press
 from ..script.viewpoint import Viewpoint
 
-# Softer than usual, with a stiffer tumour: the estimate is given neither.
-BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)
-TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)
+BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)  # Softer than the default, unknown to the estimate.
+TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)  # Stiffer than the brain, unknown to the estimate.
 
-# The tool waits in the air, and presses after the brain has sunk.
+# Press of the tool: it waits in the air, and presses after the brain has sunk.
 PRESS = press(force=0.15, rise=0.8, hold=0.4, at=(-0.004, 0.008))
 
 

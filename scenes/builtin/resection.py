@@ -7,11 +7,9 @@ from ..script.debulking import Debulking
 from ..script.head_posture import build_drainage
 from ..script.scene import Scene
 
-# Minutes go by, and fluid leaves the tissue.
-SLOW = MATERIALS["drained"].tissue
+SLOW = MATERIALS["drained"].tissue  # Drained tissue: fluid leaves it in minutes.
 
-# Without weight nothing would move: the body is taken to be free of stress in the scan.
-SCENE = Scene(
+SCENE = Scene(  # Without weight nothing would move: the model is free of stress in the scan.
     "resection",
     __doc__ or "",
     duration=5.0,

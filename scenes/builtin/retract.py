@@ -11,7 +11,7 @@ from ..script.scene import Scene
 from ..script.tool import Blade
 from ..script.tool_paths import lay
 
-BLADE = Blade()
+BLADE = Blade()  # Default blade.
 # A Prony series of brain in vitro: Miller, Chinzei 2002, J. Biomech. 35:483-490.
 RELAXING = replace(BRAIN, prony=((0.45, 0.5), (0.365, 50.0)))
 

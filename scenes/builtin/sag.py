@@ -9,9 +9,8 @@ from ..script.scene import Bounds, Scene
 from ..script.sight import PointObservation
 from ..script.viewpoint import Viewpoint
 
-# Softer than usual, with a stiffer tumour: the estimate is given neither.
-BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)
-TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)
+BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)  # Softer than the default, unknown to the estimate.
+TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)  # Stiffer than the brain, unknown to the estimate.
 
 SCENE = Scene(
     "sag",

@@ -37,15 +37,14 @@ from ..options.subject_options import (
     parse_sources,
 )
 
-# Lengths in millimetres, as on the command line.
-DEFAULTS = {
+DEFAULTS = {  # Default values of the options; lengths in millimetres, as on the command line.
     "radius": 12.0,
     "cover": 10.0,
     "tumour_shape": "sphere",
     "site": "central",
     "craniotomy": 50.0,
 }
-PRESETS = {
+PRESETS = {  # Values of the options that differ from the default, by preset.
     "default": {},
     "superficial": {"cover": 3.0},
     "subcortical": {"cover": 10.0},
@@ -54,7 +53,7 @@ PRESETS = {
     "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
 NOTED = 3.0
-"""Per cent of the tumour's volume: a mesh that misses more of it is noted."""
+"""Smallest share of the tumour's volume missing from the mesh that is reported [%]."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

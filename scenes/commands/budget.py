@@ -32,9 +32,11 @@ if TYPE_CHECKING:
 
     Bodies = list[tuple[PatientSample, tuple[np.ndarray, ...]]]
 
-FEWEST, FEWEST_SAMPLES = 8, 200
+FEWEST = 8  # Minimum number of bodies to solve.
+FEWEST_SAMPLES = 200  # Minimum number of samples.
 # Mean errors of overlays as published: a headset in 20 patients (10.3171/2025.5.JNS243160), and 35 studies [mm].
 PUBLISHED = (2.2, 2.5)
+# Explanation under the table.
 NOTE = """
 "across" and "along" the line of sight are of the tumour's middle, "worst" of its worst surface point, 95 in 100 samples
 are below. "technical" is what camera, tracking, times and model are off by; "clinical" has also what nobody measures.

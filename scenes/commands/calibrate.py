@@ -22,13 +22,10 @@ if TYPE_CHECKING:
     from ar.tracking.tracker_calibration import HandEye, Pivot
 
 Found = TypeVar("Found", "Pivot", "HandEye")
-MOST_VIEWS = 40
-# Share of the image area that corners should cover.
-WANTED_COVER = 0.6
-# Seconds by which the times of two files of poses may differ.
-SAME_TIME = 1e-3
-# Largest distance [m] along each axis between places that may be in metres by mistake.
-STILL = 1e-3
+MOST_VIEWS = 40  # Maximum number of views used.
+WANTED_COVER = 0.6  # Share of the image area that corners should cover.
+SAME_TIME = 1e-3  # Largest difference of the times in two files of poses [s].
+STILL = 1e-3  # Motion along each axis below which positions may be in metres by mistake [m].
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

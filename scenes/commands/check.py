@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from ..script.uncertainty import TumourError
 
 
-# Name of the check that is no scene: a synthetic video whose markers disappear and return.
-TRACKING = "tracking"
+TRACKING = "tracking"  # Name of the check without a scene: a synthetic video whose markers disappear and return.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -15,7 +15,7 @@ from sim.runtime.optional_packages import require_extra
 from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_json, to_json_line
 
-FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")
+FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")  # Names of the formats.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from ..options.shared_options import add_anatomy, add_device, add_json
 from ..options.theatre_options import add_trajectory, build_requested_scene
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
-HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")
+HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")  # Column titles of the table.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

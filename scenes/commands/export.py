@@ -9,7 +9,7 @@ from sim.errors import InputError
 
 from ..options.outputs import add_force, check_output_path
 
-ENDING = ".model.npz"
+ENDING = ".model.npz"  # Ending of a model file.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
     from ..tracked.filming import Trouble, VideoFrame
 
-# Repeated here, so that `--help` does not import the renderer.
+# Kinds of disturbances. Repeated here, so that `--help` does not import the renderer.
 TROUBLES = ("reference", "tool", "bright", "smear", "gap")
 # Files that are written next to the video.
 FILES = ("camera.yaml", "camera.json", "registration.json", "tool.json", "truth.npz", "truth.csv")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-# Named here too, so that a command's help waits for no scene to be imported.
+# Names of the scenes. Repeated here, so that a command's help does not import scenes.
 NAMES = "press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force, microscope"
 PLAYING = ("demo", "render", "film", "collect", "check", "effects")
 """Commands that take the scene to play."""
 
-EXAMPLES = {
+EXAMPLES = {  # Examples in the help of each command.
     "anatomy": """examples:
   sulcus anatomy --out brain.vtu --preset superficial
   sulcus anatomy --labels labels.nii.gz --brain 1,2 --tumour 3 --opening-over 2 --out patient.vtu

@@ -20,21 +20,15 @@ from sim.material import Tissue
 
 from ..options.tissue_options import check_stiffness
 
-# [ml] Brains of adults, with their ventricles: beyond, a mask lacks a part or holds more than brain.
-SMALL, LARGE = 850.0, 2000.0
-# Share of the brain that a tumour has; labels of another convention are often more.
-MUCH = 0.25
-# [m] From the opening to the tumour: farther than a press of the cortex moves anything.
-FAR = 0.040
-# Ratio of the longest edge of a voxel to the shortest above which surfaces show steps along one axis.
-OBLONG = 2.5
-# Share of the brain that a T1 in the same space covers, at least.
-COVERED = 0.98
-# [ml] Of a sheet of dura, a few voxels thick.
-THICK = 40.0
-AXES = ("LR", "PA", "IS")
-# Pieces that are listed.
-MOST = 4
+SMALL = 850.0  # Smallest volume of an adult brain with its ventricles [ml]: below, a mask lacks a part.
+LARGE = 2000.0  # Largest volume of an adult brain with its ventricles [ml]: above, a mask contains more than brain.
+MUCH = 0.25  # Largest volume of a tumour relative to the brain: labels of another convention are often larger.
+FAR = 0.040  # Distance from the craniotomy to the tumour above which pressing the cortex moves nothing there [m].
+OBLONG = 2.5  # Ratio of the longest to the shortest edge of a voxel above which surfaces show steps along one axis.
+COVERED = 0.98  # Smallest share of the brain that a T1 in the same space covers.
+THICK = 40.0  # Largest volume of a sheet of dura, a few voxels thick [ml].
+AXES = ("LR", "PA", "IS")  # Letters of the negative and positive direction of each RAS axis.
+MOST = 4  # Maximum number of pieces that are listed.
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,14 @@ from .inspection import Inspection
 
 Colour = tuple[int, int, int]
 
-# Pixels: a panel's side, the column of text, from one of its lines to the next, its letters, and where things begin.
-SIDE, COLUMN, LINE, SIZE, PAD = 480, 500, 22, 16, 14
-# Letters of a line of text, at most.
-WIDTH = 58
-GROUND, TEXT, FAINT, WARNING = (12, 12, 14), (238, 238, 232), (160, 160, 156), (255, 196, 92)
-BRAIN: Colour = (104, 116, 138)
+SIDE = 480  # Side of a panel [pixel].
+COLUMN = 500  # Width of the column of text [pixel].
+LINE = 22  # Line spacing of the text [pixel].
+SIZE = 16  # Size of the letters [pixel].
+PAD = 14  # Margin of text and scale bar [pixel].
+WIDTH = 58  # Maximum number of letters in a line of text.
+GROUND, TEXT, FAINT, WARNING = (12, 12, 14), (238, 238, 232), (160, 160, 156), (255, 196, 92)  # Colours (RGB).
+BRAIN: Colour = (104, 116, 138)  # Colour of the brain (RGB).
 COLOURS: dict[str, Colour] = {
     "brain": BRAIN,
     "ventricles": (66, 132, 214),
@@ -36,15 +38,13 @@ COLOURS: dict[str, Colour] = {
     "opening": (70, 205, 110),
 }
 """Colour of each part; later parts are drawn over earlier ones."""
-CORTEX: Colour = (176, 168, 164)
-# [m] Round the brain; thickness of the opening's line in a slice; share of colour over a scan.
-ROOM, RIND, TINT = 6e-3, 2.2e-3, 0.6
-# Share of the tumour's colour over the cortex that hides it.
-SHADOW = 0.45
-# Directions of RAS, against and along.
-SIDES = ("LR", "PA", "IS")
-# Direction of the light on the cortex: from the viewer's upper left.
-LIGHT = np.array([-0.4, 0.5, 0.77])
+CORTEX: Colour = (176, 168, 164)  # Colour of the covered cortex (RGB).
+ROOM = 6e-3  # Margin of a view round the brain [m].
+RIND = 2.2e-3  # Half the thickness of the craniotomy's line in a slice [m].
+TINT = 0.6  # Opacity of colours over a scan.
+SHADOW = 0.45  # Opacity of the tumour's colour over the cortex that hides it.
+SIDES = ("LR", "PA", "IS")  # Letters of the negative and positive direction of each RAS axis.
+LIGHT = np.array([-0.4, 0.5, 0.77])  # Direction of the light on the cortex: from the viewer's upper left.
 
 
 @dataclass(frozen=True)

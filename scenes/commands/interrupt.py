@@ -14,10 +14,8 @@ from types import FrameType
 
 # Exit codes after Ctrl-C (a normal end) and SIGTERM (the shell's code).
 CODES = {signal.SIGINT: 0, signal.SIGTERM: 128 + signal.SIGTERM}
-# Exit code of a command that Ctrl-C stops during its work and that can be resumed.
-INTERRUPTED = 128 + signal.SIGINT
-# Maximum time for cleaning up after a signal [s].
-PATIENCE = 0.3
+INTERRUPTED = 128 + signal.SIGINT  # Exit code of a command that Ctrl-C stops during its work and that can be resumed.
+PATIENCE = 0.3  # Maximum time for cleaning up after a signal [s].
 # Polling interval of the main thread [s]: a signal may be delivered to another thread, which does not wake it.
 POLL = 0.1
 

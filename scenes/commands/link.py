@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
     from ..tracked.tracked_tool import TrackedTool
 
+# Options with the names of transforms and images.
 NAMES = "--tool-name", "--reference-name", "--camera-name", "--registration-name"
 PORT = 18944
 """Default port of OpenIGTLink."""
-# Time for notifying clients before the server stops [s].
-FAREWELL = 0.25
+FAREWELL = 0.25  # Time for notifying clients before the server stops [s].
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

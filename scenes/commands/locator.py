@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from surrogate.locating.locator import Locator
     from surrogate.locating.regions import Region
 
+# Help on the default stiffness of regions.
 REGIONS = f"{AS_LEARNED}. A locator knows how many times a region is as stiff as a brain of {1e-3 * BRAIN.young:g} kPa"
 
 

@@ -47,10 +47,9 @@ if TYPE_CHECKING:
     from ..tracked.picture import Painter
     from ..tracked.run import Shown
 
-FILMS = (".mp4", ".gif", ".webp")
-# Only this machine reaches the page.
-HOST = "127.0.0.1"
-UNSTATED = (
+FILMS = (".mp4", ".gif", ".webp")  # Endings of video file names.
+HOST = "127.0.0.1"  # Address of the page: reachable from this machine only.
+UNSTATED = (  # Warning about a calibration without a covariance.
     "{} states no covariance of the camera: the error has no part of its calibration in it. Calibrate yours by `sulcus "
     "calibrate`."
 )

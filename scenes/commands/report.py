@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from ..report.page import Section
     from ..report.study import ReportStudy
 
-# Loads of the data that is made where none is given; loads held against the reference; loads beyond the training range.
+# Numbers of loads of a short and of a full report: simulated where no data are given; compared with the reference;
+# beyond the training range.
 QUICK, WHOLE = (256, 8, 24), (3000, 64, 120)
 
 

@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 
     from ..analysis.sensitivity import Change, SensitivityRow, SensitivityStudy
 
+# Column titles of the table.
 HEAD = ("what", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
 WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
-"""Columns of a line that fits into 120; the file has every figure."""
+"""Widths of the table's columns [characters]: a line fits into 120."""
+# Explanation under the table.
 NOTE = """
 One thing is changed at a time. F: tools of known force. M: the same tools of known motion, namely what those forces
 give by default. The columns say how far the tumour is from where it is by default, over load x vertex. Mean [mm]; 95
@@ -36,7 +38,7 @@ the motion over that by default. --out and --json give the 95th percentile and t
 counts in every way in which it can be: more and less, about two axes, to four sides along the cortex.
 """
 
-# Influence of the element on the rows of nu: `python -m benchmarks elements`, default brain.
+# Influence of the element on the rows of nu, measured by `python -m benchmarks elements` on the default brain.
 LOCKING = {
     "p1": "Linear tetrahedra lock as nu nears 0.5: much of what nu does here is theirs. Take --element smoothed.",
     "smoothed": "Smoothed elements, because linear ones lock as nu nears 0.5; at 0.495 these still lose some 5 %.",

@@ -47,8 +47,8 @@ from ..options.tissue_options import (
 from ..script.shipped_files import get_template_path
 from .interrupt import INTERRUPTED, interrupt_on_termination
 
-# Sizes [mm] of tools that press on a brain.
-SMALLEST_MM, LARGEST_MM = 0.1, 200.0
+SMALLEST_MM = 0.1  # Smallest size of a tool that presses on a brain [mm].
+LARGEST_MM = 200.0  # Largest size of a tool that presses on a brain [mm].
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -14,8 +14,8 @@ from sim.errors import InputError
 from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_json, to_json_line
 
-# Tracked bodies, and coordinate systems of their poses.
-BODIES, FRAMES = ("tool", "patient", "board", "camera"), ("camera", "patient", "board")
+BODIES = ("tool", "patient", "board", "camera")  # Tracked bodies.
+FRAMES = ("camera", "patient", "board")  # Coordinate systems of written poses.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

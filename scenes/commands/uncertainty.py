@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
     from ..script.uncertainty import Uncertainty
 
-FEWEST = 8
+FEWEST = 8  # Minimum number of bodies to solve.
+# Explanation under the table.
 NOTE = """
 Two errors, always apart. "model": what the answer is off by against finite elements of the same body. "tumour": the
 largest distance of its surface from where it is in the patient. It has what nobody measures: tissue, skull, the tool's

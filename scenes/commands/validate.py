@@ -14,8 +14,7 @@ from ..options.shared_options import add_device, add_json, to_json_line
 if TYPE_CHECKING:
     from ..episodes.reading.validation import Report
 
-# Files that are named one by one in what is printed.
-MOST_SAID = 50
+MOST_SAID = 50  # Maximum number of files that are listed one by one.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

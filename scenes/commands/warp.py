@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
     from ..warp.moment import DeformedAnatomy
 
-ORDERS = ("linear", "cubic")
-# Largest accepted push [N], and distance from the open cortex [mm]: more is a typing error.
-HARDEST, FARTHEST = 20.0, 20.0
+ORDERS = ("linear", "cubic")  # Interpolations of images.
+HARDEST = 20.0  # Largest accepted force [N]: more is a typing error.
+FARTHEST = 20.0  # Largest accepted distance from the open cortex [mm]: more is a typing error.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

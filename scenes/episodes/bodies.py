@@ -38,12 +38,11 @@ from .half_made import DATA, TABLE, check_resumed, forget
 from .plan import NO_LEARNER, Bodies, EpisodePlan, compute_anatomy_digest, list_fields, to_ratio_key
 from .run_folder import BODIES, get_versions
 
-# Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
-TRIES = 6
-PRESET = "palpation"
+TRIES = 6  # Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
+PRESET = "palpation"  # Preset of the training loads.
 TOGETHER = 512
-"""Load cases that a card solves together as a model is trained: other processes want its memory, too."""
-ANATOMY, ABOUT = "anatomy.vtu", "body.json"
+"""Number of load cases that a GPU solves together while a model is trained: other processes need its memory, too."""
+ANATOMY, ABOUT = "anatomy.vtu", "body.json"  # File names in a body's folder: mesh, sampled values.
 
 
 @dataclass(frozen=True)
@@ -232,7 +231,7 @@ def _undated(model: Learned) -> Learned:
 
 
 MOST_SAID = 10
-"""Bodies that are named one by one."""
+"""Maximum number of bodies that are listed one by one."""
 
 
 def list_model_errors(folder: Path) -> dict[int, HeldOutError]:

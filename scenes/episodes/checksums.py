@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 
 SUM = "sha256"
-"""The attribute that a data set's checksum, and the file's own, is under."""
+"""Attribute that contains the checksum of a data set or of the file."""
 LISTED = "arrays"
-"""The file's attribute that names the data sets it was written with."""
+"""Attribute of the file that lists the data sets it was written with."""
 
 
 def compute_digest(data: h5py.Dataset) -> str:

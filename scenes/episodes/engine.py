@@ -26,7 +26,7 @@ from .workers import MOST_DEATHS, Workers, describe_scheduler_end
 RETRIES = 3
 """Number of retries of a task that raises an error."""
 AHEAD = 3
-"""Episodes handed out for each worker: one is made while others wait, so that none is idle."""
+"""Number of episodes assigned to each worker: one is made while others wait, so that no worker is idle."""
 POLL = 1.0
 """Interval between counts of the workers [s]."""
 EPISODE, BODY = "episode", "body"

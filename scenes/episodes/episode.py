@@ -39,12 +39,13 @@ from ..play.stage import NAMES, Stage
 from .checksums import write_checksums
 from .png import encode_png
 
-FORMAT = "sulcus episode 2"
+FORMAT = "sulcus episode 2"  # Name and version of the file format.
 DEPTH_SCALE = 1e-5
-"""Metres in one step of the 16-bit depth; 0 where nothing is seen."""
-JPEG_QUALITY = 95
+"""Resolution of the 16-bit depth [m]; depth is 0 where nothing is visible."""
+JPEG_QUALITY = 95  # JPEG quality of the images, 0 to 100.
 PIXEL_BYTES = 1.5
 """Compressed size of all images of a frame [bytes per pixel]: 0.9 to 1.0 in the scenes `press` and `draw`."""
+# Meanings of the arrays of an episode, by path.
 MEANINGS = {
     "pictures/colour": "JPEG bytes: what the camera sees, BGR when decoded by OpenCV",
     "pictures/colour_right": "JPEG bytes: what the right eye of a stereo pair sees",
@@ -89,6 +90,7 @@ MEANINGS = {
     "where it is not known",
     "tumour_error_unobserved": "the same had nothing been observed",
 }  # fmt: skip
+# Units of the arrays of an episode.
 UNITS = {
     "time": "s", "T_camera_world": "m", "T_world_tool": "m", "tip": "m", "force": "N", "contact": "m",
     "distance": "m", "distance_error": "m", "model_error": "m", "tumour_error": "m", "tumour_error_unobserved": "m",
@@ -137,7 +139,7 @@ class EpisodeRecording:
 
 
 WHOLE = EpisodeRecording()
-"""All of it, solved in every frame."""
+"""Default recording: all contents, FEM in every frame."""
 
 
 def collect(

@@ -13,11 +13,11 @@ from .engine import BODY, EPISODE
 from .rates import Rate
 from .tasks import FIRST, LATER, OF_BODY, OF_PROCESS
 
-DAY = 86400.0
+DAY = 86400.0  # One day [s].
 UNITS = (DAY, "days"), (3600.0, "h"), (60.0, "min")
-"""In which times are printed [s], where they are twice as long or longer."""
+"""Units of printed times [s], the longest first; a unit is used from twice its length."""
 PROCESSES = (1, 8, 64, 512)
-"""For how many the time is printed."""
+"""Numbers of processes for which the time is printed."""
 
 
 @dataclass(frozen=True)

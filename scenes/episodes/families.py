@@ -21,8 +21,7 @@ from .draws import Number, ValueLimits
 
 PRONY = RELAXING.prony
 """Relaxation of tissue under a spatula."""
-# A hand rests on its way between two places for this share of it.
-REST = 0.3
+REST = 0.3  # Share of the time between two places in which the tool is lifted and moves on.
 
 
 class FamilyMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -16,9 +16,9 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.partial_files import to_unfinished_path
 
 DATA = "training.h5"
-"""The loads that a body's model is trained on, until it is trained."""
+"""File name of the loads that a body's model is trained on, until training ends."""
 NOTE, TABLE = ".json", ".series.npz"
-"""Endings of companion files: the loads; and the series table, if the learner has one."""
+"""Endings of companion files: description of the loads; table of the series, if the learner has one."""
 
 
 def check_resumed(data: Path, stated: Mapping[str, str], others: Sequence[Path]) -> bool:

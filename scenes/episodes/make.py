@@ -32,6 +32,7 @@ from .run_folder import BODIES, to_episode_name
 from .scripted import build_scene, sample_body_number, sample_episode
 from .tasks import Made
 
+# 256 equally probable quantiles of the normal distribution [standard deviations].
 QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
 
 
@@ -75,9 +76,9 @@ def sense_columns(
 
 
 KEPT = 2
-"""Bodies that a process keeps open, and finite elements that each of them keeps."""
+"""Number of bodies that a process keeps open, and number of FEM solvers that each of them keeps."""
 PASSING = OSError, MemoryError
-"""The fault of the disk, or of others on the same card: another try may have more luck."""
+"""Errors of the disk, or of other processes on the same GPU: a retry may succeed."""
 
 
 def to_episode_path(folder: Path, number: int) -> Path:

@@ -31,13 +31,13 @@ KINDS = {
 }  # fmt: skip
 """Kinds of values, by the names that msgspec has for them."""
 SHIPPED = Path(__file__).parent.parent / "data" / "plans"
-"""Plans that ship, by the names of their files."""
+"""Folder of the shipped plans."""
 NO_LEARNER = "none"
-"""The learner of bodies on which finite elements play."""
+"""Learner of bodies without a model: FEM computes the deformation."""
 MOST_BYTES = 200_000
-"""Largest size of a plan's text, which every episode contains."""
+"""Maximum size of a plan's text [bytes]: every episode contains it."""
 FIXED = "fixed"
-"""The path of a camera that stays."""
+"""Path of a static camera."""
 
 
 def format_msgspec_error(error: str) -> str:

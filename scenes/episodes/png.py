@@ -11,10 +11,10 @@ from sim.runtime.optional_packages import require_extra
 with require_extra("data", "writing an episode needs"):
     from isal import isal_zlib
 
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
+SIGNATURE = b"\x89PNG\r\n\x1a\n"  # First bytes of a PNG.
 GREY, SUB = 0, 1
-"""Colour type, and the filter of a row: each sample less the one to its left."""
-LEVEL = 1
+"""PNG's numbers for grey images, and for the row filter that subtracts the sample to the left."""
+LEVEL = 1  # Compression level.
 
 
 def encode_png(picture: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from sim.runtime.atomic_files import explain_error
 from .run_folder import RATES
 from .tasks import TaskOutcome
 
-COLUMNS = "kind,number,frames,bytes,seconds,first"
+COLUMNS = "kind,number,frames,bytes,seconds,first"  # Column names of the table of rates.
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ from sim.runtime.atomic_files import explain_error, write_atomically
 from sim.runtime.partial_files import remove_left_overs
 from sim.runtime.versions import get_version
 
-FORMAT = "sulcus run 1"
+FORMAT = "sulcus run 1"  # Name and version of the folder format.
 PLAN, RUN, FAILED, BODIES, RATES = "plan.toml", "run.json", "failed", "bodies", "rates"
-"""Files of a folder other than its episodes."""
-EPISODE = re.compile(r"episode_(\d{6,})\.(?:h5|json)")
+"""Names of files and folders other than the episodes."""
+EPISODE = re.compile(r"episode_(\d{6,})\.(?:h5|json)")  # Pattern of an episode's file name.
 PARTS = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
 """Packages whose version is part of an episode's bytes."""
 

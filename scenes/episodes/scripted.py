@@ -22,10 +22,9 @@ from .draws import build_generator, sample_value
 from .families import FAMILIES, PRONY, ScenarioInputs, add_tremor
 from .plan import FIXED, EpisodePlan, PlanContents, list_fields, list_tables
 
-# Deviation of a cortex's red, green and blue from ours is the tint times one of these.
+# Largest deviation of the cortex's red, green and blue from the default, in units of the tint.
 TINTS = np.array([0.3, 1.0, 1.0])
-# A second radial coefficient is this share of the first: lenses bend less towards their edge.
-SECOND = -0.3
+SECOND = -0.3  # Ratio of the second to the first radial coefficient: lenses bend less towards their edge.
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,14 @@ from sim.errors import InputError
 from sim.runtime.processes import start_process, to_gpu_variables
 
 HERE = "127.0.0.1"
-"""Address of our own scheduler and workers: not reachable from outside this machine."""
+"""Address of the scheduler and workers: not reachable from outside this machine."""
 CARD = "GPU"
 """Resource of a worker with its own GPU, by Dask's convention."""
 ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """One thread per process: as many processes as cores, and reproducible sums."""
 MOST_DEATHS = 20
 """Number of lost workers after which a task is given up: machines may be taken back at any time."""
-SETTINGS = {
+SETTINGS = {  # Settings of Dask.
     "distributed.scheduler.allowed-failures": MOST_DEATHS,
     "distributed.scheduler.worker-ttl": None,  # clocks jump, as after sleep; who ends is seen by its process
     "distributed.scheduler.http.routes": [],  # their services need no keys

@@ -24,7 +24,7 @@ from .setting import TaskSetting, check_arguments, open_setting
 from .tasks import SECONDS, find_task
 from .touched import TissueRequest
 
-RENDERED = ("rgb_array",)
+RENDERED = ("rgb_array",)  # Supported render modes.
 METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(1.0 / SECONDS)}
 """Render modes, as Gymnasium requires."""
 

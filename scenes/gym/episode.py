@@ -18,16 +18,18 @@ from .tasks import OVER, SECONDS, Goal
 from .tool_motion import RobotTool, build_tool_frame, compute_lever, lay_tool, move_tool, shift_pose
 from .touched import TissueRequest, Touched
 
-STEP, OVER_LIMIT, DONE, ENDED = 0.01, 0.5, 10.0, -10.0
-"""Rewards of a step, of a step over a limit, of success, and of the end at a limit."""
+STEP = 0.01  # Penalty of a step.
+OVER_LIMIT = 0.5  # Penalty of a step with a load over its limit.
+DONE = 10.0  # Reward of success.
+ENDED = -10.0  # Reward of the end of an episode at a limit.
 SHARE = 3.0
-"""Reward of each share that is cut."""
-FAR, NEAR = 0.03, 0.01
-"""Distances [m] beyond which all count alike, and that count 1."""
-# Largest standard deviation of the tremor [m]; initial height of tools above the cortex, and lateral distance [m].
-TREMOR, ABOVE, ASIDE = 1e-4, (5e-3, 8e-3), (3e-3, 8e-3)
-# Steps within which the fluid falls.
-DRAINS = 60
+"""Reward of each share of the tumour that is resected."""
+FAR = 0.03  # Distance beyond which the potential no longer falls [m].
+NEAR = 0.01  # Distance that lowers the potential by 1 [m].
+TREMOR = 1e-4  # Largest standard deviation of the tremor [m].
+ABOVE = (5e-3, 8e-3)  # Range of the initial height of a tool above the cortex [m].
+ASIDE = (3e-3, 8e-3)  # Range of the initial lateral distance of a tool from its goal [m].
+DRAINS = 60  # Number of steps in which the fluid level falls.
 
 
 @dataclass(frozen=True)

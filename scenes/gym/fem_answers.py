@@ -76,10 +76,8 @@ def _stacked(starts: Sequence[Deformation]) -> Deformation:
     return starts[0] if len(starts) == 1 else join_deformations(starts)
 
 
-# Solved fluid levels, relative to its height; solutions in between are interpolated.
-APART = 0.1
-# Distance [m] from the corridor and from the tumour within which healthy tissue is considered.
-AROUND = 0.03
+APART = 0.1  # Spacing of the solved fluid levels, relative to the height; solutions in between are interpolated.
+AROUND = 0.03  # Distance from the corridor and the tumour within which healthy tissue is considered [m].
 
 
 class HealthySurface(NamedTuple):

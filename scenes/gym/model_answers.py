@@ -21,10 +21,9 @@ from surrogate.model.learned import Learned
 from ..script.site import CraniotomyFrame
 from .touched import TissueRequest, Touched
 
-# Tolerance of the ball's depth [m], and maximum number of iterations.
-NEAR, TRIES = 1e-5, 12
-# Times the strongest force of the training, beyond which none is looked for.
-STRONGEST = 1.5
+NEAR = 1e-5  # Tolerance of the ball's depth [m].
+TRIES = 12  # Maximum number of iterations for the ball's depth.
+STRONGEST = 1.5  # Largest force in the search, relative to the strongest of the training.
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,16 @@ from .tool_motion import RobotTool
 KINDS = ("states", "rgbd")
 """Kinds of observations."""
 LENGTH = 0.01
-"""Length that is 1 in an observation [m]."""
+"""Unit of lengths in an observation [m]."""
 LONG = 10.0
-"""Time that is 1 in an observation [s]: the longest episode."""
-TRACKED, FELT, SEEN = 1e-4, 2e-3, 2e-4
-"""Standard deviations of a tracked place [m], a force's component [N], and a seen motion of the cortex [m]."""
+"""Unit of times in an observation [s]: the longest episode."""
+TRACKED = 1e-4  # Standard deviation of a tracked position [m].
+FELT = 2e-3  # Standard deviation of a component of the measured force [N].
+SEEN = 2e-4  # Standard deviation of an observed motion of the cortex [m].
 BOUND = 10.0
-"""No number of an observation is larger; what would be is cut off there."""
+"""Bound of all numbers of an observation, which are clipped to it."""
 COUNT = 24
-"""Numbers of a state."""
+"""Number of components of a state."""
 FARTHEST = 2.0
 """Upper limit of depths in images [m]."""
 

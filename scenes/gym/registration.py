@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from sim.runtime.optional_packages import require_extra
 
-NAMESPACE = "sulcus"
-NAMES = ("Palpate", "Retract", "Debulk")
+NAMESPACE = "sulcus"  # Prefix of the environments' names.
+NAMES = ("Palpate", "Retract", "Debulk")  # Names of the environments.
 STEPS = 200
-"""Steps after which an episode is cut short."""
+"""Number of steps after which an episode is truncated."""
 
 
 def register_environments() -> None:

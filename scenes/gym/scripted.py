@@ -7,13 +7,11 @@ import numpy as np
 from .observation import LENGTH
 from .tasks import DEBULK, RETRACT, GymTask, find_task
 
-# A tool goes down when it is so near over its place [m]; a force above this is contact [N]: three of its deviations.
-OVER, TOUCHES = 1.5e-3, 6e-3
-# Stiffness of the tissue under a tool [N/m].
-STIFFNESS = 60.0
-# A blade goes so many times as far as the cortex shall, and by so much farther in an episode: it does not see how far
-# that is under it.
-FOLLOWS, CREEPS = 1.0, 2.0
+OVER = 1.5e-3  # Lateral distance from the goal within which a tool goes down [m].
+TOUCHES = 6e-3  # Force above which a tool is in contact [N]: three standard deviations of the measured force.
+STIFFNESS = 60.0  # Stiffness of the tissue under a tool [N/m].
+FOLLOWS = 1.0  # Motion of a blade relative to the required motion of the cortex, which is not observed under the blade.
+CREEPS = 2.0  # Increase of the ratio FOLLOWS during the longest episode.
 
 
 def compute_scripted_actions(task: str, states: np.ndarray) -> np.ndarray:

@@ -34,17 +34,14 @@ from .model_answers import Hertz, PosedModel, PressedModel
 from .tasks import Goal, GymTask
 from .touched import TissueModel
 
-PHYSICS = ("auto", "model", "fem")
-TEMPLATE = "template"
-ARGUMENTS = ("anatomy", "physics", "device", "size", "model")
-# The model with the smallest error bound is used.
-TIGHTEST = attrgetter("bound")
-# Largest distance of a goal from the point above the tumour's centre [m].
-SPREAD = 6e-3
-# A drained fluid stands so high at least, and at most, as a share of its height.
-LOWEST, HIGHEST = 0.6, 0.9
-# The patch of cortex whose shift counts has this radius [m].
-PATCH = 8e-3
+PHYSICS = ("auto", "model", "fem")  # Kinds of deformation models.
+TEMPLATE = "template"  # Name of the shipped anatomy.
+ARGUMENTS = ("anatomy", "physics", "device", "size", "model")  # Arguments that determine a setting.
+TIGHTEST = attrgetter("bound")  # Key for selecting the model with the smallest error bound.
+SPREAD = 6e-3  # Largest distance of a goal from the point above the tumour's centre [m].
+LOWEST = 0.6  # Lowest final fluid level, as a share of the height.
+HIGHEST = 0.9  # Highest final fluid level, as a share of the height.
+PATCH = 8e-3  # Radius of the patch of cortex whose shift is rewarded [m].
 
 
 @dataclass(frozen=True, eq=False)

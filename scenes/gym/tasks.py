@@ -18,7 +18,7 @@ from ..script.viewpoint import Viewpoint
 SECONDS = 0.05
 """Duration of a step [s]."""
 OVER = 1.25
-"""Multiple of a limit at which an episode ends."""
+"""Ratio of a load to its limit at which an episode ends."""
 
 
 @dataclass(frozen=True)

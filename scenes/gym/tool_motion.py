@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..script.site import CraniotomyFrame
 from ..script.tool import Instrument, Probe
 
-# Largest height of a tool above the centre of the open cortex [m].
-HIGHEST = 0.02
+HIGHEST = 0.02  # Largest height of a tool above the centre of the open cortex [m].
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,12 +31,10 @@ from ..tracked.tracked_tool import TrackedTool
 from .frame import to_stamp, to_time
 from .heard import ReceivedTransforms, Sent
 
-# # Minimum number of poses to estimate the camera's acceleration between them.
-EVEN = 3
-THEIRS = "are these its poses and registration?"
-NOT_SEEN = TrackedTargets(0, {}, {}, {})
-# Depth of the tool whose solution is timed at the start [m].
-PRESSED = 2e-3
+EVEN = 3  # Minimum number of poses to estimate the camera's acceleration between them.
+THEIRS = "are these its poses and registration?"  # Question in the warning about a misplaced tool.
+NOT_SEEN = TrackedTargets(0, {}, {}, {})  # Tracking result without targets.
+PRESSED = 2e-3  # Depth of the tool whose solution is timed at the start [m].
 
 
 @dataclass(frozen=True, eq=False)

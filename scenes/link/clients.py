@@ -22,19 +22,15 @@ from .frame import (
 from .messages import Code, encode_status
 
 REFUSED = "SulcusRefused"
-"""The device name of each STATUS that is sent to one client."""
-# Bytes of a message that is passed over if it is not wanted; a longer one ends the connection.
-LONGEST = 1 << 28
-# # Time limit for an announced body to arrive, and for a client to read its messages [s].
-PATIENCE = 10.0
-# # Time in which a new client may send a request before it is sent everything, and for the reason of a rejection [s].
-GREETING, FAREWELL = 0.2, 1.0
-# # Time to read the last message when a server ends [s].
-PARTING = 0.1
-# # Size of a slow client's system buffer [bytes]: its content is not replaced by newer messages.
-HELD = 1 << 18
-# # Size of read-ahead, and of chunks that are skipped [bytes].
-AHEAD = 1 << 16
+"""Device name of each STATUS that is sent to one client."""
+LONGEST = 1 << 28  # Maximum size of a message body [bytes]; a longer one ends the connection.
+PATIENCE = 10.0  # Time limit for an announced body to arrive, and for a client to read its messages [s].
+GREETING = 0.2  # Time in which a new client may send a request before everything is sent to it [s].
+FAREWELL = 1.0  # Time for sending the reason of a rejection, and for ending a connection [s].
+PARTING = 0.1  # Time to read the last message when a server ends [s].
+HELD = 1 << 18  # Size of a slow client's system buffer [bytes]: its content is not replaced by newer messages.
+AHEAD = 1 << 16  # Size of the chunks in which a body is skipped [bytes].
+# First letters of the message types that are requests, and of those that ask for selected messages.
 REQUESTS, ASKING = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
 
 Receive = Callable[[int, Header, bytes], None]

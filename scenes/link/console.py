@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-# # Maximum number of lines, and the interval [s].
-MOST, WHILE = 10, 5.0
-PREFIX = "sulcus link: "
+MOST = 10  # Maximum number of printed lines in an interval.
+WHILE = 5.0  # Interval in which at most MOST lines are printed [s].
+PREFIX = "sulcus link: "  # Start of each line.
 
 
 def print_safely(line: str) -> None:

@@ -13,15 +13,14 @@ with require_extra("slicer", "OpenIGTLink's checksums need"):
 
 HEADER = struct.Struct(">H12s20sQQQ")
 """Version, type, device name, time stamp, size of the body, checksum: 58 bytes, all numbers big-endian."""
-# Sizes of the extended header, of the index of metadata and of metadata, and the message's number: of version 2 on.
+# Extended header of version 2: its size, the sizes of the metadata's index and of the metadata, message number.
 EXTENDED = struct.Struct(">HHII")
 INDEXED = struct.Struct(">HHI")
 """Layout of a metadata index entry: size of its key, encoding and size of its value."""
-VERSIONS = (1, 2)
-# A time stamp counts 2^-32 s since 1970.
-TICKS = 1 << 32
-NAME_BYTES = 20
-WRONG_CHECKSUM = "wrong checksum"
+VERSIONS = (1, 2)  # Supported versions of the protocol.
+TICKS = 1 << 32  # Units of a time stamp per second; a stamp of 0 is 1970.
+NAME_BYTES = 20  # Maximum length of a device name [bytes].
+WRONG_CHECKSUM = "wrong checksum"  # Error message.
 
 
 class BadMessageError(ValueError):

@@ -11,13 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from .frame import NAME_BYTES, TICKS, BadMessageError
 
-# # Tolerance of axes from length 1 and right angles: matrices have single precision.
-SQUARE = 2e-3
-# A tracked body is nearer to its tracker [m].
-FARTHEST = 10.0
-# A time stamp that is older than the last one is out of order, but for a clock that was set back by more [s].
-SET_BACK = 5.0
-# # Number of earlier transforms of one name that are kept, for images that arrive later than the poses around them.
+SQUARE = 2e-3  # Tolerance of axes from length 1 and right angles: matrices have single precision.
+FARTHEST = 10.0  # Largest coordinate of a tracked body [m].
+SET_BACK = 5.0  # Difference from the last time stamp above which an earlier one means that the clock was set back [s].
+# Number of earlier transforms of one name that are kept, for images that arrive later than the poses around them.
 KEPT = 32
 
 

@@ -14,15 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from .frame import BadMessageError
 
-FLOATS = np.dtype(">f4")
-WHOLES = np.dtype(">u4")
-# Version, components, scalar type, endianness, space, sizes, axes and centre, start and sizes of the part that is sent.
+FLOATS = np.dtype(">f4")  # Type of numbers in a message.
+WHOLES = np.dtype(">u4")  # Type of integers in a message.
+# Image header: version, components, scalar type, endianness, space, sizes, axes and centre, start and sizes of the
+# part.
 IMAGE = struct.Struct(">HBBBB3H12f6H")
-POINT = struct.Struct(">64s32s4B3ff20s")
-STATUS = struct.Struct(">Hq20s")
-BYTES, BIG, RAS = 3, 1, 1
-ASCII = 3
-LONGEST_TEXT = (1 << 16) - 1
+POINT = struct.Struct(">64s32s4B3ff20s")  # Point: name, group, colour, position, diameter, owner.
+STATUS = struct.Struct(">Hq20s")  # Status: code, subcode, name of the error.
+BYTES, BIG, RAS = 3, 1, 1  # OpenIGTLink's numbers: unsigned bytes; big-endian; coordinates in RAS.
+ASCII = 3  # Number of the encoding US-ASCII.
+LONGEST_TEXT = (1 << 16) - 1  # Maximum length of a text [bytes].
 
 
 class Code(IntEnum):
@@ -59,7 +60,7 @@ class SentMesh:
 
 
 NOTHING = SentMesh(0, b"")
-"""A surface that is not known."""
+"""Surface that is not available."""
 
 
 def encode_polydata(points: np.ndarray, mesh: SentMesh) -> bytes:

@@ -18,16 +18,14 @@ from .answer import PoseResult
 from .frame import BadMessageError, pack_message
 from .messages import NOTHING, Code, SentMesh, encode_points, encode_polydata, encode_status, encode_string, transform
 
-# A place that is asked for belongs to tumour or open cortex where the scan has it no farther from them [m].
+# Largest distance of a requested point from the tumour or open cortex in the scan to which it is assigned [m].
 BESIDE = 2e-3
-# # Maximum number of points outside the tracked surfaces that are named.
-MOST_NAMED = 5
+MOST_NAMED = 5  # Maximum number of points outside the tracked surfaces that are named.
 MOST_PLACES = 1000
 """Maximum number of points in one request."""
 STRANGE = "places that are not in or on the tumour, nor on open cortex, so that their motion is not known"
 """Reason why points are not tracked."""
-# A place of which a tetrahedron's corners make one this near lies in it [m].
-ON = 1e-6
+ON = 1e-6  # Largest distance of a point from its position by barycentric coordinates, to be inside the tetrahedron [m].
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,15 +35,14 @@ from .messages import (
 )
 from .outgoing import MOST_PLACES, STRANGE, SentPlaces
 
-# # Intervals [s]: check of missing input, unchanged STATUS, new attempt to connect to a server.
-TICK, BEAT, AGAIN = 0.1, 1.0, 1.0
-# # Maximum number of other received transforms that are named when the wanted one does not arrive.
-MOST_OTHERS = 6
-# # Types that are received without a reply: a STATUS in reply to a STATUS would loop forever.
+TICK = 0.1  # Interval of checks for missing input [s].
+BEAT = 1.0  # Interval of unchanged STATUS messages [s].
+AGAIN = 1.0  # Interval of attempts to connect to a server [s].
+MOST_OTHERS = 6  # Maximum number of other received transforms that are named when the required one does not arrive.
+# Types that are received without a reply: a STATUS in reply to a STATUS would loop forever.
 UNANSWERED = ("STATUS", "STRING", "CAPABILITY")
-SHORT = 1 << 16
-# # Read-ahead size of a client [bytes].
-AHEAD = 1 << 18
+SHORT = 1 << 16  # Maximum size of a message without an image or points [bytes], and allowance for headers.
+AHEAD = 1 << 18  # Read-ahead size of a client [bytes].
 
 Picture = tuple[np.ndarray, int]
 """Colours (H, W, 3) uint8, and a time stamp."""

@@ -13,7 +13,7 @@ from sim.errors import InputError
 if TYPE_CHECKING:
     from ..script.scene import Scene
 
-# Named here too, so that a command's help waits for no camera to be imported.
+# Names of camera paths. Repeated here, so that a command's help does not import cameras.
 PATHS = ("hand-held", "microscope", "orbit")
 
 

@@ -17,7 +17,7 @@ from sim.runtime.atomic_files import check_output, remove_empty_parents
 from sim.runtime.journal import run_of
 from sim.runtime.partial_files import to_unfinished_path
 
-FRAME = re.compile(r"frame_\d{4,}\.png")
+FRAME = re.compile(r"frame_\d{4,}\.png")  # Pattern of a frame's file name.
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:

@@ -14,8 +14,7 @@ from sim.bodies.subject import Subject
 from sim.errors import InputError
 
 Point = tuple[float, float, float]
-# Places at which a trajectory is held against the brain.
-ON_LINE = 2000
+ON_LINE = 2000  # Number of points of a trajectory that are compared with the brain.
 
 
 def add_opening_arguments(parser: argparse.ArgumentParser) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from ..tracked.elsewhere import ExternalTracker
 
-AUTO = "auto"
+AUTO = "auto"  # Value of --clock that estimates the time offset.
 
 
 def add_poses(parser: argparse.ArgumentParser) -> None:

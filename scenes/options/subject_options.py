@@ -111,8 +111,10 @@ def label_words(args: argparse.Namespace) -> list[str]:
     return [f"{name}={value}" for name, value in given.items() if value is not None]
 
 
+# Options that place a tumour in the template.
 PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at", "head", "brain_ml", "falx_depth")
-SMALLEST_ML, LARGEST_ML = 20.0, 5000.0
+SMALLEST_ML = 20.0  # Smallest accepted volume of a brain [ml].
+LARGEST_ML = 5000.0  # Largest accepted volume of a brain [ml].
 
 
 def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:

@@ -28,8 +28,8 @@ DOUBTED = 100.0, 1e6
 Operated brains have 7.3 kPa, and their tumours 11.4 to 33.1 kPa in the mean of each kind: Chauvet et al. 2016,
 Ultraschall Med. 37:584-590. The laws of brain in `MATERIALS` have 2.0 to 3.3 kPa.
 """
-AS_BRAIN = "the tissue of the brain"
-AS_LEARNED = f"as in the models' training data, or {AS_BRAIN}"
+AS_BRAIN = "the tissue of the brain"  # Default tissue of a region.
+AS_LEARNED = f"as in the models' training data, or {AS_BRAIN}"  # Default tissue of a region with models.
 
 
 def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, default_regions: str = AS_BRAIN) -> None:

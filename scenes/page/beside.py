@@ -17,10 +17,12 @@ from ..play.stage import TOOL, TOOL_COLOUR, Stage
 from ..script.scene import Scene
 
 TUMOUR_MIDDLE, TIP = "the tumour's middle", "the tool's tip"
-"""Positions of the slices."""
+"""Labels of the positions of the slices."""
+# Chart of the distance from tip to tumour.
 DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of the model (95 %); dotted: error unknown")
-FORCE = Line("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: error unknown")
-SET = Line("force", "N", "#ffa94d", "as it is set")
+FORCE = Line("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: error unknown")  # Chart of the force.
+SET = Line("force", "N", "#ffa94d", "as it is set")  # Chart of the prescribed force.
+# Chart of the tumour's motion.
 MOVED = Line("tumour moved", "mm", "#4cf28c", "band: error of the tumour (95 %); dotted: not known")
 
 

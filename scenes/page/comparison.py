@@ -20,6 +20,7 @@ from ..play.tip_reading import measure_tip_distance
 from ..script.tool_paths import compute_lift
 from .referee import FemResult
 
+# Texts: the displayed result is FEM's; FEM's result is the reference.
 OWN, TRUTH = "this is the result of the FEM solver", "the truth is the result of the FEM solver"
 
 
@@ -114,8 +115,7 @@ class PageState:
     plan: tuple[str, ...] | None = None
 
 
-# Loads that are kept of each deformer, the last ones.
-RECENT = 120
+RECENT = 120  # Number of last loads that are kept for each deformer.
 
 
 @dataclass(frozen=True)

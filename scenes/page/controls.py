@@ -21,21 +21,23 @@ from .beside import TIP, TUMOUR_MIDDLE
 from .requests import HAND, SCRIPT, Requests
 from .text import describe_effect
 
-MOST_FORCE, MOST_DEPTH, MOST_TILT = 0.4, 8.0, 40.0
-"""Ends of the sliders [N], [mm], [deg]."""
+MOST_FORCE = 0.4  # End of the force slider [N].
+MOST_DEPTH = 8.0  # End of the depth slider [mm].
+MOST_TILT = 40.0  # End of the direction sliders [deg].
 STAYS = "stays"
 """Label of a static camera."""
 PLAN = "solver details (advanced)"
-"""Label of the note that says which solvers they try."""
+"""Label of the note on the solvers."""
 OWN_FILM = "your own video or camera"
-"""Label of the note that says how to have them in the scene's place."""
-ASKED = (
+"""Label of the note on own videos."""
+# Text of the note on own videos.
+ASKED = (  # Text of that note.
     "<p>The same page shows your own video, or what a camera of this machine sees, with the tumour drawn into it:</p>"
     "<p><code>sulcus overlay VIDEO --page --camera K.yaml --registration R.json --tool T.json</code></p>"
     "<p>A camera's number instead of the video selects that camera. <code>sulcus film palpate --out film</code> makes "
     "a video to try it on. <code>sulcus overlay --help</code> says which command makes each file.</p>"
 )
-HANDS = "A slider takes the tool in your hand; 'script' gives it back."
+HANDS = "A slider takes the tool in your hand; 'script' gives it back."  # Hint on manual control.
 
 
 def build_controls(

@@ -42,10 +42,10 @@ from .view import (
     render_page_image,
 )
 
-WAITS = "The finite elements are working on this load."
+WAITS = "The finite elements are working on this load."  # Text while FEM solves.
+# Text before the first result.
 RESTS = '<p class="stale">The undeformed body, as in the scan. The first result is being computed.</p>'
-# # Time for which a playing page shows why a frame is skipped [s].
-READING = 2.0
+READING = 2.0  # Time for which a playing page shows why a frame is skipped [s].
 
 
 class Demo:

@@ -10,7 +10,7 @@ from ar.overlay.styles import Style
 
 from ..script.tool_paths import Touch
 
-SCRIPT, HAND = "script", "hand"
+SCRIPT, HAND = "script", "hand"  # Control of the tool: scripted, manual.
 
 
 @dataclass

@@ -22,16 +22,17 @@ from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
 from .comparison import ComparisonRow
 
-SEEN = (
+SEEN = (  # Explanation of the image.
     "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "
     "the green outline shows where it is computed to be now, while the tissue moves."
 )
-ESTIMATED = (
+ESTIMATED = (  # Explanation of the image where the motion is estimated from the cortex.
     "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; the green "
     "outline shows where it is estimated to be, from the dots on the cortex alone. No force and no stiffness is known."
 )
-RESEARCH = "Research only. Not a medical device."
-MIDLINE = 5e-3
+RESEARCH = "Research only. Not a medical device."  # Restriction of use.
+MIDLINE = 5e-3  # Distance from the midline below which a tumour has no side [m].
+# Names of finite elements for users.
 ELEMENTS = {"p1": "linear tetrahedra", "p2": "quadratic tetrahedra", "smoothed": "smoothed linear tetrahedra"}
 EFFECTS = {
     "ToolForce": "push of the tool",

@@ -14,13 +14,11 @@ from ..play.stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR
 from ..script.site import CraniotomyFrame
 from .referee import FemResult
 
-FEM_COLOUR = TRUTH_COLOUR
+FEM_COLOUR = TRUTH_COLOUR  # Colour of the FEM tumour.
 STALE_COLOUR = (0.45, 0.45, 0.45)
 """Colour of the FEM tumour while it belongs to another load than the one shown."""
-# Radius of an ellipsoid before there is one [m].
-SMALL = 1e-4
-# # Distance of the orientation letters from the brain [m].
-BESIDE = 12e-3
+SMALL = 1e-4  # Radius of the ellipsoid before there is one [m].
+BESIDE = 12e-3  # Distance of the orientation letters from the brain [m].
 
 
 def build_page_bodies(stage: Stage) -> list[SceneSurface]:

@@ -24,8 +24,7 @@ from .picture_checks import (
 )
 from .player import Frame, Player
 
-# # Share of its largest motion below which the tumour counts as still.
-STILL = 0.25
+STILL = 0.25  # Share of its largest motion below which the tumour counts as still.
 NOWHERE = 0.0, np.inf, np.inf, np.inf, False
 """Metrics of a tumour at an invalid position: overlap, distance [m], two image distances [pixel], occlusion drawn."""
 

@@ -18,16 +18,22 @@ from ..script.site import CraniotomyFrame
 from ..script.tool import build_capsule
 from ..script.viewpoint import Cottonoid
 
-# Voxels across and along the axis of the opening [m]; how far they go beyond it, above its middle and below it [m].
-FINE, ALONG = 0.2e-3, 1e-3
-BEYOND, ABOVE, BELOW = 10e-3, 5e-3, 14e-3
-# Trunks that come in at the border, the widest and the narrowest vessel, and the step of a path [m].
-TRUNKS, WIDEST, NARROWEST, STEP = 14, 0.8e-3, 0.2e-3, 0.2e-3
-# In each step: the chance of a branch, how far the way turns [rad], and the width that is left. A branch's width over
-# its parent's.
-BRANCHES, TURNS, LEFT, BRANCH = 0.05, 0.12, 0.998, 0.72
-# The share of the light that a vessel takes at most, and the mottle of vessels too fine to be drawn, of a length [m].
-DARK, MOTTLE, MOTTLED = 0.75, 0.12, 0.35e-3
+FINE = 0.2e-3  # Edge of a voxel across the axis of the craniotomy [m].
+ALONG = 1e-3  # Edge of a voxel along the axis of the craniotomy [m].
+BEYOND = 10e-3  # Margin of the voxels round the craniotomy [m].
+ABOVE = 5e-3  # Height of the voxels above the centre of the craniotomy [m].
+BELOW = 14e-3  # Depth of the voxels below the centre of the craniotomy [m].
+TRUNKS = 14  # Number of vessels that enter at the border.
+WIDEST = 0.8e-3  # Largest width of a vessel [m].
+NARROWEST = 0.2e-3  # Width at which a vessel ends [m].
+STEP = 0.2e-3  # Step of a vessel's path [m].
+BRANCHES = 0.05  # Probability of a branch in each step.
+TURNS = 0.12  # Standard deviation of the turn in each step [rad].
+LEFT = 0.998  # Factor on the width in each step.
+BRANCH = 0.72  # Width of a branch relative to its parent.
+DARK = 0.75  # Largest share of the light that a vessel absorbs.
+MOTTLE = 0.12  # Contrast of the mottle: vessels too fine to be drawn.
+MOTTLED = 0.35e-3  # Length scale of the mottle [m].
 
 
 @lru_cache(maxsize=2)
@@ -85,11 +91,13 @@ def sample_vessel_paths(half: float, random: np.random.Generator) -> tuple[np.nd
 
 COTTON, GLOVE = 5, 6
 """Segmentation ids."""
-COTTON_COLOUR, GLOVE_COLOUR = (0.93, 0.92, 0.88), (0.86, 0.80, 0.66)
-# Places along a side of a square; how far above the cortex it is drawn [m].
-PLACES, THICK = 9, 0.7e-3
-# A finger's radius and length, how far it reaches over the edge, and how high it is held [m].
-FINGER, LENGTH, OVER, HIGH = 7e-3, 70e-3, 4e-3, 7e-3
+COTTON_COLOUR, GLOVE_COLOUR = (0.93, 0.92, 0.88), (0.86, 0.80, 0.66)  # Colours (RGB, 0 to 1).
+PLACES = 9  # Number of vertices along a side of a cotton square.
+THICK = 0.7e-3  # Height of a cotton square above the cortex [m].
+FINGER = 7e-3  # Radius of a finger [m].
+LENGTH = 70e-3  # Length of a finger [m].
+OVER = 4e-3  # Length of a finger beyond the edge of the craniotomy [m].
+HIGH = 7e-3  # Height of a finger above the cortex [m].
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,8 @@ from .stage import Stage
 from .stereo_observer import StereoObserver
 
 GUARDED = "guarded"
-"""The name of the best model with finite elements behind it."""
+"""Name of the best model with FEM fallback."""
+# Text: FEM's result is the reference of an estimate.
 TRUTH = "what an estimate is held against is the truth, as finite elements have it"
 
 

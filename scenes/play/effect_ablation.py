@@ -19,9 +19,8 @@ from ..script.site import CraniotomyFrame
 from .deformers import PatientSetup
 from .stage import Stage
 
-# Frames that are not timed: kernels are loaded.
-WARM_UP = 2
-ALL = "all"
+WARM_UP = 2  # Number of frames that are not timed: kernels are loaded.
+ALL = "all"  # Name of the run with all effects.
 
 
 @dataclass(frozen=True, eq=False)

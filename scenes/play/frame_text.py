@@ -13,16 +13,15 @@ from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touchi
 
 from ..script.uncertainty import REGISTRATION, TumourError
 
-# Parts of the head along the axes of RAS, and against them.
+# Parts of the head in the positive and negative direction of each RAS axis.
 SIDES = (("right", "left"), ("front", "back"), ("crown", "feet"))
-# Components of a unit vector under this are not named.
-NAMED = 0.05
-# Regions with a tissue of their own, as `Elasticity` writes them, and the name of one.
-OWN_TISSUES, OWN = re.compile(r"; region \d.*?(?=\)(?:;|$))"), re.compile(r"(?:(?<=; )|\()([\w ]+)\)?: ")
+NAMED = 0.05  # Smallest component of a unit vector that is named.
+# Pattern of the regions with own tissues, in the description by `Elasticity`.
+OWN_TISSUES = re.compile(r"; region \d.*?(?=\)(?:;|$))")
+OWN = re.compile(r"(?:(?<=; )|\()([\w ]+)\)?: ")  # Pattern of the name of one region.
 
 
-# # Warnings written into an image whose solution is unreliable.
-DOUBTS = {
+DOUBTS = {  # Warnings written into an image whose solution is unreliable.
     Outcome.EXTRAPOLATED: "outside what the model learned: do not rely on it",
     Outcome.PIERCED: "the tool penetrates the tissue: do not rely on it",
     Outcome.ON_BONE: "the tool stands on bone: do not rely on it",

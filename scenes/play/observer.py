@@ -27,14 +27,13 @@ from ..script.sight import PointObservation, StereoObservation
 from ..script.site import HOLE, CraniotomyFrame
 from ..script.tool import build_sphere
 
-# A tool so near to the cortex touches it; it hides points that are so near to it [m].
-TOUCHES, HIDES = 1e-3, 4e-3
-# # Number of tool corners, nearest to those of the cortex, that are searched for the contact point.
-CORNERS = 32
-ELLIPSOID_COLOUR = (0.21, 0.30, 0.90)
+TOUCHES = 1e-3  # Distance from the cortex within which a tool touches it [m].
+HIDES = 4e-3  # Distance from a tool within which points are hidden [m].
+CORNERS = 32  # Number of tool corners, nearest to those of the cortex, that are searched for the contact point.
+ELLIPSOID_COLOUR = (0.21, 0.30, 0.90)  # Colour of the ellipsoid (RGB, 0 to 1).
 ELLIPSOID = 5
 """Segmentation id of the ellipsoid's layer, which no image contains."""
-BALL, BALL_FACES = build_sphere()
+BALL, BALL_FACES = build_sphere()  # Unit sphere: vertices and triangles.
 NOTHING = Observation(np.zeros((0, 3)))
 """Empty observation."""
 

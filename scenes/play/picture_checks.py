@@ -27,18 +27,15 @@ from surrogate.model.guarded import find_first_model
 from .player import TRUE_STROKES, Frame, Player
 from .stage import ESTIMATED_LINES, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 
-# Barycentric weights (q, 3) at which the tumour's triangles are sampled: corners, edges and insides.
-STEPS = 24
+STEPS = 24  # Number of sampling steps along an edge of a triangle of the tumour.
+# Barycentric weights (q, 3) at which the tumour's triangles are sampled: corners, edges and interior.
 SAMPLES = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
 
-# # Share of the silhouette's pixels that may deviate.
-SLACK = 0.02
-# # Range of the ink share of a broken outline; largest changed share of occluded ground.
-BROKEN_SHARES, CHANGED = (0.35, 0.88), 0.5
-# The soft ends of two strokes [pixel]: their ink is not the outline's.
-SOFT = 2
-# # Largest distance of the number from the tip, as a share of the image width.
-FAR = 0.3
+SLACK = 0.02  # Share of the silhouette's pixels that may deviate.
+BROKEN_SHARES = (0.35, 0.88)  # Range of the share of a broken outline that is drawn.
+CHANGED = 0.5  # Largest share of occluded ground whose colour may change.
+SOFT = 2  # Total length of the soft ends of two strokes [pixel]: their colour is not the outline's.
+FAR = 0.3  # Largest distance of the number from the tip, as a share of the image width.
 
 
 def render_silhouette(camera: Camera, layer: Layer) -> np.ndarray:

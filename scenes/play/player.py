@@ -39,19 +39,17 @@ from .observer import TumourEstimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
 from .tip_reading import read_tip_distance
 
-REFUSED = "observation rejected, and the scan is shown: do not rely on it"
-# Strokes and gaps of the outlines of the truth and of the ellipsoid [pixel].
-TRUE_STROKES, ELLIPSOID_STROKES = (12, 4), (8, 5)
+REFUSED = "observation rejected, and the scan is shown: do not rely on it"  # Warning in the image.
+TRUE_STROKES = (12, 4)  # Stroke and gap lengths of the reference's outline [pixel].
+ELLIPSOID_STROKES = (8, 5)  # Stroke and gap lengths of the ellipsoid's outline [pixel].
 COVERS = (TOOL, COTTON, GLOVE)
 """Layers drawn in front of the overlay."""
-IN_BONE = "blocked by bone at the craniotomy edge: do not rely on it"
-# # Largest penetration of the tool into the craniotomy edge, carried by tissue, before the tool is drawn elsewhere, and
-# # before its load counts as infeasible [m].
-CARRIED, BLOCKED = 0.5e-3, 2e-3
-# # Image width [pixel] below which the error lines are short.
-FEW = 480
-# Displacement below which a brain is undeformed [m].
-STILL = 1e-6
+IN_BONE = "blocked by bone at the craniotomy edge: do not rely on it"  # Warning in the image.
+# Largest penetration into the craniotomy edge that tissue carries [m]: beyond, the tool is drawn elsewhere.
+CARRIED = 0.5e-3
+BLOCKED = 2e-3  # Penetration into the craniotomy edge above which a load counts as infeasible [m].
+FEW = 480  # Image width below which the error lines are short [pixel].
+STILL = 1e-6  # Largest displacement of a brain that counts as undeformed [m].
 STAGES = ("deform", "render", "overlay")
 """Stages of a frame that are timed."""
 

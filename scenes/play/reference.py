@@ -15,8 +15,7 @@ from sim.runtime.device import find_device
 from ..script.scene import Scene
 from .deformers import PatientSetup
 
-# # Number of frames that are solved together: small enough for regular progress reports.
-TOGETHER = 16
+TOGETHER = 16  # Number of frames that are solved together: small enough for regular progress reports.
 
 
 def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | OperatedFem:

@@ -12,10 +12,9 @@ from sim.effects import SkullContact
 from ..script.tool_paths import Touch
 from .player import Player
 
-T = TypeVar("T")
-# # Largest time step of one solve where the brain separates from the skull [s]. One long solve costs half as much as
-# the
-# # steps that show its course, but takes a quarter of a minute without an image.
+T = TypeVar("T")  # Type of a frame.
+# Largest time step of one solve where the brain separates from the skull [s]. One long solve costs half as much as the
+# steps that show its course, but takes a quarter of a minute without an image.
 LEAP = 0.2
 
 

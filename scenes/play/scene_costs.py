@@ -13,10 +13,8 @@ from .frame_text import shorten_source
 from .player import Frame, Player
 from .stage import DRAPE, TOOL
 
-# Frames that are drawn of each scene, evenly spaced; the first loads kernels and is not timed.
-DRAWN = 8
-# # Width and height of an image of the sheet [pixel].
-SIZE = (480, 360)
+DRAWN = 8  # Number of frames rendered of each scene, evenly spaced; the first loads kernels and is not timed.
+SIZE = (480, 360)  # Width and height of an image of the sheet [pixel].
 LINES = "green estimate, pink truth, blue 95 % of its middle"
 """Legend of the lines drawn with an estimate."""
 

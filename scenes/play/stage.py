@@ -30,27 +30,26 @@ CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", COTTON: "cotton", GLOVE: "glove"}
 """Names of the visible layers: the tumour is never visible."""
 
-CORTEX_COLOUR = (0.86, 0.60, 0.54)
-DRAPE_COLOUR = (0.16, 0.36, 0.42)
-TOOL_COLOUR = (0.78, 0.80, 0.83)
+CORTEX_COLOUR = (0.86, 0.60, 0.54)  # Colour of the cortex (RGB, 0 to 1).
+DRAPE_COLOUR = (0.16, 0.36, 0.42)  # Colour of the drape (RGB, 0 to 1).
+TOOL_COLOUR = (0.78, 0.80, 0.83)  # Colour of the tool (RGB, 0 to 1).
 # Lines that eyes without red or green tell apart, and see on cortex and drape: tests/test_scenes_checks.py.
 TUMOUR_COLOUR = (0.20, 0.94, 0.42)
 TRUTH_COLOUR = (0.90, 0.35, 0.78)
 """Colour of the tumour surface computed by FEM."""
-# # Share of the cortex colour that the scan's black keeps; depth of black below white [m].
-DARK, RELIEF = (0.33, 0.16, 0.17), 1.5e-3
+DARK = (0.33, 0.16, 0.17)  # Share of the cortex colour (RGB) that the scan's black keeps.
+RELIEF = 1.5e-3  # Depth of black below white [m].
 OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
 """Layer through which the tumour is seen, and text for the occluders."""
+# Names of the lines in an image of a prediction.
 PREDICTED_LINES = LegendNames("predicted tumour", "its error, 95 %", "in the scan")
 ESTIMATED_LINES = LegendNames("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"), "estimate moved")
 """Names of the lines in an image of a prediction, and in one of an estimate."""
-# Grey matter's outer rim mixes with fluid in the scan: it is read this far under the surface [m].
-READ_BELOW = 2.0e-3
-# # Largest depth under the bone at which the cortex may become visible [m].
-RIM = 10e-3
-DRAPE_HEIGHT, DRAPE_DEPTH = 3.0e-3, 8.0e-3
-# # Slope of the drape beyond the hole, down to the depth of the drape's wall.
-DIP = 3.0
+READ_BELOW = 2.0e-3  # Depth under the surface at which the scan is read [m]: the edge of grey matter mixes with fluid.
+RIM = 10e-3  # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
+DRAPE_HEIGHT = 3.0e-3  # Height of the drape above the brain [m].
+DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
+DIP = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 
 
 @dataclass(frozen=True, eq=False)

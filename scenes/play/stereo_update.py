@@ -19,24 +19,23 @@ from surrogate.locating.observation import Observation
 
 from ..script.site import HOLE, CraniotomyFrame
 
-# Pixels of a window to a metre of cortex, and how far it reaches from the middle of the opening, in its radii.
-FINENESS, WIDE = 6000.0, 1.05
-# # Minimum distance of points from the drape [m]: it is above the cortex, and its disparity differs.
-OFF_DRAPE = 1.5e-3
-# Points of the first pair whose middle one lies farther off the scan's cortex are of other cameras [m].
+FINENESS = 6000.0  # Resolution of the rectified images [pixel/m of cortex].
+WIDE = 1.05  # Half-width of the rectified images [radii of the craniotomy].
+OFF_DRAPE = 1.5e-3  # Minimum distance of points from the drape [m]: it is above the cortex, and its disparity differs.
+# Largest median distance of the first pair's points from the scan's cortex [m]: beyond, the calibration is of other
+# cameras.
 MISPLACED = 2.5e-3
-# Motions are searched for up to about this [m]; if half of them seem larger, eyes were swapped.
-FARTHEST = 10e-3
+FARTHEST = 10e-3  # Search range of motions [m]; if half of them seem larger, eyes were swapped.
 MOVED_FAR = (
     f" Or the cortex has moved by about {1e3 * FARTHEST:g} mm or more since the first pair, farther than it is "
     "searched for: begin with a new scan."
 )
 """Reasons why points of the first pair may not be found again."""
-# A smaller share of the points that were looked for is no sight of the cortex.
-FEWEST = 0.3
-# # Static surroundings of the opening: number of points examined, minimum number, motion [m] within which a quarter of
-# # them must stay. Others are at the edge of the drape, in front of moving tissue.
-AROUND, ENOUGH, STILL = 60, 15, 2e-3
+FEWEST = 0.3  # Smallest share of the points that must be found again.
+AROUND = 60  # Maximum number of points in the static surroundings of the craniotomy that are examined.
+ENOUGH = 15  # Minimum number of points found in the static surroundings.
+# Motion within which a quarter of the surroundings must stay [m]; the others are at the edge of the drape.
+STILL = 2e-3
 Rigid = Callable[[np.ndarray], np.ndarray]
 """Takes places (n, 3) [m] to where a tracked microscope has them."""
 

@@ -6,8 +6,8 @@ import threading
 import time as clock
 from collections.abc import Callable
 
-# A wait that is noticed [s], and how often it is looked at.
-NOTICED, LOOK = 0.3, 0.1
+NOTICED = 0.3  # Waiting time that is reported [s].
+LOOK = 0.1  # Polling interval [s].
 
 
 class Busy:

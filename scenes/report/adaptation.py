@@ -19,8 +19,7 @@ from surrogate.data.simulate import simulate
 
 from .study import ReportStudy, note_seconds, read_noted_seconds
 
-# Removed share of the tumour's volume.
-SHARE = 0.2
+SHARE = 0.2  # Removed share of the tumour's volume.
 
 
 def debulk_tumour(anatomy: Anatomy) -> Anatomy:

@@ -26,9 +26,8 @@ from .adaptation import debulk_tumour
 from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow, compare_with_reference, summarise_times
 from .study import ReportStudy
 
-OWN, HALVED = "own", "halved"
-# The tolerance of data sets.
-STANDARD = 1e-4
+OWN, HALVED = "own", "halved"  # Meshes: that of the data; with every edge halved.
+STANDARD = 1e-4  # Solver tolerance of data sets.
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from .reference import get_solutions_beyond
 from .row import ErrorFigures, ReportRow, compare_with_reference, compute_figures, summarise_times
 from .study import ReportStudy, measure_series_seconds
 
-FEWEST_LOADS = 64
+FEWEST_LOADS = 64  # Smallest number of training loads of a learning curve.
 
 
 @dataclass(frozen=True)

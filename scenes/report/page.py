@@ -21,9 +21,9 @@ from ..analysis.loglog_chart import ChartPanel, Curve, Dot, draw_panels
 from ..analysis.measurement import write_table
 from .row import ERROR, TOLERANCE_ALONE, ErrorFigures, ReportRow
 
-SIZE = (880, 560)
-DIFFERENT = "another law: model difference"
-TIME = "milliseconds a load, one at a time"
+SIZE = (880, 560)  # Width and height of a chart [pixel].
+DIFFERENT = "another law: model difference"  # Name of the group of rows with another material law.
+TIME = "milliseconds a load, one at a time"  # Label of the time axis.
 Place = tuple[float, float]
 
 
@@ -81,15 +81,18 @@ def _scatter(
     return draw_panels([ChartPanel(title, TIME, y, dots=dots, size=SIZE)]) if dots else None
 
 
+# Functions that draw the charts, by name.
 PLOTS = {"time": plot_error_against_time, "learners": plot_learners_against_time, "solves": plot_error_against_solves}
-SETS = {
+SETS = {  # Descriptions of the sets of test loads.
     "discs": "whole discs of cortex left out",
     "sectors": "whole sectors of direction left out",
     "beyond": "beyond the training range",
 }
+# Column titles of the table of error distributions.
 SPREAD_HEADS = (
     "mean mm", "p95", "p99.9", "largest", "worst vertex mm: mean", "p95", "p99.9", "mean %", "p95", "p99.9", "largest",
 )  # fmt: skip
+# Style sheet of the page.
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1200px; margin: 2em auto; padding: 0 1em; }
 table { border-collapse: collapse; font-size: 13px; margin: 1em 0; }
@@ -99,7 +102,7 @@ tr.front td:first-child { font-weight: bold; } tr.pale td { color: #777; } img {
 figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption { font-size: 13px; }
 .wide { overflow-x: auto; }
 """
-NOTES = (
+NOTES = (  # Paragraphs below the tables.
     "There are two errors, never mixed. The error against the reference says what a row is worth. The error against "
     "its own finite elements, those that it was trained on, says what learning lost. A row of another law than "
     "the reference's has a model difference instead of an error. The reference's own elements, less exactly solved, "

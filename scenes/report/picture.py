@@ -24,9 +24,8 @@ from ..script.viewpoint import Viewpoint
 from .reference import get_reference
 from .study import ReportStudy
 
-# So narrow that a pixel is a tenth of a millimetre.
-VIEW = Viewpoint(fov=np.radians(9.0), width=400, height=300)
-YELLOW = (255, 215, 50)
+VIEW = Viewpoint(fov=np.radians(9.0), width=400, height=300)  # View so narrow that a pixel is a tenth of a millimetre.
+YELLOW = (255, 215, 50)  # Colour of the reference's outline (RGB).
 
 
 def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:

@@ -21,8 +21,7 @@ from surrogate.model.npz_archive import Archive
 
 from .study import ReportStudy
 
-# Loads that are solved together where a batch is worth it: a stop loses no more than these.
-TOGETHER = 16
+TOGETHER = 16  # Number of loads solved together where a batch is faster: an interruption loses no more than these.
 
 
 @dataclass(frozen=True, eq=False)

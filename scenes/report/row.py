@@ -15,9 +15,10 @@ from surrogate.evaluation.score import spread
 from .reference import get_reference
 from .study import ReportStudy
 
-# Kind of difference from the reference: same law, another law, or the reference's own elements.
+# Differences from the reference: same law, another law, the reference's own elements.
 ERROR, DIFFERENCE, TOLERANCE_ALONE = "error", "model difference", "its tolerance alone"
-TENTHS, FEWEST_FOR_P99 = 10, 1000
+TENTHS = 10  # Number of classes of force.
+FEWEST_FOR_P99 = 1000  # Minimum number of loads for a 99th percentile.
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from .row import ReportRow
 from .study import ReportStudy
 
 Spec = FemVariant | LearnerSpec
-FAMILY = {FemVariant: "finite elements", LearnerSpec: "learnt"}
+FAMILY = {FemVariant: "finite elements", LearnerSpec: "learnt"}  # Names of families by type.
 
 
 def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
@@ -78,12 +78,11 @@ def _on_one_core(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.n
         return measure_learner(study, spec)
 
 
-ELEMENTS = ("p1", "smoothed", "p2")
-MESHES = {"2.5k": "2500", "17k": "17000"}
-TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)
+ELEMENTS = ("p1", "smoothed", "p2")  # Compared finite elements.
+MESHES = {"2.5k": "2500", "17k": "17000"}  # Numbers of nodes of the compared meshes, by name.
+TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)  # Compared solver tolerances.
 Run = Callable[[ReportStudy, Spec, Path], ReportRow]
-# Cores per measured learner, which uses one; the others prepare the next process.
-CORES = 4
+CORES = 4  # Number of CPU cores per measured learner, which uses one; the others prepare the next process.
 
 
 def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:

@@ -161,9 +161,10 @@ class ReportStudy:
         return compute_digest(np.frombuffer(stated.encode(), np.uint8), data.good, *vars(self.pushed).values())
 
 
-# Times the greatest force; degrees more than the greatest angle; of the radius, how near to the rim a centre comes.
-STRONGER, MORE_OBLIQUE, NEARER = (1.2, 1.6), (5.0, 15.0), (0.5, 0.9)
-KINDS = ("stronger", "more oblique", "nearer to the rim")
+STRONGER = (1.2, 1.6)  # Range of forces beyond the training, relative to its largest force.
+MORE_OBLIQUE = (5.0, 15.0)  # Range of angles beyond the training's largest angle [deg].
+NEARER = (0.5, 0.9)  # Range of distances of a centre from the edge, relative to the radius.
+KINDS = ("stronger", "more oblique", "nearer to the rim")  # Kinds of loads beyond the training range.
 
 
 def draw_loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) -> Loads:

@@ -13,11 +13,11 @@ from .site import CraniotomyFrame
 from .tool import Instrument, Probe
 from .tool_paths import Path, Touch
 
-# A tool that goes in more obliquely slides along the cortex [rad]. A point farther from it marks another place [m], and
-# so does a line that would have to be drawn out by more to enter.
-STEEPEST, NEAR = np.radians(60.0), 10e-3
-# Corrections after which a place in the tangent plane is that of a point of the curved cortex.
-CORRECTIONS = 6
+# Largest angle to the craniotomy's axis [rad]: a tool that enters more obliquely slides along the cortex.
+STEEPEST = np.radians(60.0)
+# Largest distance of a point from the open cortex, and largest extension of a line that is to reach it [m].
+NEAR = 10e-3
+CORRECTIONS = 6  # Number of iterations from a point in the tangent plane to one of the curved cortex.
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,11 @@ import numpy as np
 from ar.optics.camera import Camera
 from sim.errors import InputError
 
-# # Breathing frequency [Hz]: fifteen breaths a minute.
-BREATH = 0.25
-# # Frequencies of a hand that holds a camera [Hz]: slow drift, and tremor at 8 to 12 Hz (Elble and Koller 1990,
-# "Tremor").
-SLOW, TREMOR = (0.2, 2.5), (8.0, 12.0)
-# Waves of each, and the tremor's share of a hand's motion.
-WAVES, SHARE = 8, 0.1
+BREATH = 0.25  # Breathing frequency [Hz]: fifteen breaths a minute.
+SLOW = (0.2, 2.5)  # Frequencies of the slow drift of a hand that holds a camera [Hz].
+TREMOR = (8.0, 12.0)  # Frequencies of a hand's tremor [Hz] (Elble and Koller 1990, "Tremor").
+WAVES = 8  # Number of waves of drift, and of tremor.
+SHARE = 0.1  # Size of the tremor relative to the drift.
 
 
 class CameraPath(Protocol):

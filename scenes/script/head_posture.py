@@ -12,7 +12,7 @@ from sim.loads import Posture
 
 from .tool_paths import smooth
 
-SUPINE = (0.0, -1.0, 0.0)
+SUPINE = (0.0, -1.0, 0.0)  # Direction of gravity for a patient lying supine (RAS).
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,9 @@ if TYPE_CHECKING:
     from surrogate.fitting.tissue import FittedTissue
 
 Law = Literal["uniform", "log-uniform", "normal"]
-MESH, REGISTRATION, SEGMENTATION = "mesh", "registration", "segmentation"
-TOOL, SKULL = "tool's place", "skull"
-# A scene cannot be where its skulls have less probability.
-LEAST_POSSIBLE = 0.01
+MESH, REGISTRATION, SEGMENTATION = "mesh", "registration", "segmentation"  # Names of contributors.
+TOOL, SKULL = "tool's place", "skull"  # Names of contributors.
+LEAST_POSSIBLE = 0.01  # Smallest total probability of a scene's skull models.
 TOGETHER = "several together"
 """Interaction: difference from the sum of the single contributions."""
 
@@ -105,7 +104,7 @@ OF_SEGMENTATION = ParameterPrior(
     "raters agree with a Dice score of 74 - 85 %, which is 1.3 - 2.3 mm between two of them on 7 ml: Menze et al. "
     "2015, IEEE Trans. Med. Imaging 34:1993-2024",
 )  # fmt: skip
-OF_MESHES = OF_MESH, OF_MESH_SLIDING, OF_MESH_SINKING
+OF_MESHES = OF_MESH, OF_MESH_SLIDING, OF_MESH_SINKING  # Priors of the mesh error.
 PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, *OF_MESHES, OF_REGISTRATION, OF_SEGMENTATION)
 """All priors; the error of a trained model is added if one is used."""
 

@@ -40,8 +40,7 @@ from .tool import Instrument, Probe
 from .tool_paths import AIR, Path, Touch, keep_idle
 from .viewpoint import PLAIN, USUAL, Appearance, Viewpoint
 
-# # Maximum number of frames of a scene: one hour at 30 frames/s.
-MOST_FRAMES = 108_000
+MOST_FRAMES = 108_000  # Maximum number of frames of a scene: one hour at 30 frames/s.
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,8 @@ class Bounds:
     removed: float = 0.0
 
 
-PALPATION = Probe()
-# A tool that is stopped by less is where it was asked for [m].
-SHORT = 0.1e-3
+PALPATION = Probe()  # Default tool.
+SHORT = 0.1e-3  # Largest distance by which the bone's edge may stop a tool before its target without a notice [m].
 HANDLED = (ToolForce, ToolContact, Retraction)
 """Effects that need a tool."""
 

@@ -11,8 +11,7 @@ import trimesh
 
 from sim.tools import Ball, BuiltIn, Spatula, Tool, get_core
 
-# Radius of the shaft of a tool of which no more is known [m].
-SHAFT = 1.8e-3
+SHAFT = 1.8e-3  # Default radius of a tool's shaft [m].
 
 
 def build_sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:

@@ -35,11 +35,10 @@ class Touch:
 Path = Callable[[float], Touch]
 """Time [s] -> Touch."""
 
-# # Height of an idle tool above the tissue [m].
-AIR = 4e-3
+AIR = 4e-3  # Height of an idle tool above the tissue [m].
 
 
-# A push weaker than this lifts its tool off [N]: so little that none is seen to act through the air.
+# Force below which a tool is drawn above the tissue [N]: so small that no visible tool acts through the air.
 FAINT = 2e-3
 
 

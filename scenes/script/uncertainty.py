@@ -18,15 +18,14 @@ from .priors import OF_REGISTRATION, PRIORS, REGISTRATION, SEGMENTATION
 from .scene import Scene
 from .site import CraniotomyFrame
 
-FORMAT = "sulcus uncertainty 1"
+FORMAT = "sulcus uncertainty 1"  # Name and version of the file format.
 LEVEL = 0.95
 """Probability level of every printed bound."""
-SUFFIX = ".uncertainty.json"
-SURROGATE = "surrogate"
+SUFFIX = ".uncertainty.json"  # Ending of the file, next to the anatomy.
+SURROGATE = "surrogate"  # Name of a contributor.
 AT_REST = (REGISTRATION, SEGMENTATION)
-"""Contributors that put a tumour elsewhere in the scan, and as far elsewhere after it has moved."""
-# # Bound at 95 % of a Gaussian [standard deviations].
-DEVIATIONS = 1.96
+"""Contributors that displace a tumour in the scan, and by the same amount after it has moved."""
+DEVIATIONS = 1.96  # Bound at 95 % of a Gaussian [standard deviations].
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class TumourError:
         return self.prior if self.observed is None else self.observed
 
 
-NOT_KNOWN = TumourError(None)
+NOT_KNOWN = TumourError(None)  # Error that is not available.
 
 
 @dataclass(frozen=True)

@@ -68,8 +68,7 @@ PLAIN = Appearance()
 """Default look of scenes."""
 
 
-# # Depth under the cortex of the camera's target [m]: between the tool and the tumour.
-UNDER = 10e-3
+UNDER = 10e-3  # Depth under the cortex of the camera's target [m]: between the tool and the tumour.
 Eye = Literal["left", "right"]
 
 

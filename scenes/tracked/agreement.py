@@ -9,15 +9,15 @@ import numpy as np
 
 from ar.tracking.pose import Pose
 
-# A printed target is no farther from the body that carries it [m], and stays where it is on it but for this [m].
-FARTHEST, LOOSE = 0.2, 5e-3
-# # Largest standard deviation of a usable target pose [m]; number of images kept, and minimum number.
-KNOWN, KEPT, FEWEST = 2e-3, 30, 4
-# # Factor by which bodies are closer to the target with swapped files, and distance beyond which this counts [m].
-NEARER, BESIDE = 3.0, 0.02
-# # Percentile of the kept images that is used: one in ten may be misread.
-MOST = 90.0
-REMEDY = "see --poses and --clock"
+FARTHEST = 0.2  # Largest distance of a printed target from the body that carries it [m].
+LOOSE = 5e-3  # Largest motion of a printed target on the body that carries it [m].
+KNOWN = 2e-3  # Largest standard deviation of a usable target pose [m].
+KEPT = 30  # Number of last images kept.
+FEWEST = 4  # Minimum number of images for a warning about a moving target.
+NEARER = 3.0  # Factor by which bodies must be closer to the target with swapped files for a warning.
+BESIDE = 0.02  # Smallest distance of a target from its body for a warning about swapped files [m].
+MOST = 90.0  # Percentile of the kept images that is used [%]: one in ten may be misread.
+REMEDY = "see --poses and --clock"  # Remedy in warnings.
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,9 @@ from ..page.beside import draw_slices_through
 from .follower import TrackingResult
 from .picture import Painter
 
+# Chart of the distance from tip to tumour.
 DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion (95 %); dotted: not to be relied on")
+# Chart of the overlay's error.
 WITHIN = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation")
 
 

@@ -13,12 +13,14 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as, to_path
 
-SUFFIXES = (".yaml", ".yml")
+SUFFIXES = (".yaml", ".yml")  # Endings of calibration files.
 INTRINSICS = "sulcus intrinsics"
 """Format of the covariance file of a calibration."""
-FORMATS = {"opencv": to_opencv_text, "ros": to_ros_text}
+FORMATS = {"opencv": to_opencv_text, "ros": to_ros_text}  # Writers of calibration files, by format.
+# Remedy in error messages.
 GIVE_HAND_EYE = "Give what `sulcus calibrate --hand-eye A.csv B.csv --json` prints, B being the camera."
-LARGEST_HAND_EYE, RIGID = 1 << 16, 1e-4
+LARGEST_HAND_EYE = 1 << 16  # Maximum size of a hand-eye calibration file [bytes].
+RIGID = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles.
 
 
 def read_calibration(path: str | Path) -> Calibration:

@@ -36,12 +36,12 @@ SCENE = "palpate"
 """Scene of the video."""
 CAMERA = USUAL.resize_calibration(800, 600, scale=True)
 """Camera of the video: fewer pixels than usual, so that it takes seconds."""
-# # Frame rate [1/s], length [s], and start time in the scene [s]: the ball makes contact at 0.4 s.
-RATE, LENGTH, BEGIN = 10.0, 1.7, 0.5
-# # Covered targets and gaps, with their times [s].
+RATE = 10.0  # Frame rate [1/s].
+LENGTH = 1.7  # Length of the video [s].
+BEGIN = 0.5  # Start time in the scene [s]: the ball makes contact at 0.4 s.
+# Covered targets and gaps, with their times [s].
 TROUBLES = (Trouble("reference", 0.25, 0.55), Trouble("tool", 0.85, 1.05), Trouble("gap", 1.25, 1.55))
-# # Width of the tissue displacement around a tool's tip [m].
-ROUND = 25e-3
+ROUND = 25e-3  # Standard deviation of the tissue displacement around a tool's tip [m].
 
 
 @dataclass(frozen=True, eq=False)

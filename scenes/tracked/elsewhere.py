@@ -23,9 +23,8 @@ from .agreement import Agreement
 from .pose_file import TrackedRow
 
 AT_REST = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
-"""The camera in its own frame."""
-# # Time between poses and an image [s] beyond which they belong to another clock or another recording.
-FAR = 1.0
+"""Pose of the camera in its own coordinate system."""
+FAR = 1.0  # Time between poses and an image beyond which they belong to another clock or another recording [s].
 
 
 def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:

@@ -15,8 +15,8 @@ from ar.tracking.targets import Detector, list_targets
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-# # Number of first images of a video, and stride of those examined.
-LOOKED, EACH = 120, 10
+LOOKED = 120  # Number of first images of a video among which some are examined.
+EACH = 10  # Stride of the examined images.
 
 
 def check_video(film: Path, rate: float, calibration: Calibration, camera: str) -> None:

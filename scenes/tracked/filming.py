@@ -33,12 +33,13 @@ USUAL = Calibration((1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02
 """Default camera of a video."""
 VIEW = Viewpoint(distance=0.32).calibrate(USUAL)
 """View from arm's length: it shows the opening, the reference near it and the tool's cube."""
-# The reference's middle from the site, to the right, up and outwards [m]; turned from the line of sight [degree].
-BESIDE, TURNED = (-0.078, 0.010, 0.022), (28.0, -24.0)
-# From the tool's tip up its shaft to the middle of its cube [m].
-MOUNT = 0.09
-# # Colour of a hand that covers a target; added brightness of an over-exposed image; length of a smear [pixel].
-HAND, BRIGHT, SMEAR = (196, 148, 128), 12.0, 41
+# Centre of the reference relative to the craniotomy, to the right, up and outwards [m].
+BESIDE = (-0.078, 0.010, 0.022)
+TURNED = (28.0, -24.0)  # Rotation of the reference about x and y from the line of sight [deg].
+MOUNT = 0.09  # Distance from the tool's tip up its shaft to the centre of its cube [m].
+HAND = (196, 148, 128)  # Colour of a hand that covers a target (RGB).
+BRIGHT = 12.0  # Factor on the brightness of an over-exposed image.
+SMEAR = 41  # Length of a smear [pixel].
 KINDS = {
     "reference": "a hand covers the patient's reference",
     "tool": "a hand covers the tool's cube",
@@ -235,7 +236,7 @@ def _seen(
 
 
 NAMES = {"tool": "tool", "patient": "reference"}
-"""The trouble of each target's name."""
+"""Disturbance that covers each target."""
 
 
 def _covered(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: np.ndarray) -> np.ndarray:

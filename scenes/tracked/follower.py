@@ -24,24 +24,24 @@ from .plausible import describe_implausible, describe_misplaced_tool
 from .tool_motion import BrainMotion, ToolMotion
 from .tracked_tool import TrackedTool
 
-# # Time for which the overlay keeps its position after the reference is lost: hand-held, its error is then less than
-# # LIMIT. Longest gap between images [s].
-HELD, GAP = 0.1, 0.2
-# # Longest gap of a slow video, in its own intervals; maximum interval [s].
-MISSED, SLOWEST = 1.5, 1.0
-# # Rounding of image times [s].
-ROUNDING = 1e-6
-# # Largest position error of a reliable overlay [m].
-LIMIT = 5e-3
-UNKNOWN = "scan position, tissue motion unknown: do not rely on it"
-# # Motion during the readout of a rolling shutter: share of it that is the overlay's error, and factor to the error of
-# # a tool's tip, which is far from its cube: measured in docs/notes/overlay_experiments.md, "Rolling shutter".
-SKEW, LEVER = 0.5, 2.0
-# # Decay of a hand's maximum speed within a second.
-CALMS = 0.1
-UNCHECKED = "not checked whose registration this is: make one by `sulcus register --anatomy`"
-NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"
-TOOL, PATIENT = build_tool_cube().name, build_patient_reference().name
+# Time for which the overlay keeps its position after the reference is lost [s]: hand-held, its error is then less than
+# LIMIT.
+HELD = 0.1
+GAP = 0.2  # Longest gap between images [s].
+MISSED = 1.5  # Longest gap of a slow video [intervals].
+SLOWEST = 1.0  # Maximum interval between images [s].
+ROUNDING = 1e-6  # Rounding of image times [s].
+LIMIT = 5e-3  # Largest position error of a reliable overlay [m].
+UNKNOWN = "scan position, tissue motion unknown: do not rely on it"  # Warning in the image.
+# Overlay error as a share of the motion during the readout of a rolling shutter: measured in
+# docs/notes/overlay_experiments.md, "Rolling shutter".
+SKEW = 0.5
+# Factor on the overlay error of a rolling shutter for a tool's tip, which is far from its cube: the same page.
+LEVER = 2.0
+CALMS = 0.1  # Factor on the estimate of a maximum hand speed after one second without faster motion.
+UNCHECKED = "not checked whose registration this is: make one by `sulcus register --anatomy`"  # Warning in the image.
+NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"  # Warning in the image.
+TOOL, PATIENT = build_tool_cube().name, build_patient_reference().name  # Names of the targets.
 
 
 class TumourState(Enum):

@@ -30,14 +30,11 @@ from .run import Shown, Timed, overlay_one
 from .seekable_film import SeekableFilm
 from .words import describe_overlay, report
 
-# # Brightness factor of an outdated image; time for which the page stays after a failure [s].
-FADED, STAYS = 0.35, 2.0
-# # Polling interval of an idle page [s].
-LOOKS = 0.03
-# # Time without an image after which a camera may be unplugged [s].
-UNPLUGGED = 1.0
-# # Number of results kept for a table and a summary, without their colours.
-KEPT = 20_000
+FADED = 0.35  # Brightness factor of an outdated image.
+STAYS = 2.0  # Time for which the page stays after a failure [s].
+LOOKS = 0.03  # Polling interval of an idle page [s].
+UNPLUGGED = 1.0  # Time without an image after which a camera may be unplugged [s].
+KEPT = 20_000  # Number of results kept for a table and a summary, without their colours.
 
 
 @dataclass(eq=False)

@@ -23,7 +23,7 @@ from ..script.uncertainty import DEVIATIONS
 from .follower import TrackingResult, TumourState
 from .tracked_tool import TrackedTool
 
-ABOVE = "the tool does not touch: as in the scan"
+ABOVE = "the tool does not touch: as in the scan"  # Text in the image.
 SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
 """The opening is visible within the drape's hole; all else may be bone."""
 IN_GREY = (TumourState.NO_TOOL, TumourState.STALE, TumourState.NO_REFERENCE)

@@ -12,11 +12,10 @@ from sim.geometry.surface import is_enclosing
 from ..play.stage import Stage
 from .tracked_tool import TrackedTool
 
-# A reference is no farther from the opening, and a tool that works is at some time no farther from the head [m]. Nor
-# are its tip or its markers deeper inside the brain: no model knows of such a cut.
-REACH, NEAR, DEEP = 0.3, 0.2, 0.03
-# A tool that was near is laid aside no farther from the head [m]: beyond, no tracker of this patient sees it.
-FAR = 1.0
+REACH = 0.3  # Largest distance of a reference from the craniotomy [m].
+NEAR = 0.2  # Distance from the head within which a tool in use comes at some time [m].
+DEEP = 0.03  # Largest depth of a tool's tip or markers inside the brain [m]: no model includes such a cut.
+FAR = 1.0  # Largest distance of a laid-down tool from the head [m]: beyond, no tracker of this patient sees it.
 
 
 def describe_implausible(registration: Registration, stage: Stage, camera: Camera) -> str:

@@ -19,22 +19,24 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from surrogate.locating.observed_files import read_columns
 
+# Column names: time, position, rotation.
 TIME, PLACE, TURN = "time_s", ("x_mm", "y_mm", "z_mm"), ("qx", "qy", "qz", "qw")
-TIP, TIP_DEVIATION = ("tip_x_mm", "tip_y_mm", "tip_z_mm"), "tip_off_mm"
+TIP, TIP_DEVIATION = ("tip_x_mm", "tip_y_mm", "tip_z_mm"), "tip_off_mm"  # Column names: tip, its standard deviation.
+# Column names: upper triangle of the covariance.
 COVARIANCE = tuple(f"cov_{row}{column}" for row in range(6) for column in range(row, 6))
+# Column names: number of corners, residual, computing time, coordinate system.
 LAST = ("corners", "residual_px", "ms", "frame")
-CAMERA = "camera: x right, y down, z forward"
-# Columns in which a tracker says that it saw the body, and what they hold then.
+CAMERA = "camera: x right, y down, z forward"  # Description of the camera's coordinate system.
+# Columns with the status of a body: whether the tracker saw it.
 STATUS = "state", "valid", "visible", "tracked", "seen"
+# Values of the status columns of a body that the tracker saw.
 SEEN = "ok", "good", "seen", "valid", "visible", "tracked", "tracking", "true", "yes", "1", "1.0"
-# Number of kinds of unseen rows that a warning names.
-MOST_WORDS = 3
-# # Tolerance of a quaternion's length from 1, and maximum distance of a position from the origin [m].
-ROUNDED, FARTHEST = 0.01, 100.0
-# # Conversion of the covariance from metres and radians to millimetres and radians.
-UNITS = np.repeat([1e3, 1.0], 3)
+MOST_WORDS = 3  # Number of kinds of unseen rows that a warning names.
+ROUNDED = 0.01  # Tolerance of a quaternion's length from 1.
+FARTHEST = 100.0  # Largest distance of a position from the origin along an axis [m].
+UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres and radians to millimetres and radians.
 USUAL = 0.25e-3, float(np.radians(0.1))
-"""Deviations of a tracker that states none, along and about each axis [m], [rad]."""
+"""Standard deviations of a tracker that reports none, along and about each axis [m], [rad]."""
 
 
 def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:

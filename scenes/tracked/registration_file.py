@@ -15,15 +15,13 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.file_limits import FARTHEST
 from sim.runtime.outside_files import read_as, to_path
 
-FORMAT = "sulcus registration 1"
-WANTED = "Make one by `sulcus register`."
-# # Maximum size of a valid file [bytes]; tolerance of a rotation's columns from length 1 and right angles.
-LARGEST, RIGID = 1 << 16, 1e-4
-# A covariance's eigenvalues may be below 0 by this share of the largest, by rounding.
-ROUNDING = 1e-9
-# Two meshes of one scan are no farther apart, bounds and tumour [m].
-SAME = 5e-3
-_UNITS = np.repeat([1e3, 1.0], 3)
+FORMAT = "sulcus registration 1"  # Name and version of the file format.
+WANTED = "Make one by `sulcus register`."  # Remedy in error messages.
+LARGEST = 1 << 16  # Maximum size of a valid file [bytes].
+RIGID = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles.
+ROUNDING = 1e-9  # Share of its largest eigenvalue by which a covariance's smallest may be below 0, by rounding.
+SAME = 5e-3  # Largest difference of bounds and tumour between two meshes of one scan [m].
+_UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres and radians to millimetres and radians.
 
 
 def read_registration(path: str | Path) -> Registration:

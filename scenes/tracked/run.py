@@ -20,12 +20,10 @@ from .follower import Follower, TrackingResult, TumourState
 from .picture import Painter
 from .truth import OverlayError
 
-# Edges of the histogram of latencies [ms].
-EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)
-# # Age at which an image is stale [s].
-OLD = 0.2
-# A video's grey level from which something lies in front: black is not quite black there. In a file all above 0 does.
-FAINT = 32
+EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)  # Edges of the histogram of latencies [ms].
+OLD = 0.2  # Age at which an image is stale [s].
+FAINT = 32  # Smallest grey level of an occluder in a mask video, where black is not exactly 0; in a mask PNG it is 1.
+# Column names of the table of results.
 COLUMNS = (
     "time_s", "state", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", "motion_off_mm", "within_mm",
     "tracking_mm", "camera_mm", "registration_mm", "tool_mm", "model_mm", "shutter_mm", "ms", "latency_ms", "words",

@@ -16,8 +16,8 @@ from ..play.frame_text import describe_outcome
 from ..play.stage import Stage
 from ..script.uncertainty import DEVIATIONS
 
-UNBOUND = "the model states no error: do not rely on it"
-REFUSED = "the tool is farther inside the brain than the model knows: do not rely on it"
+UNBOUND = "the model states no error: do not rely on it"  # Warning in the image.
+REFUSED = "the tool is farther inside the brain than the model knows: do not rely on it"  # Warning in the image.
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
 
 REST = "rest"
-"""The deformer that lets the brain stay as in the scan."""
+"""Name of the deformer that leaves the brain undeformed, as in the scan."""
 
 
 def build_tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:

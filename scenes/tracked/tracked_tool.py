@@ -18,12 +18,12 @@ from sim.tools import BuiltIn, parse_tool
 
 from ..script.tool import add_shaft
 
-FORMAT = "sulcus tool 1"
+FORMAT = "sulcus tool 1"  # Name and version of the file format.
+# Remedy in error messages.
 WANTED = "Give a tool of `sulcus film`, or one with format, shape, T_cube_tool and tip_covariance_mm2."
-# A file of a tool has no more bytes.
-LONGEST = 100_000
-# # Tolerance of a rotation's rows from orthonormality [1], and maximum distance of a tool's tip from its cube [m].
-SQUARE, FARTHEST = 1e-3, 1.0
+LONGEST = 100_000  # Maximum size of a tool's file [bytes].
+SQUARE = 1e-3  # Tolerance of a rotation's rows from orthonormality.
+FARTHEST = 1.0  # Largest distance of a tool's tip from its cube [m].
 
 
 def build_nominal_cube() -> np.ndarray:

@@ -22,15 +22,14 @@ from .picture import Painter
 from .run import OLD, Timed, overlay_one
 from .tool_motion import ToolMotion
 
-# # Lost targets are searched in every third image, and then found. Maximum error of a drawn outline [pixel].
-BACK, OFF = 3, 2.0
-# # Number of pixels of an ink below which they are no line.
-NO_LINE = 5
-# # Text required in an image, by covered target.
-WORDS = {"reference": "reference lost", "tool": "tool lost"}
-STALE = "stale"
-# # Times of the repeated image and of the delayed one [s]; its delay.
-REPEATED, DELAYED, LATE = 0.1, 0.2, 2.5 * OLD
+BACK = 3  # Maximum number of images until a returned target is found: lost ones are searched in every third image.
+OFF = 2.0  # Maximum error of a drawn outline [pixel].
+NO_LINE = 5  # Number of pixels of an outline's colour below which there is no line.
+WORDS = {"reference": "reference lost", "tool": "tool lost"}  # Text required in an image, by covered target.
+STALE = "stale"  # Text required in a stale image.
+REPEATED = 0.1  # Time of the repeated image [s].
+DELAYED = 0.2  # Time of the delayed image [s].
+LATE = 2.5 * OLD  # Delay of the delayed image [s].
 
 
 @dataclass(frozen=True)

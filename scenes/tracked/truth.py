@@ -22,12 +22,11 @@ from surrogate.model.npz_archive import Archive
 from ..play.stage import Stage
 from .follower import TrackingResult
 
-FORMAT = "sulcus film 1"
-WANTED = "Give the truth.npz that `sulcus film` wrote."
-COLUMNS = ("T_camera_scan", "T_scan_tool")
-SPACES = {"scan": "RAS [m]", "camera": "x right, y down, z forward [m]"}
-# Beyond its band by more than this a tumour is wrong [m].
-WRONG = 1e-3
+FORMAT = "sulcus film 1"  # Name and version of the file format.
+WANTED = "Give the truth.npz that `sulcus film` wrote."  # Remedy in error messages.
+COLUMNS = ("T_camera_scan", "T_scan_tool")  # Arrays of poses.
+SPACES = {"scan": "RAS [m]", "camera": "x right, y down, z forward [m]"}  # Axes and unit of the coordinate systems.
+WRONG = 1e-3  # Error beyond its bound above which a tumour is wrong [m].
 
 
 @dataclass(frozen=True, eq=False)

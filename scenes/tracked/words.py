@@ -14,7 +14,7 @@ from .follower import TrackingResult, TumourState
 from .run import Shown
 
 PATIENT_ERROR = "<p>Tumour position error: not known. Tissue and segmentation add to the overlay error.</p>"
-DRAWN = {
+DRAWN = {  # Texts on the page, by the state of the tumour.
     TumourState.GOOD: "The tumour is drawn where it is now.",
     TumourState.REST: "The tumour is drawn as in the scan, for the tool does not touch.",
 }

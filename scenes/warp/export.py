@@ -29,13 +29,11 @@ LOOKS = {
     "cortex": (0.86, 0.60, 0.54, 1.0),
     "tumour": (0.20, 0.94, 0.42, 1.0),
 }
-"""Surfaces, and their colours."""
-# A vertex that goes farther moves [m].
-MOVED = 1e-4
-# Grid error at the tumour, relative to the largest motion, above which a warning is given.
-COARSE = 0.1
-# Grid spacing of a sequence [m], and largest total number of values.
-SEQUENCE_SPACING, MOST_NUMBERS = 3e-3, 400_000_000
+"""Colours (RGBA, 0 to 1) of the surfaces."""
+MOVED = 1e-4  # Displacement above which a vertex moves [m].
+COARSE = 0.1  # Grid error at the tumour, relative to the largest motion, above which a warning is given.
+SEQUENCE_SPACING = 3e-3  # Grid spacing of a sequence [m].
+MOST_NUMBERS = 400_000_000  # Maximum number of values of a sequence.
 
 
 @dataclass(frozen=True)

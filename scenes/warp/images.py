@@ -21,27 +21,23 @@ from sim.fields.warp_fields import WarpFields
 
 from .nrrd_files import DIGITS
 
-# Less of the brain inside an image, or on voxels that are not empty, is worth a warning.
-ENOUGH = 0.98, 0.5
-# Threshold of dark voxels (air with noise), relative to the brightest few per cent.
-BRIGHTEST, DARK = 99.0, 0.1
-# Least gain of brain on bright voxels, and least share of it, when x and y are negated.
-BETTER, WELL = 0.05, 0.7
-# Largest number of distinct integers of a label map; sampling stride along each axis.
-FEW, SAMPLED = 120, 3
-# Labels fill areas: fewer neighbours of one value than this share are intensities.
-ALIKE = 0.5
-SUFFIXES = (".seg.nrrd", *READERS)
+ENOUGH = 0.98, 0.5  # Smallest shares of the brain inside an image, and on voxels that are not 0, without a warning.
+BRIGHTEST = 99.0  # Percentile of the positive values that counts as bright [%].
+DARK = 0.1  # Threshold of dark voxels (air with noise), relative to the value at BRIGHTEST.
+BETTER = 0.05  # Smallest gain of brain on bright voxels when x and y are negated.
+WELL = 0.7  # Smallest share of brain on bright voxels when x and y are negated.
+FEW = 120  # Largest number of distinct integers of a label map.
+SAMPLED = 3  # Sampling stride along each axis [voxels].
+ALIKE = 0.5  # Smallest share of neighbours of one value in a label map: labels fill areas.
+SUFFIXES = (".seg.nrrd", *READERS)  # Endings of image files.
 ORDERS = {"nearest": 0, "linear": 1, "cubic": 3}
-"""Interpolation between voxels, and the degree of its spline."""
+"""Spline degree by the name of the interpolation."""
 WHOLE = np.uint8, np.int16, np.uint16, np.int32
-"""Types of whole numbers that every reader of NIfTI knows."""
+"""Integer types that every reader of NIfTI supports."""
 DISPLACEMENT = 1006
 """NIfTI's intent: vectors in millimetres, RAS."""
-# Voxels that move less [m] stay as they are.
-STILL = 1e-8
-# Slices that are looked at together: bounds the memory that it takes.
-TOGETHER = 8
+STILL = 1e-8  # Displacement below which voxels stay unchanged [m].
+TOGETHER = 8  # Number of slices processed together: limits memory.
 
 
 def measure_shown_share(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:

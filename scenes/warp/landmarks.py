@@ -13,9 +13,9 @@ from sim.geometry.locate import locate
 from sim.geometry.tetmesh import compute_signed_volumes
 from surrogate.locating.prior import compute_tumour_share
 
-TUMOUR, NEAREST, CORTEX = "tumour", "tumour, nearest to its centroid", "open cortex"
+TUMOUR, NEAREST, CORTEX = "tumour", "tumour, nearest to its centroid", "open cortex"  # Names of the landmarks.
 CENTROID = "centroid of the tumour now"
-"""Names of the points, as Slicer shows them."""
+"""Name of the displaced tumour's centroid in Slicer."""
 SAID = {
     TUMOUR: "tissue at the centroid of the tumour's volume in the scan, as `sulcus locate` has it.",
     NEAREST: "that centroid lies outside the tissue; this is the tumour's point nearest to it.",
@@ -23,8 +23,7 @@ SAID = {
     CENTROID: "of the displaced tumour's volume. The tissue there may be another than in the scan.",
 }
 """Description of each landmark."""
-# Tolerance [m] within which a point belongs to a tetrahedron.
-ROUNDING = 1e-9
+ROUNDING = 1e-9  # Tolerance within which a point belongs to a tetrahedron [m].
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.bodies.voxels import LPS
 
-SCHEMA = (
+SCHEMA = (  # Address of Slicer's schema of markups.
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     "markups-schema-v1.0.3.json#"
 )

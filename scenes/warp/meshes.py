@@ -15,9 +15,9 @@ from sim.geometry.surface import compute_vertex_normals
 
 from .nrrd_files import LPS
 
-STL_HEADER = 80
-# glTF's numbers: of a file, its chunks, and what they hold.
-MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+STL_HEADER = 80  # Length of an STL header [bytes].
+MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942  # glTF's numbers of a file and of its chunks.
+# glTF's numbers of component types, and of what a buffer contains.
 FLOAT, UNSIGNED, VERTICES, INDICES = 5126, 5125, 34962, 34963
 TO_GLTF = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 """From RAS to glTF's axes: x to the patient's left, y up to the head, z forwards."""

@@ -29,8 +29,7 @@ from ..script.scene import Scene
 
 ENSEMBLE = "registration, segmentation, tissue and skull, as `sulcus uncertainty` has it"
 """Description of the bound of a scene."""
-# Two meshes of one body have nodes so near [m].
-SAME = 1e-6
+SAME = 1e-6  # Largest distance of corresponding nodes in two meshes of one body [m].
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,18 +13,16 @@ from sim.bodies.voxels import LPS
 from sim.fields.grid import Grid, build_grid_around
 from sim.fields.in_tetrahedra import interpolate_in_tetrahedra
 
-TYPES = {"f4": "float", "u1": "unsigned char"}
-# Lowest compression level: more hardly reduces floats.
-LEVEL = 1
+TYPES = {"f4": "float", "u1": "unsigned char"}  # Names of data types in NRRD.
+LEVEL = 1  # Compression level, the lowest: more hardly reduces floats.
 DIGITS = 4
 """Decimals of displacements in millimetres: further ones have no meaning, and take half of a file."""
 TUMOUR, SHELL = 1, 2
-"""The labels."""
-COLOURS = {TUMOUR: (0.20, 0.94, 0.42), SHELL: (0.95, 0.75, 0.20)}
-# Edge of a voxel [m], and what stays free round the segments.
-VOXEL, MARGIN = 0.5e-3, 2e-3
-# SNOMED CT's words for a mass, as Slicer writes them.
-MASS = (
+"""Labels of the segments: tumour, what may be tumour."""
+COLOURS = {TUMOUR: (0.20, 0.94, 0.42), SHELL: (0.95, 0.75, 0.20)}  # Colours (RGB, 0 to 1) of the segments.
+VOXEL = 0.5e-3  # Edge of a voxel [m].
+MARGIN = 2e-3  # Margin round the segments [m].
+MASS = (  # SNOMED CT's terms for a mass, as Slicer writes them.
     "Segmentation category and type - 3D Slicer General Anatomy list~SCT^49755003^Morphologically Altered Structure"
     "~SCT^4147007^Mass~^^~Anatomic codes - DICOM master list~^^~^^"
 )

@@ -17,16 +17,20 @@ from sim.geometry.tetmesh import compute_signed_volumes
 from .landmarks import Landmark, list_landmarks
 from .moment import DeformedAnatomy
 
-# Weights of corners at the places between vertices: of a tetrahedron, of a triangle. No field is fitted there.
-WITHIN, ON = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4)), 0.58 * np.eye(3) + 0.21 * (1.0 - np.eye(3))
-FINEST, COARSEST, FIRST = 0.3e-3, 5e-3, 1e-3
-"""Spacings of a field [m], and the one that is tried first."""
+# Weights of corners at the places inside a tetrahedron; no field is fitted there.
+WITHIN = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4))
+# Weights of corners at the places inside a triangle; no field is fitted there.
+ON = 0.58 * np.eye(3) + 0.21 * (1.0 - np.eye(3))
+FINEST = 0.3e-3  # Smallest spacing of a field [m].
+COARSEST = 5e-3  # Largest spacing of a field [m].
+FIRST = 1e-3  # Spacing that is tried first [m].
 ENOUGH = 0.05e-3
-"""The error of tumour and landmarks that a spacing is looked for to reach [m]."""
-MOST, MOST_ASKED = 32_000_000, 96_000_000
-"""Nodes of a field: where it is looked for, and where it is asked for. A million take 12 MB of memory."""
-# Search for a spacing: step [m], safety factor, maximum number of trials.
-STEP, SPARE, TIMES = 0.05e-3, 0.95, 3
+"""Tolerance of the error of tumour and landmarks in the search for a spacing [m]."""
+MOST = 32_000_000  # Maximum number of nodes in the search for a spacing. A million take 12 MB of memory.
+MOST_ASKED = 96_000_000  # Maximum number of nodes at a spacing given by the user.
+STEP = 0.05e-3  # Step of the spacing in the search [m].
+SPARE = 0.95  # Safety factor of the spacing in the search.
+TIMES = 3  # Maximum number of trials in the search for a spacing.
 
 
 @dataclass(frozen=True, eq=False)

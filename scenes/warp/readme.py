@@ -8,6 +8,7 @@ from .images import Warped
 from .landmarks import CENTROID, NEAREST, SAID, TUMOUR
 from .places import WITHIN
 
+# First part of the text.
 INTRODUCTION = """sulcus warp: a deformed brain, for other programs
 Research only. Not a medical device.
 
@@ -16,6 +17,7 @@ The anatomy: {file}, digest {digest}. Its space is RAS (right, anterior, superio
 {trust}
 """
 
+# Part of the text on the files.
 FILES = """
 FILES
 field_resampling.nii.gz  for images. At each place now, where that tissue was: NIfTI, 5-D, intent 1006, mm, RAS.
@@ -35,6 +37,7 @@ Others     VTP and STL are in millimetres, LPS: x to the patient's left, y to th
            deformed.glb is in metres: x to the patient's left, y to the head, z to the front.
 """
 
+# Part of the text on limitations.
 LIMITS = """
 WHAT IS NOT KNOWN
 Only the brain was computed. Skull, air and skin were not: there the fields are no prediction.

@@ -16,9 +16,10 @@ BRAIN = "tissue"
 """Provenance key of the brain's tissue. A region of the same tissue as the brain has no entry."""
 TUMOUR, REGION = "tumour's tissue", "tissue of region "
 """Provenance key of the tumour's tissue; prefix of another region's key, before its label."""
+# HDF5 type of an outcome's name, as long as the longest.
 NAME_TYPE = f"S{max(len(outcome.name) for outcome in Outcome)}"
 
-CHECKSUM = np.dtype("<u4")
+CHECKSUM = np.dtype("<u4")  # HDF5 type of a row's CRC-32.
 
 
 def describe_tissue_source(tissue: Elasticity) -> dict[str, str]:

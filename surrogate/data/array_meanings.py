@@ -6,20 +6,20 @@ from dataclasses import dataclass
 
 import h5py
 
-TITLE = (
+TITLE = (  # Description of the whole file.
     "Results of a finite-element solver to loads of a tool on a brain. anatomy/ is the body; loads/CAUSE/ are the "
     "loads, one row each; `answers/` has the result of each load, row by row; unit/ has responses to unit forces. SI "
     "units; coordinates are the anatomy's own, in RAS (x to the right, y to the front, z up)."
 )
-GROUPS = {
+GROUPS = {  # Descriptions of the file's groups.
     "anatomy": "The body in its rest configuration, and how it is held. `digest` is a hash of all arrays here.",
     "loads": "What the tool does, one row a load case. `digest` is a hash of all arrays here.",
     "answers": "The static result for each row of loads/.",
     "unit": "Small-strain responses to a unit force of 1 N at one node of the open cortex: of each node in unit/node "
     "along x, then y, then z. They are scaled from 1e-6 N, and superpose. Empty where the loads are poses.",
 }
-CASE, VERTEX, RAS = "load case", "mesh vertex, as the rows of anatomy/nodes", "x, y, z (RAS)"
-CHECKED = (
+CASE, VERTEX, RAS = "load case", "mesh vertex, as the rows of anatomy/nodes", "x, y, z (RAS)"  # Names of array axes.
+CHECKED = (  # Meaning of the checksums.
     "zlib.crc32 of the row's bytes, little-endian and in this order: displacement, outcome (padded with zeros), "
     "iterations, residual, and reaction where there is one"
 )
@@ -40,7 +40,7 @@ class Meaning:
             array.attrs["frame"] = "RAS"
 
 
-_ROWS = {
+_ROWS = {  # Meanings of the arrays that have one row per load case or unit force.
     "outcome": Meaning("1", CASE, "outcome of the solver; rows with names that begin with CONVERGED are reliable"),
     "iterations": Meaning("1", CASE, "steps that the solver took"),
     "residual": Meaning(
@@ -48,7 +48,7 @@ _ROWS = {
     ),
     "checksum": Meaning("1", CASE, CHECKED),
 }
-MEANINGS = {
+MEANINGS = {  # Meanings of all arrays, by their path in the file.
     "anatomy/nodes": Meaning("m", f"vertex; {RAS}", "positions at rest"),
     "anatomy/tets": Meaning("1", "tetrahedron; corner", "rows of anatomy/nodes, of positive volume"),
     "anatomy/middles": Meaning(

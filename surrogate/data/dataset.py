@@ -30,21 +30,17 @@ from sim.tools import BuiltIn, read_tool_statement
 from .answer_rows import compute_row_checksums, format_row_numbers, get_row_type
 from .cortex_patch import open_patch
 
-CAUSES: dict[str, type[Cause]] = {
+CAUSES: dict[str, type[Cause]] = {  # Types of loads that a data set may contain, by name.
     kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture, Touching)
 }
-FORMAT = "sulcus data 2"
-# Format without checksums, with flags of the finished rows: can be read, but not resumed.
-UNCHECKED = "sulcus data 1"
-# Arrays of a mesh; linear ones have no `middles`.
-MESH = ("nodes", "tets", "region", "middles")
-# Attribute that holds the hash of all other texts.
-SEAL = "digest of these attributes"
-# Rows read at once.
-CHUNK = 256
-# Largest valid displacement [body lengths]; force [N] that cannot cause it, to check unit responses.
-FARTHEST, FAINTEST = 1.0, 1e-3
-REMEDY = "Make it with `sulcus simulate`."
+FORMAT = "sulcus data 2"  # Name and version of the file format.
+UNCHECKED = "sulcus data 1"  # Format without checksums, with flags of the finished rows: can be read, but not resumed.
+MESH = ("nodes", "tets", "region", "middles")  # Names of a mesh's arrays; linear meshes have no `middles`.
+SEAL = "digest of these attributes"  # Attribute that contains the hash of all other texts.
+CHUNK = 256  # Number of rows read at once.
+FARTHEST = 1.0  # Largest valid displacement [body lengths].
+FAINTEST = 1e-3  # Force that cannot cause a displacement of FARTHEST [N], to check unit responses.
+REMEDY = "Make it with `sulcus simulate`."  # Remedy in error messages.
 
 
 @dataclass(frozen=True, eq=False)

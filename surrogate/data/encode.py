@@ -86,7 +86,7 @@ def _relaxed(pushed: Pushed) -> list[np.ndarray]:
     return [] if known is None else [known]
 
 
-ENCODERS: dict[str, Encoder] = {
+ENCODERS: dict[str, Encoder] = {  # Functions from loads to features, by name.
     "nodal": compute_nodal_shares,
     "rooted": compute_rooted_shares,
     "tool": compute_tool_features,

@@ -21,8 +21,8 @@ BROUGHT = 1.0
 """Maximum time that a tool takes to arrive [s]."""
 HISTORY = f"the tool came within {BROUGHT:g} s, or within the load's time if that is shorter, and stayed until then"
 """Description of the rows of such a data set."""
-SOONEST, LATEST = 0.05, 100.0
-"""Range of sampled times [s]."""
+SOONEST = 0.05  # Smallest sampled time [s].
+LATEST = 100.0  # Largest sampled time [s].
 
 
 def sample_times(count: int, seed: int) -> np.ndarray:

@@ -17,10 +17,9 @@ from sim.tools import Ball, BuiltIn, Capsule, Core, compute_extent, get_core, na
 from .cortex_patch import Patch
 from .tool_loads import build_axes_about
 
-# Distance of a foot from the surface [m] below which the surface's normal is used.
-ON_IT = 1e-6
-# Spacing of a core's sample points [radii]; number of samples along a rod from its end.
-APART, ALONG = 1.0, 6
+ON_IT = 1e-6  # Distance of a point from the surface below which the surface's normal is used [m].
+APART = 1.0  # Spacing of a core's sample points [radii].
+ALONG = 6  # Number of samples along a rod from its end.
 
 
 @dataclass(frozen=True, eq=False)

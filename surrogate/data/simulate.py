@@ -43,15 +43,14 @@ from .dataset import (
 )
 from .tasks import LoadBatch, SolverPool, count_posed_tools, solve_batches
 
-# Names of the file's groups in reports of their seconds.
-STAGES = {"unit": "unit responses", "answers": "loads"}
-# HDF5 version from which the metadata of arrays have checksums.
+STAGES = {"unit": "unit responses", "answers": "loads"}  # Names of the file's groups in reports of their seconds.
+# Lower and upper bound of the HDF5 version: from v108 on, metadata of arrays have checksums.
 READERS = ("v108", "v108")
 UNTIMED = "not known"  # same width as a number
-RATES = {"unit": "seconds a unit response", "answers": "seconds a load"}
+RATES = {"unit": "seconds a unit response", "answers": "seconds a load"}  # Provenance keys of the solver's rates.
 OF_ITS_MAKING = ("date", *RATES.values())
 """Provenance entries that differ each time a data set is made."""
-T = TypeVar("T")
+T = TypeVar("T")  # Type of the solved rows.
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,14 @@ from .cortex_patch import Patch, find_nearest
 from .encode import split_forces
 from .tool_loads import find_perpendiculars, spread
 
-FEWEST, MOST, SHARE = 6, 200, 0.15
-# Fraction 1/n of the loads, and maximum number, set aside from every split to calibrate bounds.
-APART, MOST_APART = 4, 2000
-RADII = (6e-3, 5e-3, 4e-3, 3e-3, 2e-3, 1e-3)
-# Number of sectors, of which two opposite ones are held out; angle to the normal below which a force is in none [deg].
-SECTORS, UPRIGHT = 8, 10.0
+FEWEST = 6  # Minimum number of held-out discs.
+MOST = 200  # Maximum number of candidate positions for the discs' centres.
+SHARE = 0.15  # Share of the patch's area that the discs should cover.
+APART = 4  # One of this many loads is set aside from every split to calibrate bounds.
+MOST_APART = 2000  # Maximum number of loads set aside to calibrate bounds.
+RADII = (6e-3, 5e-3, 4e-3, 3e-3, 2e-3, 1e-3)  # Candidate radii of the discs, the default first [m].
+SECTORS = 8  # Number of sectors, of which two opposite ones are held out.
+UPRIGHT = 10.0  # Angle to the normal below which a force is in no sector [deg].
 
 
 @dataclass(frozen=True, eq=False)

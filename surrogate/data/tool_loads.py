@@ -13,15 +13,14 @@ from sim.material import BRAIN
 
 from .cortex_patch import Patch, find_nearest, open_patch
 
-ATTEMPTS = 2000
-# Loads sampled together (more only take memory); random numbers of a load in each attempt.
-BLOCK, NUMBERS = 8192, 8
-# Largest depth [m] and mean contact pressure [Pa]: beyond, a tool perforates; tissue harm begins at 2.7-4 kPa.
-DEEPEST, HARDEST = 15e-3, 8e3
+ATTEMPTS = 2000  # Maximum number of draws of a load.
+BLOCK = 8192  # Number of loads sampled together: more only take memory.
+NUMBERS = 8  # Number of random numbers of a load in each attempt.
+DEEPEST = 15e-3  # Largest depth of a tool [m]: beyond, it perforates.
+HARDEST = 8e3  # Largest mean contact pressure [Pa]: beyond, a tool perforates; tissue harm begins at 2.7-4 kPa.
 # E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) estimates a load's depth before it is solved.
 PLANE_MODULUS = BRAIN.young / (1.0 - BRAIN.poisson**2)
-# Radii and forces of a tool at which its nominal loads are counted.
-LATTICE = 200
+LATTICE = 200  # Number of radii and of forces of a tool at which its nominal loads are counted.
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class ToolLoads:
         return (self.pressure[0] <= pressure) & (pressure <= self.pressure[1]) & (depth <= self.depth)
 
 
-TOOLS = {
+TOOLS = {  # Ranges of loads of common tools, by name.
     tool.name: tool
     for tool in (
         ToolLoads("palpation", (5e-3, 7.5e-3), (0.05, 0.4), depth=10e-3),
@@ -71,7 +70,7 @@ TOOLS = {
 }
 # Stress test of the solver, not surgery: 1 N on 3 mm would be a flat punch 40 mm deep.
 BRUTAL = ToolLoads("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
-PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)
+PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)  # Names of all presets.
 BEYOND_TISSUE = ("seed", BRUTAL.name)
 """Presets whose loads strain tissue beyond measurements on brain: their equilibria are stored all the same."""
 
@@ -217,10 +216,11 @@ def build_axes_about(shaft: np.ndarray) -> np.ndarray:
     return np.stack([*find_perpendiculars(shaft), shaft], axis=2)
 
 
-POSITIONS, DIRECTIONS, MAGNITUDES = 11, 30, np.linspace(0.10, 1.05, 20)
-# Radius [m] of the area of one free surface node of the published mesh.
-PUBLISHED_FOOTPRINT = 7e-3
-PUBLISHED_CONE = np.pi / 3.0
+POSITIONS = 11  # Number of positions of the published loads.
+DIRECTIONS = 30  # Number of directions of the published loads.
+MAGNITUDES = np.linspace(0.10, 1.05, 20)  # Forces of the published loads [N].
+PUBLISHED_FOOTPRINT = 7e-3  # Radius of the area of one free surface node of the published mesh [m].
+PUBLISHED_CONE = np.pi / 3.0  # Largest angle between a published force and the inward normal [rad].
 
 
 def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:

@@ -15,16 +15,16 @@ from sim.tools import Ball, BuiltIn, Capsule, Spatula, compute_distances, comput
 from .cortex_patch import Patch, build_barycentric_lattice, open_patch
 from .tool_loads import TOOLS, build_axes_about, draw, find_perpendiculars, interpolate_ends, sample_pushes
 
-# Presets that a ball can represent.
-ROUND = ("palpation", "bipolar", "dissector")
-# Smallest and largest depth of a ball as shares of its radius: deeper, a ball without shaft would be swallowed.
-SHALLOW, DEEP = 0.05, 0.9
-# Largest depth of a rod [radii] and of a blade [widths]; largest tilt of a blade [rad].
-ROD, BLADE, LEAN = 2.0, 2.0 / 3.0, np.radians(20.0)
-# Lowering of a tool: distance that counts as contact [m], maximum number of steps, rows of sample points a triangle.
-TOUCHES, STEPS, ROWS = 1e-6, 200, 4
-# Smallest search radius of the surface, times three [m].
-AROUND = 10e-3
+ROUND = ("palpation", "bipolar", "dissector")  # Presets that a ball can represent.
+SHALLOW = 0.05  # Smallest depth as a share of the tool's radius.
+DEEP = 0.9  # Largest depth of a ball as a share of its radius: deeper, a ball without shaft would be swallowed.
+ROD = 2.0  # Largest depth of a rod [radii].
+BLADE = 2.0 / 3.0  # Largest depth of a blade [widths].
+LEAN = np.radians(20.0)  # Largest tilt of a blade [rad].
+TOUCHES = 1e-6  # Distance that counts as contact when a tool is lowered [m].
+STEPS = 200  # Maximum number of steps when a tool is lowered.
+ROWS = 4  # Rows of surface sample points in a triangle when a tool is lowered.
+AROUND = 10e-3  # Lower bound of a third of the search radius round the tool [m].
 
 
 def choose_ball(preset: str) -> Ball:

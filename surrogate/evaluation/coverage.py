@@ -14,7 +14,7 @@ from ..data.encode import split_forces
 from ..model.conformal import LEVELS
 from ..model.learned import Learned
 
-TENTHS = 10
+TENTHS = 10  # Number of classes of force for which coverage is reported.
 Held = tuple[float | None, ...]
 """Share of loads within their bounds for each of `conformal.LEVELS`; None where bounds give no guarantee."""
 

@@ -50,8 +50,9 @@ class SolveCounts:
         return self.loads + self.units + self.series
 
 
-WARM_UP, TIMED = 10, 100
-T = TypeVar("T")
+WARM_UP = 10  # Number of loads solved before the timed ones.
+TIMED = 100  # Number of timed loads.
+T = TypeVar("T")  # Type of a deformer's input.
 
 
 @dataclass(frozen=True)

@@ -40,17 +40,15 @@ EXPONENTS = (9.5, 19.0)
 """Candidate -m of Ogden's law, equally probable: tissue stiffens with indentation, so a dent alone gives no E."""
 YOUNGS = np.geomspace(300.0, 12000.0, 300)
 """Candidate Young's moduli [Pa] at small strain, equally probable."""
-# Solved forces relative to the force needed for linear tissue.
-TIMES = (0.6, 1.2, 2.2, 3.6, 5.5)
-# A command's mesh and elements are dented as deep as finer or quadratic ones by a force that is so many times less: on
-# the template 1.08 to 1.16 times (docs/notes/fit_experiments.md).
+TIMES = (0.6, 1.2, 2.2, 3.6, 5.5)  # Solved forces as multiples of the force that linear tissue would need.
+# Ratio of the force on finer or quadratic meshes to that on a command's mesh, for the same dent: 1.08 to 1.16 on the
+# template (docs/notes/fit_experiments.md).
 SOFT = 1.11
-# Standard deviation of the logarithm of a modulus by further errors.
-OFF = 0.45
-# Number of times that errors are recomputed from the estimated dent.
-ROUNDS = 3
-# Normal quantiles of a force reading, equally probable; number of samples of a modulus.
-READINGS, SAMPLES = np.array([-1.4, -0.7, 0.0, 0.7, 1.4]), 101
+OFF = 0.45  # Standard deviation of the logarithm of a modulus due to further errors.
+ROUNDS = 3  # Number of iterations that recompute the errors from the estimated dent.
+# Equally probable normal quantiles of a force reading [standard deviations].
+READINGS = np.array([-1.4, -0.7, 0.0, 0.7, 1.4])
+SAMPLES = 101  # Number of samples of a modulus.
 
 
 def estimate_young_moduli(

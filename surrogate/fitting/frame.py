@@ -19,16 +19,15 @@ from ..locating.observed_files import PLACE, SIGMA, read_columns
 
 RADIUS = 6e-3
 """Default radius of the disc on which a tool presses [m]."""
-# Range of tool radii [m], and largest force of a tool on a brain [N].
-RADII, HARDEST = (0.5e-3, 30e-3), 10.0
+RADII = (0.5e-3, 30e-3)  # Smallest and largest tool radius [m].
+HARDEST = 10.0  # Largest force of a tool on a brain [N].
 FORCE_SIGMA = 0.1
 """Default standard deviation of a measured force, relative to it."""
-FRAME, WIDE, FORCE = "frame", "radius", "force"
-# Allowed columns after the position, and columns with optional cells.
-ALLOWED = {
+FRAME, WIDE, FORCE = "frame", "radius", "force"  # Column names: number of the frame, radius of the tool, force.
+ALLOWED = {  # Allowed columns after the position, and columns with optional cells.
     (FRAME, *PLACE, *more) for more in ((), (WIDE,), (FORCE,), (WIDE, FORCE), (FORCE, SIGMA), (WIDE, FORCE, SIGMA))
 }
-EMPTY = (WIDE, FORCE, SIGMA)
+EMPTY = (WIDE, FORCE, SIGMA)  # Columns whose cells may be empty.
 
 
 @dataclass(frozen=True)

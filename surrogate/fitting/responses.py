@@ -32,9 +32,10 @@ LINEAR = ("bonded", "slide")
 """Skulls for which FEM is solved; one that separates keeps contact under a tool, as sliding contact does."""
 FORCE = 0.01
 """Tool force along each axis [N]."""
-# Number of head positions, shares of the remaining fluid in each, random seed.
-POSTURES, LEVELS, SEED = 6, (0.7, 0.4, 0.15), 5
-ACCURACY = Accuracy(tolerance=1e-3)
+POSTURES = 6  # Number of head positions.
+LEVELS = (0.7, 0.4, 0.15)  # Shares of the remaining fluid in each head position.
+SEED = 5  # Random seed of the head positions.
+ACCURACY = Accuracy(tolerance=1e-3)  # Accuracy of the FEM results.
 
 
 @dataclass(frozen=True, eq=False)

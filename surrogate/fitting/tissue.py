@@ -19,12 +19,11 @@ FINE_POISSONS = np.linspace(0.45, 0.4945, 13)
 """Poisson's ratios, equally probable a priori."""
 CLASSES = {"compressible": (0.0, 0.4725), "nearly incompressible": (0.4725, 0.5)}
 """Two classes of Poisson's ratio, equally probable a priori."""
-INTERVAL = (0.025, 0.5, 0.975)
-# Width of an interval, relative to the prior's, and distance of probabilities from the prior's, that count as
-# uninformative.
-AS_WIDE, AS_PROBABLE = 0.85, 0.15
-FORMAT = "sulcus tissue 1"
-SUFFIX = ".tissue.json"
+INTERVAL = (0.025, 0.5, 0.975)  # Probabilities of the reported quantiles: lower end, median, upper end.
+AS_WIDE = 0.85  # Log-width of an interval, relative to the prior's, above which it is uninformative.
+AS_PROBABLE = 0.15  # Largest difference of probabilities from the prior's below which they are uninformative.
+FORMAT = "sulcus tissue 1"  # Name and version of the file format.
+SUFFIX = ".tissue.json"  # Ending of the file, next to the anatomy.
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,14 +20,13 @@ from ..locating.prior import MotionPrior
 from .frame import ObservedFrame
 from .responses import LINEAR, Responses
 
-LACK, LACK_LENGTH = 0.05, 10e-3
-"""Model error of linear tissue as a share of a point's motion: independent and correlated part; length [m]."""
-# Lower bound of a point's motion in the model error, relative to the mean motion.
-LEAST = 0.1
-# Candidate sizes of motions, relative to the observation.
-SIZES = (0.3, 1.0, 3.0)
-# Coarsening of evidence (exponent 1 / this): of drained fluid, and of tools, whose dents are nonlinear.
-COARSENED, COARSENED_TOOLS = 2.0, 8.0
+# Model error of linear tissue as a share of a point's motion, in the independent and in the correlated part.
+LACK = 0.05
+LACK_LENGTH = 10e-3  # Correlation length of the correlated part [m].
+LEAST = 0.1  # Lower bound of a point's motion in the model error, relative to the mean motion.
+SIZES = (0.3, 1.0, 3.0)  # Candidate sizes of motions, relative to the observation.
+COARSENED = 2.0  # Divisor of the log evidence of drained fluid.
+COARSENED_TOOLS = 8.0  # Divisor of the log evidence of tools, whose dents are nonlinear.
 
 
 def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:

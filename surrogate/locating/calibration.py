@@ -24,23 +24,21 @@ LEVEL = 0.95
 """Nominal coverage of ellipsoids."""
 RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 """Squared radius of the 95 % ellipsoid of a Gaussian [standard deviations^2]: chi-squared, 3 degrees of freedom."""
-# Number of trials, and number of nearest trials (by `compute_likeness`) that calibrate the covariance of an
-# observation.
-TRIALS, NEAREST = 960, 120
-# Feature offset that separates clouds from named points (log units); weight of the extent feature.
-UNLIKE, EXTENT = 1e3, 4.0
-# Tolerance beyond the largest trial features (log units), so that 400 points, the maximum used, are covered.
+TRIALS = 960  # Number of trials.
+NEAREST = 120  # Number of trials, nearest by `compute_likeness`, that calibrate an observation's covariance.
+UNLIKE = 1e3  # Feature offset that separates point clouds from corresponding points [log units].
+EXTENT = 4.0  # Weight of the extent feature.
+# Tolerance beyond the largest trial features [log units], so that 400 points, the maximum used, are covered.
 MARGIN = 0.05
-# Causes that move the brain in a trial.
-ALONE = (TOOL, DRAINAGE, SWELLING, OEDEMA)
-# Ranges of a trial: number of points, share of the open cortex, tissue compliance relative to the ensemble, errors
-# relative to `SIGMA`. Rigid error along each axis [m], probability of none.
-POINTS, COVER, SOFTER, ERRORS = (20, 400), (0.1, 1.0), (0.7, 2.0), (0.05, 1.0)
-SHIFTS, UNSHIFTED = (0.05e-3, 3e-3), 0.25
-# Lower bound of motion over error, so that its logarithm is finite.
-LITTLE = 1e-3
-# Minimum RMS motion of the open cortex [m] for a member to be used in a trial.
-LEAST_SEEN = 0.5e-3
+ALONE = (TOOL, DRAINAGE, SWELLING, OEDEMA)  # Causes that move the brain in a trial.
+POINTS = (20, 400)  # Range of a trial's number of points.
+COVER = (0.1, 1.0)  # Range of a trial's observed share of the open cortex.
+SOFTER = (0.7, 2.0)  # Range of a trial's tissue compliance relative to the ensemble.
+ERRORS = (0.05, 1.0)  # Range of a trial's point errors relative to `SIGMA`.
+SHIFTS = (0.05e-3, 3e-3)  # Range of a trial's rigid error along each axis [m].
+UNSHIFTED = 0.25  # Probability of no rigid error in a trial.
+LITTLE = 1e-3  # Lower bound of motion over error, so that its logarithm is finite.
+LEAST_SEEN = 0.5e-3  # Minimum RMS motion of the open cortex for a member to be used in a trial [m].
 
 
 def run_trials(

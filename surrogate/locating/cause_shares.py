@@ -16,12 +16,11 @@ from .causes import KINDS
 from .posterior import Posterior
 from .prior import MotionPrior
 
-# Number of posterior samples; probability outside a share's interval at each end; max. width of a determined interval.
-DRAWS, BEYOND, KNOWN = 400, 0.05, 0.5
-# Swelling shares may be negative.
-WORDS = {"swelling": "swelling or shrinking"}
-# Smallest share that is reported.
-LEAST_NAMED = 0.005
+DRAWS = 400  # Number of posterior samples.
+BEYOND = 0.05  # Probability outside a share's interval at each end.
+KNOWN = 0.5  # Maximum width of the interval of a determined share.
+WORDS = {"swelling": "swelling or shrinking"}  # Names of causes whose share may be negative.
+LEAST_NAMED = 0.005  # Smallest share that is reported.
 
 
 @dataclass(frozen=True)

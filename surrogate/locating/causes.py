@@ -21,12 +21,12 @@ from .regions import Region, build_tissue
 
 KINDS = ("tool", "drainage", "swelling", "tumour swelling", "oedema")
 """Names of the causes of an ensemble."""
-TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA = range(len(KINDS))
-# Swelling is one rising wave; the second wave is zero.
-RISE = Wave(0.25, 0.0)
-# Number of points on the open cortex; tissues: Poisson's ratio of the brain, tumour stiffness over the brain's.
-POINTS, TISSUES = 70, ((0.45, 2.0), (0.49, 0.7))
-ACCURACY = Accuracy(tolerance=1e-3)
+TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA = range(len(KINDS))  # Numbers of the causes in `KINDS`.
+RISE = Wave(0.25, 0.0)  # Swelling is one rising wave; the second wave is zero.
+POINTS = 70  # Number of points on the open cortex where a tool acts.
+# Candidate tissues: Poisson's ratio of the brain, ratio of tumour to brain stiffness.
+TISSUES = ((0.45, 2.0), (0.49, 0.7))
+ACCURACY = Accuracy(tolerance=1e-3)  # Accuracy of the FEM results for tools.
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,11 @@ class Causes:
     regions: tuple[Region, ...] = ()
 
 
-USUAL = Causes()
-# Young's modulus [Pa] at small strain; motions are normalised in magnitude, so it hardly matters.
-YOUNG = 3000.0
-# Radius of the disc on which a force acts on the cortex [m].
-SPREAD = 7e-3
-# Skull model that separates from the brain.
-LETS_GO = "contact"
-# Direction of gravity in the scan, as in `Gravity`.
-SUPINE = np.array(Gravity().direction)
+USUAL = Causes()  # Default causes.
+YOUNG = 3000.0  # Young's modulus at small strain [Pa]; motions are normalised in magnitude, so it hardly matters.
+SPREAD = 7e-3  # Radius of the disc on which a force acts on the cortex [m].
+LETS_GO = "contact"  # Skull model that separates from the brain.
+SUPINE = np.array(Gravity().direction)  # Direction of gravity in the scan, as in `Gravity`.
 
 
 def build_linear_tissue(times: float, poisson: float) -> Material:

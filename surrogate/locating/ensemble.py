@@ -33,10 +33,8 @@ from .causes import (
     build_swellings,
 )
 
-# Relative tolerance: far below observation errors.
-ACCURACY = Accuracy(tolerance=3e-3)
-# Smallest RMS motion [m] of the open cortex: below it, a member is mainly round-off.
-LEAST_MOTION = 2e-5
+ACCURACY = Accuracy(tolerance=3e-3)  # Relative solver tolerance far below observation errors.
+LEAST_MOTION = 2e-5  # Smallest RMS motion of the open cortex [m]: below it, a member is mainly round-off.
 
 
 def round_tumour(anatomy: Anatomy, reach: float) -> tuple[Anatomy, tuple[int, ...]]:

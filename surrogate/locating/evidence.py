@@ -11,24 +11,22 @@ from sim.geometry.locate import Located
 
 from ..array_functions import compute_squared_distances
 
-# Non-rigid error of a point [m]: independent noise, spatially correlated noise.
-WHITE, SMOOTH = 0.3e-3, 0.5e-3
+WHITE = 0.3e-3  # Independent part of a point's non-rigid error [m].
+SMOOTH = 0.5e-3  # Spatially correlated part of a point's non-rigid error [m].
 SIGMA = float(np.hypot(WHITE, SMOOTH))
 """Standard deviation of a point's non-rigid error along each axis [m]: independent and correlated noise together."""
-# Correlation length of the correlated noise [m].
-LENGTH = 15e-3
-# Model error of the shapes: independent and correlated part as shares of the observed motion, correlation length [m].
-LACK_WHITE, LACK_SMOOTH, LACK_LENGTH = 0.08, 0.1, 5e-3
+LENGTH = 15e-3  # Correlation length of a point's correlated non-rigid error [m].
+LACK_WHITE = 0.08  # Independent model error of the shapes as a share of the observed motion.
+LACK_SMOOTH = 0.1  # Correlated model error of the shapes as a share of the observed motion.
+LACK_LENGTH = 5e-3  # Correlation length of the correlated model error [m].
 SHIFT = 0.8e-3
 """Default standard deviation of the rigid error (registration shift) along each axis [m]."""
-# Rotation error about each axis [rad], per metre of shift.
-TURN = float(np.radians(0.3)) / SHIFT
+TURN = float(np.radians(0.3)) / SHIFT  # Rotation error about each axis per metre of registration shift [rad/m].
 
-# Rigid error of a failed registration along each axis [m]; smallest rigid error of any registration [m].
-SLIPPED, LEAST_SHIFT = 10e-3, 1e-5
+SLIPPED = 10e-3  # Rigid error of a failed registration along each axis [m].
+LEAST_SHIFT = 1e-5  # Smallest rigid error of any registration along each axis [m].
 
-# Block size: triangular matrices with fewer than twice this many rows are inverted directly.
-SMALL = 48
+SMALL = 48  # Block size: triangular matrices with fewer than twice this many rows are inverted directly.
 (trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 
 

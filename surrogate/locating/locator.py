@@ -22,24 +22,21 @@ from .prior import MotionPrior
 from .regions import Region
 from .rounds import match_and_update
 
-# Largest share of outliers; largest `surprise` that a cause of the ensemble can explain.
-MOST_OUTLIERS, MOST_SURPRISE = 0.35, 2.5
-# The registration may have slipped where that makes what is seen so many times as probable, as a logarithm. On twins it
-# does so for one of 432 motions, and for all slips of 8 to 20 mm along the cortex (docs/notes/locate_experiments.md).
+MOST_OUTLIERS = 0.35  # Largest share of outliers.
+MOST_SURPRISE = 2.5  # Largest `surprise` that a cause of the ensemble can explain.
+# Smallest log-odds of a registration slip against a motion for which a slip is assumed possible: in synthetic tests one
+# of 432 motions, and all slips of 8 to 20 mm along the cortex (docs/notes/locate_experiments.md).
 DOUBTFUL = -2.0
-# Least logarithm of a slip's probability over that of a motion for which a warning names the slip. True motions have
-# -7 in the median (docs/notes/locate_experiments.md).
+# Smallest log-odds of a slip against a motion for which a warning names the slip. True motions have -7 in the median
+# (docs/notes/locate_experiments.md).
 ALIKE = -2.5
-# Ratio to the reported error above which a rigid error counts as wide.
-WIDE = 2.0
-# Share of swelling above which `OEDEMA_WORDS` is reported.
-SWELLS = 0.5
-OEDEMA_WORDS = (
+WIDE = 2.0  # Ratio to the reported rigid error above which an estimated one counts as excessive.
+SWELLS = 0.5  # Share of swelling and oedema above which `OEDEMA_WORDS` is reported.
+OEDEMA_WORDS = (  # Warning for brains that swell.
     "The brain swells or shrinks, by what was seen. If that is oedema round the tumour alone, the tumour moves about "
     "half as far, and ellipsoids often miss it: look for it in the scan."
 )
-# Normal samples by which the 95 % radius is estimated.
-DRAWS = 4000
+DRAWS = 4000  # Number of normal samples from which the 95 % radius is estimated.
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ from .locator import Locator
 from .prior import NOWHERE, PRESSED, MotionPrior, build_prior
 from .regions import Region, check_regions
 
-FORMAT = "sulcus locator 6"
-REMEDY = "Move it away, and `sulcus locate` makes it again."
-LABELS = ("kind", "skull", "place")
-ARRAYS = ("shape", *LABELS, "centre")
+FORMAT = "sulcus locator 6"  # Name and version of the file format.
+REMEDY = "Move it away, and `sulcus locate` makes it again."  # Remedy in error messages.
+LABELS = ("kind", "skull", "place")  # Arrays of numbers of causes, skulls and places, one per shape.
+ARRAYS = ("shape", *LABELS, "centre")  # Arrays of a file with the whole brain's shapes.
 
 
 def to_locator_path(anatomy: str | Path) -> Path:

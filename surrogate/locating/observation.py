@@ -18,23 +18,22 @@ from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 from ..array_functions import compute_squared_distances
 from .evidence import SHIFT, SIGMA, Evidence, build_motion_evidence
 
-FEWEST = 6
-# Smallest ratio of the spread of points across a line to that along it.
-THIN = 0.05
-# Distance [m] from the surface: limit of half of the points, limit of any point.
-NEAR, FAR = 6e-3, 12e-3
-# Limits for a cloud and for tips: they are on the current surface, and drained brains sink by over a centimetre.
-NEAR_NOW, FAR_NOW = 18e-3, 30e-3
-# Distance below which points count as one [m]; largest coordinate [m].
-ONE_PLACE, FARTHEST = 1e-3, 1e6
-# Largest median motion of a brain [m]; largest rigid error of a tracker [m].
-LONGEST_MOTION, FARTHEST_OFF = 0.025, 0.02
-# Smallest error of a point [m] (below: metres in a file of millimetres); smallest motion that is not zero [m].
-LEAST_SIGMA, STILL = 0.01e-3, 1e-9
+FEWEST = 6  # Minimum number of points, and of different places.
+THIN = 0.05  # Smallest ratio of the spread of points across a line to that along it.
+NEAR = 6e-3  # Largest distance of at least half of the points from the open cortex [m].
+FAR = 12e-3  # Largest distance of a point from the open cortex [m]; points beyond are outliers.
+NEAR_NOW = 18e-3  # NEAR for positions on the displaced surface [m]: drained brains sink by over a centimetre.
+FAR_NOW = 30e-3  # FAR for positions on the displaced surface, and for tool tips [m].
+ONE_PLACE = 1e-3  # Distance below which points count as one [m].
+FARTHEST = 1e6  # Largest coordinate [m].
+LONGEST_MOTION = 0.025  # Largest median motion of a brain [m].
+FARTHEST_OFF = 0.02  # Largest rigid error of a tracker [m].
+LEAST_SIGMA = 0.01e-3  # Smallest error of a point [m]: below, a file of millimetres has metres.
+STILL = 1e-9  # Smallest motion that is not zero [m].
 # Largest median error [m]: with more, points give no information about motions of a few millimetres.
 LARGEST_SIGMA = 0.01
-# Likely unit and axis errors: factor that brings the points to the cortex, hint to the user.
-UNITS = (
+# Likely unit errors: factor that brings the points to the cortex, hint to the user.
+UNITS = (  # Likely unit and axis errors: factor that brings the points to the cortex, hint to the user.
     (1.0, ""),
     (1e-3, "if they were a thousandth of that: files are in mm, arrays in metres"),
     (1e3, "if they were a thousand times of that: files are in mm, arrays in metres"),
@@ -42,9 +41,9 @@ UNITS = (
     (1e-2, "if they were a hundredth of that: they look like an array of centimetres"),
     (25.4, "if they were 25.4 times of that: they look like inches"),
 )
+# Likely axis errors: signs of x, y and z that bring the points to the cortex, hint to the user.
 FRAMES = (((1.0, 1.0, 1.0), ""), ((-1.0, -1.0, 1.0), "if x and y were turned: they are LPS"))
-# Largest ratio of the span of points to that of the open cortex, and its inverse: beyond, units are wrong.
-SPANS = 6.0
+SPANS = 6.0  # Largest ratio of the span of points to that of the open cortex, and its inverse: beyond, units are wrong.
 MOST = 400
 """Maximum number of points used, spread over those given: more add nothing, as neighbours share errors."""
 

@@ -13,11 +13,13 @@ from sim.runtime.outside_files import read_as, to_path
 
 from .observation import Observation
 
+# Column names: position, motion, standard deviation.
 PLACE, MOTION, SIGMA = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma"
 NAMES = ("label", "name", "id")
 """Columns that name a point; they are ignored."""
-# Limits of a list of points: rows, characters of a line, largest number.
-MOST_ROWS, LONGEST_LINE, LARGEST = 1_000_000, 1000, 1e9
+MOST_ROWS = 1_000_000  # Maximum number of rows of a list of points.
+LONGEST_LINE = 1000  # Maximum number of characters of a line.
+LARGEST = 1e9  # Largest absolute value of a number.
 
 
 def read_observation(path: str | Path, tips: str | Path | None = None) -> Observation:

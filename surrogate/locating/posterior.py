@@ -23,17 +23,13 @@ from .evidence import SHIFT, SLIPPED, Evidence, invert_triangular
 from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, MotionPrior
 from .whitened import Equations, WhitenedSystem, add_places, whiten
 
-# Significance level of a motion, for each of three tests.
-MOVED = 0.005
-# Significance level of an outlier; number of points up to which none is tested.
-IMPROBABLE, FEWEST = 1e-4, 4
-NO_TIPS, NO_ROWS = np.zeros((0, 3)), np.zeros(0, int)
-# Coarsening: evidence is raised to the power of one over this, as model errors make hypotheses look too improbable.
-COARSENED = 2.0
-# Kind of the rigid error's unknowns, next to those of causes.
-RIGID = -1
-# Number of the most probable hypotheses in the mixture.
-MIXED = 24
+MOVED = 0.005  # Significance level of a motion, for each of three tests.
+IMPROBABLE = 1e-4  # Significance level of an outlier.
+FEWEST = 4  # Number of points up to which none is tested as an outlier.
+NO_TIPS, NO_ROWS = np.zeros((0, 3)), np.zeros(0, int)  # Empty arrays: no tool tips (0, 3), no rows (0,).
+COARSENED = 2.0  # Divisor of the log evidence, as model errors make hypotheses look too improbable.
+RIGID = -1  # Kind of the unknowns of the rigid error, next to the numbers of causes.
+MIXED = 24  # Maximum number of hypotheses in the mixture: the most probable ones.
 (potrs,) = get_lapack_funcs(("potrs",), dtype=np.float64)
 
 

@@ -20,30 +20,29 @@ from sim.errors import InputError
 from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING, Presses, choose_spaced
 from .ensemble import Ensemble, compute_surface_motion
 
-# Maximum number of shapes of each kind in each skull; smallest share of the variance of one of them.
+# Maximum number of shapes of each cause in each skull model.
 MOST = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}
-SMALLEST_SHARE = 1e-6
-# Places that one tool may press on, shapes of each, and radius [m] of its forces.
-PLACES, PLACE_SHAPES, REACH = 30, 6, 6e-3
-# Prior sizes as shares of the observed motion: of each cause; of a tumour's swelling with a swelling brain; of forces
-# all over the cortex, which compensate for missing shapes.
+SMALLEST_SHARE = 1e-6  # Smallest share of the variance of one shape.
+PLACES = 30  # Number of places that one tool may press on.
+PLACE_SHAPES = 6  # Maximum number of shapes of each place.
+REACH = 6e-3  # Standard deviation of the weight of forces round a place [m].
+# Prior size of motions by cause, as a share of the observed motion. That of `TUMOUR_SWELLING` is with a swelling brain;
+# that of `TOOL` is of forces all over the cortex, which compensate for missing shapes.
 SIZE = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, OEDEMA: 1.0, TOOL: 0.15}
-# Rigid error relative to the reported one (a brain that sinks looks much like one); the last, inf, is a slipped
-# registration.
+# Candidate rigid errors relative to the reported one (a sinking brain resembles one); inf: a slipped registration.
 RIGIDS = (0.1, 1.0, np.inf)
 # Skull whose tool shapes are used: one that separates keeps contact under a tool, so sliding contact applies.
 PRESSED = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
-# Causes other than tools, and the sets of them that may act together.
-BESIDE = (DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA)
+BESIDE = (DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA)  # Causes other than tools.
+# Sets of causes other than tools that may act together.
 SETS = (
     (), (DRAINAGE,), (SWELLING,), (OEDEMA,), (DRAINAGE, SWELLING), (SWELLING, OEDEMA),
     (DRAINAGE, SWELLING, TUMOUR_SWELLING),
 )  # fmt: skip
-# Sets with which a tool may press on one place.
-WITH_PLACE = SETS[:6]
-NOWHERE = -1
-# Standard deviation [m] of the pressed place about a touching tip; probability that it presses on none.
-TOUCHED, UNTOUCHED = 4e-3, 0.05
+WITH_PLACE = SETS[:6]  # Sets with which a tool may press on one place.
+NOWHERE = -1  # Place number of shapes that belong to no place.
+TOUCHED = 4e-3  # Standard deviation of the distance between a touching tip and the pressed place [m].
+UNTOUCHED = 0.05  # Probability that a touching tip presses on no place.
 
 
 @dataclass(frozen=True, eq=False)

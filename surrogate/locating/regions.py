@@ -12,8 +12,7 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material, Tissue
 
-# Relative tolerance for equal stiffness ratios.
-ALIKE = 1e-6
+ALIKE = 1e-6  # Relative tolerance for equal stiffness ratios.
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from .observation import Observation, place_again, to_evidence
 from .posterior import Posterior, condition_prior
 from .prior import MotionPrior
 
-# Maximum number of iterations; they end once the tumour's centroid moves by less than this [m].
-ROUNDS, STEADY = 6, 0.2e-3
+ROUNDS = 6  # Maximum number of iterations of the posterior.
+STEADY = 0.2e-3  # Motion of the tumour's centroid below which the iteration ends [m].
 
 
 def match_and_update(prior: MotionPrior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:

@@ -32,8 +32,7 @@ from .learned import Learned
 
 # Effects that do nothing without a load of their kind: training may include them although a scene does not.
 ON_CALL = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, Gravity)}
-# Relative tolerance for equal tool sizes: 26 mm are 0.026 m or 1e-3 * 26.
-SAME = 1e-9
+SAME = 1e-9  # Relative tolerance for equal tool sizes: 26 mm are 0.026 m or 1e-3 * 26.
 # Training effects of models whose file does not give them.
 UNSAID = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 

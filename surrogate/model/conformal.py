@@ -19,20 +19,18 @@ from ..data.indentation import get_relaxation
 from ..regressors.protocol import compute_standardisation
 from .training_range import Measured, Outside
 
-LEVELS = (0.95, 0.99)
-# Calibration loads in a class of force; maximum number of classes.
-CLASS, CLASSES = 200, 10
-# Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
-RIDGE = 1e-2
-# Number of features of the load itself: force, radius, angle, overhang. The others are its position.
-LOAD = 4
-# Minimum number of errors for a quadratic scale: ten per term.
-BENDS = 150
-# Limit of standardised features [standard deviations]; smallest error as a share of the mean.
-FARTHEST, LEAST = 4.0, 1e-3
-# Growth of a bound beyond the training range, per unit of `Outside.beyond`. Growth with the distance from the nearest
-# training load [1/m]: default without loads that determine it; maximum.
-GROWTH, USUAL_GROWTH, MOST_GROWTH = 4.0, 1e3, 2e4
+LEVELS = (0.95, 0.99)  # Nominal coverage of the bounds.
+CLASS = 200  # Default minimum number of calibration loads in a class of force.
+CLASSES = 10  # Maximum number of classes of force.
+RIDGE = 1e-2  # Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
+LOAD = 4  # Number of features of the load itself: force, radius, angle, overhang. The others are its position.
+BENDS = 150  # Minimum number of errors for a quadratic scale: ten per term.
+FARTHEST = 4.0  # Limit of standardised features [standard deviations].
+LEAST = 1e-3  # Smallest error as a share of the mean error.
+GROWTH = 4.0  # Relative growth of a bound beyond the training range, per unit of `Outside.beyond`.
+# Default growth with the distance from the nearest training load, where no loads determine it [1/m].
+USUAL_GROWTH = 1e3
+MOST_GROWTH = 2e4  # Maximum growth with the distance from the nearest training load [1/m].
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,11 +35,10 @@ from .tip_distance import Distance, TipModel
 from .tool_contact import ForceModel, build_warm_encoders, collect_held_state, compute_wrench
 from .training_range import Envelope, Measured, Outside, measure_loads
 
-# Largest force or footprint relative to the training's. On the template's brain FEM finds no equilibrium for three
-# loads of this size, and at twice the force the error of a prediction is up to 31 %.
+# Largest force or footprint relative to the training's. On the template FEM finds no equilibrium for three loads of
+# this size, and at twice the force the error of a prediction is up to 31 %.
 FARTHEST = 3.0
-# Rounding error of training points, stored in single precision [m].
-STORED = 1e-6
+STORED = 1e-6  # Rounding error of training points, stored in single precision [m].
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ LIMIT = 0.2e-3
 """Limit of the maximum vertex error of the tumour, at 95 %, beyond which FEM is used instead of a model [m]."""
 LIMITS = (LIMIT, 0.1e-3, 0.05e-3, 0.02e-3, 0.01e-3, 0.0)
 """Candidate limits: a model gets the largest one that satisfies `MEAN` and `WORST`; with 0, FEM solves all loads."""
-MEAN, WORST = 0.01, 0.2e-3
-"""Error limits of a model without FEM fallback: mean share of the motion; 99.9th percentile of vertices [m]."""
+MEAN = 0.01  # Largest mean error of a model without FEM fallback, as a share of the motion.
+WORST = 0.2e-3  # Largest 99.9th percentile of the vertex errors of a model without FEM fallback [m].
 FEWEST_FOR_P999 = 1000
 """Minimum number of loads for a 99.9th percentile."""
 

@@ -16,8 +16,7 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import compute_digest
 from sim.runtime.file_limits import LARGEST_HEADER, LARGEST_MODEL
 
-# Maximum size of an array's header [bytes].
-LONGEST = 10_000
+LONGEST = 10_000  # Maximum size of an array's header [bytes].
 
 
 def compute_seal(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:

@@ -44,8 +44,8 @@ class Own:
     regressor: type[Regressor]
 
 
-OWN: dict[str, Own] = {}
-K = TypeVar("K", bound=type[Regressor])
+OWN: dict[str, Own] = {}  # User-defined learners, by name.
+K = TypeVar("K", bound=type[Regressor])  # Type of a registered class.
 
 
 def register_learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:

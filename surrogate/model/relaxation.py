@@ -23,9 +23,8 @@ from ..data.holding import compute_unfaded
 
 MEMORY = "relaxation"
 """Key in `Deformation.memory`: depth [m], position of first contact [m], then each h [m]; (B, 4 + pairs)."""
-# Limits of the training: a tool moving back makes h negative, by at most this share of g d; a tool slides by at most
-# this share of its footprint's radius.
-BACK, SLID = 0.02, 0.5
+BACK = 0.02  # Limit of the training: a tool moving back makes h negative by at most this share of g d.
+SLID = 0.5  # Limit of the training: a tool slides by at most this share of its footprint's radius.
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,10 +37,11 @@ from .tool_contact import ForceModel
 from .training_range import Envelope
 from .vetting import check_finite_state, check_model_state
 
-FORMAT = "sulcus model 2"
-REMEDY = "Make one with `sulcus train`."
+FORMAT = "sulcus model 2"  # Name and version of the file format.
+REMEDY = "Make one with `sulcus train`."  # Remedy in error messages.
+# General regressors, by name.
 REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "pcr": Pcr, "ann": Ann, "svr": Svr, "gp": Gp}
-# Regressors that depend on the tool features and their meaning.
+# All types of fitted parts, by name: also regressors that depend on the tool features and their meaning.
 FITTED: dict[str, type[Fitted]] = {
     **REGRESSORS,
     "pairs": ForcePairs,

@@ -14,8 +14,8 @@ from ..regressors.force_series import add_pressing
 from ..regressors.gp import Gp
 from .conformal import Bound
 
-# Maximum number of training loads: to fit the Gaussian process's lengths, and to condition it.
-ROWS, MOST = 300, 2000
+ROWS = 300  # Maximum number of training loads that fit the Gaussian process's lengths.
+MOST = 2000  # Maximum number of training loads that condition the Gaussian process.
 
 
 @dataclass(frozen=True, eq=False)

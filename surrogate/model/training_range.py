@@ -15,7 +15,7 @@ from ..data.cortex_patch import Patch
 from ..data.encode import split_forces
 from ..data.indentation import Indented
 
-# Relative tolerance, so that round-off puts no training load outside.
+# Tolerance of lengths [m], angles [rad] and relative forces, so that round-off puts no training load outside.
 SLACK = 1e-6
 
 

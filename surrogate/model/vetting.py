@@ -21,8 +21,7 @@ from .learned import Learned, ModelPart
 from .left_out import LeftOut
 from .training_range import Envelope
 
-# Number of tool features, and so of the features of bounds.
-FEATURES = 7
+FEATURES = 7  # Number of tool features, and so of the features of bounds.
 
 
 def check_model_state(name: str, model: Learned) -> None:

@@ -32,9 +32,8 @@ if TYPE_CHECKING:
 
 # Regressors whose formulas use only operations that a wire supports.
 TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series, ForcePairs)
-# Version of the names, shapes and meanings of inputs, outputs and metadata.
-FORMAT = "sulcus onnx 1"
-TEXT = (
+FORMAT = "sulcus onnx 1"  # Version of the names, shapes and meanings of inputs, outputs and metadata.
+TEXT = (  # Description in the ONNX file.
     "Displacements of a brain under a pressing tool, and how far they may be off, as sulcus learned them from finite "
     "elements. Loads are not checked: give finite numbers and positive radii. Research only; not a medical device."
 )

@@ -15,8 +15,8 @@ from ..array_functions import Rounded, compute_squared_distances, find_columns_i
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-# Operator set and format version of 2021 and 2022: all current runtimes read them.
-OPSET, FORMAT_VERSION = 17, 8
+OPSET = 17  # ONNX operator set of 2021: all current runtimes read it.
+FORMAT_VERSION = 8  # ONNX format version of 2022: all current runtimes read it.
 # Type numbers of `onnx.TensorProto`.
 KINDS = {np.dtype(kind): number for kind, number in (("f4", 1), ("i8", 7), ("?", 9), ("f8", 11))}
 OPERATORS = {

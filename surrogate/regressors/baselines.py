@@ -17,8 +17,7 @@ import numpy as np
 from ..array_functions import compute_squared_distances
 from .protocol import Stored, compute_standardisation
 
-# Smallest singular value relative to the largest: below is round-off.
-RANK = 1e-9
+RANK = 1e-9  # Smallest singular value relative to the largest: below is round-off.
 
 
 @dataclass(eq=False)

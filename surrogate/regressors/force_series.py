@@ -16,25 +16,18 @@ from sim.errors import InputError
 from ..array_functions import Rounded, find_columns_in_use, multiply_rows, predict_in_chunks, take_rows_of
 from .gp import Gp
 
-ORDERS = 3
-# Products of direction components, order by order: 3, 6 and 10 products.
+ORDERS = 3  # Order of the power series in the force.
+# Indices of the direction components in each product, by order: 3, 6 and 10 products.
 FACTORS = [np.array(list(combinations_with_replacement(range(3), order))).T for order in range(1, ORDERS + 1)]
-# Columns of each order.
-SPANS = (slice(0, 3), slice(3, 9), slice(9, 19))
-TERMS = SPANS[-1].stop
-# Number of radii of a parabola.
-STENCIL = 3
-# Height [m] equivalent to a barycentric coordinate of -1.
-BESIDE = 1e-2
-# Share of the largest training force, below which the remainder is smaller than the table's own errors.
-FAINT = 0.4
-# Rounding step [m] of the Gaussian process's dual coefficients at the largest force: a file then takes a third of the
-# bytes.
+SPANS = (slice(0, 3), slice(3, 9), slice(9, 19))  # Columns of the products of each order.
+TERMS = SPANS[-1].stop  # Number of products of all orders.
+STENCIL = 3  # Number of radii of an interpolating parabola.
+BESIDE = 1e-2  # Height equivalent to a barycentric coordinate of -1 [m].
+FAINT = 0.4  # Share of the largest training force, below which the remainder is smaller than the table's own errors.
+# Rounding step of the Gaussian process's dual coefficients at the largest force [m]: a third of the file size.
 DUAL_STEP = 2e-6
-# Number of features: `compute_tool_features`, and force over radius.
-FEATURES = 9
-# Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
-FLAT = 1e-6
+FEATURES = 9  # Number of features: `compute_tool_features`, and force over radius.
+FLAT = 1e-6  # Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
 
 
 def compute_forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:

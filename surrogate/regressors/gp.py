@@ -17,9 +17,10 @@ from sim.runtime.threads import limit_to_one_thread
 from ..array_functions import compute_squared_distances
 from .protocol import Stored, compute_standardisation
 
-# Bounds of lengths [standard deviations of a feature], and of the noise relative to the variance of an output.
-LENGTHS, NOISE = (0.05, 1e3), (1e-8, 1.0)
-START_LENGTH, START_NOISE = 3.0, 1e-4
+LENGTHS = (0.05, 1e3)  # Bounds of the lengths [standard deviations of a feature].
+NOISE = (1e-8, 1.0)  # Bounds of the noise relative to the variance of an output.
+START_LENGTH = 3.0  # Initial length [standard deviations of a feature].
+START_NOISE = 1e-4  # Initial noise relative to the variance of an output.
 
 
 @dataclass(eq=False)

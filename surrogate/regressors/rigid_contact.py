@@ -29,33 +29,31 @@ from sim.tools import Ball
 if TYPE_CHECKING:
     from sim.discretisation.nearest_places import PlacedBox
 
-# FEM keeps tissue within a gap of the ball [m]: on average half of it.
-THICKER = 0.5 * ToolContact((Ball(1.0),)).gap
-# Facets within this distance of a tool's core are contact candidates [radii].
-REACH = 1.5
-# Contact search: penetration tolerance [m], smallest motion that continues [tolerances], maximum number of iterations.
-TOLERANCE, SETTLED, MOST = 1e-6, 3.0, 60
-# Step of a rod or a blade [radii], so that tissue stays before it; its penetration tolerance [m].
-STRIDE, COARSER = 0.5, 1e-5
-# Iterations at intermediate steps: more change the result by less than its error, in twice the time.
+THICKER = 0.5 * ToolContact((Ball(1.0),)).gap  # Mean gap that FEM keeps between tissue and tool [m].
+REACH = 1.5  # Distance from a tool's core within which facets are contact candidates [radii].
+TOLERANCE = 1e-6  # Penetration tolerance of a ball [m].
+SETTLED = 3.0  # Smallest motion that continues the contact search [tolerances].
+MOST = 60  # Maximum number of iterations of the contact search.
+STRIDE = 0.5  # Step of a rod or a blade on its path [radii], so that tissue stays before it.
+COARSER = 1e-5  # Penetration tolerance of a rod or a blade [m].
+# Number of iterations at intermediate steps: more change the result by less than its error, in twice the time.
 PASSING = 3
-# Maximum number of contact points stored for a warm start: the strongest.
-MOST_HELD = 128
-# Constraints without force are dropped, which is faster; after this many iterations they stay, so that there are no
-# cycles.
+MOST_HELD = 128  # Maximum number of contact points stored for a warm start: the strongest.
+# Number of iterations after which constraints without force stay, so that there are no cycles. Until then they are
+# dropped, which is faster.
 FORGETFUL = 15
 # Compliance of a point relative to the nodes' mean, below which it counts as bone, which the tool enters: no force, or
 # an unbounded one, would keep it out.
 LEAST = 0.02
-# LAPACK directly: the problems are so small that a wrapper takes longer than the work.
+# LAPACK's factorisation and solves: the problems are so small that a wrapper takes longer than the work.
 FACTORED, SOLVED_BY, SOLVED = get_lapack_funcs(("potrf", "trtrs", "posv"), dtype=np.float64)
-# Maximum number of exchanges of the active set; penetration of an inactive point that is tolerated [m].
-TURNS, ENTERED = 10, 1e-8
-# Regularisation relative to the mean diagonal, as points of neighbouring facets on a common edge coincide. The first
-# one that gives a positive definite matrix in single precision is used.
+TURNS = 10  # Maximum number of exchanges of the active set.
+ENTERED = 1e-8  # Penetration of an inactive point that is tolerated [m].
+# Candidate regularisations relative to the mean diagonal, as points of neighbouring facets on a common edge coincide.
+# The first one that gives a positive definite matrix in single precision is used.
 APART = (1e-6, 1e-5, 1e-4)
-# Number of features of a ball, and of a rod or a blade.
-LYING, STANDING = 8, 17
+LYING = 8  # Number of features of a ball.
+STANDING = 17  # Number of features of a rod or a blade.
 
 
 @dataclass(eq=False)

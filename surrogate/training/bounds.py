@@ -25,7 +25,8 @@ from ..model.training_range import Measured, Outside, measure_loads
 from .examples import Examples
 from .expansion import Expansion
 
-SCALE, ENOUGH = 3, CLASS
+SCALE = 3  # One in this many calibration loads fits the scale of a bound; the others fit its quantiles.
+ENOUGH = CLASS  # Number of calibration loads below which all fit the quantiles.
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +71,12 @@ class BoundFit:
     curved: bool
 
 
-TUMOUR = BoundFit(CLASS, True)
-# The tip sometimes snaps through with the cortex, so that the tail of its errors grows with the force: classes are as
-# small as a 99 % bound allows, and the scale's logarithm is linear.
+TUMOUR = BoundFit(CLASS, True)  # Settings of the bound of the tumour.
+# Settings of the bound of the tip distance. The tip sometimes snaps through with the cortex, so that the tail of its
+# errors grows with the force: classes are as small as a 99 % bound allows, and the scale's logarithm is linear.
 TIP = BoundFit(100, False)
-# Bound of the force of a tool moved by pose.
-FORCE = BoundFit(CLASS, True)
-WAYS = {"tumour": TUMOUR, "tip": TIP, "force": FORCE}
+FORCE = BoundFit(CLASS, True)  # Settings of the bound of the force of a tool moved by pose.
+WAYS = {"tumour": TUMOUR, "tip": TIP, "force": FORCE}  # Settings of all bounds, by name.
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,24 +39,21 @@ from ..regressors.rigid_contact import RigidContact
 from .examples import Examples, compute_residual_responses
 from .fem_tables import add_edge_midpoints, choose_radii, condense_contact, find_disc_nodes, join_bases, tabulate
 
-# Truncation tolerance and maximum number of modes of a model's basis; of the series' contribution beyond the exact
-# orders, a fiftieth of the motion; tolerance of compliance.
-COARSE = (1e-3, 60)
+COARSE = (1e-3, 60)  # Truncation tolerance and maximum number of modes of a model's basis.
+# Truncation tolerance and maximum number of modes of the series beyond the exact orders, 2 % of the motion.
 ADDED = (5e-3, 160)
-TABLE_TOLERANCE = 1e-4
-# Truncation tolerance of the second order's modes: of the motion, one in 1,000.
-SECOND = 3e-3
-# Truncation tolerance and maximum number of modes of the series' table; number of places, far apart, that span it.
-WIDE, FEW = (1e-5, 192), 40
+TABLE_TOLERANCE = 1e-4  # Truncation tolerance of the compliance matrix.
+SECOND = 3e-3  # Truncation tolerance of the second order's modes: 0.1 % of the motion.
+WIDE = (1e-5, 192)  # Truncation tolerance and maximum number of modes of the series' table.
+FEW = 40  # Number of places, far apart, that span the series' table.
 # Models that use the contact on linear tissue; the second is trained on its residual.
 TOUCHED = ("contact", "contact-gp")
-# Models that use the power series; the second is trained on its residual.
-EXPANDED = ("series", "series-gp")
-# Rounding of tables relative to their largest motion at the largest force. On the template this moves the tumour's
-# worst vertex by at most 0.01 mm in 95 % of loads, a ninth of the model's error.
-PAIR_STEP, SERIES_STEP = 1e-3, 2e-3
-# Components of motion that are read at once: limits memory.
-STRIP = 1536
+EXPANDED = ("series", "series-gp")  # Models that use the power series; the second is trained on its residual.
+# Rounding of the second order's table relative to its largest entry. On the template this and SERIES_STEP move the
+# tumour's worst vertex by at most 0.01 mm in 95 % of loads, a ninth of the model's error.
+PAIR_STEP = 1e-3
+SERIES_STEP = 2e-3  # Rounding of the series' tables relative to their largest motion at the largest force.
+STRIP = 1536  # Number of motion components that are read at once: limits memory.
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,8 @@ from ..data.encode import Basis, reduce
 from ..regressors.force_series import FACTORS, ORDERS, STENCIL, TERMS
 from ..regressors.rigid_contact import RigidContact
 
-# Nodes whose unit responses are computed together: limits memory.
-STRIP = 64
-# Truncation tolerance of a basis, as a share of the unit responses.
-TOLERANCE = 1e-4
+STRIP = 64  # Number of nodes whose unit responses are computed together: limits memory.
+TOLERANCE = 1e-4  # Truncation tolerance of a basis, as a share of the unit responses.
 
 
 def condense_contact(
@@ -74,8 +72,7 @@ def compute_unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.nd
     return np.concatenate(found)
 
 
-# Maximum ratio of neighbouring radii.
-RATIO = 1.5
+RATIO = 1.5  # Maximum ratio of neighbouring radii.
 
 
 def choose_radii(least: float, greatest: float) -> np.ndarray:

@@ -84,10 +84,11 @@ class SharedInputs:
         return np.zeros(len(points), bool) if self.split is None else self.split.is_covered(points)
 
 
-# Held-out discs of inner fits: number of centres, far apart; share of the loads that they hold.
-CENTRES, SHARE = 6, 0.2
-# Minimum number of loads for a selection of settings; maximum number used; number of outputs, the strongest, used.
-FEWEST, MOST, STRONGEST = 40, 600, 8
+CENTRES = 6  # Number of discs, far apart, that inner fits hold out.
+SHARE = 0.2  # Share of the loads in the held-out discs of inner fits.
+FEWEST = 40  # Minimum number of loads for a selection of settings.
+MOST = 600  # Maximum number of loads used for a selection of settings.
+STRONGEST = 8  # Number of outputs, the strongest, used for a selection of settings.
 
 
 @dataclass(frozen=True)
@@ -128,8 +129,9 @@ def find_inner_discs(points: np.ndarray) -> np.ndarray:
     return distance <= np.quantile(distance, SHARE)
 
 
-# Candidate settings, the default first: units in a layer and weight decay; C and epsilon in quartile ranges.
+# Candidate networks, the default first: units in a layer and weight decay.
 ANN = tuple(partial(Ann, hidden, decay) for hidden in (64, 128) for decay in (1e-2, 3e-3))
+# Candidate support vector regressions, the default first: C and epsilon [quartile ranges].
 SVR = tuple(partial(Svr, c, tube) for c in (1.0 / 1.349, 10.0, 100.0) for tube in (1.0 / 13.49, 1e-2, 3e-3, 1e-3))
 # Encoder and regressor of each model type but the compliance matrix; principal components are those of the nodal
 # forces.
@@ -140,8 +142,7 @@ LEARNT: dict[str, tuple[str, Callable[[], RegressorFactory]]] = {
     "gp": ("tool", Gp),
     "residual": ("tool", partial(Tuned, ANN)),
 }
-# Model types for poses: the tool's position replaces its force.
-POSED = ("gp", "ann", "svr")
+POSED = ("gp", "ann", "svr")  # Model types for poses: the tool's position replaces its force.
 
 
 def fit_parts(name: str, inputs: SharedInputs, examples: Examples) -> tuple[ModelPart, ...]:

@@ -38,11 +38,9 @@ from .examples import Examples
 from .expansion import EXPANDED, TOUCHED, Expansion
 from .learners import LEARNT, POSED, SharedInputs, fit_force_model, fit_parts
 
-# Model types for pushes, and for poses.
-LEARNERS = ("linear", *LEARNT, *EXPANDED)
-OF_POSES = (*TOUCHED, *POSED)
-# Minimum number of calibration loads for a 95 % bound.
-FEWEST_APART = 19
+LEARNERS = ("linear", *LEARNT, *EXPANDED)  # Model types for pushes.
+OF_POSES = (*TOUCHED, *POSED)  # Model types for poses.
+FEWEST_APART = 19  # Minimum number of calibration loads for a 95 % bound.
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,11 +24,12 @@ from .columns import SHEET, describe_task
 from .croissant import COLUMNS, build_croissant_metadata
 from .datasheet import MARK, NAME, get_template_notice, has_template, write_datasheet
 
-TABLE = "episodes.csv"
+TABLE = "episodes.csv"  # File name of the table of episodes.
 NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)
 """Files of a card."""
 MOST_EPISODES = 5000
 """Number of episodes above which a run does not write the card automatically: each takes 20 to 50 ms."""
+# Text of the licence file.
 LICENCE = f"""# Licence of this data set
 
 {MARK}

@@ -16,7 +16,7 @@ from ..reading.contents import LONGEST_TEXT, EpisodeContents
 from ..reading.schema import PICTURES
 from ..reading.windows import read_numbers
 
-TASKS = {
+TASKS = {  # Descriptions of tasks, by family.
     "press": "Press on one place of the open cortex, hold, and let go.",
     "slide": "Press, slide along a straight line over the open cortex, and let go.",
     "draw": "Lay the tool on the open cortex, and draw the tissue aside.",
@@ -27,8 +27,7 @@ TASKS = {
     "drain": "Drain fluid and turn the head, while the brain sinks.",
     "debulk": "Cut the tumour out in shares.",
 }
-# One of this many bodies (or episodes, if there are fewer bodies) is held out.
-HELD_OUT = 10
+HELD_OUT = 10  # One in this many bodies (or episodes, if there are fewer bodies) is held out.
 
 
 def describe_task(contents: EpisodeContents) -> str:
@@ -49,10 +48,8 @@ def mark_held_out(episodes: Sequence[EpisodeContents]) -> list[bool]:
     return [str(one.said.get("anatomy")) in out for one in episodes]
 
 
-# From one frame to the next, against the mean of all [s].
-UNEVEN = 1e-4
-# Frames that are held in memory at once.
-BLOCK = 64
+UNEVEN = 1e-4  # Largest deviation of the time between frames from the mean [s].
+BLOCK = 64  # Number of frames held in memory at once.
 NUMBERS = (
     "force", "force_read", "tip", "contact", "distance", "K", "T_camera_world", "T_camera_world_tracked",
     "T_world_tool_tracked", "tumour_predicted",
@@ -60,10 +57,12 @@ NUMBERS = (
 """Arrays that are exported unchanged, one row per frame, next to the tool's pose."""
 SPACE = "world: RAS [m]; camera: x right, y down, z forward [m]"
 """Coordinate system of all positions."""
+# Names of the components of a state: position and unit quaternion of the tool.
 STATE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+# Names of the components of an action: translation and rotation vector of the tool.
 ACTION = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
 SHEET, LICENCE = "DATASHEET.md", "LICENSE.md"
-"""Their names."""
+"""File names of the data sheet and the licence."""
 
 
 def list_shared_images(episodes: Sequence[EpisodeContents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:

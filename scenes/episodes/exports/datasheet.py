@@ -13,8 +13,7 @@ from ..reading.contents import EpisodeContents
 from ..reading.schema import ARRAYS, PICTURES
 from ..run_folder import RUN, RunSettings
 
-# Longest of each list.
-MOST_DRAWN = 100
+MOST_DRAWN = 100  # Maximum length of each list of sampled values.
 
 
 def read_parameters(contents: EpisodeContents) -> dict[str, Any]:
@@ -124,10 +123,9 @@ def format_origins(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
             yield f"- In {count} episodes the anatomy is the maker's own, `{origin}`. Write here whose it is."
 
 
-MARK = "<!-- sulcus card 1 -->"
-NAME = "with sulcus"
-# Most of what moved, solved or touched tissue that is named.
-MOST_LISTED = 12
+MARK = "<!-- sulcus card 1 -->"  # Line that marks a generated data sheet.
+NAME = "with sulcus"  # Text by which a data sheet names its program.
+MOST_LISTED = 12  # Maximum number of effects, solvers and tools that are listed.
 
 
 def write_datasheet(
@@ -252,6 +250,7 @@ def format_plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
         yield f"## Plan\n\n```toml\n{text.strip()}\n```\n"
 
 
+# Section on limitations.
 UNKNOWN = """## What is not known
 
 - How near the simulated motion is to a patient's. Finite elements and models agree with each other, not with a patient.

@@ -83,17 +83,18 @@ class RowStatistics:
         return {**{name: np.atleast_1d(array).tolist() for name, array in lists.items()}, "count": [self.count]}
 
 
-VERSION = "v3.0"
+VERSION = "v3.0"  # Version of the LeRobot format.
 DEPTH_RANGE = (0.1, 0.6)
 """Depth range for readers that scale depth [m]: contains tools, cortex and drape of all scenes."""
-EXPORTED = ("colour", "colour_right", "depth", "segmentation", "tumour_mask")
-# Megabytes of one table, and tables of one folder, as LeRobot has them.
-FILE_MEGABYTES, FOLDER_FILES = 100, 1000
-# Number of images of an episode used for statistics, and pixel stride along each side.
-LOOKED_AT, SPARSE = 5, 4
-DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-EPISODES = Path("meta/episodes/chunk-000/file-000.parquet")
-PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+EXPORTED = ("colour", "colour_right", "depth", "segmentation", "tumour_mask")  # Exported images.
+FILE_MEGABYTES = 100  # Maximum size of a table [MB], as in LeRobot.
+FOLDER_FILES = 1000  # Maximum number of tables in a folder, as in LeRobot.
+LOOKED_AT = 5  # Number of images of an episode used for statistics.
+SPARSE = 4  # Pixel stride along each side of the images used for statistics.
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"  # Path of a table of frames.
+EPISODES = Path("meta/episodes/chunk-000/file-000.parquet")  # Path of the table of episodes.
+PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # Parquet type of an image.
+# Columns of time and numbers that LeRobot requires in each row.
 COUNTED = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 

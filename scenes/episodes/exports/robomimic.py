@@ -29,9 +29,8 @@ from .columns import (
     split_into_blocks,
 )
 
-EXPORTED = ("colour", "colour_right", "depth", "segmentation")
-# Size of decoded images compressed by gzip, relative to the episodes' JPEG and PNG.
-SWELLS = 4
+EXPORTED = ("colour", "colour_right", "depth", "segmentation")  # Exported images.
+SWELLS = 4  # Size of decoded images compressed by gzip, relative to the episodes' JPEG and PNG.
 GYM = 2
 """robomimic's number for environments of Gymnasium's kind."""
 

@@ -25,10 +25,9 @@ from .contents import REMEDY, format_finding, inspect_contents
 from .validation import Report, validate_episode
 from .windows import read_numbers
 
-# Largest difference of two solutions [mm]: at training accuracy; of played frames, at live accuracy.
-SAME_MM, LIVE_MM = 0.02, 0.2
-# Bytes that looking at one file may take.
-MOST_BYTES = 8 * 1024**3
+SAME_MM = 0.02  # Largest difference of two solutions at training accuracy [mm].
+LIVE_MM = 0.2  # Largest difference of two solutions in played frames, at live accuracy [mm].
+MOST_BYTES = 8 * 1024**3  # Maximum memory for the examination of one file [bytes].
 
 
 def solve_again(report: Report, count: int, device: str = "auto") -> Report:

@@ -18,8 +18,8 @@ from sim.runtime.outside_files import read_as, to_path
 
 from .schema import ARRAYS, FORMATS, FRAMES, NEEDED, PICTURES, SOLVED, Array
 
-HINT = "`sulcus validate` says more; "
-REMEDY = f"{HINT}make it anew, or leave it out."
+HINT = "`sulcus validate` says more; "  # Hint in error messages.
+REMEDY = f"{HINT}make it anew, or leave it out."  # Remedy in error messages.
 
 
 def open_episode(path: Path) -> h5py.File:
@@ -76,15 +76,12 @@ class OpenFiles:
             self._open.popitem()[1].close()
 
 
-# Groups in groups, and what lies in all of them: an episode has one group, `pictures`.
-DEEPEST, MOST_NAMES = 3, 500
-# Frames of one episode: hours.
-MOST_FRAMES = 1_000_000
-# Largest number of pixels along an image's side.
-LARGEST_SIDE = 16384
-# Bytes of a text that heads a file: a plan, or what was drawn.
-LONGEST_TEXT = 1 << 20
-FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
+DEEPEST = 3  # Maximum depth of nested groups: an episode has one group, `pictures`.
+MOST_NAMES = 500  # Maximum number of names in a group.
+MOST_FRAMES = 1_000_000  # Maximum number of frames of an episode: hours.
+LARGEST_SIDE = 16384  # Largest image side [pixel].
+LONGEST_TEXT = 1 << 20  # Maximum size of a text attribute [bytes]: a plan, or the sampled values.
+FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}  # Allowed HDF5 filters.
 
 
 @dataclass(frozen=True, eq=False)

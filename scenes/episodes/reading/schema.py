@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-FORMATS = ("sulcus episode 1", "sulcus episode 2")
-COLOUR, DEPTH, LABELS = "colour", "depth", "labels"
-FRAMES, SOLVED = "frames", "solved"
+FORMATS = ("sulcus episode 1", "sulcus episode 2")  # Supported file formats.
+COLOUR, DEPTH, LABELS = "colour", "depth", "labels"  # Decoders of images.
+FRAMES, SOLVED = "frames", "solved"  # Names of array axes: frames, frames solved by FEM.
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ def get_suffix(name: str) -> str:
     return "jpg" if PICTURES[name] == COLOUR else "png"
 
 
-_POSE = Array((FRAMES, 4, 4))
-_PLACE = Array((FRAMES, 3), known=False)
-_ERROR = Array((FRAMES,), known=False, limited=False)
-_FORCE = Array((FRAMES, 3), unit="N", known=False)
+_POSE = Array((FRAMES, 4, 4))  # Pose of a body.
+_PLACE = Array((FRAMES, 3), known=False)  # Position, which may be unknown.
+_ERROR = Array((FRAMES,), known=False, limited=False)  # Error bound, which may be unknown or infinite.
+_FORCE = Array((FRAMES, 3), unit="N", known=False)  # Force [N], which may be unknown.
 
 ARRAYS: Mapping[str, Array] = {
     "time": Array((FRAMES,), unit="s"),
@@ -106,4 +106,4 @@ ARRAYS: Mapping[str, Array] = {
 }
 """Arrays other than images, by name. Only `time` is required."""
 
-NEEDED = ("time",)
+NEEDED = ("time",)  # Required arrays.

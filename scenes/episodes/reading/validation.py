@@ -22,14 +22,12 @@ from .contents import REMEDY, EpisodeContents, format_finding, get_array, inspec
 from .schema import ARRAYS, LABELS, PICTURES
 from .windows import read_numbers, read_one_image
 
-# Frames that are drawn again, spread evenly.
-LOOKED_AT = 12
-# Share of a silhouette's pixels that may differ by rounding or machine, and the least number.
-TURNED, FEW = 1e-3, 4
-# Rows that are held in memory at once.
-BLOCK = 256
-# A rotation's rows against unit length and right angles.
-ROTATED = 1e-6
+LOOKED_AT = 12  # Number of frames that are rendered again, spread evenly.
+TURNED = 1e-3  # Share of a silhouette's pixels that may differ by rounding or machine.
+FEW = 4  # Number of pixels that may differ in addition.
+BLOCK = 256  # Number of rows held in memory at once.
+ROTATED = 1e-6  # Tolerance of a rotation's rows from unit length and right angles.
+# Arrays of poses.
 POSES = ("T_camera_world", "T_camera_world_right", "T_camera_world_tracked", "T_world_tool", "T_world_tool_tracked")
 
 
