@@ -44,7 +44,7 @@ class TestTrust:
         assert format_trust(answer(Outcome.PREDICTED), GUARDED).startswith(
             "<p><b>trained model (guarded)</b>: inside the range"
         )
-        assert "as the error bound of the model is too large</b>: solved" in format_trust(
+        assert "as the error bound of the model is too large</b>: converged" in format_trust(
             answer(Outcome.CONVERGED), GUARDED
         )
 

@@ -8,10 +8,10 @@ import pytest
 from sim.bodies.tip_distance import build_tip_gauge
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
+from surrogate.data.indentation import get_only_pushes
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import APART
 from surrogate.data.tool_loads import draw
-from surrogate.model.learned import get_only_pushes
 from surrogate.training.bounds import ENOUGH, TUMOUR, bound_by, collect_missed
 from surrogate.training.train import train
 

@@ -20,11 +20,11 @@ from sim.loads import Loads, Pushed, Touching
 from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
+from surrogate.data.indentation import get_only_pushes
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.coverage import measure_distance_coverage
-from surrogate.model.learned import get_only_pushes
 from surrogate.model.store import load, save
 from surrogate.model.tip_distance import TipModel
 from surrogate.training.bounds import (

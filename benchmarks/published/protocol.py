@@ -12,7 +12,7 @@ from sim.deformation import Deformation, join_deformations
 from sim.errors import InputError
 from sim.loads import Loads
 from surrogate.data.cortex_patch import find_nearest
-from surrogate.model.learned import get_only_pushes
+from surrogate.data.indentation import get_only_pushes
 
 from .models import Published, published_model
 

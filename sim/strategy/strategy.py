@@ -38,8 +38,7 @@ NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS history
 class SolverResult:
     """Solution u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, load fractions, inverted elements.
 
-    Linear iterations of the batch; L-BFGS history for the next frame. With moving tools: `gone` (B,), the fraction of
-    their path reached, and `anew` (B,) bool, True if the solution began undeformed.
+    Also the L-BFGS history; with moving tools `gone` (B,), the path fraction reached, and `anew` (B,): began undeformed.
     """
 
     u: wp.array

@@ -127,3 +127,21 @@ def _places(core: Core) -> np.ndarray:
         steps[2], high[2] = ALONG, low[2] + ALONG * APART * core.radius
     axes = [np.linspace(first, last, count + 1) for first, last, count in zip(low, high, steps, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def get_only_pushes(loads: Loads) -> Pushed:
+    """Return the pushes of loads without other causes.
+
+    Raises
+    ------
+    InputError
+        Loads of another kind.
+    """
+    pushed = loads.get_only(Pushed)
+    if pushed is None:
+        names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
+        raise InputError(
+            f"the loads have the causes {names}, but this model was trained on pushing forces only: give `Pushed` "
+            "alone, or ask the finite elements."
+        )
+    return pushed

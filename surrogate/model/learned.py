@@ -25,7 +25,7 @@ from ..data.answer_rows import read_tissue_statement
 from ..data.cortex_patch import Patch, find_nearest, open_patch
 from ..data.encode import ENCODERS, Basis, Encoder, split_forces
 from ..data.holding import read_series
-from ..data.indentation import add_relaxation, get_poses, to_indentation
+from ..data.indentation import add_relaxation, get_only_pushes, get_poses, to_indentation
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound, compute_features
@@ -388,21 +388,3 @@ def build_prediction(
         bound=bound,
         source=source,
     )
-
-
-def get_only_pushes(loads: Loads) -> Pushed:
-    """Return the pushes of loads without other causes.
-
-    Raises
-    ------
-    InputError
-        Loads of another kind.
-    """
-    pushed = loads.get_only(Pushed)
-    if pushed is None:
-        names = ", ".join(type(cause).__name__ for cause in loads.causes) or "none"
-        raise InputError(
-            f"the loads have the causes {names}, but this model was trained on pushing forces only: give `Pushed` "
-            "alone, or ask the finite elements."
-        )
-    return pushed
