@@ -38,7 +38,7 @@ NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS history
 class SolverResult:
     """Solution u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, load fractions, inverted elements.
 
-    Also the L-BFGS history; with moving tools `gone` (B,), the path fraction reached, and `anew` (B,): began undeformed.
+    Also the L-BFGS history; with moving tools `gone` (B,), the path fraction reached, and `anew` (B,), undeformed.
     """
 
     u: wp.array
