@@ -1,4 +1,4 @@
-"""Pictures in files: PNG, a folder of frames, a film; and pictures out of bytes from outside, of the stated size."""
+"""Image files (PNG, folder of frames, video), and decoding of untrusted image bytes with a given size."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def write_film(path: Path, pictures: Iterable[np.ndarray], frames_per_second: fl
     Raises
     ------
     ValueError
-        Another suffix, a rate that is not positive, no image, or images of different sizes.
+        An unknown suffix, a rate that is not positive, no image, or images of different sizes.
     OSError
         A file that cannot be written.
     """
@@ -166,12 +166,12 @@ def decode_colour(code: bytes, width: int, height: int) -> np.ndarray:
 
 
 def decode_depth(code: bytes, width: int, height: int, scale: float) -> np.ndarray:
-    """Decode depth (height, width) float32 [m] from a PNG of 16 bits with unit `scale` [m]; 0 where nothing is seen.
+    """Decode depth (height, width) float32 [m] from a PNG of 16 bits with unit `scale` [m]; 0 without a surface.
 
     Raises
     ------
     ValueError
-        As `decode_colour`.
+        See `decode_colour`.
     """
     steps = _decoded(code, (height, width), cv2.IMREAD_UNCHANGED | AS_STORED, np.uint16)
     return steps * np.float32(scale)
@@ -183,7 +183,7 @@ def decode_labels(code: bytes, width: int, height: int) -> np.ndarray:
     Raises
     ------
     ValueError
-        As `decode_colour`.
+        See `decode_colour`.
     """
     return _decoded(code, (height, width), cv2.IMREAD_UNCHANGED | AS_STORED, np.uint8)
 

@@ -25,9 +25,9 @@ class Rounded:
     Parameters
     ----------
     whole
-        (n, r) numbers of steps, int16, column by column: similar numbers side by side compress better.
+        Numbers of steps (n, r) int16, column by column: similar numbers next to each other compress better.
     step
-        (r,) float32, in the table's unit.
+        Step sizes (r,) float32, in the table's unit.
     """
 
     whole: np.ndarray

@@ -47,7 +47,7 @@ def test_a_frame_is_solved_again_after_its_past(episode):
     with h5py.File(episode, "a") as file:
         file["tumour_fem"][2, 0, 2] += 4e-4
     (said,) = solve_again(Report(episode), 3, "cpu").problems
-    assert said.startswith("frame 2, solved again, is 0.")
+    assert said.startswith("frame 2, solved again: 0.")
 
 
 def slow(path):
@@ -76,4 +76,4 @@ def test_a_file_that_ends_its_reader_ends_no_other(whole, tmp_path):
     broken = tmp_path / "broken.h5"
     broken.write_bytes(whole.read_bytes())
     reports = {report.path: report for report in validate_files([broken, whole], 1, end)}
-    assert "ends the process that reads it" in reports[broken].problems[0] and not reports[whole].problems
+    assert "reading it crashes the process" in reports[broken].problems[0] and not reports[whole].problems

@@ -42,4 +42,4 @@ def test_the_command_names_every_part_and_refuses_bad_input(box, tmp_path, capsy
         main(["budget", "--help"])
     assert "palpate and retract take over 4 minutes" in " ".join(capsys.readouterr().out.split())
     assert main(["budget", "sag", *words[2:]]) == 2
-    assert "finds its tumour by what is seen" in capsys.readouterr().err
+    assert "estimates the tumour position" in capsys.readouterr().err

@@ -46,7 +46,7 @@ def test_image_folder_gives_camera_and_covariance(folder, tmp_path, capsys):
     out = tmp_path / "new" / "camera.yaml"
     assert main(["calibrate", str(folder), "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "11 pictures, the board in 10, 10 views used" in said and "rms 0." in said and "\nfx 5" in said
+    assert "11 images, the board in 10, 10 views used" in said and "rms 0." in said and "\nfx 5" in said
     found = read_calibration(out)
     assert found.name == "sulcus calibrate: camera" and (found.width, found.height) == (WIDTH, HEIGHT)
     np.testing.assert_allclose(found.K, K, atol=2.5)
@@ -114,9 +114,9 @@ def test_files_of_others_are_kept(folder, tmp_path, capsys):
 
 
 def test_one_thing_is_calibrated_at_a_time(folder, tmp_path, capsys):
-    assert "give one of" in refused([], capsys)
-    assert "give one of" in refused([folder, "--pivot", tmp_path / "a.csv", "--out", "k.yaml"], capsys)
-    assert "--out and --size belong" in refused(["--pivot", tmp_path / "a.csv", "--out", "k.yaml"], capsys)
+    assert "give a video or" in refused([], capsys)
+    assert "give a video or" in refused([folder, "--pivot", tmp_path / "a.csv", "--out", "k.yaml"], capsys)
+    assert "--out and --size require" in refused(["--pivot", tmp_path / "a.csv", "--out", "k.yaml"], capsys)
 
 
 def write_poses(path, turns, places, head=HEAD, more=""):

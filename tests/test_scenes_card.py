@@ -37,7 +37,7 @@ def test_a_card_says_what_there_is(folder, tmp_path, capsys):
         "| `site.path` | straight | 2 |",
         "- seed: 0 (in 1)\n- seed: 1 (in 1)",
         "device: cpu; packages: h5py 3",
-        "In 2 episodes the files do not say whose brain it is",
+        "In 2 episodes the files do not give the source of the brain",
         "[press]",
         "0.100 mm",
         "1 could not be made",

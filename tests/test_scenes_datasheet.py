@@ -23,7 +23,7 @@ def test_a_card_says_whose_brain_it_is_and_what_played(box, tmp_path):
         file.attrs.update({"parameters": json.dumps(drawn), "deformer": "fem"})
     write_card(path.parent)
     sheet = (path.parent / "DATASHEET.md").read_text()
-    assert "the brain is the ICBM 152 template's" in sheet and "Finite elements played 1 of the episodes" in sheet
+    assert "the brain is the ICBM 152 template's" in sheet and "FEM was used directly in 1 of the episodes" in sheet
     assert "error of the model" not in sheet and "radius_mm" not in sheet and "from least to greatest" not in sheet
     assert "McGill" in (path.parent / "LICENSE.md").read_text()
     other = write_episode(tmp_path / "other/episode_000000.h5", box)

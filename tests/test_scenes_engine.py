@@ -120,7 +120,7 @@ def test_scheduler_rejects_clients_without_its_keys(workers):
 
 def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path):
     address = "tcp://127.0.0.1:9"
-    with pytest.raises(InputError, match=f"--scheduler {address}: no Dask scheduler answers"):
+    with pytest.raises(InputError, match=f"--scheduler {address}: no Dask scheduler at this address"):
         connect_workers(address, "cpu", patience=0.5).__enter__()
     counts, added = [], []
     with ExitStack() as closing:

@@ -20,8 +20,8 @@ from scenes.episodes.run_folder import Failure, begin, mark_failed, unmark
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["none"], "no plan is called 'none': choose"),
-        (["small", "--scheduler", "tcp://127.0.0.1:9x"], "no Dask scheduler answers there"),
+        (["none"], "there is no plan 'none': choose"),
+        (["small", "--scheduler", "tcp://127.0.0.1:9x"], "no Dask scheduler at this address"),
         (["small", "--estimate"], "no episode was measured there"),
         (["small", "--slurm", "2"], "give --device cpu, or --device cuda"),
         (["small", "--slurm", "2", "--device", "cpu", "--workers", "2"], "leave --workers and --scheduler out"),
@@ -87,7 +87,7 @@ def test_signal_stops_processes_and_keeps_resumable_work(number, tmp_path):
         client.kill()
     # Python ends itself by SIGINT where the interrupt met a string that was executed: shells say 130 of both.
     assert client.returncode in (130, -signal.SIGINT), error
-    assert "the same command goes on in" in error and "Traceback" not in error, error
+    assert "run the same command again to resume in" in error and "Traceback" not in error, error
     assert (folder / "run.json").exists() and not list(folder.glob("episode_*"))
 
 

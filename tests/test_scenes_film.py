@@ -71,8 +71,8 @@ def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):
     for more, why in [
         (["--path", "microscope"], "one calibration"),
         (["--noise", "-1"], "not below 0"),
-        (["--trouble", "gap:0-9"], "no picture would be taken"),
-        (["--trouble", "tool:30-40"], "tool:30-40 meets no picture of this film"),
+        (["--trouble", "gap:0-9"], "no image would be recorded"),
+        (["--trouble", "tool:30-40"], "tool:30-40 contains no image of this video"),
     ]:
         assert main([*words, *few, *more]) == 2
         assert why in capsys.readouterr().err

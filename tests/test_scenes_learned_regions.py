@@ -55,7 +55,7 @@ class TestScenes:
     def test_other_scenes_keep_settings_and_reject_model(self, theatre, capsys):
         scene = asked(theatre, short(), "--region", "5:400")
         assert scene.elasticity == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF, NECROSIS_LABEL: replace(BRAIN, young=400.0)})
-        kept = "press keeps, as the models beside the anatomy have it: region 2 (tumour): neo-hookean, E 9 kPa, nu 0.49"
+        kept = "press keeps the tissue from the models' training data: region 2 (tumour): neo-hookean, E 9 kPa, nu 0.49"
         assert capsys.readouterr().err == f"{kept}\n"
         asked(theatre, short(), *WORDS)
         assert capsys.readouterr().err == ""

@@ -63,7 +63,7 @@ def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay
         (["--client", ":18944"], "--client :18944"),
         *((["--client", host], f"--client {host}: port 18944 of this machine") for host in SELF),
         (["--registration", "none.json"], "none.json: no such file"),
-        ([], "no model beside"),
+        ([], "no model next to"),
         (
             ["--host", "198.51.100.1", "--tool", str(FILM / "tool.json"), "--deformer", "rest"],
             "no server on 198.51.100.1",

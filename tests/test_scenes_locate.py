@@ -150,7 +150,7 @@ def test_people_read_sentences(files, capsys, words):
     words = [str(folder / word) if word.endswith(".csv") else word for word in words]
     assert main(["locate", str(folder / "box.vtu"), *words, "--out", str(folder / "other.vtu"), "--force"]) == 0
     said = capsys.readouterr().out
-    assert "The middle of the tumour has moved by" in said and "With a probability of 95 %" in said
+    assert "The centre of the tumour has moved by" in said and "With a probability of 95 %" in said
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,7 @@ def test_a_small_locator_has_no_result_of_every_vertex(files, body, tmp_path, ca
     assert "is small" in capsys.readouterr().err and not (tmp_path / "out.vtu").exists()
     assert main(words) == 0  # for the tumour alone it is enough
     said = capsys.readouterr().out
-    assert "The middle of the tumour has moved by" in said and "written" not in said
+    assert "The centre of the tumour has moved by" in said and "written" not in said
     assert main([*words, "--json"]) == 0
     alone = json.loads(capsys.readouterr().out)
     whole = [*words[:-1], str(folder / "box.locator.npz"), "--json", "--out", str(tmp_path / "out.vtu")]

@@ -232,7 +232,7 @@ def test_lps_that_is_stated_as_ras_is_doubted(folder, box):
     for name, signs in (("right", [1.0, 1.0, 1.0, 1.0]), ("wrong", [-1.0, -1.0, 1.0, 1.0])):
         save(folder / f"{name}.nii.gz", values.astype(np.float32), np.diag(signs) @ affine)
         warnings = read_picture(folder / f"{name}.nii.gz", moved, False).warnings
-        assert any("LPS that is stated as RAS" in warning for warning in warnings) == (name == "wrong")
+        assert any("LPS marked as RAS" in warning for warning in warnings) == (name == "wrong")
 
 
 def test_a_folder_that_is_not_empty_is_left_alone(folder, capsys):

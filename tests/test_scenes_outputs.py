@@ -138,7 +138,7 @@ def test_foreign_data_and_models_are_found_next_to_mesh(tmp_path):
     assert find_foreign_files(mesh, "new") == [tmp_path / "me.model.npz"]
     with open_journal(tmp_path / "me.h5.partial", {"anatomy": "old"}):
         pass
-    with pytest.raises(InputError, match=r"me.h5.partial and me.model.npz beside it.*--force"):
+    with pytest.raises(InputError, match=r"me.h5.partial and me.model.npz next to it.*--force"):
         check_no_foreign_files(mesh, "new", force=False)
     assert len(check_no_foreign_files(mesh, "new", force=True)) == 2
 

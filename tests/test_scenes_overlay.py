@@ -175,7 +175,7 @@ def test_what_does_not_belong_together_is_refused(tmp_path, capsys):
     assert "give --tool TOOL.json" in refused("--deformer", "fem")
     tool = "--tool", str(FILM / "tool.json")
     assert "no deformer is called 'bogus' here: choose one of fem, rest." in refused(*tool, "--deformer", "bogus")
-    assert "films are written as" in refused("--out", str(tmp_path / "x.avi"))
+    assert "unsupported video type" in refused("--out", str(tmp_path / "x.avi"))
     assert "--rate 0" in refused("--rate", "0")
     assert "no such file" in refused(film=str(tmp_path / "none.mp4"))
     (tmp_path / "text.mp4").write_text("no video")

@@ -161,7 +161,7 @@ def test_video_and_camera_pages_differ_from_demo(capsys):
     said = capsys.readouterr().out
     assert f"open http://localhost:{port} (Ctrl-C ends)" in said and "its motion not known" in said
     assert main(["overlay", film, *given, "--page", "--live"]) == 2
-    assert "films without a page" in capsys.readouterr().err
+    assert "not supported with --page" in capsys.readouterr().err
     for own in (film, "0"):
         assert main(["demo", own]) == 2
         assert f"sulcus overlay {own} --page" in capsys.readouterr().err

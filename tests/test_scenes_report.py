@@ -120,4 +120,4 @@ def test_page_is_written_and_missing_row_reported(study, study_rows, monkeypatch
 
     monkeypatch.setattr("scenes.report.rows.measure_rows", stopped)
     assert main(words) == 130
-    assert "the same command goes on" in capsys.readouterr().err
+    assert "run the same command again to resume" in capsys.readouterr().err

@@ -97,7 +97,7 @@ def test_every_figure_stands_under_its_head(tmp_path):
     [
         (["--loads", "0"], "--loads 0"),
         (["--device", "abacus"], "abacus"),
-        (["--data", "a/x.h5", "b/x.h5"], "one name"),
+        (["--data", "a/x.h5", "b/x.h5"], "the same name"),
         (["--data", "a.h5", "--anatomy", "b.vtu"], "--anatomy"),
         (["--data", "a.h5"], "no such file"),
     ],

@@ -63,8 +63,8 @@ def found(anatomy):
 
 def test_every_thing_has_its_row(found):
     assert list(found) == [
-        ("motion itself", ""), ("force or motion", "5 % off"), ("its direction", "2 deg off"),
-        ("its position", "1 mm off"), ("E", "-20%"), ("E", "+20%"), ("nu", "0.49"), ("nu", "0.495"),
+        ("motion itself", ""), ("force or motion", "+-5 %"), ("its direction", "+-2 deg"),
+        ("its position", "+-1 mm"), ("E", "-20%"), ("E", "+20%"), ("nu", "0.49"), ("nu", "0.495"),
         ("tumour's stiffness", "0.5 x"), ("tumour's stiffness", "2 x"), ("tumour's stiffness", "3 x"),
         ("skull", "slide"), ("skull", "contact"), ("element", "smoothed"),
     ]  # fmt: skip
@@ -87,7 +87,7 @@ def test_stiffness_matters_under_known_force_alone(found, now, factor):
 
 
 def test_a_linear_body_answers_in_proportion(found):
-    for one in (found["force or motion", "5 % off"].force, found["force or motion", "5 % off"].motion):
+    for one in (found["force or motion", "+-5 %"].force, found["force or motion", "+-5 %"].motion):
         assert one.percent == pytest.approx(5.0, rel=1e-6)
         assert one.motion == pytest.approx(1.0, rel=1e-7)
         assert one.mean_mm == pytest.approx(0.05 * found["motion itself", ""].force.mean_mm, rel=1e-6)
@@ -215,10 +215,10 @@ def test_the_command(tmp_path, capsys):
     assert main([*words, "--device", "cpu", "--out", str(tmp_path / "table.csv")]) == 0
     said = capsys.readouterr().out
     for text in (
-        "| force or motion    | as drawn    | 5 % off   |",
+        "| force or motion    | as drawn    | +-5 %     |",
         "| surrogate's error  |             | table     |        | 0.123  |",
-        "held-out bipolar loads", "of the kind p2", "--beside p2", "This anatomy has no skull",
-        "Take --element smoothed",
+        "held-out bipolar loads", "FEM with element p2", "--beside p2", "This anatomy has no skull",
+        "Use --element smoothed",
     ):  # fmt: skip
         assert text in said
     assert max(len(line) for line in said.splitlines() if line.startswith("|")) <= 120

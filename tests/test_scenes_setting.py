@@ -92,11 +92,11 @@ def test_a_ball_presses_what_lies_at_the_cortex(stiff, box, tmp_path):
 def test_a_model_that_may_not_answer_is_named_with_the_reason(stiff):
     """One that is asked for is refused; one that lies beside the body is warned of."""
     beside, force = str(to_model_path(stiff)), "it was trained on what a tool's force does, and here is none"
-    with pytest.raises(InputError, match=rf"model\.npz: does not answer the task retract: {force}, but .*ToolContact"):
+    with pytest.raises(InputError, match=rf"model\.npz: is not applicable .*task retract: {force}, but .*ToolContact"):
         open_setting(RETRACT, str(stiff), "auto", "cpu", SIZE, beside)
-    with pytest.raises(InputError, match=r"model\.npz: does not answer the task debulk: tissue is cut away"):
+    with pytest.raises(InputError, match=r"model\.npz: is not applicable to the task debulk: tissue is resected"):
         open_setting(DEBULK, str(stiff), "auto", "cpu", SIZE, beside)
-    with pytest.raises(InputError, match=rf"no trained model of .*stiff\.vtu answers the task retract: {force}"):
+    with pytest.raises(InputError, match=rf"no trained model of .*stiff\.vtu is applicable .*task retract: {force}"):
         open_setting(RETRACT, str(stiff), "model", "cpu", SIZE)
-    with pytest.warns(UserWarning, match=rf"finite elements answer the task retract on .*, no trained model: {force}"):
+    with pytest.warns(UserWarning, match=rf"FEM is used for .* retract on .*: no .* model is applicable: {force}"):
         open_setting(RETRACT, str(stiff), "auto", "cpu", SIZE)

@@ -20,11 +20,11 @@ def test_the_command_names_broken_files_and_ends_with_one(whole, tmp_path, capsy
     said = json.loads(capsys.readouterr().out)
     assert said["broken"] == 1 and said["files"][1]["path"] == str(broken)
     size, (problem,) = whole.stat().st_size, said["files"][1]["problems"]
-    assert f"cannot be read as an episode: it is cut off: 3000 of {size} bytes. Make it anew" in problem
+    assert f"cannot be read as an episode: it is cut off: 3000 of {size} bytes. Make it again" in problem
     assert "sulcus validate" not in problem
     with h5py.File(broken, "w") as file:
         file.attrs.update({"format": "sulcus episode 2", "width": 40, "height": 30})
-    assert validate_episode(broken).problems == ["it has no 'time'. Make it anew, or leave it out."]
+    assert validate_episode(broken).problems == ["it has no 'time'. Make it again, or leave it out."]
     assert main(["validate", str(tmp_path / "none.h5")]) == 2 and "no such file" in capsys.readouterr().err
     assert main(["validate", str(whole), "--workers", "0"]) == 2
 
@@ -40,6 +40,6 @@ def test_statistics_cover_whole_episodes_and_name_missing(box, tmp_path, capsys)
     (tmp_path / "episode_000002.h5").unlink()
     assert main(["validate", str(tmp_path), "--workers", "1"]) == 1
     unit, gone, *_, frames, error = capsys.readouterr().out.splitlines()
-    assert "'mN'" in unit and "episode_000002.h5: is gone; episodes.csv names it" in gone
+    assert "'mN'" in unit and "episode_000002.h5: is gone; episodes.csv lists it" in gone
     assert "1 of 3 episodes are whole: 4 frames, 4 of them solved" in frames
     assert "0.000200 mm on average, 0.000200 mm at most" in error

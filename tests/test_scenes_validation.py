@@ -46,7 +46,7 @@ WRONG = {
     "camera": (changed("K", lambda x: x.__setitem__((0, 0), -1.0)), "'K' is no matrix of a camera"),
     "label": (
         set_picture("segmentation", 2, packed("labels", np.full((30, 40), 9, np.uint8))),
-        r"'segmentation' of frame 2 has labels [9] that nothing names",
+        r"'segmentation' of frame 2 has labels [9] without a name",
     ),
     "size": (
         set_picture("colour", 1, packed("colour", np.zeros((60, 80, 3), np.uint8))),

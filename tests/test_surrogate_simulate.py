@@ -211,7 +211,7 @@ def test_what_is_said_at_ctrl_c_stands_on_its_own_line(folder, tmp_path, monkeyp
     words = ["simulate", str(folder / "box.vtu"), "--out", str(tmp_path / "a.h5"), "--count", "40", "--device", "cpu"]
     assert main(words) == 130
     *before, last = capsys.readouterr().err.splitlines()
-    assert last == f"stopped; the same command goes on from {tmp_path / 'a.h5'}.partial" and "3/40" in before[-1]
+    assert f"run the same command again to resume from {tmp_path / 'a.h5'}.partial" in last and "3/40" in before[-1]
 
     def stopped_too(*given, **more):
         raise KeyboardInterrupt

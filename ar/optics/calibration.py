@@ -35,7 +35,7 @@ class Calibration:
     lens
         Lens distortion.
     name
-        Of the camera; may be empty.
+        Name of the camera; may be empty.
     readout
         Rolling-shutter readout time: from the first row of an image to the last [s]. An image's time is that of its
         middle row.
@@ -90,7 +90,7 @@ class Calibration:
         Raises
         ------
         ValueError
-            Another size without `scale`, or another aspect ratio.
+            An image of another size without `scale`, or another aspect ratio.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -201,7 +201,7 @@ def parse_calibration(text: str) -> Calibration:
         raise ValueError("camera_matrix must be (fx 0 cx; 0 fy cy; 0 0 1): calibrate without skew.")
     for key, shape in (("rectification_matrix", (3, 3)), ("projection_matrix", (3, 4))):
         if key in keys:
-            _read_matrix(root, key, shape)  # of rectified pictures, which are not made here
+            _read_matrix(root, key, shape)  # for rectified images, which are not used here
     (fx, _, cx), (_, fy, cy) = K[:2].tolist()
     width, height = (_int(root, key) for key in ("image_width", "image_height"))
     lens, name = _lens(root, keys), _name(root, keys)

@@ -1,10 +1,10 @@
-"""Cameras: where a world point lands in the picture, pairs of them, and those with a rolling shutter.
+"""Cameras: projection of world points into the image, stereo pairs, and rolling shutters.
 
 OpenCV's convention throughout: camera frame x right, y down, z forward; pixel (u, v) = (column, row) with whole numbers
-at pixel centres, so that the picture spans -0.5 .. width - 0.5. World points are in metres (RAS in this project).
+at pixel centres, so that the image spans -0.5 .. width - 0.5. World points are in metres (RAS in this project).
 
-The rows of a rolling shutter are taken one after the other: a camera that moves is elsewhere in each. A picture's time
-is that of its middle row, from which times are counted.
+The rows of a rolling shutter are exposed one after the other: a moving camera has another pose in each. The time of an
+image is that of its middle row; row times are relative to it.
 """
 
 from __future__ import annotations
@@ -153,14 +153,14 @@ class Camera:
         Parameters
         ----------
         focal_length
-            Of the lens itself [m].
+            Focal length of the lens [m].
         before, now
             Focus distances [m] during calibration, and now.
 
         Raises
         ------
         ValueError
-            A focal length that is not above 0, or a distance that is not larger.
+            A focal length <= 0, or a distance <= the focal length.
         """
         if not 0.0 < focal_length < min(before, now) < np.inf:
             raise ValueError(

@@ -57,7 +57,7 @@ class Lens:
 
     @cached_property
     def reach(self) -> float:
-        """Largest distance from the axis, X / Z, where the distortion is one-to-one: points beyond are not seen.
+        """Largest distance from the axis, X / Z, where the distortion is one-to-one: points beyond are not projected.
 
         Polynomials fold back. In a disc where the Jacobian's symmetric part is positive definite, no two points have
         the same image.

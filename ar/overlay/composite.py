@@ -54,7 +54,7 @@ APART = 2 * ROW  # Distance of a style's text from the number next to the tip [p
 
 @dataclass(frozen=True, eq=False)
 class Overlaid:
-    """Image with lines and text in it: colour (H, W, 3) uint8, and taken (H, W) uint8, above 0 at lines and text.
+    """Image with lines and text: colour (H, W, 3) uint8, and taken (H, W) uint8, above 0 at lines and text.
 
     `named`: True if a legend names the lines.
     """
@@ -93,11 +93,11 @@ class Sketch:
     Parameters
     ----------
     colour, taken
-        As of `Overlaid`.
+        See `Overlaid`.
     faint, thin
         (H, W) bool: lines of the margin, and of rings, which text may cover.
     around
-        Box that was drawn in; None if nothing is visible.
+        Box of the drawn region; None if nothing is visible.
     ground
         Ground over the surface in the box, if the style shows it.
     """
@@ -119,26 +119,26 @@ def composite(
     marks: Marks = NO_MARKS,
     words: Words = NO_WORDS,
 ) -> Overlaid:
-    """Return the picture with a hidden surface drawn into it. On a card, no depth comes back from it but for a cut.
+    """Return the image with a hidden surface drawn into it. On a GPU, depth is copied back only for a cut.
 
     Parameters
     ----------
     picture, camera
-        What the camera sees, and that camera.
+        Camera image, and its camera.
     hidden
-        The surface to show; its colour is used, its place is its silhouette whatever lies in front.
+        Surface to show, in its colour; its whole silhouette is used, regardless of occluders.
     style
-        "contour": the outline. "window": besides, the ground is dimmed round the outline and the surface shows through,
-        shaded, and darker the deeper it lies. "fill": besides the outline, a flat tint. "depth": one that is the
-        stronger the nearer the surface lies to the ground, with its scale. "rings": lines on the ground along which it
-        is equally far from the surface (`distances.py`). "cut": an inset (`cut.py`). "none": nothing but a doubt.
+        "contour": the outline. "window": also the surface, shaded and darker with depth, while the ground around the
+        outline is dimmed. "fill": outline and a flat tint. "depth": outline and a tint that is stronger at smaller
+        depth, with its scale. "rings": lines of equal distance from the surface on the ground (`distances.py`).
+        "cut": an inset (`cut.py`). "none": only warnings.
     cover, marks, words
-        What lies over the surface, and what is drawn and written besides its outline.
+        Occluders of the surface, and additional marks and text.
 
     Raises
     ------
     ValueError
-        An unknown style, or a camera or a mask whose size is not the picture's.
+        An unknown style, or a camera or a mask whose size differs from the image's.
     """
     _check(picture, camera, style, cover.covered)
     if style == "none":

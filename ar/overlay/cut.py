@@ -106,13 +106,13 @@ def draw_section(
     Parameters
     ----------
     seen
-        As returned by `compute_profile`.
+        Profile from `compute_profile`.
     size
         Width and height [pixel].
     tip
-        (3,) [m]: a dot.
+        Tip of the tool (3,) [m], drawn as a dot.
     error
-        Error bound of the surface [m]: a broken line at this distance outside.
+        Error bound of the surface [m]: drawn as a dashed line at this distance outside.
     """
     wide, tall = size
     low, scale = _frame(plane, hidden, seen[0], tip, size)

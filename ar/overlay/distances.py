@@ -43,9 +43,9 @@ def compute_seen_distance(
     Parameters
     ----------
     camera, depth
-        Of the whole image; z in the camera frame, (H, W) float32 [m] on the surface's device.
+        Camera and depth of the whole image; z in the camera frame, (H, W) float32 [m] on the surface's device.
     box
-        Rows and columns.
+        Rows and columns of the box.
     """
     device = str(tree.device)
     load(device, __name__)
@@ -133,9 +133,9 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
     Parameters
     ----------
     sheet
-        (h, w, 4) uint8.
+        Drawing (h, w, 4) uint8.
     distance
-        (h, w) float32 [m] from the visible point at each pixel to the hidden surface; NaN where there is no ring.
+        Distance (h, w) float32 [m] from the visible point at each pixel to the hidden surface; NaN without a ring.
     free
         (h, w) bool: free places for a number; false at other lines.
     """

@@ -23,7 +23,7 @@ class Gauge:
     Parameters
     ----------
     tip, nearest
-        (3,) [m] world points: the tool's tip and the closest point of the hidden surface.
+        World points (3,) [m]: the tool's tip and the closest point of the hidden surface.
     read
         The distance [m], if known more accurately than by the line between the two.
     error
@@ -76,18 +76,18 @@ def write_gauge(
     lines: np.ndarray,
     thin: np.ndarray,
 ) -> None:
-    """Write the gauge's number next to the tip, in place; nothing if neither end of its line has a pixel.
+    """Write the gauge's number next to the tip, in place; nothing if neither end of its line is visible.
 
     It is placed inside the image, even over other lines if there is no space.
 
     Parameters
     ----------
     colour, taken
-        As in `lay`.
+        See `lay`.
     lines, thin
-        As in `Below`.
+        See `Below`.
     covered
-        (H, W) uint8: above 0 at tools, which the number leaves visible if it can.
+        (H, W) uint8: above 0 at tools, which the number does not cover if possible.
     """
     ends, _ = camera.project(np.stack([gauge.tip, gauge.nearest]))
     seen = ends[np.isfinite(ends).all(axis=1)]

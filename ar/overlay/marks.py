@@ -120,7 +120,7 @@ class Marks:
     Parameters
     ----------
     margin
-        One number or (V,) [m]: error bound of the surface. If positive, a dashed second outline runs at that distance.
+        Error bound of the surface, one number or (V,) [m]. If positive, a dashed second outline runs at that distance.
     gauge
         Draws the line from the tip to the hidden surface, and its length in millimetres next to the tip.
     before

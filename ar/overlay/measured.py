@@ -42,7 +42,7 @@ class Measure:
     name
         Name of the hidden surface.
     error
-        Its error bound [m]; None if not available.
+        Error bound [m]; None if not available.
     """
 
     style: Style

@@ -1,4 +1,4 @@
-"""Outlines of what a camera sees: their places in the picture, how they are drawn, and where a picture shows them."""
+"""Outlines of visible surfaces: projection into the image, drawing, and detection in an image."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class Lines:
     Parameters
     ----------
     ink
-        (3,) in 0 .. 255: colour of the hidden surface's outline, and of its tint.
+        Colour (3,) in 0 .. 255 of the hidden surface's outline, and of its tint.
     solid
         True if the outline is drawn as one solid line.
     under, above

@@ -1,9 +1,9 @@
-"""Elements of the page in HTML: a picture with its words as one message; tabs for slices and the last seconds; keys.
+"""HTML elements of the page: image and text as one message; tabs for slices and the last seconds; keys.
 
-A browser loads pictures later than it sets words, and drops a picture that is replaced before it is loaded. A slow
-browser would show new words beside an old picture. So both wait, out of sight, until the picture is loaded.
+A browser loads images later than it sets text, and drops an image that is replaced before it is loaded. A slow
+browser would show new text next to an old image. Therefore both are hidden until the image is loaded.
 
-Tabs, keys and names of controls are of the visitor's own browser: the server hears of none of them.
+Tabs, keys and names of controls exist only in the client's browser: the server does not receive them.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Spot:
     alt: str
 
 
-MAIN = Spot(PICTURE, SAID, NEXT, "what the camera sees")  # Place of the camera image.
+MAIN = Spot(PICTURE, SAID, NEXT, "camera image with overlay")  # Place of the camera image.
 # Place of the slices.
 ASIDE_SPOT = Spot(SLICES, HISTORY, "sulcus-next-aside", "axial, coronal and sagittal slices of the scan")
 # Script that shows the next image. If images are loaded out of order, older ones are dropped.

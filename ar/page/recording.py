@@ -48,7 +48,7 @@ class PageRecording:
         Raises
         ------
         ValueError
-            Nothing was shown.
+            No recorded images.
         OSError
             Not enough space on the disk.
         """

@@ -16,11 +16,11 @@ class Solid:
     Parameters
     ----------
     values
-        (X, Y, Z) in [0, 1]; the layer's colour is multiplied by a blend from `dark` (0) to white (1).
+        Values (X, Y, Z) in [0, 1]; the layer's colour is multiplied by a blend from `dark` (0) to white (1).
     T_index_world
         (4, 4) affine: voxel index of an undeformed point [m]. Points outside take the value at the border.
     dark
-        (3,) multiplier at value 0.
+        Colour factor (3,) at value 0.
     relief
         Height [m] of value 1 above value 0: darker is deeper. Shading only; the surface stays.
     height
@@ -64,9 +64,9 @@ class Layer:
     name, id
         Name; number in the segmentation, 1 .. 255 (0 is the background).
     vertices, triangles
-        (V, 3) [m], (F, 3); visible from both sides.
+        Vertices (V, 3) [m] and triangles (F, 3); visible from both sides.
     colour
-        (3,) or (V, 3), sRGB in [0, 1].
+        Colour (3,) or (V, 3), sRGB in [0, 1].
     gloss, shininess
         Strength of the wet highlight, 0 .. 1, and its Blinn–Phong exponent.
     solid, rest

@@ -66,9 +66,9 @@ def rasterise(
     Parameters
     ----------
     vertices, triangles
-        (V, 3) world points [m]; (F, 3) vertex indices.
+        World points (V, 3) [m]; vertex indices (F, 3).
     near
-        Nothing closer than this depth [m] is drawn; triangles may extend through the plane and behind the camera.
+        Minimum drawn depth [m]; triangles may extend through the plane and behind the camera.
     device
         A Warp device.
 

@@ -78,7 +78,7 @@ def build_real_image(
     layers
         Known surfaces of the scene; their positions and ids are used. The nearest one is visible.
     box
-        Rows and columns in which layers are drawn; elsewhere nothing is known.
+        Rows and columns in which layers are drawn; elsewhere depth is not available.
 
     Raises
     ------

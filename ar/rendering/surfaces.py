@@ -223,7 +223,7 @@ class Stack:
         Raises
         ------
         ValueError
-            Another shape, or numbers that are not finite.
+            An array of another shape, or numbers that are not finite.
         """
         count = self.vertices - self.still_vertices
         if isinstance(vertices, wp.array):

@@ -1,10 +1,10 @@
-"""Depths from what two eyes see: the windows made alike, matched row by row, and each match with its error.
+"""Depth from stereo pairs: photometric alignment of the windows, matching along rows, and the error of each match.
 
-Points are followed into a later picture too: searched for coarsely, matched exactly, there and back.
+Points are also tracked into a later image: coarse search, sub-pixel matching, forward-backward check.
 
 Hirschmüller 2008, "Stereo processing by semiglobal matching and mutual information", IEEE Trans. Pattern Anal. Mach.
-Intell. 30:328-341, finds the whole pixel. Lucas, Kanade 1981, "An iterative image registration technique", Proc. IJCAI
-674-679, finds the rest, and from the texture's slope how surely.
+Intell. 30:328-341, gives whole pixels. Lucas, Kanade 1981, "An iterative image registration technique", Proc. IJCAI
+674-679, gives the sub-pixel part, and its error from the image gradient.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ BLACK = 12.0  # Mean grey level of an eye's window below which the eye is dark.
 
 @dataclass(frozen=True, eq=False)
 class StereoView:
-    """View of both eyes at the same time.
+    """View of both cameras at the same time.
 
     Parameters
     ----------
     geometry
-        Geometry of the eyes.
+        Geometry of the stereo pair.
     left, right
         Windows (size, size) uint8, normalised.
     hidden
-        (size, size) bool, of the left window: tools, glare, and too little texture.
+        Mask (size, size) bool of the left window: tools, glare, and too little texture.
     hidden_right
-        Tools and glare in the right window.
+        Mask of tools and glare in the right window.
     """
 
     geometry: Rectified
@@ -106,7 +106,7 @@ class Cloud:
     which
         (k,): numbers of the requested pixels.
     points
-        (k, 3) [m] in the world.
+        World points (k, 3) [m].
     sigma
         (k,) [m]: standard deviation of the depth's error; lateral errors are smaller.
     """
@@ -124,7 +124,7 @@ def compute_stereo_view(
     Raises
     ------
     ValueError
-        An eye without light.
+        A dark image.
     """
     windows = geometry.rectify(left, right)
     greys = [cv2.cvtColor(window, cv2.COLOR_RGB2GRAY) for window in windows]
@@ -168,12 +168,12 @@ def equalise(grey: np.ndarray, covered: np.ndarray, square: int) -> tuple[np.nda
 
 
 def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
-    """Compute 3-D points at pixels (n, 2) of the left window, where the right eye sees them too.
+    """Compute 3-D points at pixels (n, 2) of the left window that the right camera also sees.
 
     Raises
     ------
     ValueError
-        Rows of both eyes that do not correspond: cameras other than the calibrated ones.
+        Rows of the two images that do not correspond: cameras other than the calibrated ones.
     """
     rough = view.sample(pixels, view.disparity)
     which = np.flatnonzero(np.isfinite(rough))

@@ -1,4 +1,4 @@
-"""Rectification of two eyes: windows about their target, whose rows correspond."""
+"""Rectification of stereo pairs: windows around the target, whose rows correspond."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ Maps = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Rectified:
-    """Rectified windows of a pair of eyes. Points at the target's depth have the same position in both.
+    """Rectified windows of a stereo pair. Points at the target's depth have the same position in both.
 
     Fusiello, Trucco, Verri 2000, "A compact algorithm for rectification of stereo pairs", Mach. Vis. Appl. 12:16-22.
 
     Parameters
     ----------
     T_window_world
-        (4, 4): positions [m] in the left eye's rectified frame, whose x axis points to the right eye.
+        Transform (4, 4) to positions [m] in the left camera's rectified frame, whose x axis points to the right camera.
     focal, principal
-        Of the left window: focal length and principal point (2,) [pixel].
+        Focal length and principal point (2,) of the left window [pixel].
     baseline, depth
-        Distance between the eyes; distance from there to the target along the axis [m].
+        Distance between the cameras; distance from there to the target along the axis [m].
     size
-        Of a window along each side [pixel].
+        Side length of a window [pixel].
     maps
-        Of the left and of the right eye: image positions of the window's pixels.
+        Image positions of the window's pixels, of the left and of the right camera.
     """
 
     T_window_world: np.ndarray

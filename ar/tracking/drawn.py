@@ -1,4 +1,4 @@
-"""Pictures of printed targets and stamps of time as a camera would take them: for trials with known poses."""
+"""Synthetic camera images of printed targets and time stamps, for tests with known poses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def render_targets(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[
     camera
         Camera with its pose in the world.
     targets
-        Each with its T_world_target (4, 4).
+        Targets, each with its T_world_target (4, 4).
     """
     own = replace(camera, T_camera_world=np.eye(4))
     placed = [

@@ -28,9 +28,9 @@ class BoardView:
     name
         Name of the image.
     points
-        (n, 3) on the board [m].
+        Points (n, 3) on the board [m].
     pixels
-        (n, 2) detected positions.
+        Detected positions (n, 2) [pixel].
     sharpness
         Steepest slope of its edges, as a share of their contrast [1/pixel].
     """
@@ -148,9 +148,9 @@ def compute_calibration_error(
     T_camera_target
         (4, 4) [m]: fitted to the corners by this camera.
     corners, place
-        (n, 3) and (3,) [m] in the target's frame.
+        Corners (n, 3) and point (3,) [m] in the target's frame.
     covariance
-        (9, 9) of `ar.tracking.intrinsics.PARAMETERS`.
+        Covariance (9, 9) of `ar.tracking.intrinsics.PARAMETERS`.
     """
     distortion = np.pad(np.ravel(camera.distortion), (0, 5))[: max(5, np.size(camera.distortion))]
     turn = cv2.Rodrigues(T_camera_target[:3, :3])[0]
@@ -179,7 +179,7 @@ class Intrinsics:
     calibration
         The camera.
     covariance
-        (9, 9) of `PARAMETERS`.
+        Covariance (9, 9) of `PARAMETERS`.
     rms
         Root mean square distance [pixel] between detected and projected corners, over all views used.
     used, left_out

@@ -69,8 +69,8 @@ def read_camera_images(
 def read_newest(pictures: Generator[Named | None], patience: float) -> Iterator[Named | None]:
     """Yield the newest image at each request; None if none arrived within `patience` [s].
 
-    A thread of its own takes the images: those that arrive between requests are dropped, and none waits. It ends, and
-    closes the images, when this iterator ends.
+    A separate thread reads the images; those that arrive between requests are dropped. It ends, and closes the
+    images, when this iterator ends.
 
     Raises
     ------

@@ -40,7 +40,7 @@ class PlacedFace:
     face
         Face to print.
     left, top
-        Its left and upper side [mm] from the page's upper left corner, without its border.
+        Distances of its left and upper side from the page's upper left corner [mm], without its border.
     turns
         Quarter turns clockwise.
     """
@@ -60,7 +60,7 @@ class Page:
     name
         Name of its target.
     pixels
-        (H, W) uint8, 0 or 255, `PER_MM` per millimetre.
+        Image (H, W) uint8, 0 or 255, `PER_MM` per millimetre.
     placed
         Faces on it.
     """

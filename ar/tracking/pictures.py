@@ -38,11 +38,11 @@ class Named:
     name
         Name of its file, or the number of its frame.
     grey
-        (H, W) uint8.
+        Grey image (H, W) uint8.
     time
         Time in the video [s]; 0 for a file.
     colour
-        (H, W, 3) uint8 sRGB, if requested.
+        Colour image (H, W, 3) uint8 sRGB, if requested.
     """
 
     name: str
@@ -76,7 +76,7 @@ def read_video(path: Path, rate: float, colour: bool = False, first: int = 0) ->
     Raises
     ------
     ValueError
-        As `read_images`.
+        See `read_images`.
     """
     if path.is_dir():
         files = islice(enumerate(_files(path)), first, None)
@@ -92,7 +92,7 @@ def count_frames(path: Path) -> int:
     Raises
     ------
     ValueError
-        As `read_images`.
+        See `read_images`.
     """
     if path.is_dir():
         return len(_files(path))

@@ -39,9 +39,9 @@ class Pose:
     Parameters
     ----------
     T_camera_target
-        (4, 4) [m].
+        Pose (4, 4) [m].
     covariance
-        (6, 6) of a translation in the camera's frame [m] and a small rotation about the target's origin in its axes
+        Covariance (6, 6) of a translation in the camera frame [m] and a rotation about the target's origin in its axes
         [rad].
     residual
         Root mean square distance [pixel] between detected and projected corners.
@@ -211,7 +211,7 @@ class Tracker:
     camera
         Calibrated camera; its pose is ignored.
     targets
-        Of different names, and with different markers.
+        Targets with different names and different markers.
     """
 
     camera: Camera

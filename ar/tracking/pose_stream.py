@@ -44,11 +44,11 @@ class PoseStream:
     Parameters
     ----------
     times
-        (n,) [s] of the tracker's clock, ascending.
+        Times (n,) [s] of the tracker's clock, ascending.
     poses
         (n, 4, 4) [m]: T_tracker_body.
     covariances
-        (n, 6, 6) of a translation [m] in the tracker's frame and a small rotation [rad] about the body's origin in its
+        Covariances (n, 6, 6) of translation [m] in the tracker frame and rotation [rad] about the body's origin in its
         axes.
     daily
         True if the clock restarts after 24 hours: then times are defined up to whole days.

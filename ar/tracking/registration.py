@@ -59,7 +59,7 @@ class Registration:
     T_patient_scan
         (4, 4) [m]: maps positions in the scan, RAS, to the frame of the reference.
     covariance
-        (6, 6) of a translation in the reference's frame [m], and of a small rotation about `centre` in its axes [rad].
+        Covariance (6, 6) of a translation in the reference's frame [m] and a rotation about `centre` in its axes [rad].
         It is widened for few points, so that the 95 % ellipsoid by chi^2 has its nominal coverage.
     centre
         (3,) [m]: centroid of the points, in the scan.
@@ -109,7 +109,7 @@ def register_points(scan: np.ndarray, patient: np.ndarray) -> Registration:
 
 
 def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Nearest) -> Registration:
-    """Fit like `register_points`, with additional points `seen` (m, 3) [m] of the surface, in the reference's frame.
+    """Fit as in `register_points`, with additional points `seen` (m, 3) [m] of the surface, in the reference's frame.
 
     Pairs (n, 3) and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by registration
     of multiple range images") are weighted by their own scatter. A surface that moved since the scan biases the result.
@@ -117,7 +117,7 @@ def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray,
     Raises
     ------
     ValueError
-        As `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean
+        See `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean
         square).
     """
     if len(seen) < FEWEST_SURFACE:
@@ -245,14 +245,14 @@ class PairResiduals:
     Parameters
     ----------
     off
-        (n,) [m]: residual distance in the registration by all pairs.
+        Residual distances (n,) [m] in the registration by all pairs.
     left_out
-        (n,) [m]: residual distance in the registration by the other pairs.
+        Residual distances (n,) [m] in the registration by the other pairs.
     studentised
-        (n,): the latter, over the deviation that the others' scatter gives it along and about all axes. NaN for three
-        pairs, from which scatter cannot be estimated.
+        The latter (n,) divided by its standard deviation as predicted from the others' scatter. NaN for three pairs,
+        from which scatter cannot be estimated.
     chance
-        Probability that a set without a wrong pair has one that fits as badly as the worst of these; NaN as above.
+        Probability that a set without outliers has a residual as large as the largest of these; NaN for three pairs.
     """
 
     off: np.ndarray
@@ -275,13 +275,13 @@ def compute_pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResidua
     """Compute residuals of pairs of points (n, 3) [m], in the scan and in the reference's frame.
 
     Externally studentised residuals, of three coordinates each (Cook, Weisberg 1982, "Residuals and influence in
-    regression"). Their squares are F-distributed with 3 and 3 n - 9 degrees of freedom. The chance of the worst is that
-    by Bonferroni.
+    regression"). Their squares are F-distributed with 3 and 3 n - 9 degrees of freedom. The p-value of the worst pair
+    has a Bonferroni correction.
 
     Raises
     ------
     ValueError
-        As `register_points`.
+        See `register_points`.
     """
     found = register_points(scan, patient)
     T, count = found.T_patient_scan, len(scan)

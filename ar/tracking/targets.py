@@ -72,7 +72,7 @@ class Face:
 
     @property
     def outline(self) -> np.ndarray:
-        """Four corners in the target's frame (4, 3) [m], clockwise as it is seen, from the upper left one."""
+        """Four corners in the target's frame (4, 3) [m], clockwise in the image, from the upper left one."""
         own = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
         return (own * [*self.size, 1.0]) @ self.T_target_face[:3, :3].T + self.T_target_face[:3, 3]
 
@@ -90,7 +90,7 @@ class Target:
     name
         Name in files and messages.
     faces
-        Each with markers of its own.
+        Faces, each with its own markers.
     """
 
     name: str
@@ -159,7 +159,7 @@ class DetectedCorners:
     Parameters
     ----------
     points
-        In the target's frame (n, 3) [m].
+        Points (n, 3) [m] in the target's frame.
     pixels
         Detected positions (n, 2).
     face
@@ -178,7 +178,7 @@ class Detector:
     Parameters
     ----------
     targets
-        Of different names, and with different markers.
+        Targets with different names and different markers.
     """
 
     targets: Sequence[Target]

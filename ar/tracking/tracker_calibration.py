@@ -39,7 +39,7 @@ class HandEye:
     spread
         Root mean square angle [rad] of the motions' axes from their closest common axis.
     distances
-        (n,) root mean square `shift` of the motions from and to each pose [m]; 0 for poses without any.
+        Root mean square (n,) `shift` of the motions from and to each pose [m]; 0 for poses without any.
     """
 
     X: np.ndarray
@@ -175,17 +175,17 @@ class Pivot:
     Parameters
     ----------
     tip
-        (3,) in the tool's frame [m].
+        Tip (3,) [m] in the tool's frame.
     centre
-        (3,) pivot point, in the frame of the poses [m].
+        Pivot point (3,) [m] in the frame of the poses.
     covariance
-        (6, 6) of tip and centre [m^2].
+        Covariance (6, 6) of tip and centre [m^2].
     rms
         Root mean square distance [m] between the centre and the tip at each pose.
     tilt
         Root mean square rotation angle [rad] of the direction in the tool that rotated least.
     distances
-        (n,) between the centre and the tip at each pose [m].
+        Distances (n,) between the centre and the tip at each pose [m].
     """
 
     tip: np.ndarray

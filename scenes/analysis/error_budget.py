@@ -42,30 +42,30 @@ class Filmed:
     Parameters
     ----------
     site, viewpoint
-        The open cortex, and the camera with its calibration and path.
+        Open cortex, and camera with its calibration and path.
     duration
         Duration of the scene [s], from which times of the camera's path are sampled.
     T_scan_patient
-        (4, 4) of the patient's reference.
+        Transform (4, 4) of the patient's reference.
     covariance
-        (9, 9) of the calibration.
+        Covariance (9, 9) of the calibration.
     time
-        Of the moment [s].
+        Time of the moment [s].
     rest, field, normals
-        (n, 3) [m]: the tumour's surface in the scan, how it moves, and its outward normals after that.
+        (n, 3) [m]: tumour surface in the scan, its displacement, and its outward normals after that.
     velocity
-        (n, 3) [m/s] of the surface.
+        Velocity (n, 3) [m/s] of the surface.
     bodies
-        How it moves in other bodies (b, n, 3) [m].
+        Displacements of the surface in the sampled bodies (b, n, 3) [m].
     meshes, own_mesh
-        By which share of its motion each body's mesh is off (b,), and by which so many meshes of the scene's own are.
+        Discretisation error relative to the motion (b,), of each body's mesh and of samples for the scene's mesh.
     surrogate
-        The bound [m] that a trained model states, 0 for finite elements.
+        Bound [m] reported by a trained model; 0 for FEM.
     registration
-        As it was measured; None: the published shift stands for it.
+        Measured registration; None: the published shift is used.
     corner, latency, clock
-        What a corner is off by [pixel], and times of pictures and poses [s], as standard deviations. The picture that
-        is drawn on is by `latency` later [s] than the one that was tracked.
+        Standard deviations of corner positions [pixel], latency [s] and image times relative to poses [s]. The
+        displayed image is `latency` [s] later than the tracked one.
     """
 
     site: CraniotomyFrame
@@ -102,7 +102,7 @@ class Filmed:
 
     @cached_property
     def believed(self) -> tuple[Calibration, ...]:
-        """Calibrations as they may have been found; to make one takes far longer than to use it."""
+        """Sampled calibrations; building one takes much longer than using it."""
         scale = np.sqrt(np.diag(self.covariance))
         scale[scale == 0.0] = 1.0  # exact inputs
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
@@ -122,9 +122,9 @@ class OverlayErrors:
     Parameters
     ----------
     across, along, pixels
-        (S,) of the tumour's middle.
+        Errors (S,) of the tumour's centre [m], [m], [pixel].
     worst
-        (S,) [m]: of the point of its surface that is farthest off, in all directions.
+        Maximum surface error (S,) [m], in all directions.
     """
 
     across: np.ndarray
@@ -155,7 +155,7 @@ def sample_errors(filmed: Filmed, contributors: Sequence[str], count: int, seed:
 def _samples(
     filmed: Filmed, contributors: frozenset[str], count: int, seed: int
 ) -> Iterator[tuple[Camera, Camera, np.ndarray, np.ndarray]]:
-    """Yield the true and the believed camera, the tumour's surface as it is, and as it is drawn (n, 3) [m]."""
+    """Yield the true and the estimated camera, and the true and the drawn tumour surface (n, 3) [m]."""
     target = build_patient_reference()
     corners = sum(len(face.corners) for face in target.faces)
 
@@ -248,10 +248,10 @@ def _compared(
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """The errors of an overlay: of each contributor alone, and of `TECHNICAL` and `CLINICAL` ones together.
+    """Error budget of an overlay: each contributor alone, and all of `TECHNICAL` and `CLINICAL`.
 
-    `held` is the share of twins' samples within the band, where there are twins, and its standard deviation. Samples of
-    one body are held or not together, and one twin has no deviation.
+    `held`: coverage of the band on synthetic test cases, and its standard deviation (None for one case). Samples of one
+    body are correlated.
     """
 
     alone: dict[str, OverlayErrors]
@@ -261,11 +261,11 @@ class ErrorBudget:
 
     @property
     def band(self) -> float:
-        """With a probability of 95 % no point of the tumour's surface is farther off [m]."""
+        """95th percentile of the maximum surface error [m]."""
         return float(np.quantile(self.clinical.worst, LEVEL))
 
     def find_largest(self, what: Literal["middle", "worst"]) -> str:
-        """Return the contributor that alone puts the middle, or the worst point, off the most in 95 of 100 samples."""
+        """Return the contributor with the largest 95th percentile of the error of the centre, or of the worst point."""
         return max(self.alone, key=lambda name: float(np.quantile(getattr(self.alone[name], what), LEVEL)))
 
 
@@ -287,7 +287,7 @@ def compute_budget(
 
 
 def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | None]:
-    """The share of samples (S,) bool, and how far that is off, as bodies (S,) differ: clusters, of which it is a ratio.
+    """Return the share of samples (S,) bool, and its standard deviation with bodies (S,) as clusters (ratio estimator).
 
     Cochran (1977), "Sampling techniques", equation 2.46.
     """

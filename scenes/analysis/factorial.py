@@ -37,10 +37,10 @@ PLACES = ((0.0, 0.0), (6.0, 0.0), (0.0, 6.0))
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination: its levels, by factor, and the tumour's mean motion [mm] under known force and known motion.
+    """Combination of levels by factor, with the tumour's mean motion [mm] under prescribed force and prescribed motion.
 
-    The known motion is that of the tool under the force in the default body of the same opening and depth. NaN where a
-    load did not converge.
+    The prescribed motion is that of the tool under the force in the default body of the same opening and depth. NaN if
+    a load did not converge.
     """
 
     levels: Mapping[str, str | float]

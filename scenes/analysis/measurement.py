@@ -60,9 +60,9 @@ def measure_peak_memory() -> float | None:
 
 @contextmanager
 def watch_gpu_memory(device: str) -> Iterator[list[int]]:
-    """Yield the bytes of the card that are taken while the block runs, beyond those taken before.
+    """Yield the GPU memory [bytes] used while the block runs, in excess of that used before.
 
-    Zero without a card.
+    Zero without a GPU.
     """
     where = wp.get_device(None if device == "auto" else device)
     taken = [0]

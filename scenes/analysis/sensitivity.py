@@ -48,7 +48,7 @@ class Aim:
 
 @dataclass(frozen=True)
 class Variant:
-    """One thing changed: what, from where, to where, and the body and aim that say so."""
+    """Variant with one changed factor: its name, default and changed value, and the resulting body and aim."""
 
     what: str
     default: str
@@ -62,9 +62,9 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [
-        Variant("force or motion", "as drawn", "5 % off", body, Aim(share=0.05)),
-        Variant("its direction", "as drawn", "2 deg off", body, Aim(turn=np.radians(2.0))),
-        Variant("its position", "as drawn", "1 mm off", body, Aim(shift=1e-3)),
+        Variant("force or motion", "as drawn", "+-5 %", body, Aim(share=0.05)),
+        Variant("its direction", "as drawn", "+-2 deg", body, Aim(turn=np.radians(2.0))),
+        Variant("its position", "as drawn", "+-1 mm", body, Aim(shift=1e-3)),
         *(
             Variant(
                 "E", young, f"{step:+.0%}", replace(body, tissue=replace(tissue, young=(1.0 + step) * tissue.young))
@@ -118,7 +118,7 @@ class Change:
     Parameters
     ----------
     mean_mm, p95_mm, largest_mm
-        Of the distances between the two, over every load x vertex [mm].
+        Mean, 95th percentile and maximum of the difference, over every load x vertex [mm].
     worst95_mm
         95th percentile over loads of the largest vertex distance [mm], comparable with a surrogate's bound.
     percent
@@ -139,7 +139,7 @@ class Change:
 
 @dataclass(frozen=True)
 class SensitivityRow:
-    """A variant under tools of known force, and under tools of known motion."""
+    """Variant with its changes under tools of prescribed force, and of prescribed motion."""
 
     variant: Variant
     force: Change
@@ -166,15 +166,15 @@ class SensitivityStudy:
 
 
 def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[SensitivityRow]:
-    """First the default, whose change is its whole motion; then each variant's change from it.
+    """Yield the default, whose change is its whole motion, then each variant's change from it.
 
-    Known motions are those of the default under its forces: the mean motion of each footprint. Every solve starts at
-    the default's answer, so that where a load has several equilibria the same one is followed.
+    Prescribed motions are those of the default under its forces: the mean motion of each footprint. Every solve starts
+    at the default's solution, so that the same equilibrium is followed if a load has several.
 
     Raises
     ------
     InputError
-        An anatomy without tumour or open cortex; loads of another kind than `Pushed`; what `Fem` refuses.
+        An anatomy without tumour or open cortex; loads of another kind than `Pushed`; input rejected by `Fem`.
     """
     nodes, patch = study.anatomy.tumour_nodes, open_patch(study.anatomy)
     if not len(nodes):
@@ -227,9 +227,9 @@ def change(answer: Deformation, default: Deformation, origin: np.ndarray) -> Cha
 
 
 def match_motion(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
-    """Tools that move the tissue under them as far as `answer` says that the forces of `loads` do.
+    """Build tools with the tissue motion that the forces of `loads` have in `answer`.
 
-    The mean motion of each footprint, from the motion of the mesh's own vertices: on quadratic elements nearly.
+    The mean motion of each footprint is computed from corner vertices: approximate for quadratic elements.
     """
     cause = loads.get_only(Pushed)
     if cause is None:

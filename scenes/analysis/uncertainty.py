@@ -1,4 +1,4 @@
-"""The ensemble of a scene: bodies and tools drawn from priors, solved by finite elements, and how far they differ."""
+"""Ensemble of a scene: bodies and tools sampled from priors, solved by FEM, and their differences."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ SoundDraws = list[tuple[PatientSample, tuple[np.ndarray, ...]]]
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMotions:
-    """Motions of the tumour's surface at each moment, and how it lies.
+    """Motions and normals of the tumour's surface at each moment.
 
     Parameters
     ----------
     fields
-        Of the scene itself, at each moment (n, 3) [m]. Vertices differ where tissue was cut.
+        Displacements of the scene at each moment (n, 3) [m]. The vertices differ if tissue was cut.
     normals
-        Outward, at each moment (n, 3).
+        Outward normals at each moment (n, 3).
     """
 
     times: tuple[float, ...]
@@ -142,7 +142,7 @@ def get_tissue(scene: Scene) -> Material:
     Raises
     ------
     InputError
-        Another than of Young's modulus and Poisson's ratio, here or in a region.
+        A tissue without Young's modulus and Poisson's ratio, in the scene or in a region.
     """
     elasticity = scene.elasticity
     strange = [one for one in elasticity.regions.values() if not isinstance(one, Material)]
@@ -156,12 +156,12 @@ def get_tissue(scene: Scene) -> Material:
 
 
 def get_tumour_tissue(scene: Scene) -> Material:
-    """Return the tumour's tissue in a scene, or the brain's where it has none of its own.
+    """Return the tumour's tissue in a scene, or the brain's if the tumour has none.
 
     Raises
     ------
     InputError
-        As `get_tissue`.
+        See `get_tissue`.
     """
     brain, tumour = get_tissue(scene), scene.elasticity.regions.get(TUMOUR_LABEL)
     return tumour if isinstance(tumour, Material) else brain
@@ -203,9 +203,9 @@ def solve_nominal(theatre: PatientSetup, scene: Scene) -> SurfaceMotions:
 
 
 def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
-    """Return the tumour's motions at each moment; None where some has no equilibrium.
+    """Compute the tumour's motions at each moment; None if one of them has no equilibrium.
 
-    A moment that has none from the one before is gone to by way of times between.
+    If the step from the previous moment does not converge, intermediate times are solved.
     """
     fem, last, found, stage, before = (
         theatre.build_fem(scene, ACCURACY, batch=1),
@@ -250,12 +250,12 @@ def find_sound_draws(draws: Sequence[PatientSample], answers: Iterable[Answer]) 
 
 
 def filter_sound_draws(scene: Scene, draws: Sequence[PatientSample], answers: Iterable[Answer]) -> SoundDraws:
-    """Return the sound draws, as `find_sound_draws`, of a scene with enough of them.
+    """Return the sound draws, see `find_sound_draws`, of a scene; check that there are enough.
 
     Raises
     ------
     InputError
-        Too few draws have an equilibrium.
+        Too few draws with an equilibrium.
     """
     sound = find_sound_draws(draws, answers)
     if len(sound) < LEAST * len(draws):
@@ -276,7 +276,7 @@ def estimate_uncertainty(
     Raises
     ------
     InputError
-        Too few draws have an equilibrium.
+        Too few draws with an equilibrium.
     """
     answers = tuple(answers)
     sound = filter_sound_draws(scene, draws, answers)
@@ -330,7 +330,7 @@ def split_contributions(
 ) -> dict[str, float]:
     """Return each contributor's own error [m]: root mean square over the draws, at the worst surface point of each.
 
-    A linear fit of the draws (draws, n, 3) tells the causes apart; what it leaves is of several together.
+    A linear fit of the draws (draws, n, 3) separates the causes; its residual is their interaction.
     """
     off, columns = motion - field, collect_contributor_values(draws, scene)
     design = np.concatenate(list(columns.values()), axis=1)

@@ -49,7 +49,7 @@ PRESETS = {  # Values of the options that differ from the default, by preset.
     "superficial": {"cover": 3.0},
     "subcortical": {"cover": 10.0},
     "deep": {"cover": 25.0},
-    # Tonutti et al. 2017: forces from 20 mm off the centre of a tumour of 12 mm radius, 98 cm2 of cortex left free.
+    # Tonutti et al. 2017: forces act 20 mm from the centre of a tumour of 12 mm radius; 98 cm2 of exposed cortex.
     "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
 NOTED = 3.0
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     with time_stage("mesh"):
         anatomy = make_anatomy(subject, plan)
     for path in check_no_foreign_files(args.out, anatomy.digest, args.force):
-        print(f"{path}: was made with the anatomy that is replaced: simulate and train anew.", file=sys.stderr)
+        print(f"{path}: belongs to the replaced anatomy: simulate and train again.", file=sys.stderr)
     with time_stage("write the mesh"):
         intensity = subject.intensity and subject.intensity.crop(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
         write_anatomy(args.out, anatomy)
@@ -219,7 +219,7 @@ def _region(name: str, volume: float, figures: dict) -> str:
 def _sentences(figures: dict) -> str:
     lines = [
         "{nodes} nodes, {tets} tetrahedra; worst dihedral angle {worst_dihedral_deg} deg",
-        "brain {brain_ml:.0f} ml; surface off by {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
+        "brain {brain_ml:.0f} ml; surface error {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
         "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
         *(_region(name, volume, figures) for name, volume in figures["regions_ml"].items()),
         *(f"{name} {held} nodes that do not move" for name, held in figures["septa_nodes"].items()),

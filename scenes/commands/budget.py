@@ -1,4 +1,4 @@
-"""`sulcus budget`: how many millimetres to believe of an overlay on a tracked camera, and what takes most of them."""
+"""`sulcus budget`: error budget of an overlay on a tracked camera, by contributor."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ FEWEST_SAMPLES = 200  # Minimum number of samples.
 PUBLISHED = (2.2, 2.5)
 # Explanation under the table.
 NOTE = """
-"across" and "along" the line of sight are of the tumour's middle, "worst" of its worst surface point, 95 in 100 samples
-are below. "technical" is what camera, tracking, times and model are off by; "clinical" has also what nobody measures.
+"across" and "along" the line of sight: error of the tumour's centre; "worst": maximum surface error, 95th percentile.
+"technical": errors of camera, tracking, times and model; "clinical": also those of quantities that are not measured.
 """
 
 
@@ -91,12 +91,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve bodies, draw errors, and say what each contributor is worth. Returns 0.
+    """Solve bodies, sample errors, and report the contribution of each source. Returns 0.
 
     Raises
     ------
     InputError
-        What cannot be read, numbers out of range, or a scene that cannot be solved.
+        Unreadable files, numbers out of range, or a scene that cannot be solved.
     """
     from ..analysis.error_budget import Filmed, choose_moment, compute_budget, compute_velocity
     from ..analysis.uncertainty import sample_mesh_errors, solve_nominal, split_contributions
@@ -151,19 +151,19 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _seen(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
-    """Return the scene with a calibrated camera.
+    """Build the scene with a calibrated camera.
 
     Raises
     ------
     InputError
-        A scene whose tumour is found by what is seen, or whose tissue is none that is drawn; a camera that zooms.
+        A scene with an estimated tumour, a tissue without priors, or a camera that zooms.
     """
     from ..analysis.uncertainty import get_tissue
 
     scene = build_requested_scene(args, args.scene, theatre)
     if scene.sight is not None:
         raise InputError(
-            f"the scene {scene.name} finds its tumour by what is seen, and says its error: choose another."
+            f"the scene {scene.name} estimates the tumour position and reports its error: choose another scene."
         )
     get_tissue(scene)
     filmed = add_targets(args, scene)
@@ -192,14 +192,14 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
         return sample_usual_covariance(calibration)
     if args.camera is None:
         raise InputError("--intrinsics belongs to a camera: give it by --camera.")
-    wanted = "Give the K.json that `sulcus calibrate` wrote beside the camera."
+    wanted = "Give the K.json that `sulcus calibrate` wrote next to the camera."
     with read_as(path, "a covariance of intrinsics", wanted):
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
         covariance, values = np.array(stored["covariance"], float), np.array(stored["values"], float)
         if covariance.shape != (9, 9) or not np.isfinite(covariance).all() or not (np.diag(covariance) >= 0.0).all():
             raise InputError(f"its covariance is none of nine parameters. {wanted}")
         if not np.allclose(values[:4], [*calibration.focal, *calibration.principal], rtol=1e-3):
-            raise InputError(f"is of another camera, or of another size of its pictures, than --camera. {wanted}")
+            raise InputError(f"belongs to another camera or image size than --camera. {wanted}")
     return covariance
 
 
@@ -209,7 +209,7 @@ def _bodies(args: argparse.Namespace, theatre: PatientSetup, scene: Scene, count
     Raises
     ------
     InputError
-        Too few have one.
+        Too few bodies with an equilibrium.
     """
     from ..analysis.uncertainty import filter_sound_draws, solve_ensemble
     from ..script.priors import sample_priors
@@ -263,7 +263,7 @@ def _flat(args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: d
 
 
 def _figures(errors: OverlayErrors) -> dict[str, dict[str, float]]:
-    """Medians and 95 in 100 of one row."""
+    """Medians and 95th percentiles of one row."""
     columns = {
         "across_mm": 1e3 * errors.across, "along_mm": 1e3 * np.abs(errors.along), "pixels": errors.pixels,
         "middle_mm": 1e3 * errors.middle, "worst_mm": 1e3 * errors.worst,
@@ -286,13 +286,13 @@ def _lines(report: dict[str, Any]) -> list[str]:
         lines.append(f"{name:<29}" + "".join(f"{cell:>14}" for cell in cells) + f"{row['worst_mm']['p95']:>18.2f}")
     lines += [
         NOTE,
-        f"Most of it: {report['largest']['middle']} for the middle, {report['largest']['worst']} for the worst point.",
-        f"In 95 of 100 samples no point is off by {report['band_mm']:.1f} mm.",
+        f"Largest part: {report['largest']['middle']} (centre), {report['largest']['worst']} (maximum).",
+        f"In 95 % of the samples the maximum surface error is below {report['band_mm']:.1f} mm.",
     ]
     if report["held_twins"] is not None:
         off = report["held_twins_off"]
-        about = "" if off is None else f" (+- {off:.1%}, as these bodies differ)"
-        lines.append(f"On other bodies, with other errors, that held for {report['held_twins']:.1%}{about}.")
+        about = "" if off is None else f" (+- {off:.1%}, from the variation between these bodies)"
+        lines.append(f"On synthetic test cases with other errors, the coverage was {report['held_twins']:.1%}{about}.")
     low, high = report["published_mm"]
     place = "docs/notes/uncertainty_experiments.md"
-    return [*lines, f"Published errors of overlays, in the mean: {low:g} to {high:g} mm ({place})."]
+    return [*lines, f"Published mean overlay errors: {low:g} to {high:g} mm ({place})."]

@@ -64,16 +64,16 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Nothing, or two things to calibrate; files that cannot be read or written; data that do not determine the
+        No input, or two kinds of input; files that cannot be read or written; data that do not determine the
         result.
     """
     asked = [each for each in (args.pictures, args.pivot, args.hand_eye) if each is not None]
     if len(asked) != 1:
-        raise InputError("give one of a video or a folder of pictures, --pivot POSES.csv, or --hand-eye A.csv B.csv.")
+        raise InputError("give a video or a folder of images, --pivot POSES.csv, or --hand-eye A.csv B.csv.")
     if args.pictures is not None:
         return _camera(args)
     if args.out or args.size:
-        raise InputError("--out and --size belong to pictures of the board: leave them out, and take --json.")
+        raise InputError("--out and --size require images of the board: leave them out, and use --json.")
     return _tip(args) if args.pivot is not None else _bodies(args)
 
 
@@ -117,10 +117,10 @@ def _camera(args: argparse.Namespace) -> int:
     if args.json:
         print(to_json_line(report))
         return 0
-    print(f"{seen.looked_at} pictures, the board in {len(seen.views)}, {len(found.used)} views used")
+    print(f"{seen.looked_at} images, the board in {len(seen.views)}, {len(found.used)} views used")
     if found.left_out:
-        print(f"left out, for they fit badly: {', '.join(found.left_out)}")
-    print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered:.0f} % of the picture")
+        print(f"held out because of a large residual: {', '.join(found.left_out)}")
+    print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered:.0f} % of the image")
     for name, value, deviation in zip(report["parameters"], found.values, found.deviations, strict=True):
         print(f"{name} {value:.6g} +- {deviation:.2g}{' px' if name[0] in 'fc' else ''}")
     if found.covered < WANTED_COVER:

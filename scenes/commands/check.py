@@ -88,8 +88,8 @@ def run(args: argparse.Namespace) -> int:
             "tumour_error_unobserved_mm": _mm(error.prior),
         }
         print(
-            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_who(scene, name)} is off by {figures.error_mm:.3f} "
-            f"mm of the {figures.motion_mm:.2f} mm that it moves. Its outline is off by {figures.drawn:.1f} px, "
+            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_who(scene, name)}: error {figures.error_mm:.3f} "
+            f"mm at a motion of {figures.motion_mm:.2f} mm. Outline error {figures.drawn:.1f} px, "
             f"overlap {figures.overlap:.3f} (1 is best). {figures.leaked:.0%} leaks out of the "
             f"skull{_bond(figures.bond)}{_estimates(figures)}",
             file=table,
@@ -114,9 +114,9 @@ def _tracking(args: argparse.Namespace, theatre: PatientSetup, table: TextIO) ->
     figures = measure_tracking(film, *build_default_pipeline(film, args.style))
     broken = figures.find_violations()
     print(
-        f"{TRACKING:11s} {'FAILS' if broken else 'passes'}  markers covered, pictures repeated, late and missing: "
-        f"{figures.confident} of {figures.pictures} pictures draw a lost or old place as known, {figures.unsaid} do "
-        f"not say so. Known places are off by {figures.off:.1f} px, and known again after {figures.back:g} pictures",
+        f"{TRACKING:11s} {'FAILS' if broken else 'passes'}  markers covered; images repeated, late and missing: "
+        f"{figures.confident} of {figures.pictures} images draw a lost or old position as valid, {figures.unsaid} do "
+        f"not report it. Error of valid positions {figures.off:.1f} px; valid again after {figures.back:g} images",
         file=table,
     )
     for sentence in broken:
@@ -125,7 +125,7 @@ def _tracking(args: argparse.Namespace, theatre: PatientSetup, table: TextIO) ->
 
 
 def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
-    """Return the largest of a scene's frames: what the model promises [m], and how far the tumour may be off."""
+    """Return the maxima over a scene's frames: error bound of the model [m], and tumour position error."""
     from ..play.frame_text import find_worst
 
     promised = [frame.model_error for frame in frames if frame.model_error is not None]
@@ -138,12 +138,12 @@ def _mm(metres: float | None) -> float | None:
 
 def _who(scene: Scene, name: str) -> str:
     """Describe what is compared with FEM: the tumour of a deformation model, or an estimated one."""
-    return f"{name}: the tumour" if scene.sight is None else f"{name} is the truth; the estimate of the tumour"
+    return f"{name}: the tumour" if scene.sight is None else f"{name} is the reference; tumour estimate"
 
 
 def _bond(share: float) -> str:
     """Describe how close the skull's bond is to its strength, if there is one."""
-    return f", whose bond bears {share:.0%} of its strength" if math.isfinite(share) else ""
+    return f", bond at {share:.0%} of its strength" if math.isfinite(share) else ""
 
 
 def _estimates(figures: SceneFigures) -> str:

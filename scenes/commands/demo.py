@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> int:
 
     if args.scene.isdecimal() or Path(args.scene).suffix.lower() in FILMS or Path(args.scene).is_dir():
         own = f"sulcus overlay {args.scene} --page --camera K.yaml --registration R.json --tool T.json"
-        raise InputError(f"{args.scene} is no scene. For a film or a camera of your own: {own}")
+        raise InputError(f"{args.scene} is not a scene. For your own video or camera: {own}")
     if not args.seconds > 0.0:
-        raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
+        raise InputError(f"--seconds {args.seconds:g}: must be > 0; or leave it out.")
     list_addresses(args)
     find_device(args.device, LIVE.precision)
     # One thread for all kernels of the first image: each compilation reads Warp's headers first, for two seconds.

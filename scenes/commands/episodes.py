@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         with interrupt_on_termination() as stop_if_asked:
             return _made(args, plan, out, stop_if_asked)
     except KeyboardInterrupt:
-        print(f"stopped; the same command goes on in {out}", file=sys.stderr)
+        print(f"stopped; run the same command again to resume in {out}", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -165,7 +165,7 @@ def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Wo
 def _progress(
     out: Path, there: RunStatistics, total: int, stop_if_asked: Callable[[], None]
 ) -> Iterator[ProgressListener]:
-    """Yield a bar of episodes, with frames a second and what failed; and what each task took, into the folder."""
+    """Yield a listener that shows progress (frames per second, failures) and records task durations in the folder."""
     from tqdm import tqdm
 
     from ..episodes.engine import BODY

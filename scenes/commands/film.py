@@ -108,11 +108,11 @@ def run(args: argparse.Namespace) -> int:
     theatre = build_requested_theatre(args, args.scene)
     scene = _scene(args, theatre)
     if all("gap" in taking.list_disturbances(time) for time in scene.times[:: args.every].tolist()):
-        raise InputError("no picture would be taken: give --seconds and --trouble that leave some.")
+        raise InputError("no image would be recorded: choose --seconds and --trouble that leave some.")
     _demand_troubles(taking.troubles, scene.times[:: args.every])
     calibration = scene.viewpoint.calibration
     assert calibration is not None
-    folder = check_output_folder(args.out, "film and its truth")
+    folder = check_output_folder(args.out, "video and its ground truth")
     paths = {name: check_output_path(folder / name, Path(name).suffix, args.force) for name in FILES}
     player = theatre.build_player(args.deformer or "fem", scene)
     mounts = mount_targets(player)
@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
     write_table(paths["truth.csv"], truth, player.stage.tumour_at_rest.vertices)
     moved = 1e3 * float(np.linalg.norm(truth.displacement, axis=2).mean(axis=1).max())
     report = {"scene": scene.name, "frames": len(shots), "film": str(film), "tumour_moves_mm": moved}
-    said = f"{len(shots)} pictures of {scene.name}, in which the tumour moves by up to {moved:.2f} mm: {film}"
+    said = f"{len(shots)} images of {scene.name}; maximum tumour displacement {moved:.2f} mm: {film}"
     print(to_json_line(report) if args.json else said)
     return 0
 
@@ -143,13 +143,13 @@ def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
     for each in troubles:
         if not ((each.since <= times) & (times < each.until)).any():
             raise InputError(
-                f"--trouble {each.kind}:{each.since:g}-{each.until:g} meets no picture of this film, which ends at "
-                f"{times[-1]:.2f} s: give times within it, or a smaller --every."
+                f"--trouble {each.kind}:{each.since:g}-{each.until:g} contains no image of this video, which ends at "
+                f"{times[-1]:.2f} s: choose times within it, or a smaller --every."
             )
 
 
 def _scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
-    """Return the scene as the camera sees it, and no longer than is asked for."""
+    """Return the scene with its tracked camera, limited to the requested duration."""
     scene = add_targets(args, build_requested_scene(args, args.scene, theatre))
     if args.readout is not None:
         view = scene.viewpoint
@@ -188,6 +188,6 @@ def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: li
             screen.show(number, colour)
         return frames
     except OSError as error:
-        raise InputError(f"{args.out}: the film cannot be written ({explain_error(error)}). {REMEDY}") from error
+        raise InputError(f"{args.out}: the video cannot be written ({explain_error(error)}). {REMEDY}") from error
     except ValueError as error:
         raise InputError(str(error)) from error

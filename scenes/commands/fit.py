@@ -1,4 +1,4 @@
-"""`sulcus fit`: what tissue a patient has, from what is seen of the open cortex in several frames."""
+"""`sulcus fit`: estimate a patient's tissue from observations of the open cortex in several frames."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def find_fitted_tissue(path: Path | None, anatomy: Path, digest: str) -> FittedT
     Raises
     ------
     InputError
-        As `load_tissue`; a requested file that is missing.
+        See `load_tissue`; a requested file that is missing.
     """
     from surrogate.fitting.tissue import load_tissue, to_tissue_path
 

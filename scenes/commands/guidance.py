@@ -21,7 +21,7 @@ next: open moved.vtu in ParaView; `displacement` is in metres""",
 next: sulcus train brain.h5 --out brain.model.npz""",
     "train": """example:
   sulcus train brain.h5 --out brain.model.npz --learners linear,series,series-gp
-next: sulcus demo --anatomy brain.vtu, which finds brain.model.npz beside the mesh; or sulcus judge""",
+next: sulcus demo --anatomy brain.vtu, which finds brain.model.npz next to the mesh; or sulcus judge""",
     "judge": """example:
   sulcus simulate brain.vtu --out fresh.h5 --count 200 --seed 1
   sulcus judge brain.model.npz fresh.h5
@@ -40,14 +40,14 @@ next: open located.vtu in ParaView; `displacement` and `deviation` are in metres
     "locator": """examples:
   sulcus locator patient.vtu
   sulcus locator patient.vtu --small
-next: sulcus demo sag --anatomy patient.vtu, which finds patient.locator.npz beside the mesh""",
+next: sulcus demo sag --anatomy patient.vtu, which finds patient.locator.npz next to the mesh""",
     "fit": """examples:
   sulcus fit patient.vtu drained1.csv drained2.csv pressed.csv --tool-log tools.csv
   sulcus fit patient.vtu drained1.csv drained2.csv --rigid 0.3 --json
 next: sulcus uncertainty press --anatomy patient.vtu, which draws its bodies from patient.tissue.json""",
     "scenes": """examples:
   sulcus scenes
-  sulcus scenes --out pictures
+  sulcus scenes --out images
 next: sulcus demo palpate""",
     "effects": """example:
   sulcus effects press --every 20
@@ -70,17 +70,17 @@ next: sulcus validate, before you share the data set""",
     "validate": """examples:
   sulcus validate press.h5
   sulcus validate episodes --solve 3 --json
-next: make broken episodes anew, or remove them""",
+next: make broken episodes again, or remove them""",
     "episodes": """examples:
   sulcus episodes small --count 8 --out data
   sulcus episodes small --count 1000000 --out data --estimate
 next: give the same command on every machine that sees the folder""",
     "markers": """example:
   sulcus markers --out markers
-next: print markers/markers.pdf at 100 %, measure its rulers, glue; then film the board for sulcus calibrate""",
+next: print markers/markers.pdf at 100 %, measure its rulers, glue; then record the board for sulcus calibrate""",
     "track": """example:
   sulcus track film.mp4 --camera camera.yaml --reference-frame patient --out tool.csv
-next: sulcus calibrate --pivot tool.csv, where the film shows the tool pivoting""",
+next: sulcus calibrate --pivot tool.csv, if the video shows the tool pivoting""",
     "warp": """examples:
   sulcus warp patient.vtu --scene press --frame-number 60 --image t1.nii.gz --out warp
   sulcus warp patient.vtu --located located.vtu --image t1.nii.gz --out warp
@@ -88,11 +88,11 @@ next: read warp/README.txt""",
     "film": """examples:
   sulcus film palpate --out film --path hand-held
   sulcus film palpate --out film --trouble reference:1-1.5 --trouble bright:2.5-2.8
-next: sulcus overlay film/film.mp4 --camera film/camera.yaml --registration ..., as docs/overlay.md has it""",
+next: sulcus overlay film/film.mp4 --camera film/camera.yaml --registration ... (see docs/overlay.md)""",
     "overlay": """examples:
   sulcus overlay film.mp4 --camera K.yaml --registration R.json --tool T.json --out shown.mp4
   sulcus overlay 0 --camera K.yaml --registration R.json --tool T.json
-next: look at the film that it wrote""",
+next: look at the video that it wrote""",
     "link": """examples:
   sulcus link patient.vtu --model poses.model.npz --registration registration.json
   sulcus link patient.vtu --model poses.model.npz --client localhost --port 18945
@@ -100,18 +100,18 @@ next: look at the film that it wrote""",
 next: add a client of localhost in 3D Slicer's OpenIGTLinkIF; docs/external_tracker.md names what comes""",
     "calibrate": """examples:
   sulcus calibrate board.mp4 --out camera.yaml
-  sulcus calibrate pictures --size 1280x960 --out camera.yaml --json
+  sulcus calibrate images --size 1280x960 --out camera.yaml --json
   sulcus calibrate --pivot poses.csv
   sulcus calibrate --hand-eye tool.csv camera.csv
 
-columns of poses: time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw, from the body to its tracker; others are passed over
+columns of poses: time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw, from the body to its tracker; other columns are ignored
 
 next: look at the rms and the standard deviations; a good camera has less than 0.3 px""",
     "register": """examples:
   sulcus register touched.csv --anatomy patient.vtu --out registration.json
   sulcus register touched.csv --anatomy patient.vtu --surface traced.csv --out registration.json
 
-px,py,pz in touched.csv: the tip's place beside the patient's reference, from sulcus track
+px,py,pz in touched.csv: position of the tip relative to the patient's reference, from sulcus track
 
 next: look at the error at the tumour; with 5 mm, touch more points, all round the head""",
     "budget": """examples:
@@ -124,7 +124,7 @@ next: open the table in a spreadsheet""",
     "uncertainty": """examples:
   sulcus uncertainty press --anatomy patient.vtu
   sulcus uncertainty press palpate --draws 40 --twins 20 --out tried.json
-next: sulcus demo press --anatomy patient.vtu, whose picture and words have it""",
+next: sulcus demo press --anatomy patient.vtu, which shows both errors""",
     "report": """example:
   sulcus report --quick --out report
 next: open report/index.html""",

@@ -40,25 +40,25 @@ class Inspection:
     brain, tumour
         Volumes.
     pieces
-        Of the tumour: volume and place in words, the largest first.
+        Pieces of the tumour: volume and position in words, the largest first.
     parts
-        Volumes of the other tissues that the labels tell.
+        Volumes of the other tissues in the label map.
     regions
-        What the tumour is made of, and those of the parts that become regions, in words.
+        Descriptions of the tumour's tissue and of the parts that become regions.
     depth
-        From the tumour to the nearest cortex.
+        Distance from the tumour to the nearest cortex.
     opening
-        Where its middle lies (RAS).
+        Position of its centre (RAS).
     place
-        The same in words.
+        Description of that position.
     distance
-        From the middle of the opening to the tumour.
+        Distance from the centre of the opening to the tumour.
     voxel
-        Edges; lengths here are off by up to the longest.
+        Edge lengths; the longest bounds the error of the lengths here.
     axes, mirrored
-        Where the file's axes point, as three letters of R or L, A or P, S or I; whether they are left-handed.
+        Directions of the file's axes, as three letters of R or L, A or P, S or I; True if they are left-handed.
     warnings
-        Sentences.
+        Warnings, as sentences.
     """
 
     brain: float

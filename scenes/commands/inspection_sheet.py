@@ -58,9 +58,9 @@ class InspectionView:
     right, down
         Unit vectors (3,) along the image's columns and rows.
     middle
-        (3,) [m]: what its middle shows.
+        Position (3,) [m] of the image's centre.
     reach
-        [m] Half of its side.
+        Half of its side length [m].
     """
 
     name: str

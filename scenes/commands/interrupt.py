@@ -29,15 +29,15 @@ class Ended(BaseException):
 
 
 def run_until_ended(work: Callable[[ExitStack], int]) -> int:
-    """Return what `work` returns, once it has cleaned up; at a signal, clean up and leave the process at once.
+    """Run `work`, clean up and return its result; at a signal, clean up and exit the process immediately.
 
-    A thread of its own does the work: the main thread, which alone hears signals, is free to hear them while the work
-    is in a long call. What is computed at a signal is dropped with the process: no file is open for writing here.
+    The work runs in its own thread, so that the main thread, which receives signals, is free during long calls.
+    Results computed during a signal are dropped: no file is open for writing here.
 
     Parameters
     ----------
     work
-        Puts what closes it on the stack it is given.
+        Function that registers its cleanup on the given stack.
     """
     closing = ExitStack()
     if threading.current_thread() is not threading.main_thread():
@@ -69,10 +69,10 @@ def run_until_ended(work: Callable[[ExitStack], int]) -> int:
 
 @contextmanager
 def interrupt_on_termination() -> Iterator[Callable[[], None]]:
-    """Do at SIGTERM what Ctrl-C does: clean up, and end what was started.
+    """Treat SIGTERM like Ctrl-C: clean up, and end started processes.
 
-    Python drops an error that a finaliser raises: a signal that comes while one runs is repeated after it. Long work
-    also calls the function that is yielded, now and then: it raises KeyboardInterrupt if a signal came.
+    Python drops errors of finalisers: a signal during a finaliser is repeated after it. Long work should also call the
+    yielded function regularly: it raises KeyboardInterrupt after a signal.
     """
     came, over = threading.Event(), threading.Event()
 

@@ -1,4 +1,4 @@
-"""`sulcus judge`: hold models to a data set that they have never seen: their errors, and whether their bounds hold."""
+"""`sulcus judge`: evaluate models on an independent data set: errors, and coverage of their bounds."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         figures["force"] = {name: asdict(found) for name, found in forces.items()}
         print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": compute_rejected_share(preset)}))
     else:
-        print(f"{len(loads)} loads, against the finite elements that answered them:\n{format_scores(scores, motion)}")
+        print(f"{len(loads)} loads, compared with their FEM solutions:\n{format_scores(scores, motion)}")
         if describe_rejected(preset):
             print(describe_rejected(preset))
         for name in models:

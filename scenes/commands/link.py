@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
     if len(names.by_wire) < len(NAMES):
         raise InputError(f"{', '.join(NAMES)}: must differ in their first 20 characters, which messages carry.")
     if args.host not in ("127.0.0.1", "localhost", "::1"):
-        said = "OpenIGTLink asks for no password: whoever reaches this address may move the tumour that all see"
+        said = "OpenIGTLink has no password: every program that can reach this address can move the displayed tumour"
         print(f"sulcus link: {said}", file=sys.stderr)
     source = None if args.client is None else parse_address(args.client)
     if source is not None and source[1] == args.port and is_here(source[0], args.host):
@@ -225,12 +225,12 @@ def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: E
 
 
 def open_link(args: argparse.Namespace) -> LinkSession:
-    """Return the link that the arguments ask for; in an event loop.
+    """Return the requested link; call it in an event loop.
 
     Raises
     ------
     InputError
-        As `run`.
+        See `run`.
     """
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
@@ -258,7 +258,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
         else describe_other_mesh(registration, theatre.anatomy, str(args.registration))
     )
     if registration is None or registration.scanned is None:
-        said += ". Every answer is doubtful: give --registration with a file of `sulcus register --anatomy`"
+        said += ". All results are unreliable: give --registration with a file of `sulcus register --anatomy`"
     if said:
         print(f"sulcus link: {said}", file=sys.stderr)
     tool = tool or _tool_of(theatre, args.anatomy)
@@ -294,7 +294,7 @@ def _tool_of(theatre: PatientSetup, path: Path) -> TrackedTool:
     posed = [(model.bound, model.tool) for model in theatre.models.values() if model.tool is not None]
     if not posed:
         raise InputError(
-            f"no model beside {path} knows a tool's poses. Give --tool TOOL.json with --deformer fem, or make a model: "
+            f"no model next to {path} supports tool poses. Give --tool TOOL.json with --deformer fem, or train one: "
             "`sulcus simulate --pose-control`, `sulcus train`."
         )
     return TrackedTool(min(posed, key=lambda each: each[0])[1], np.diag([1.0, -1.0, -1.0, 1.0]))

@@ -1,4 +1,4 @@
-"""`sulcus locate`: where the tumour is, from what is seen of the open cortex, with what is not known of it."""
+"""`sulcus locate`: estimate the tumour position, with covariance, from observations of the open cortex."""
 
 from __future__ import annotations
 
@@ -122,12 +122,12 @@ def _numbers(found: Location, points: int, regions: tuple[Region, ...], out: Pat
 
 def _sentences(found: Location, out: Path | None) -> str:
     x, y, z = (round(value, 1) + 0.0 for value in 1e3 * found.centroid)  # a zero has no sign
-    sure = "With a probability of 95 %" if found.calibrated else "At a guess"
+    sure = "With a probability of 95 %" if found.calibrated else "As a rough estimate"
     lines = [
-        f"The middle of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",
-        f"{sure} it is within {1e3 * found.p95:.1f} mm of there.",
-        f"The motion explains {found.explained:.0%} of what was seen. Causes: {found.named_causes}.",
-        f"The observation as a whole seems off by {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
+        f"The centre of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",
+        f"{sure} its error is at most {1e3 * found.p95:.1f} mm.",
+        f"The motion explains {found.explained:.0%} of the observations. Causes: {found.named_causes}.",
+        f"Estimated registration shift of the observation: {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
     ]
     lines += _warnings(found)
     return "\n".join(lines if out is None else [*lines, f"written: {out}"])

@@ -75,7 +75,7 @@ def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, reg
     from surrogate.locating.causes import Causes
     from surrogate.locating.locator_store import make_locator
 
-    print(f"sulcus: {path} takes minutes to make; if it is stopped, the same command goes on", file=sys.stderr)
+    print(f"sulcus: {path} takes minutes to build; if interrupted, run the command again to resume", file=sys.stderr)
     with tqdm(file=sys.stderr) as bar:
 
         def progress(stage: str, done: int, total: int) -> None:
@@ -86,12 +86,12 @@ def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, reg
 
 
 def find_locator(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
-    """Load the locator next to the anatomy, or make one; it covers every vertex, unless it may be `small`.
+    """Load the locator next to the anatomy, or build one; it covers every vertex, unless it may be `small`.
 
     Raises
     ------
     InputError
-        As `load_locator`; a small one; one of other regions than those requested.
+        See `load_locator`; a small locator; a locator of other regions than those requested.
     """
     from surrogate.locating.locator_store import load_locator, save_locator, to_locator_path
     from surrogate.locating.regions import describe_regions
@@ -124,7 +124,7 @@ def list_regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Regi
     Raises
     ------
     InputError
-        As `parse_region_tissues` and `list_known_regions`; a statement that is no tissue.
+        See `parse_region_tissues` and `list_known_regions`; a value that is not a tissue.
     """
     from sim.effects import Elasticity
     from surrogate.locating.regions import list_known_regions

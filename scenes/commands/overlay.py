@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_skull_argument(parser)
     add_element_argument(parser)
-    add_device(parser, "finite elements and pictures")
+    add_device(parser, "FEM and images")
     add_json(parser)
     add_force(parser)
 
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
 
     camera = args.pictures.isdecimal() and not Path(args.pictures).exists()
     if not 0.0 < args.rate < np.inf:
-        raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
+        raise InputError(f"--rate {args.rate:g}: frame rate [1/s] must be > 0.")
     if camera or args.page:
         return run_until_ended(partial(_served, args, camera))
     inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth, args.covered]
@@ -160,7 +160,7 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     films = {"--out": args.out, "--truth": args.truth, "--covered": args.covered, "--poses": args.poses}
     given = [name for name, value in (films | {"--live": args.live or None}).items() if value is not None]
     if given:
-        raise InputError(f"{', '.join(given)}: for films without a page. Leave it out here.")
+        raise InputError(f"{', '.join(given)}: not supported with --page. Leave it out.")
     list_addresses(args)
     if not args.seconds > 0.0:
         raise InputError(f"--seconds {args.seconds:g}: give a positive number, or leave it out.")
@@ -220,7 +220,7 @@ def _ended(
 
 def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
     if path.suffix not in FILMS:
-        raise InputError(f"{path}: films are written as {', '.join(FILMS)}; give a name that ends so.")
+        raise InputError(f"{path}: unsupported video type: expected {', '.join(FILMS)}.")
     return check_output_path(path, path.suffix, force, inputs)
 
 
@@ -240,7 +240,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     from ..tracked.tracked_tool import read_tool
 
     if args.tool is None and args.deformer not in (None, REST):
-        raise InputError(f"--deformer {args.deformer} answers for a tool's poses: give --tool TOOL.json, too.")
+        raise InputError(f"--deformer {args.deformer} requires tool poses: give --tool TOOL.json, too.")
     for path in (args.anatomy, args.model, args.truth):
         if path is not None and not Path(path).is_file():
             raise InputError(f"{path}: no such file. See whether its name is right.")
@@ -314,17 +314,17 @@ def _report(shown: list[Shown], who: str) -> dict[str, object]:
 def _words(report: dict) -> str:
     """Return the same for people."""
     count, latency = report["pictures"], report["latency"]
-    lines = [f"{count} pictures; motion by {report['motion_by']}"]
+    lines = [f"{count} images; motion by {report['motion_by']}"]
     lines += [f"  {100.0 * number / count:5.1f} %  {state}" for state, number in report["states"].items()]
     lines.append(f"{latency['what']}: {latency['p50_ms']:.0f} ms (median), {latency['p95_ms']:.0f} ms (95 %)")
     off = report.get("off")
     if off and off["pictures"]:
         lines += [
-            f"off, where it is drawn as known ({off['pictures']} pictures), median and 95 %:",
+            f"error where the position is valid ({off['pictures']} images), median and 95th percentile:",
             f"  outline {off['outline_px_p50']:.1f}, {off['outline_px_p95']:.1f} px; overlap {off['overlap_p50']:.3f}",
-            f"  middle {off['middle_mm_p50']:.2f}, {off['middle_mm_p95']:.2f} mm; worst point "
+            f"  centre {off['middle_mm_p50']:.2f}, {off['middle_mm_p95']:.2f} mm; maximum "
             f"{off['worst_mm_p50']:.2f}, {off['worst_mm_p95']:.2f} mm across the view",
-            f"  the band of {off['band_mm_p50']:.2f} mm holds it in {off['held_percent']:.0f} %; wrong: {off['wrong']}",
+            f"  error band {off['band_mm_p50']:.2f} mm: coverage {off['held_percent']:.0f} %; wrong: {off['wrong']}",
         ]
     lines += [f"written: {report[name]}" for name in ("out", "table") if report[name]]
     return "\n".join(lines)

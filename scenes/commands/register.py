@@ -97,18 +97,18 @@ def _stored(fits: PairResiduals) -> dict[str, object]:
 
 
 def _table(fits: PairResiduals) -> list[str]:
-    """Return the same for people: a row for each pair, and what the worst one means."""
+    """Format the residuals: a row for each pair, and a warning about the worst one."""
     if np.isnan(fits.chance):
         rows = [f"{row + 1:4d} {1e3 * off:7.2f} mm" for row, off in enumerate(fits.off)]
-        return ["pair   is off", *rows, "three pairs do not tell a wrong one: touch a fourth, better six"]
-    lines = ["pair   is off   beside the others   of what they allow"]
+        return ["pair    error", *rows, "three pairs cannot show an outlier: touch a fourth, better six"]
+    lines = ["pair    error      held-out error   studentised error"]
     for row, (off, left, times) in enumerate(zip(fits.off, fits.left_out, fits.studentised, strict=True)):
         lines.append(f"{row + 1:4d} {1e3 * off:5.2f} mm {1e3 * left:16.2f} mm {times:17.1f} x")
     worst = fits.worst
     if fits.suspect:
         lines.append(
-            f"pair {worst + 1} is suspect: it lies {1e3 * fits.left_out[worst]:.1f} mm from where the others have it. "
-            f"In {100.0 * fits.chance:.2g} % of sound sets one fits as badly. Touch it again, or leave it out"
+            f"pair {worst + 1} may be an outlier: it is {1e3 * fits.left_out[worst]:.1f} mm from the others' fit. "
+            f"{100.0 * fits.chance:.2g} % of sets without outliers have this residual. Touch it again, or leave it out"
         )
     return lines
 

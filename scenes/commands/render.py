@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     check_output_folder(args.out, "frames")
     if args.film is not None:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):
-            raise InputError(f"{args.film}: films are written as .mp4, .gif or .webp; give a name that ends so.")
+            raise InputError(f"{args.film}: unsupported video type: expected .mp4, .gif or .webp.")
         check_output_path(args.film, args.film.suffix, args.force, [args.camera])
     theatre = build_requested_theatre(args, args.scene)
     scene = apply_camera_options(args, build_requested_scene(args, args.scene, theatre))
@@ -67,8 +67,8 @@ def run(args: argparse.Namespace) -> int:
     film, who = None if args.film is None else str(args.film), theatre.describe_deformer(name, scene)
     report = {"scene": scene.name, "deformer": name, "solver": who, "frames": len(written), "not_good": bad}
     report |= {"out": str(args.out), "film": film}
-    beside = "" if film is None else f", film {film}"
-    unanswered = f"; answers that did not converge or are extrapolated: {bad}" if bad else ""
+    beside = "" if film is None else f", video {film}"
+    unanswered = f"; solutions that did not converge or are extrapolated: {bad}" if bad else ""
     said = f"{len(written)} frame{'s' * (len(written) != 1)} by {who}, written to {args.out}{beside}{unanswered}"
     print(json.dumps(report) if args.json else said)
     return 1 if bad else 0

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         sections = _measured(args)
     except KeyboardInterrupt:
-        print(f"stopped; the same command goes on from {args.out}", file=sys.stderr)
+        print(f"stopped; run the same command again to resume from {args.out}", file=sys.stderr)
         return INTERRUPTED
     _say(args, sections)
     return 0 if all(row.state == "measured" for part in sections for row in part.rows) else 1
@@ -87,9 +87,9 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     if args.loads is not None and args.loads < 1:
         raise InputError(f"--loads {args.loads} plays nothing: give at least 1.")
     if args.data and args.anatomy:
-        raise InputError("--anatomy says nothing beside --data, which brings its own: leave one of them out.")
+        raise InputError("--anatomy cannot be combined with --data, which contains an anatomy: leave one of them out.")
     if len({path.stem for path in args.data}) < len(args.data):
-        raise InputError("two of the data sets have one name, which their rows would share: rename one.")
+        raise InputError("two of the data sets have the same name: rename one.")
     paths = args.data
     if not paths:
         paths = [args.out / "palpation.h5"]

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
             write_png(args.out / "sheet.png", tile_images(list(pictures.values())))
         except OSError as error:
             raise InputError(
-                f"{args.out}: the pictures cannot be written ({explain_error(error)}). {REMEDY}"
+                f"{args.out}: the images could not be written ({explain_error(error)}). {REMEDY}"
             ) from error
     if args.json:
         print(json.dumps({"scenes": rows, "out": None if args.out is None else str(args.out)}))

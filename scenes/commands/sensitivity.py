@@ -31,18 +31,18 @@ WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
 """Widths of the table's columns [characters]: a line fits into 120."""
 # Explanation under the table.
 NOTE = """
-One thing is changed at a time. F: tools of known force. M: the same tools of known motion, namely what those forces
-give by default. The columns say how far the tumour is from where it is by default, over load x vertex. Mean [mm]; 95
-[mm], which in 95 of 100 loads no vertex exceeds, as a surrogate's bound is stated. %: the mean over the motion; x:
-the motion over that by default. --out and --json give the 95th percentile and the largest too. What a tool is off by
-counts in every way in which it can be: more and less, about two axes, to four sides along the cortex.
+One factor is changed at a time. F: tools of prescribed force. M: the same tools with the motion of the default under
+those forces. Columns: difference of the tumour's displacement from the default. Mean [mm]: over load x vertex; 95 [mm]:
+95th percentile over loads of the maximum vertex difference, comparable with a surrogate's bound. %: mean difference
+relative to the motion; x: motion relative to the default's. --out and --json also give the 95th percentile over load x
+vertex and the maximum. Tool errors are computed for more and less, about two axes, to four sides along the cortex.
 """
 
 # Influence of the element on the rows of nu, measured by `python -m benchmarks elements` on the default brain.
 LOCKING = {
-    "p1": "Linear tetrahedra lock as nu nears 0.5: much of what nu does here is theirs. Take --element smoothed.",
-    "smoothed": "Smoothed elements, because linear ones lock as nu nears 0.5; at 0.495 these still lose some 5 %.",
-    "p2": "Quadratic elements lock little: at nu 0.495 they still lose some 4 %.",
+    "p1": "Linear tetrahedra lock as nu approaches 0.5: much of its effect here is locking. Use --element smoothed.",
+    "smoothed": "Smoothed elements, because linear ones lock as nu nears 0.5; at 0.495 these still lose about 5 %.",
+    "p2": "Quadratic elements lock little: at nu 0.495 they still lose about 4 %.",
 }
 
 
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve them all; 1 if one did not converge."""
+    """Solve all variants; return 1 if one did not converge."""
     from ..analysis.measurement import describe_machine, write_table
     from ..analysis.sensitivity import BodyVariant, SensitivityStudy, list_variants, measure_variants
     from ..play.deformers import open_theatre
@@ -186,20 +186,20 @@ def _remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | No
     """List remarks that a reader of the table needs, in sentences."""
     said = []
     if failed:
-        said.append(f"{failed} solves did not converge: they, and what is compared with them, are in no figure.")
+        said.append(f"{failed} solves did not converge: they and their comparisons are excluded.")
     if model is not None and _bound(model):
         stated = _stated(model)
         said.append(
-            f"The surrogate's error is its stated bound on held-out {stated['preset']} loads against its own "
-            f"finite elements, of the kind {stated['element']}. How far off those are, --compare says."
+            f"Surrogate error: reported bound on held-out {stated['preset']} loads relative to its own "
+            f"FEM with element {stated['element']}. Use --compare for the error of that element."
         )
     else:
-        said.append("No surrogate's error stands beside: no model with a bound lies beside this anatomy (--model).")
+        said.append("No surrogate error is given: there is no model with a bound next to this anatomy (--model).")
     said.append(LOCKING[study.body.element])
     if not beside:
-        said.append("The mesh's own error is not known here: --compare p2 compares quadratic elements on this mesh.")
+        said.append("The discretisation error is not available: --compare p2 compares quadratic elements on this mesh.")
     if not study.anatomy.slide_normal.any():
-        said.append("This anatomy has no skull: what it does has no row.")
+        said.append("This anatomy has no skull: there is no row for the skull.")
     return said
 
 

@@ -148,14 +148,14 @@ def run(args: argparse.Namespace) -> int:
             solved = simulate(out, solver.deformer, loads, provenance, solver.batch, progress)
         except KeyboardInterrupt:
             bar.close()  # its line ends
-            print(f"stopped; the same command goes on from {to_unfinished_path(out)}", file=sys.stderr)
+            print(f"stopped; run the same command again to resume from {to_unfinished_path(out)}", file=sys.stderr)
             return INTERRUPTED
     _report(args, solver.description, len(loads), solved)
     return 0
 
 
 def _drawn(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
-    """Return the tool whose poses were asked for, if they were, and the loads; of tissue that relaxes with times."""
+    """Return the tool of pose control, or None, and sampled loads, with times for viscoelastic tissue."""
     asked = _asked(args)
     if not args.pose_control:
         if asked is not None:
@@ -224,5 +224,5 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
         print(describe_rejected(args.tool_preset))
     if failed:
         print(
-            f"{failed} answers are not reliable (their outcomes say why); they stay in the file and are not trained on."
+            f"{failed} solutions are unreliable (see their outcomes): they stay in the file, but are not trained with."
         )

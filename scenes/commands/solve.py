@@ -130,12 +130,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def start_of(file: MeshFile, name: str, metre: float) -> Deformation | None:
-    """Return the first guess in a file's point data `start`, if there is one. `metre`: the file's unit of length in m.
+    """Return the first guess in a file's point data `start`, if there is one. `metre`: the file's unit of length [m].
 
     Raises
     ------
     InputError
-        Of the wrong shape, or not finite.
+        A guess of the wrong shape, or not finite.
     """
     if "start" not in file.point_data:
         return None

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from ..tracked.pose_file import write_poses
 
     if not 0.0 < args.rate < np.inf:
-        raise InputError(f"--rate {args.rate:g}: give the number of pictures a second, above 0.")
+        raise InputError(f"--rate {args.rate:g}: frame rate [1/s] must be > 0.")
     if args.body == args.reference_frame:
         raise InputError(
             f"the {args.body} is at rest in its own frame: choose --reference-frame camera, or another --body."
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         said = {verdict.name.lower(): count for verdict, count in Counter(row.verdict for row in rows).items()}
         print(to_json_line({"out": str(out), "pictures": len(rows), "states": said, "ms": middle, "seconds": seconds}))
     else:
-        print(f"{len(rows)} pictures of the {args.body}, {middle:.1f} ms each (median):")
+        print(f"{len(rows)} images of the {args.body}, {middle:.1f} ms each (median):")
         for (lacks, verdict), count in Counter((row.lacks, row.verdict) for row in rows).most_common():
             print(f"  {100.0 * count / len(rows):5.1f} %  {f'{lacks} ' if lacks else ''}{verdict.value}")
         print(f"written: {out}, in the {args.reference_frame}'s frame")

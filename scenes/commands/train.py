@@ -95,24 +95,24 @@ def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
         )
     if good // APART < FEWEST_APART:
         notes.append(
-            f"of {good} loads {good // APART} are kept to calibrate error bounds, and {FEWEST_APART} are needed: the "
-            "models will know no bound for each load by itself, only one for all. "
-            f"`sulcus simulate --count {APART * FEWEST_APART}` is the least."
+            f"of {good} loads {good // APART} calibrate error bounds; at least {FEWEST_APART} are needed: the "
+            "models will have one bound for all loads instead of one for each. "
+            f"`sulcus simulate --count {APART * FEWEST_APART}` gives enough."
         )
     return notes
 
 
 def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
-    notes = [f"{failed} cases that did not converge were left aside."] if failed else []
+    notes = [f"{failed} cases that did not converge were excluded."] if failed else []
     notes += [words for words in [describe_rejected(preset)] if words]
     bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
     return "\n".join(
         [
             *notes,
             trained.split.summarise(),
-            "error at the tumour's vertices on the held-out loads, against the finite elements on the same mesh:",
+            "error at the tumour's vertices on the held-out loads, relative to FEM on the same mesh:",
             format_scores(trained.scores, 1e3 * trained.motion),
-            f"worst vertex of 95 in 100 held-out loads within [mm]: {bounds}; scenes play that of the least",
+            f"95th percentile of the maximum vertex error on held-out loads [mm]: {bounds}; scenes use the smallest",
             *(f"on those discs {name} is {describe_error(model)}" for name, model in trained.models.items()),
             *(f"on those discs bounds of {name} held for {found}" for name, found in trained.left_out.items()),
             *(
@@ -128,9 +128,9 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
 
 def _calibration(trained: Trained) -> str:
     if trained.calibrated < FEWEST_APART:
-        few = f"{trained.calibrated} others are too few to calibrate a bound for each load"
-        return f"{few}: pictures show the one of the worst vertex above for every load, which is not calibrated"
-    return f"{trained.calibrated} others calibrated bounds"
+        few = f"{trained.calibrated} other loads are too few to calibrate a bound for each load"
+        return f"{few}: images show the maximum vertex error above for every load, which is not calibrated"
+    return f"{trained.calibrated} other loads calibrated the bounds"
 
 
 def _stated(model: Learned) -> dict[str, object]:

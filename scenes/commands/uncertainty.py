@@ -1,4 +1,4 @@
-"""`sulcus uncertainty`: how far the tumour of a scene may be from where it is shown, and what of that is whose."""
+"""`sulcus uncertainty`: tumour position error of a scene, and the contribution of each source."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 FEWEST = 8  # Minimum number of bodies to solve.
 # Explanation under the table.
 NOTE = """
-Two errors, always apart. "model": what the answer is off by against finite elements of the same body. "tumour": the
-largest distance of its surface from where it is in the patient. It has what nobody measures: tissue, skull, the tool's
-place, registration, segmentation. What a scene says acts (force, fluid, cuts) is taken as known.
+Two separate errors. "model": difference from FEM on the same mesh. "tumour": maximum distance between the predicted
+surface and the tumour in the patient. It includes unknowns that are not measured: tissue, skull, position of the tool,
+registration, segmentation. Force, fluid level and resection are assumed to be as prescribed in the scene.
 """
 
 
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tissue", type=Path, metavar="FILE.json",
         help="tissue fitted by `sulcus fit`, sampled instead of the priors (default: "
-        "MESH.tissue.json beside the anatomy, where there is one)",
+        "MESH.tissue.json next to the anatomy, if it exists)",
     )  # fmt: skip
     add_seed(parser, "the draws")
     add_device(parser, "finite elements")
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve an ensemble of each scene, and keep what it says."""
+    """Solve an ensemble of each scene, and store the results."""
     from ..analysis.uncertainty import (
         estimate_uncertainty,
         get_tissue,
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     theatre = open_theatre(args.anatomy, args.model, args.device, names)
     scenes = [build_requested_scene(args, name, theatre) for name in names]
     out = args.out or to_uncertainty_path(args.anatomy or get_template_path())
-    # Before hours are spent: tissue must be one that is drawn. A file that is there is read, and scenes are added.
+    # Check before hours of work: the tissue must have priors. An existing file is read, and scenes are added to it.
     for scene in scenes:
         get_tissue(scene)
     check_output_path(out, ".json", resumed=True)

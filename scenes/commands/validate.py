@@ -1,4 +1,4 @@
-"""`sulcus validate`: whether episodes are whole, and what is wrong with those that are not."""
+"""`sulcus validate`: check that episodes are complete, and list their faults."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Nothing there to look at.
+        No files to check.
     """
     from tqdm import tqdm
 
@@ -80,7 +80,7 @@ def list_lost_episodes(folder: Path) -> list[Report]:
     from ..episodes.exports.card import TABLE, list_card_files
     from ..episodes.reading.validation import Report
 
-    words = f"is gone; {TABLE} names it. Make it anew, or write the card anew: `sulcus convert FOLDER --to card`."
+    words = f"is gone; {TABLE} lists it. Make it again, or write the card again: `sulcus convert FOLDER --to card`."
     return [Report(folder / name, [words]) for name in list_card_files(folder) if not (folder / name).is_file()]
 
 

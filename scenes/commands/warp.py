@@ -115,9 +115,9 @@ def run(args: argparse.Namespace) -> int:
     for warning in report["warnings"]:
         print(f"sulcus warp: {warning}", file=sys.stderr)
     print(to_json_line({**report, "out": str(args.out)}) if args.json else format_warp(report, args.out))
-    wrong = "" if report["converged"] else "the answer did not converge"
+    wrong = "" if report["converged"] else "the solution did not converge"
     if report["fields_fold"]:
-        wrong = "space folds, see README.txt"
+        wrong = "the displacement field folds: see README.txt"
     if wrong:
         print(f"sulcus warp: {wrong}: do not rely on what was written", file=sys.stderr)
     return 1 if wrong else 0
@@ -129,7 +129,7 @@ def check_warp_options(args: argparse.Namespace) -> None:
     Raises
     ------
     InputError
-        One that is missing, is no use, or has such a value; two images whose names would be one.
+        A missing or unused option, or an invalid value; two images with the same output name.
     """
     from ..warp.images import to_warped_name
     from ..warp.places import COARSEST, FINEST
@@ -149,12 +149,12 @@ def check_warp_options(args: argparse.Namespace) -> None:
 
 
 def build_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
-    """Return the scene that is asked for; a load is one whose tool pushes all the time.
+    """Return the requested scene; a load is a scene with a constantly pushing tool.
 
     Raises
     ------
     InputError
-        A scene or a frame that there is not; a force that is no push, or too hard; a place that is not on the cortex.
+        An unknown scene or frame; a force that does not push, or is too large; a point away from the cortex.
     """
     if args.load is not None:
         return apply_tissue_options(args, replace(build_pushing_scene(theatre, args.load), name="load"), theatre)
@@ -163,17 +163,17 @@ def build_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
     if not 0 <= args.frame_number <= last:
         raise InputError(f"--frame-number {args.frame_number}: {scene.name} has the frames 0 to {last}.")
     if args.sequence is not None and not 1 <= args.sequence <= last:
-        raise InputError(f"--sequence {args.sequence}: give 1 to {last}, one frame in so many.")
+        raise InputError(f"--sequence {args.sequence}: must be between 1 and {last} (exports every Nth frame).")
     return scene
 
 
 def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float, float]) -> Scene:
-    """Return the scene of a round tool that pushes on the open cortex at X, Y, Z [mm, RAS] with a force [N].
+    """Return the scene of a round tool that pushes the open cortex at X, Y, Z [mm, RAS] with a force [N].
 
     Raises
     ------
     InputError
-        As `build_scene`.
+        See `build_scene`.
     """
     from ..script.scene import find_scene
     from ..script.tool_paths import Touch
@@ -198,12 +198,12 @@ def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float,
 def select_moments(
     args: argparse.Namespace, theatre: PatientSetup, scene: Scene | None
 ) -> tuple[DeformedAnatomy, list[tuple[float, DeformedAnatomy]]]:
-    """Return the moment that is asked for, and those of a sequence with their times [s]; None as scene: of a file.
+    """Return the requested moment, and those of a sequence with their times [s]; scene None: read from a file.
 
     Raises
     ------
     InputError
-        As `read_moment`.
+        See `read_moment`.
     """
     from tqdm import tqdm
 
@@ -226,13 +226,13 @@ def format_warp(report: dict, out: Path) -> str:
     error, bound = report["grid_error_mm"], report["bound_mm"]
     lines = [
         f"Moved by: {report['moved_by']}. The largest displacement is {report['largest_displacement_mm']:.2f} mm.",
-        f"On a grid of {report['spacing_mm']:g} mm the tumour is off the finite elements by at most "
-        f"{error['tumour']['worst']:.3f} mm, and the open cortex by {error['cortex']['worst']:.3f} mm.",
-        f"How far the tumour may be off in the patient is not known: {report['bound_of']}."
+        f"On a grid of {report['spacing_mm']:g} mm the maximum error of the tumour relative to FEM is "
+        f"{error['tumour']['worst']:.3f} mm, of the open cortex {error['cortex']['worst']:.3f} mm.",
+        f"The tumour position error in the patient is not available: {report['bound_of']}."
         if bound is None
-        else f"In the patient, with 95 %, no point of the tumour is off by more than {bound:.1f} mm.",
+        else f"Tumour position error in the patient (95 %): maximum surface error {bound:.1f} mm.",
     ]
     for image in report["images"]:
         lost = image["outside"] + image["gone"]
-        lines.append(f"{image['name']}: {image['moved']:,} voxels moved, {lost:,} are 0 as nothing is known of them.")
+        lines.append(f"{image['name']}: {image['moved']:,} voxels moved, {lost:,} without source data are set to 0.")
     return "\n".join([*lines, f"Written to {out}; README.txt there says how to open it."])

@@ -1,1 +1,1 @@
-"""Data sets: plans, episodes drawn from them, and what reads them."""
+"""Data sets: plans, episodes sampled from them, and readers."""

@@ -47,7 +47,7 @@ ANATOMY, ABOUT = "anatomy.vtu", "body.json"  # File names in a body's folder: me
 
 @dataclass(frozen=True)
 class EpisodeBody:
-    """A body: where its files are, and what was drawn for it by name."""
+    """Body of a data set: folder of its files, and its sampled parameters by name."""
 
     folder: Path
     drawn: Mapping[str, Any]
@@ -70,12 +70,12 @@ class EpisodeBody:
         return (self.tissue, Held(), SKULLS["contact" if lets_go else self.drawn["bodies.tissue.skull"]], *more)
 
     def open_theatre(self, device: str) -> PatientSetup:
-        """Open the body with its models, as its files have them.
+        """Open the body and the models in its files.
 
         Raises
         ------
         InputError
-            As `open_theatre`.
+            See `open_theatre`.
         """
         shipped = self.drawn["bodies.anatomies"] == "template" and not to_model_path(self.anatomy).is_file()
         return open_theatre(self.anatomy, to_model_path(get_template_path()) if shipped else None, device)
@@ -118,15 +118,15 @@ def sample_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dic
 def write_body(
     folder: Path, plan: EpisodePlan, seed: int, number: int, device: str, others: Sequence[Path] = ()
 ) -> bool:
-    """Make a body in a folder of its own: anatomy, scan, trained model, and `body.json`, last.
+    """Make a body in its own folder: anatomy, scan, trained model, and `body.json` last.
 
-    Loads that were solved there before, or in `others`, are not solved again; returns whether there were any. The files
-    have the same bytes all the same.
+    Loads that were solved before, there or in `others`, are not solved again; returns True if there were any. The
+    files have the same bytes in both cases.
 
     Parameters
     ----------
     others
-        Folders in which the same body was half made, or just now is.
+        Folders in which the same body was partly made, or is being made.
 
     Raises
     ------
@@ -158,11 +158,11 @@ def read_body(folder: Path) -> EpisodeBody:
     try:
         return EpisodeBody(folder, json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: is no body of a data set ({error}). Make the episodes anew.") from error
+        raise InputError(f"{path}: is not a body of a data set ({error}). Make the episodes again.") from error
 
 
 def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
-    """Return an anatomy, its scan, and what was drawn."""
+    """Return an anatomy, its scan, and the sampled parameters."""
     bodies = plan.contents.bodies
     values = sample_body(bodies, seed, number)
     kind = str(values["bodies.anatomies"])
@@ -226,7 +226,7 @@ def _train(
 
 
 def _undated(model: Learned) -> Learned:
-    """Return a model that says of its training nothing but what is the same whenever it is trained."""
+    """Return a model without the training metadata that differ from run to run."""
     return replace(model, training={key: text for key, text in model.training.items() if key not in OF_ITS_MAKING})
 
 

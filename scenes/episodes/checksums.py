@@ -1,4 +1,4 @@
-"""Checksums of a file's data sets and attributes: what was written is what is read."""
+"""Checksums of a file's data sets and attributes."""
 
 from __future__ import annotations
 

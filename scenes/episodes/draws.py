@@ -17,7 +17,7 @@ class Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     uniform, log
-        Least and greatest; evenly between, or evenly on a logarithmic scale.
+        Limits of a uniform or log-uniform distribution.
     normal
         Mean and standard deviation; cut off at three deviations.
     choice, weights
@@ -80,20 +80,20 @@ def sample_value(value: object, random: np.random.Generator) -> float | str | bo
 
 
 def check_spread(value: object, name: str, limits: ValueLimits | None, words: tuple[str, ...] = ()) -> None:
-    """See that all that may be drawn is possible.
+    """Check that every value that can be sampled is valid.
 
     Parameters
     ----------
     limits
-        Of numbers; None of words.
+        Allowed range of numbers; None for words.
     words
-        Those that are known; empty: any.
+        Allowed words; empty: any word.
 
     Raises
     ------
     InputError
-        A range that is upside down or without end, weights that are none, a value outside the limits, or a word that
-        is not known.
+        A reversed or infinite range, invalid weights, a value outside the limits, or a word that is not in
+        `words`.
     """
     spread = spread_of(value)
     given = [kind for kind in ("uniform", "log", "normal", "choice") if getattr(spread, kind) is not None]

@@ -73,14 +73,14 @@ def find_still_missing(
     """Count episodes that exist or have failed permanently, and list the missing ones in their order of execution.
 
     The first client takes them in ascending order. Later clients use a random order, so that two in one folder seldom
-    make the same episode at the same time. If they do, one writes over the other's file the same bytes.
+    make the same episode at the same time. If they do, one overwrites the other's file with the same bytes.
 
     Parameters
     ----------
     found
-        Numbers of all episodes that are there.
+        Numbers of all existing episodes.
     again
-        Whether to try those again that failed for good.
+        True to retry permanently failed episodes.
     """
     there = found & set(numbers)
     gone = set() if again else {number for number, one in list_failures(folder).items() if not one.lost}
@@ -100,17 +100,17 @@ def make_all(
     heard: ProgressListener,
     before: RunStatistics,
 ) -> RunStatistics:
-    """Make episodes that are missing, each after its body; failures are noted in the folder. What was done in all.
+    """Make episodes that are missing, each after its body; failures are noted in the folder. Returns the totals.
 
     Parameters
     ----------
     before
-        What was done before.
+        Totals of earlier work.
 
     Raises
     ------
     InputError
-        A worker that cannot work in this folder, a full disk, a scheduler that ended.
+        A worker without access to this folder, a full disk, or a scheduler that ended.
     """
     ended: SimpleQueue[Future] = SimpleQueue()
     busy: dict[str, tuple[str, int, Future]] = {}
@@ -200,7 +200,7 @@ def _outcomes(
 
 def _reason(error: object) -> str:
     if isinstance(error, KilledWorker):
-        return f"its worker was ended {MOST_DEATHS} times, for want of memory most likely"
+        return f"its worker was killed {MOST_DEATHS} times, probably out of memory"
     return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
 
 
@@ -212,13 +212,13 @@ def write_sbatch_script(command: Sequence[str], machines: int, device: str, name
     Parameters
     ----------
     command
-        What each machine runs, but for --workers.
+        Command that each machine runs, without --workers.
     machines
-        Jobs in the array.
+        Number of jobs in the array.
     device
-        "cpu": as many processes as the job has cores. "cuda": half again as many, which share the job's card.
+        "cpu": one process per core of the job. "cuda": 1.5 processes per core, which share the job's GPU.
     name
-        Of the job.
+        Name of the job.
     """
     on_card = device == "cuda"
     # A process takes 1 to 3 GB.

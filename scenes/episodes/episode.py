@@ -47,48 +47,48 @@ PIXEL_BYTES = 1.5
 """Compressed size of all images of a frame [bytes per pixel]: 0.9 to 1.0 in the scenes `press` and `draw`."""
 # Meanings of the arrays of an episode, by path.
 MEANINGS = {
-    "pictures/colour": "JPEG bytes: what the camera sees, BGR when decoded by OpenCV",
-    "pictures/colour_right": "JPEG bytes: what the right eye of a stereo pair sees",
-    "pictures/overlay": "JPEG bytes: the colour picture with the predicted tumour drawn into it",
-    "pictures/segmentation": "PNG bytes, 8 bit: the id of what is seen, see the root's `segmentation`",
-    "pictures/tumour_mask": "PNG bytes, 8 bit: 1 where the predicted tumour would be seen were nothing in front of it",
+    "pictures/colour": "JPEG bytes: camera image, BGR when decoded by OpenCV",
+    "pictures/colour_right": "JPEG bytes: image of the right camera of a stereo pair",
+    "pictures/overlay": "JPEG bytes: the colour image with an overlay of the predicted tumour",
+    "pictures/segmentation": "PNG bytes, 8 bit: id of the visible object, see the root's `segmentation`",
+    "pictures/tumour_mask": "PNG bytes, 8 bit: 1 in the silhouette of the predicted tumour, including hidden parts",
     "K": "pinhole camera matrix (3, 3) [pixel]; of a camera that zooms or focuses, as it starts",
     "K_of_frame": "(frames, 3, 3): the same in each frame, where the camera moves",
     "distortion": "(8,) k1 k2 p1 p2 k3 k4 k5 k6 of the lens, as cv2.projectPoints takes them; none without a lens",
-    "bound": "(frames, 2): the model's largest error of a tumour vertex against its finite elements, in 95 and "
-    "in 99 of 100 loads; NaN: none is stated",
+    "bound": "(frames, 2): 95 % and 99 % bounds of the model's maximum tumour vertex error relative to "
+    "its FEM; NaN: not available",
     "tumour_nodes": "mesh vertices of the rows of tumour_*", "tumour_left": "which of them are not cut out",
-    "outcome_predicted": "how the deformer's answer came about", "outcome_fem": "the same of the finite elements",
-    "tumour_predicted": "positions, by the deformer, or by what is seen where the scene has a sight",
-    "tumour_fem": "positions, by the finite elements, in the frames `fem_frames`",
+    "outcome_predicted": "outcome of the deformer", "outcome_fem": "outcome of FEM",
+    "tumour_predicted": "positions, by the deformer, or by the locator if the scene has observations",
+    "tumour_fem": "positions, by FEM, in the frames `fem_frames`",
     "cortex_nodes": "mesh vertices of the rows of cortex_*: the open cortex",
     "cortex_predicted": "positions, by the deformer", "cortex_rest": "positions in the scan",
-    "cortex_fem": "positions, by the finite elements, in the frames `fem_frames`",
-    "fem_frames": "numbers of the frames that finite elements have solved: the rows of *_fem",
+    "cortex_fem": "positions, by FEM, in the frames `fem_frames`",
+    "fem_frames": "numbers of the frames that FEM solved: the rows of *_fem",
     "force_read": "the force as a sensor reads it, with its noise",
     "T_camera_world_right": "(frames, 4, 4): that of the right eye of a stereo pair, whose left eye is the camera",
     "T_camera_world_tracked": "(frames, 4, 4): the same as a tracker has it, with its noise",
     "T_world_tool_tracked": "(frames, 4, 4): the tool's pose as a tracker has it, with its noise",
     "tumour_rest": "positions in the scan",
     "reaction_fem": "(frames, tools, 6): force that each tool exerts, and its moment about the tool's lowest point",
-    "reaction_predicted": "(frames, tools, 6): the same by the deformer, where it knows it",
-    "reaction_bound": "(frames, 2): the model's largest error of that force, in 95 and in 99 of 100 loads; NaN: none "
-    "is stated",
-    "time": "since the scene began", "seconds": "what each stage of the picture took",
+    "reaction_predicted": "(frames, tools, 6): the same by the deformer, if available",
+    "reaction_bound": "(frames, 2): 95 % and 99 % bounds of the model's error of that force; NaN: "
+    "not available",
+    "time": "time since the start of the scene", "seconds": "duration of each stage of the image",
     "T_camera_world": "(frames, 4, 4): takes points of the world to the camera's frame: x_camera = T x_world",
     "T_world_tool": "(frames, 4, 4): takes points of the tool's own frame to the world: x_world = T x_tool",
     "force": "of the tool on the brain, in the world's frame",
     "pictures/depth": "PNG bytes, 16 bit: distance along the camera's z axis; 0 where nothing is seen",
     "contact": "where the tool pushes, on the cortex of the scan",
-    "tip": "the tool's lowest point, against the open cortex's mean outward normal",
-    "distance": "from the tool's tip to the predicted tumour, as the picture says it (a model may correct it)",
-    "distance_error": "what the model's `distance` is off by against its finite elements, exceeded in 5 of 100 loads; "
-    "NaN where it is not known",
-    "model_error": "no tumour vertex is farther from where the model's finite elements have it, in 95 of 100 loads; "
-    "NaN of finite elements themselves, and where it is not known",
-    "tumour_error": "95 of 100 times no point of the tumour's surface is farther from where it is in the patient. NaN "
-    "where it is not known",
-    "tumour_error_unobserved": "the same had nothing been observed",
+    "tip": "the tool's lowest point, along the open cortex's mean outward normal",
+    "distance": "from the tool's tip to the predicted tumour, as displayed (a model may correct it)",
+    "distance_error": "error of the model's `distance` relative to its FEM, exceeded in 5 % of the loads; "
+    "NaN: not available",
+    "model_error": "95 % bound of the maximum tumour vertex error relative to the model's FEM; "
+    "NaN for FEM itself, or if not available",
+    "tumour_error": "95 % bound of the maximum tumour surface error relative to the patient. NaN: "
+    "not available",
+    "tumour_error_unobserved": "the same bound without observations",
 }  # fmt: skip
 # Units of the arrays of an episode.
 UNITS = {
@@ -109,24 +109,24 @@ UNITS = {
 
 @dataclass(frozen=True)
 class EpisodeRecording:
-    """Settings of what is written of a scene.
+    """Settings of the recording of a scene.
 
     Parameters
     ----------
     solved_every
         FEM solves every Nth frame; None: FEM plays the scene, and its solutions are stored directly.
     overlay
-        Whether the image with the overlay is stored too.
+        True to also store the image with the overlay.
     dated
-        Whether the date and wall times are kept: without them the same scene gives the same bytes.
+        True to store date and wall times; without them the same scene gives the same bytes.
     grain
-        The colour picture (H, W, 3) uint8 of a frame's number as the camera reads it.
+        Function from the number of a frame and its colour image (H, W, 3) uint8 to the image with camera noise.
     sensed
-        What sensors read of the other columns, by name.
+        Sensor readings (with noise) of the other columns, by name.
     stated
         Further attributes.
     fem
-        The finite elements that solve, where they are at hand.
+        FEM solver to use, if it already exists.
     """
 
     solved_every: int | None = 1

@@ -39,12 +39,12 @@ class RunEstimate:
     measured, measured_bodies
         Numbers on which the estimate is based.
     seconds, frames, bytes
-        Of one process that has started [s], frames, and bytes, of all episodes and their bodies.
+        Totals of all episodes and their bodies: time of one started process [s], number of frames, and size.
     start, opening
-        How much longer than others its first episode takes a process, which loads and compiles; and the first of them
-        on each further body [s]. NaN: not known.
+        Extra time of the first episode of a process, which loads and compiles; and of its first episode on each
+        further body [s]. NaN: not available.
     apart
-        Whether `seconds` are those of others; if not, they hold both.
+        True if `seconds` exclude first episodes; False if they include them.
     """
 
     episodes: int
@@ -72,7 +72,7 @@ def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEs
     Raises
     ------
     InputError
-        Nothing that was measured.
+        No measured episodes.
     """
     own = {kind: [rate for rate in rates if rate.kind == kind] for kind in (EPISODE, BODY)}
     if not own[EPISODE]:
@@ -100,7 +100,7 @@ def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEs
 
 
 def _longer(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
-    """Return the mean extra time of the one compared with the others [s]; for a single one, all of it may be noise."""
+    """Return the mean extra time of first episodes [s]; the error of a single measurement is the whole time."""
     if not (first and others):
         return Amount(np.nan, np.nan)
     one, other = (_mean([rate.seconds for rate in those]) for those in (first, others))

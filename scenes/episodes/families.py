@@ -31,7 +31,7 @@ class FamilyMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pushing(FamilyMotion, frozen=True):
-    """A ball is pushed with a force; `spread` is how far from the middle, as a share of the way to the bone."""
+    """Push of a ball with a force; `spread` is its distance from the centre relative to that of the bone."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.35)
     radius_mm: Annotated[Number, ValueLimits(1, 15, "mm")] = (5.0, 7.5)
@@ -39,7 +39,7 @@ class Pushing(FamilyMotion, frozen=True):
 
 
 class Press(Pushing, frozen=True):
-    """Press on one place, aslant, hold, and let go."""
+    """Press one position obliquely, hold, and release."""
 
     tilt_deg: Annotated[Number, ValueLimits(0, 45, "°")] = (0.0, 25.0)
 
@@ -126,13 +126,13 @@ class Scenario:
     Parameters
     ----------
     path, tool, lying, surgery
-        As of a `Scene`.
+        See `Scene`.
     effects
         Effects beyond tissue, constraints and skull.
     relaxes
-        Whether the tissue does.
+        True if the tissue is viscoelastic.
     lets_go
-        Whether the brain may separate from the skull, whatever the body's skull does otherwise.
+        True if the brain may separate from the skull, regardless of the body's skull model.
     """
 
     path: Path = keep_idle

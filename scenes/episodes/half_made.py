@@ -1,7 +1,7 @@
 """Solved loads of an unfinished body: the next process that makes it resumes them.
 
-Each process makes a body in a hidden folder of its own, and copies what others have of the same body. So there are no
-locks: records of loads prove themselves (`sim.runtime.journal`), those of who is at work just now, too.
+Each process makes a body in its own hidden folder, and copies results of others for the same body. No locks are
+needed: records of loads have checksums (`sim.runtime.journal`), also those of running processes.
 """
 
 from __future__ import annotations

@@ -39,8 +39,8 @@ QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
 def add_noise(colour: np.ndarray, deviation: float, random: np.random.Generator) -> np.ndarray:
     """Return an image (H, W, 3) uint8 with Gaussian noise [grey levels], independent of pixel and colour.
 
-    The noise has 256 values, each as probable: quantiles of the normal law. They are quicker to draw by far, and fit
-    into a byte up to a deviation of 40.
+    The noise has 256 values, each as probable: quantiles of the normal law. They are much faster to sample, and fit
+    into a byte up to a standard deviation of 40.
     """
     if deviation == 0.0:
         return colour

@@ -1,4 +1,4 @@
-"""A plan: what a data set's episodes are drawn from."""
+"""Plan of a data set: distributions that episodes are sampled from."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FIXED = "fixed"
 def format_msgspec_error(error: str) -> str:
     """Return an error of msgspec as a sentence that begins with the key in question.
 
-    What else it says stays as it is.
+    The remaining text is unchanged.
     """
     words, _, place = error.partition(" - at `$.")
     table = place.rstrip("`")
@@ -106,8 +106,8 @@ class LearnerPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Bodies of the episodes: their number; sampled once from the seed.
 
-    `anatomies`: "drawn", the template's brain with a tumour and an opening that are drawn; "template", the anatomy
-    that ships; or an own .vtu, next to the plan.
+    `anatomies`: "drawn", the template's brain with a sampled tumour and opening; "template", the shipped anatomy;
+    or a custom .vtu next to the plan.
     """
 
     count: Annotated[int, ValueLimits(1, 100_000)] = 1
@@ -171,20 +171,20 @@ class PlanContents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class EpisodePlan:
-    """A plan as it was read.
+    """Episode plan as read from its file.
 
     Parameters
     ----------
     name
-        Of the file, without its ending.
+        Name of the file, without its suffix.
     text
-        The file's TOML.
+        TOML text of the file.
     contents
-        What it says.
+        Parsed contents of the file.
     folder
-        Where own anatomies are looked for.
+        Folder of custom anatomies.
     own
-        Digests of the own anatomies' files and their scans, by the names of the anatomies.
+        Digests of custom anatomies and their scans, by the anatomy's name.
     """
 
     name: str
@@ -205,18 +205,18 @@ def list_shipped() -> list[str]:
 
 
 def load_plan(name: str) -> EpisodePlan:
-    """Return a plan that ships, by name, or one's own, by the path of its .toml.
+    """Load a shipped plan by name, or a custom one by the path of its .toml file.
 
     Raises
     ------
     InputError
-        No such plan; a file that is no TOML, or says what no plan says; a range that is impossible; an own anatomy
-        that is not there.
+        An unknown plan; invalid TOML or unknown keys; an impossible range; a missing custom
+        anatomy.
     """
     path = Path(name) if name.endswith(".toml") else SHIPPED / f"{name}.toml"
-    if not os.path.isfile(path):  # which accepts any name
+    if not os.path.isfile(path):  # accepts any name
         raise InputError(
-            f"no plan is called {name!r}: choose {', '.join(list_shipped())}, or name a file of your own, .toml."
+            f"there is no plan {name!r}: choose {', '.join(list_shipped())}, or give the path of a .toml file."
         )
     with read_as(path, "a plan", "A plan is text in UTF-8."):
         if path.stat().st_size > MOST_BYTES:
@@ -235,7 +235,7 @@ def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
         A file that is not there, or cannot be read.
     """
     found, path = sha256(), plan.folder / anatomy
-    with read_as(path, "an anatomy", "Put it beside the plan."):
+    with read_as(path, "an anatomy", "Put it next to the plan."):
         for file in (path, *filter(Path.is_file, [to_intensity_path(path)])):
             found.update(sha256(file.read_bytes()).digest())
     return found.hexdigest()[:16]
@@ -247,7 +247,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
     Raises
     ------
     InputError
-        As `load_plan`.
+        See `load_plan`.
     """
     try:
         contents = msgspec.toml.decode(text, type=PlanContents)
@@ -289,7 +289,7 @@ def _kinds_of(table: type[msgspec.Struct]) -> dict[str, tuple[object, ValueLimit
 
 
 def list_tables(contents: PlanContents) -> dict[str, msgspec.Struct]:
-    """Return the tables of a plan by name: those whose fields are drawn for each episode, and those of bodies."""
+    """Return the tables of a plan by name: those sampled for each episode, and those of bodies."""
     bodies, motion = contents.bodies, {f"motion.{name}": each for name, each in contents.motion.named.items()}
     of_bodies = {f"bodies.{name}": getattr(bodies, name) for name in ("tumour", "tissue", "learner")}
     seen = {"look": contents.look, "hand": contents.hand, "noise": contents.noise}
@@ -321,9 +321,9 @@ def _check(contents: PlanContents) -> None:
     for each in _own_anatomies(contents):
         path = PurePath(each)
         if path.suffix != ".vtu":
-            raise InputError(f"bodies.anatomies: {each!r} is none: give drawn, template, or a .vtu beside the plan.")
+            raise InputError(f"bodies.anatomies: {each!r} is invalid: give drawn, template or a .vtu next to the plan.")
         if path.is_absolute() or ".." in path.parts:
-            raise InputError(f"bodies.anatomies: {each!r} leaves the plan's folder: put the file beside the plan.")
+            raise InputError(f"bodies.anatomies: {each!r} is outside the plan's folder: put the file next to the plan.")
 
 
 def to_ratio_key(region: str) -> str:

@@ -21,9 +21,9 @@ COLUMNS = "kind,number,frames,bytes,seconds,first"  # Column names of the table 
 
 @dataclass(frozen=True)
 class Rate:
-    """One task: "episode" or "body", its number, frames and bytes, and the seconds of one worker.
+    """Measured task: kind ("episode" or "body"), number, frames, size [bytes], and duration in one worker [s].
 
-    `first` says in what it was that worker's first: one of `tasks.FIRST`.
+    `first`: first task of its kind by that worker, one of `tasks.FIRST`.
     """
 
     kind: str

@@ -1,6 +1,6 @@
 """State of a run on disk: its settings, finished and failed episodes.
 
-The folder is the state, and nothing else is: an episode is made if its file is there, and a file appears whole.
+The folder is the only state: an episode is complete if its file exists, because files are written atomically.
 Processes that work in the folder do not communicate. Two that make the same episode write the same bytes.
 """
 
@@ -30,16 +30,16 @@ PARTS = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings of a run: all that determines the bytes of an episode, except its number.
+    """Settings of a run: everything that determines the bytes of an episode, except its number.
 
     Parameters
     ----------
     plan, digest
         Name of the plan, and the digest of its text.
     device
-        "cpu" or "cuda": solutions on one differ from the other's in the last digits.
+        "cpu" or "cuda": solutions of the two differ in the last digits.
     versions
-        Of the packages in `PARTS`.
+        Versions of the packages in `PARTS`.
     """
 
     plan: str
@@ -77,9 +77,9 @@ def begin(folder: Path, run: RunSettings, text: str, force: bool = False) -> boo
     Parameters
     ----------
     text
-        The plan as it is written beside the episodes.
+        Text of the plan, as stored next to the episodes.
     force
-        Whether a folder with other files, or of other versions, is worked in all the same.
+        True to accept a folder with other files, or of other versions.
 
     Raises
     ------

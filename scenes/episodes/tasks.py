@@ -29,15 +29,15 @@ class Made:
     Parameters
     ----------
     path
-        Its file, or its folder.
+        Path of the file or folder.
     frames, bytes
-        Number of frames, and size.
+        Number of frames, and size [bytes].
     failed
         Reason of a failure; empty on success.
     skipped
-        Whether it existed before.
+        True if the result existed before.
     resumed
-        Whether a part of it was.
+        True if a part of it existed before.
     """
 
     path: Path
@@ -50,14 +50,14 @@ class Made:
 
 @dataclass(frozen=True)
 class RunWork:
-    """Functions that make bodies and episodes: at module level, so that workers can import them, or partials of these.
+    """Functions that make bodies and episodes: module-level (or partials), so that workers can import them.
 
     Parameters
     ----------
     body_of
-        The number of the body that an episode needs.
+        Function from an episode's number to that of its body.
     make_body, make_episode
-        Make the one of a number, or find the existing one.
+        Functions that make the item of a number, or find the existing one.
     """
 
     body_of: Callable[[int], int]
@@ -72,19 +72,19 @@ class TaskOutcome:
     Parameters
     ----------
     seconds
-        Duration.
+        Duration [s].
     failed
         Reason of a failure.
     lost
-        Whether another run may succeed.
+        True if another attempt may succeed.
     skipped
-        Whether the result existed.
+        True if the result existed.
     halt
         Reason why no other task can succeed.
     resumed
-        Whether a part of it was there.
+        True if a part of it existed.
     first
-        In what it is the first of its worker, which then loads and compiles: one of `FIRST`.
+        First task of its kind by its worker, which loads and compiles: one of `FIRST`.
     """
 
     number: int
@@ -109,13 +109,13 @@ class _Process:
 def try_task(
     make: Callable[[int], Made], number: int, folder: Path, run: RunSettings, body: TaskOutcome | None = None
 ) -> TaskOutcome:
-    """Make the one of a number, by a worker that sees the run's folder and has its versions.
+    """Make item `number`, if the worker can access the run's folder and has its versions.
 
     Raises
     ------
     Exception
-        As `make`; it may go better another time. On a card what is not the input's fault spoils the process, which
-        ends itself at its next task.
+        See `make`; another attempt may succeed. On a GPU, errors not caused by the input make the process
+        unusable: it ends itself at its next task.
     """
     if _Process.spoilt:
         os._exit(1)

@@ -68,8 +68,8 @@ def start_processes(
             times = 1 if _has_served(one) else one.times + 1
             if times > starts:
                 raise InputError(
-                    f"a process on {devices[place]} has ended {starts} times as it started "
-                    f"(exit code {one.process.exitcode}). Give fewer --workers, or look for want of memory."
+                    f"a process on {devices[place]} crashed {starts} times at start-up "
+                    f"(exit code {one.process.exitcode}). Use fewer --workers, or check the free memory."
                 )
             _close(one)
             crew[place] = _start(address, security, devices[place], times)
@@ -133,7 +133,7 @@ class Workers:
     Parameters
     ----------
     client
-        To their scheduler.
+        Connection to the scheduler.
     device
         "cpu" or "cuda".
     where
@@ -174,20 +174,20 @@ class Workers:
 def start_own_workers(
     devices: Sequence[str], settings: Mapping[str, object] | None = None, starts: int = 10
 ) -> Iterator[Workers]:
-    """Yield processes of this machine, one for each name in `devices`, each with the card that its name has.
+    """Yield processes of this machine, one for each name in `devices`, each with the GPU in its name.
 
-    They are spawned, started again when they end, and killed when the block ends or this process does. A scheduler and
-    its workers run what any client sends them: keys that exist in the memory of these processes alone (TLS) keep other
-    users of the machine out.
+    They are spawned, restarted if they end, and killed when the block or this process ends. A scheduler and its
+    workers execute the code of any client: TLS keys that exist only in the memory of these processes exclude other
+    users of the machine.
 
     Parameters
     ----------
     devices
-        As "cpu" or "cuda:1"; all of one kind.
+        Devices, such as "cpu" or "cuda:1"; all of one kind.
     settings
-        Of Dask, beside `SETTINGS`.
+        Settings of Dask, in addition to `SETTINGS`.
     starts
-        How often in a row a process may end before its first task is done.
+        Maximum number of consecutive crashes of a process before its first task is done.
     """
     device = devices[0].split(":")[0]
     with _environment(), config.set({**SETTINGS, **(settings or {})}):
@@ -206,26 +206,26 @@ def start_own_workers(
 
 @contextmanager
 def connect_workers(address: str, device: str, patience: float = PATIENCE) -> Iterator[Workers]:
-    """Yield the workers of a running scheduler, who may come and go.
+    """Yield the workers of a running scheduler; their number may change.
 
     Parameters
     ----------
     device
-        "cpu", "cuda", or "auto": cuda if one of them offers a card just now.
+        "cpu", "cuda", or "auto": cuda if one of the workers has a GPU.
     patience
         Time-out of the scheduler [s].
 
     Raises
     ------
     InputError
-        A scheduler that does not answer.
+        A scheduler that cannot be reached.
     """
     silence_dask()
     try:
         client = Client(address, set_as_default=False, timeout=patience)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"--scheduler {address}: no Dask scheduler answers there. Start one by `dask scheduler`, and give the "
+            f"--scheduler {address}: no Dask scheduler at this address. Start one by `dask scheduler`, and use the "
             "address that it prints."
         ) from error
     with client:
@@ -248,4 +248,4 @@ def _environment() -> Iterator[None]:
 
 def describe_scheduler_end(where: str) -> InputError:
     """Return the error of a lost scheduler."""
-    return InputError(f"{where}: their scheduler ended. What is finished stays; the same command goes on.")
+    return InputError(f"{where}: their scheduler ended. Results are kept; run the same command again to resume.")

@@ -32,12 +32,12 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(
 def open_environment_setting(
     task: str, observation: str, render_mode: str | None, given: Mapping[str, Any], together: bool | None = None
 ) -> TaskSetting:
-    """Open the setting of environments; anatomy, physics, device, size and model are `given` as to `open_setting`.
+    """Open the setting of environments; anatomy, physics, device, size and model are `given`, see `open_setting`.
 
     Raises
     ------
     InputError
-        As `open_setting`; an unknown task, observation or render mode.
+        See `open_setting`; an unknown task, observation or render mode.
     """
     if observation not in KINDS:
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
@@ -47,14 +47,14 @@ def open_environment_setting(
 
 
 class Operation(gymnasium.Env):
-    """One environment: `gymnasium.make("sulcus/Palpate-v0")`.
+    """Single environment: `gymnasium.make("sulcus/Palpate-v0")`.
 
     Parameters
     ----------
     task
         "palpate", "retract" or "debulk".
     anatomy, physics, device, size, model
-        As `open_setting`.
+        See `open_setting`.
     observation
         "states", or "rgbd": with images.
     render_mode
@@ -63,7 +63,7 @@ class Operation(gymnasium.Env):
     Raises
     ------
     InputError
-        As `open_environment_setting`.
+        See `open_environment_setting`.
     """
 
     metadata = METADATA
@@ -87,7 +87,7 @@ class Operation(gymnasium.Env):
         self.episode, self.pictures = Episode(self.setting), ObservationCamera(self.setting)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode: what is seen, and the truth; `options` are none.
+        """Begin an episode: return observation and ground truth; no `options` are supported.
 
         Raises
         ------
@@ -102,12 +102,12 @@ class Operation(gymnasium.Env):
         return self._observed(step), step.info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Move the tool: what is seen, the reward, whether the goal or a limit was reached, False, and the truth.
+        """Move the tool: return observation, reward, True if the goal or a limit was reached, False, and ground truth.
 
         Raises
         ------
         InputError
-            As `Episode.ask`.
+            See `Episode.ask`.
         """
         (touched,) = self.setting.answers.compute_responses([self.episode.ask(action)])
         step = self.episode.take(touched)
@@ -131,25 +131,25 @@ class Operation(gymnasium.Env):
 
 
 class Operations(VectorEnv):
-    """Many environments: `gymnasium.make_vec("sulcus/Palpate-v0", num_envs=64)`.
+    """Vectorised environments: `gymnasium.make_vec("sulcus/Palpate-v0", num_envs=64)`.
 
-    One whose episode is over begins the next in its next step, whatever the action; the reward is 0 then.
+    After the end of an episode, the environment's next step ignores the action, begins an episode and has reward 0.
 
     Parameters
     ----------
     num_envs
         Number of environments.
     max_episode_steps
-        After so many steps an episode is cut short.
+        Number of steps after which an episode is truncated.
     task, anatomy, observation, physics, device, size, render_mode
-        As of `Operation`.
+        See `Operation`.
     together
-        As `open_setting`.
+        See `open_setting`.
 
     Raises
     ------
     InputError
-        As `Operation`; a number of environments or steps below 1.
+        See `Operation`; a number of environments or steps below 1.
     """
 
     metadata = METADATA | {"autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -252,20 +252,20 @@ class Operations(VectorEnv):
 
 
 def make_many(task: str, count: int, processes: bool = False, **given: Any) -> VectorEnv:
-    """Make `count` environments of a task, as `gymnasium.make_vec` does.
+    """Make `count` environments of a task, like `gymnasium.make_vec`.
 
     Parameters
     ----------
     processes
-        Whether each has a process of its own. Children are spawned, because a process that uses a GPU cannot be forked:
-        a script that asks for them needs `if __name__ == "__main__":`.
+        True for one process per environment. Processes are spawned, because a process that uses a GPU cannot be
+        forked: a script that uses them needs `if __name__ == "__main__":`.
     given
         Other arguments of `Operation`.
 
     Raises
     ------
     InputError
-        As `Operation`.
+        See `Operation`.
     """
     name = f"{NAMESPACE}/{find_task(task).name.capitalize()}-v0"
     if processes:

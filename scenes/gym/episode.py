@@ -1,4 +1,4 @@
-"""One episode of one environment: its goal, the hand, what was reached, and what that is worth."""
+"""Episode of one environment: goal, tool, reached amount and reward."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class Episode:
         self.over = True
 
     def begin(self, random: np.random.Generator) -> TissueRequest:
-        """Draw an episode; what is asked of the tissue as it begins."""
+        """Sample an episode and return its first request to the tissue model."""
         self.random, self.drawn = random, draw(self.setting, random)
         self.hand, self.touched, self.judged = self.drawn.hand, None, None
         self.step, self.held, self.violations, self.cut, self.over = 0, 0, 0, 0, False

@@ -1,4 +1,4 @@
-"""A tool that is moved, and a brain that sinks and is cut, as finite elements answer them."""
+"""FEM response to a moved tool, and to drainage and resection of the brain."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from .touched import TissueRequest, Touched
 
 @dataclass(frozen=True, eq=False)
 class PosedElements:
-    """Finite elements in contact with a rigid tool.
+    """FEM in contact with a rigid tool.
 
     The pressure under a ball is that of Hertz under its force; under a blade it is the highest of `sim.pressure`.
 
     Parameters
     ----------
     fem
-        Of `ToolContact` with the tool.
+        FEM with `ToolContact` of the tool.
     ball
-        The tool, if it is one.
+        Hertz model of the tool, if the tool is a ball.
     together
-        Whether all are answered at once.
+        True if all environments are solved in one batch.
     """
 
     fem: Fem
@@ -89,18 +89,18 @@ class HealthySurface(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CutElements:
-    """Finite elements under weight, at levels of the fluid and after steps of the resection; each is solved once.
+    """FEM under gravity, by fluid level and resection step; each state is solved once.
 
-    The tool is a ball that meets healthy tissue as `Hertz` has it. The tumour lets it in, and the tool moves no tissue.
+    Contact of the tool, a ball, with healthy tissue follows `Hertz`. The ball enters the tumour and moves no tissue.
 
     Parameters
     ----------
     site
         The open cortex.
     fem
-        Of the resection.
+        FEM of the resection.
     ball
-        The tool's, on the brain's tissue.
+        Hertz model of the tool on brain tissue.
     """
 
     site: CraniotomyFrame

@@ -1,4 +1,4 @@
-"""A tool that is moved, as models that were trained on forces or on its poses answer it."""
+"""Predicted response to a moved tool, by models trained on forces or on tool poses."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Hertz:
     Parameters
     ----------
     radius
-        Of the ball [m].
+        Radius of the ball [m].
     tissue
-        Of the half space; what counts is its stiffness at small strains.
+        Tissue of the half space; only its stiffness at small strains is used.
     """
 
     radius: float
@@ -72,20 +72,20 @@ class Hertz:
 class PressedModel:
     """Search for the force under which the predicted cortex touches the ball.
 
-    The force acts at the place of the cortex at rest that is nearest to the ball's middle, straight away from that. The
-    footprint is as wide as the contact of `Hertz`. Where the model knows only wider ones, the ball is deeper by what
-    Hertz's formula has between both.
+    The force acts at the point of the undeformed cortex nearest to the ball's centre, away from the centre. The
+    footprint has the contact radius of `Hertz`. If the model was trained only on wider footprints, the depth is
+    corrected by the difference of Hertz's formula.
 
     Parameters
     ----------
     site
         The open cortex.
     model
-        Trained on pushes.
+        Model trained on pushes.
     ball
-        The tool's, on the model's tissue.
+        Hertz model of the tool on the model's tissue.
     together
-        Whether all are answered at once.
+        True if all environments are predicted in one batch.
     """
 
     site: CraniotomyFrame
@@ -124,7 +124,7 @@ class PressedModel:
         return answers
 
     def _loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
-        """Pushes of sizes (k,) [N], each on a footprint as wide as its contact, as far as the model knows such."""
+        """Pushes of sizes (k,) [N], each on a footprint of its contact radius, clipped to the training range."""
         return Loads((Pushed(point, size[:, None] * inward, self._footprint(size)),))
 
     def _footprint(self, size: np.ndarray) -> np.ndarray:
@@ -165,9 +165,9 @@ class PosedModel:
     Parameters
     ----------
     model
-        Trained on poses of the tool.
+        Model trained on poses of the tool.
     ball
-        The tool, if it is one.
+        Hertz model of the tool, if the tool is a ball.
     """
 
     model: Learned

@@ -49,18 +49,18 @@ def compute_states(
     task: GymTask, goal: Goal, hand: RobotTool, sensed: np.ndarray, time: float, done: float, frame: np.ndarray,
     origin: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Numbers (24,) float32 of a state, in the frame (3, 3) of twists, from the open cortex's middle (3,) [m].
+    """State vector (24,) float32, in the axes (3, 3) of twists, relative to the open cortex's centre (3,) [m].
 
     Parameters
     ----------
     hand
-        As it is tracked.
+        Tracked pose of the tool.
     sensed
-        Force on the tissue [N] and motion of the open cortex [m] as they are read (2, 3).
+        Measured force on the tissue [N] and motion of the open cortex [m], as rows (2, 3).
     time
-        Since the episode began [s].
+        Time since the start of the episode [s].
     done
-        Share of what is to be done that is kept up, or cut.
+        Completed share of the steps to hold, or of the tissue to cut.
     """
     parts = (
         (hand.place - origin) @ frame / LENGTH,

@@ -18,7 +18,7 @@ Seen = tuple[Touched, np.ndarray, int]
 
 
 class ObservationCamera:
-    """Draws what the camera of a setting sees."""
+    """Renderer of camera images of a setting."""
 
     def __init__(self, setting: TaskSetting):
         self.setting = setting

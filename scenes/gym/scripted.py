@@ -1,4 +1,4 @@
-"""A policy of each task that needs no training: it goes by what a robot observes."""
+"""Scripted policy of each task, based on the robot's observations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CREEPS = 2.0  # Increase of the ratio FOLLOWS during the longest episode.
 
 
 def compute_scripted_actions(task: str, states: np.ndarray) -> np.ndarray:
-    """Actions (..., 6) float32 for states (..., 24) of a task by name.
+    """Return actions (..., 6) float32 for states (..., 24) of a task by name.
 
     Raises
     ------

@@ -126,32 +126,32 @@ def open_setting(
     model: str | None = None,
     together: bool | None = None,
 ) -> TaskSetting:
-    """Return a task on a body, read once for all environments of a process.
+    """Return a task on an anatomy, which is read once for all environments of a process.
 
     Parameters
     ----------
     anatomy
         "template", or the path of a .vtu file.
     physics
-        "model": the best trained model of the tool's poses, or of pushes where the tool is a ball. "fem": finite
-        elements. "auto": the model where there is one; if one exists that is not applicable, a warning gives the
+        "model": the best trained model of tool poses, or of pushes if the tool is a ball. "fem": FEM. "auto": the
+        model if one is applicable, otherwise FEM; if models exist that are not applicable, a warning gives the
         reason.
     device
-        As of `Fem`.
+        See `Fem`.
     size
         Width and height of images [pixel].
     model
-        A file of trained models. None: the one next to the anatomy; of the template and a spatula the one that ships.
-        Regions have the tissue that its models learned.
+        File of trained models. None: the file next to the anatomy, or the shipped one for template and spatula.
+        Regions have the tissue that the models were trained with.
     together
-        Whether all environments are solved in one batch; None: on a GPU only. On the CPU that is several times as fast,
-        but the last digits depend on the neighbours.
+        True to solve all environments in one batch; None: on a GPU only. On the CPU one batch is several times as
+        fast, but the last digits depend on the other environments.
 
     Raises
     ------
     InputError
-        Files that cannot be read; a body without tumour or open cortex; a device that is not there. A model that is not
-        there, or that is named and may not answer.
+        Unreadable files; an anatomy without tumour or open cortex; an unavailable device; a missing model, or a given
+        model that is not applicable.
     """
     theatre = _theatre(anatomy, _shipped(task) if model is None and anatomy == TEMPLATE else model, device)
     if not theatre.anatomy.in_tumour.any():
@@ -197,7 +197,7 @@ def _touched(task: GymTask, scene: Scene, site: CraniotomyFrame) -> Tissue:
 def _refusals(task: GymTask, scene: Scene, theatre: PatientSetup) -> dict[str, str | None]:
     """Return, by name, why a trained model is not applicable; None if it is. For a ball, models of pushes apply too."""
     if task.cuts:
-        return dict.fromkeys(theatre.models, "tissue is cut away, which no model learned")
+        return dict.fromkeys(theatre.models, "tissue is resected, which no model supports")
     ball = isinstance(task.tool, Probe)
     pushes = replace(scene, effects=(scene.elasticity, Held(), Bonded(), ToolForce()))
     moved, pushed = theatre.list_rejections(scene), theatre.list_rejections(pushes) if ball else {}
@@ -209,7 +209,7 @@ def _refusals(task: GymTask, scene: Scene, theatre: PatientSetup) -> dict[str, s
             and each.tool is not None
             and (each.force is None or not (ball or has_tool_pressure(each)))
         ):
-            found[name] = f"it does not know its tool's {'force' if each.force is None else 'pressure'}"
+            found[name] = f"it does not predict its tool's {'force' if each.force is None else 'pressure'}"
     return found
 
 
@@ -219,18 +219,18 @@ def _say_none(task: GymTask, anatomy: str, physics: str, model: str | None, why:
     Raises
     ------
     InputError
-        One was asked for.
+        A model is required.
     """
     remedy = "Give physics='fem', or train one: docs/gym.md has the commands."
     if model is not None:
-        raise InputError(f"{model}: does not answer the task {task.name}: {why}. {remedy}")
+        raise InputError(f"{model}: is not applicable to the task {task.name}: {why}. {remedy}")
     because = f": {why or 'there is none'}"
     if physics == "model":
         raise InputError(
-            f"physics='model': no trained model of {anatomy} answers the task {task.name}{because}. {remedy}"
+            f"physics='model': no trained model of {anatomy} is applicable to the task {task.name}{because}. {remedy}"
         )
     if why is not None and not task.cuts:
-        said = f"finite elements answer the task {task.name} on {anatomy}, no trained model{because}. {remedy}"
+        said = f"FEM is used for the task {task.name} on {anatomy}: no trained model is applicable{because}. {remedy}"
         warnings.warn(said, stacklevel=2)
 
 
@@ -245,12 +245,12 @@ def _shipped(task: GymTask) -> str | None:
 
 
 def check_arguments(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:
-    """Arguments `anatomy`, `physics`, `device`, `size` and `model` as `open_setting` takes them.
+    """Validate `anatomy`, `physics`, `device`, `size` and `model`, see `open_setting`.
 
     Raises
     ------
     InputError
-        What is none of those.
+        An invalid value.
     """
     anatomy, physics, device, size, model = (given[name] for name in ARGUMENTS)
     if not isinstance(anatomy, str | Path):

@@ -1,4 +1,4 @@
-"""The tasks: which tool, how far it goes in a step, what it must not exceed, and the tissue that it meets."""
+"""Tasks: tool, step sizes, limits of force and pressure, and tissue."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Goal:
     Parameters
     ----------
     place
-        (3,) [m] in the scan.
+        Goal position (3,) [m] in the scan.
     direction
-        (3,) unit vector: which way tissue is pressed or drawn.
+        (3,) unit vector in which tissue is pressed or drawn.
     amount
-        The force [N], the distance [m], or the shares, that are asked for.
+        Requested force [N], distance [m], or number of shares.
     fluid
-        Share of its height to which the fluid falls.
+        Final fluid level as a share of its height.
     """
 
     place: np.ndarray
@@ -52,27 +52,27 @@ class GymTask:
     name, title
         Name in lower case; description.
     tool
-        What the robot holds.
+        Tool of the robot.
     force, pressure
         Limits of the force on the tissue [N], and of the pressure under the tool [Pa].
     amount
-        Least and greatest that a goal asks for, in its own unit; `unit` is what an observation has as 1.
+        Range of the goal's amount, in its own unit; `unit` is the amount with the observation 1.
     tolerance
         Tolerance relative to the requested amount.
     aside
-        How far the tool may be from its place [m].
+        Maximum distance of the tool from its goal position [m].
     held
-        Steps that it must be kept up.
+        Number of consecutive steps for which the goal must be held.
     forward
-        Of a push: its greatest angle against the inward axis [rad].
+        Maximum angle of a push to the inward axis [rad].
     step, turn
-        What an action of 1 moves [m] and turns [rad].
+        Translation [m] and rotation [rad] of an action of 1.
     tilt
-        How far the tool may lean from its first posture [rad].
+        Maximum tilt of the tool from its first orientation [rad].
     deepest
-        How far below the middle of the open cortex it may go [m].
+        Maximum depth below the centre of the open cortex [m].
     cuts
-        Whether tissue is taken away.
+        True if tissue is resected.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A tool that twists move: where it is, and what stops it."""
+"""Tool moved by twists: its pose, and the limits of its motion."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class RobotTool:
     Parameters
     ----------
     place
-        Of the point about which it turns (3,) [m]: a ball's middle, or the middle of a blade's face.
+        Position (3,) [m] of the point of rotation: centre of a ball, or centre of a blade's face.
     turned
-        T_world_tool's rotation (3, 3).
+        Rotation (3, 3) of T_world_tool.
     """
 
     place: np.ndarray
@@ -57,8 +57,8 @@ def move_tool(
 ) -> RobotTool:
     """Return a tool after a twist (6,) [m, rad], in the frame of `build_tool_frame`, about its own point.
 
-    The bone stops it at the opening's edge. It goes no deeper than `deepest` [m] below the open cortex's middle. It
-    leans by no more than `tilt` [rad] from its first posture: a turn beyond that is left out.
+    The bone limits its position at the opening's edge. Its depth below the open cortex's centre is at most `deepest`
+    [m]. Its tilt from the first orientation is at most `tilt` [rad]: rotations beyond that are ignored.
     """
     frame = build_tool_frame(site)
     place = site.clip_to_opening(hand.place + frame @ twist[:3], tool.radius)

@@ -18,17 +18,17 @@ class Touched:
     Parameters
     ----------
     motion, nodes
-        (n, 3) [m] of mesh vertices (n,).
+        Displacements (n, 3) [m] of mesh vertices (n,).
     force
         Force of the tool on the tissue (3,) [N].
     pressure
-        The highest under the tool [Pa].
+        Maximum pressure under the tool [Pa].
     good
-        Whether the solution is reliable.
+        True if the solution is reliable.
     error
         95 % bound of the tumour vertex error relative to the model's FEM [m]; 0 for FEM itself.
     memory
-        What the next answer starts from.
+        State from which the next solution starts.
     """
 
     motion: np.ndarray
@@ -53,7 +53,7 @@ class TissueRequest:
     fluid
         Fluid level relative to its full height.
     done
-        Steps of a resection that are done.
+        Number of completed resection steps.
     """
 
     pose: np.ndarray

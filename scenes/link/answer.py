@@ -120,7 +120,7 @@ class PoseResponder:
     tracking
         Standard deviation of the tip's position along each axis [m], which messages do not contain.
     registration
-        From a file; None: it is received, with unknown error and unknown patient.
+        Registration from a file; None: it is received, with unknown error and patient.
     """
 
     motion: ToolMotion
@@ -179,7 +179,7 @@ class PoseResponder:
         return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)
 
     def _registration(self, heard: ReceivedTransforms) -> Registration | str:
-        """From the file, or as it was sent; or why there is none."""
+        """Return the registration from the file or the last message, or the reason why there is none."""
         if self.registration is not None:
             return self.registration
         sent = heard.sent.get(heard.names.registration)

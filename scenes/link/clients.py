@@ -41,7 +41,7 @@ Longest = Callable[[str], int]
 
 @dataclass(eq=False)
 class Client:
-    """One connection: what it waits for, by what it is, and whether it asks for each message."""
+    """Connected client: pending messages by kind, and True if it polls each message."""
 
     number: int
     writer: asyncio.StreamWriter
@@ -188,7 +188,7 @@ class LinkClients:
             self._count("client that vanished")
 
     async def _read(self, client: Client, reader: asyncio.StreamReader) -> None:
-        """Hear what a client sends, until it ends or sends what cannot be followed."""
+        """Receive messages of a client until it closes, or sends an invalid message."""
         try:
             while True:
                 raw = await reader.readexactly(HEADER.size)
@@ -272,7 +272,7 @@ async def _pass_over(reader: asyncio.StreamReader, size: int) -> None:
 
 
 def _hold_little(writer: asyncio.StreamWriter) -> None:
-    """Have the system hold few bytes that a client has not read, and notice one that vanished."""
+    """Limit the system's send buffer for unread bytes, and enable keep-alive to detect lost clients."""
     writer.transport.set_write_buffer_limits(high=0)
     own = writer.get_extra_info("socket")
     own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD)

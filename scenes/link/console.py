@@ -20,7 +20,7 @@ def print_safely(line: str) -> None:
 
 
 def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
-    """Return a function that writes lines, no more than 10 in 5 s; the next one says how many were left out."""
+    """Return a function that writes lines, no more than 10 in 5 s; the next line reports how many were suppressed."""
     begun, count, left_out = -WHILE, 0, 0
 
     def note(line: str) -> None:

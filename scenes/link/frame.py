@@ -34,17 +34,17 @@ class Header:
     Parameters
     ----------
     version
-        1, or 2 where an extended header and metadata surround the content.
+        1; or 2 for an extended header and metadata around the content.
     kind, name
         Type and device name.
     stamp
-        When it was true, in 2^-32 s since 1970; 0: not said.
+        Time stamp of the content, in 2^-32 s since 1970; 0: not given.
     size
-        Of its body, in bytes.
+        Size of the body [bytes].
     checksum
-        CRC-64 of the body (ECMA-182, from 0).
+        CRC-64 of the body (ECMA-182, initial value 0).
     metadata
-        By key, once the body was read.
+        Metadata by key, available after the body was read.
     """
 
     version: int
@@ -62,7 +62,7 @@ def read_header(raw: bytes) -> Header:
     Raises
     ------
     BadMessageError
-        Another version, or a type or name that is not of printable ASCII characters: this is no OpenIGTLink.
+        An unknown version, or a type or name with characters other than printable ASCII: not OpenIGTLink.
     """
     version, kind, name, stamp, size, checksum = HEADER.unpack(raw)
     words = [text.split(b"\0", 1)[0] for text in (kind, name)]

@@ -44,7 +44,7 @@ class TransformNames:
 
 @dataclass(frozen=True, eq=False)
 class Sent:
-    """A transform as it came: T (4, 4) [m], its time stamp, when it came [s], and from which client."""
+    """Received transform: T (4, 4) [m], its time stamp, time of arrival [s], and number of the client."""
 
     T: np.ndarray
     stamp: int
@@ -59,11 +59,11 @@ class ReceivedTransforms:
     Parameters
     ----------
     names
-        Which are listened to.
+        Names of the accepted transforms.
     stale
-        How old one of a moving body may be [s].
+        Maximum age of a moving body's transform [s].
     sent, earlier
-        The newest, and some before them, the oldest first.
+        Newest transforms, and earlier ones (oldest first), by name.
     """
 
     names: TransformNames
@@ -72,19 +72,19 @@ class ReceivedTransforms:
     earlier: Mapping[str, tuple[Sent, ...]] = field(default_factory=dict)
 
     def add_transform(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> ReceivedTransforms:
-        """With a transform (4, 4) [mm] of one client.
+        """Return the state with a transform (4, 4) [mm] of one client added.
 
         Raises
         ------
         BadMessageError
-            A matrix that is no rigid motion, or one that says that nothing is seen; a time that does not go on;
-            another client that sends the same transform.
+            A matrix that is not a rigid motion, or that marks an invisible body; a time stamp that does not
+            increase; another client that sends the same transform.
         """
         if not matrix[:3, :3].any():
-            raise BadMessageError("zeros, which trackers send of what they do not see")
+            raise BadMessageError("zeros, which trackers send for invisible bodies")
         T = to_rigid(matrix)
         if name != self.names.registration and np.array_equal(matrix, np.eye(4)):
-            raise BadMessageError("the identity, which trackers send of what they do not see")
+            raise BadMessageError("the identity, which trackers send for invisible bodies")
         last = self.sent.get(name)
         if last is not None and last.sender != sender and now - last.arrived < self.stale:
             raise BadMessageError("another client sends it, too")
@@ -123,12 +123,12 @@ class ReceivedTransforms:
 
 
 def check_status(metadata: Mapping[str, str]) -> None:
-    """Reject a transform that its tracker says is not that of a body it sees: any status that is not OK.
+    """Reject a transform of a body that its tracker does not see: any status other than OK.
 
     Raises
     ------
     BadMessageError
-        A status, as of 3D Slicer and PLUS, that is not OK.
+        A status, as sent by 3D Slicer and PLUS, other than OK.
     """
     for key, value in metadata.items():
         if key.casefold().endswith("status") and value.casefold() != "ok":

@@ -43,9 +43,9 @@ class Code(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class SentMesh:
-    """Triangles (m, 3) of a surface whose points move, as they are sent.
+    """Encoded triangles (m, 3) of a moving surface.
 
-    The bytes of the triangles are made once.
+    The triangles are encoded once.
     """
 
     count: int
@@ -75,12 +75,12 @@ def transform(T: np.ndarray) -> bytes:
 
 
 def read_transform(content: bytes) -> np.ndarray:
-    """Return the matrix (4, 4) [mm] of a TRANSFORM, whatever it holds.
+    """Return the matrix (4, 4) [mm] of a TRANSFORM, without checking it.
 
     Raises
     ------
     BadMessageError
-        Another size.
+        A content of another size.
     """
     T = np.eye(4)
     T[:3] = _floats(content, 12).reshape(4, 3).T
@@ -93,7 +93,7 @@ def read_position(content: bytes) -> np.ndarray:
     Raises
     ------
     BadMessageError
-        Another size, as of a place without its orientation; a quaternion that is none.
+        A content of another size, such as a position without orientation; an invalid quaternion.
     """
     numbers = _floats(content, 7)
     if not abs(np.linalg.norm(numbers[3:]) - 1.0) < 1e-2:
@@ -124,7 +124,7 @@ def read_points(content: bytes) -> tuple[list[str], np.ndarray]:
     Raises
     ------
     BadMessageError
-        Another size; places that are not finite.
+        A content of another size; positions that are not finite.
     """
     if len(content) % POINT.size:
         raise BadMessageError(f"wrong size: {len(content)} bytes, no multiple of {POINT.size}")

@@ -30,18 +30,18 @@ ON = 1e-6  # Largest distance of a point from its position by barycentric coordi
 
 @dataclass(frozen=True, eq=False)
 class SentPlaces:
-    """Places in or on the tumour, or on open cortex.
+    """Points in or on the tumour, or on the open cortex.
 
     Parameters
     ----------
     names
-        One each.
+        Name of each point.
     rest
-        Where the scan has them (n, 3) [m].
+        Positions in the scan (n, 3) [m].
     vertices, weights
-        (n, 4): the mesh's vertices that they move with, and how much with each.
+        (n, 4): mesh vertices that determine their motion, and interpolation weights.
     strange
-        Which other places were asked for, and how far they are from all that is followed; empty: none.
+        Description of points that cannot be followed, with their distances; empty: none.
     """
 
     names: tuple[str, ...]
@@ -73,7 +73,7 @@ class Outgoing:
         )
 
     def build_scan(self, stamp: int) -> bytes:
-        """Return the tumour as the scan has it."""
+        """Return the tumour at its position in the scan."""
         _, vertices, mesh = self._surfaces[0]
         at = self.stage.anatomy.mesh.nodes[vertices]
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
@@ -152,7 +152,7 @@ class Outgoing:
         return encode_points([places.names[row] for row in here], at[here])
 
     def _distance_words(self, answer: PoseResult) -> str:
-        """Return the distance from tip to tumour with its error and what that is of; or why it is not known."""
+        """Describe the distance from tip to tumour with its error and source, or the reason why it is not available."""
         known, gauge = answer.known, answer.gauge
         if gauge is None:
             return f"not known: {known.words}"

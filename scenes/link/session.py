@@ -1,4 +1,4 @@
-"""The loop of a live link: the newest pose is solved in a thread, and a task of its own reports what is old."""
+"""Loop of a live link: the newest pose is solved in a thread, and a separate task reports old poses."""
 
 from __future__ import annotations
 

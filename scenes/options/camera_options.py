@@ -46,12 +46,12 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
-    """Return the scene as the camera of `add_camera`'s options sees it, where there are any.
+    """Return the scene with the requested camera; unchanged if the options of `add_camera` are not given.
 
     Raises
     ------
     InputError
-        As `read_calibration`; a size without a calibration, or of another shape; as `HandHeld`.
+        See `read_calibration`; a size without a calibration, or of another shape; see also `HandHeld`.
     """
     from ..script.camera_paths import PATHS as MADE
     from ..tracked.calibration_file import read_calibration
@@ -80,7 +80,7 @@ def add_targets(args: argparse.Namespace, scene: Scene) -> Scene:
     Raises
     ------
     InputError
-        As `apply_camera_options`; a camera that zooms.
+        See `apply_camera_options`; a camera that zooms.
     """
     from ..tracked.filming import VIEW, from_where_it_sees_all
 

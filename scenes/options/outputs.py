@@ -1,6 +1,6 @@
-"""Checks of what a command would write, before the work: for all commands, with what was made of a mesh next to it.
+"""Checks of output files before the work, for all commands; files that were made of a mesh are next to it.
 
-A file that is there is replaced by --force only. What resumes or extends its own output needs no --force.
+An existing file is replaced only with --force. Commands that resume or extend their own output need no --force.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ def check_output_path(
     inputs: Sequence[str | Path | None] = (),
     resumed: bool = False,
 ) -> Path:
-    """Check that a file can be written and, unless `force`, does not exist; return its path and leave nothing behind.
+    """Check that a file can be written and, unless `force`, does not exist; return its path without creating files.
 
-    What the command reads, its `inputs`, is never replaced. A file that it resumes, `resumed`, may exist.
+    The command's `inputs` are never replaced. A file that the command resumes, `resumed`, may exist.
 
     Raises
     ------
     InputError
-        As `check_output`; a file that the command reads; without `force`, a file that is there.
+        See `check_output`; an input of the command; without `force`, an existing file.
     """
     with remove_empty_parents(Path(path)):
         path = check_output(path, suffix)
@@ -76,7 +76,7 @@ def check_output_frames(folder: Path, force: bool) -> list[Path]:
     Raises
     ------
     InputError
-        Without `force`, where there are frames.
+        Existing frames, without `force`.
     """
     frames = sorted(path for path in folder.glob("frame_*.png") if FRAME.fullmatch(path.name))
     if frames and not force:
@@ -123,13 +123,13 @@ def check_no_foreign_files(mesh: Path, digest: str, force: bool) -> list[Path]:
     Raises
     ------
     InputError
-        Without `force`, where there is one.
+        An existing file, without `force`.
     """
     found = find_foreign_files(mesh, digest)
     if found and not force:
         raise InputError(
-            f"{mesh}: would be another anatomy than the one that {' and '.join(path.name for path in found)} beside it "
-            "belong to. Repeat the first command, choose another --out, or give --force to replace them."
+            f"{mesh}: would replace the anatomy to which {' and '.join(path.name for path in found)} next to it "
+            "belong. Repeat the first command, choose another --out, or give --force to replace them."
         )
     return found
 

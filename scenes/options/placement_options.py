@@ -112,7 +112,7 @@ def place_craniotomy(subject: Subject, args: argparse.Namespace) -> Subject:
 
 def _depth(subject: Subject, place: np.ndarray) -> float:
     """Return the depth [m] of a point (3,) below the brain surface; negative outside."""
-    # Some voxels off the surface the field of a volume says no more than the side.
+    # Beyond a few voxels from the surface, the field of a volume gives only the side.
     apart = float(np.linalg.norm(subject.cortex - place, axis=1).min())
     return -apart if subject.brain(place[None])[0] > 0.0 else apart
 

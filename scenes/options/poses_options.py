@@ -132,6 +132,6 @@ def _clock_of(args: argparse.Namespace, calibration: Calibration, tool: PoseStre
         found = estimate_video_clock(film, calibration, tool, patient)
     except ValueError as error:
         raise InputError(f"--clock {AUTO}: {error}") from error
-    said = f"the tracker's clock is {found.offset:.4f} s ahead of the pictures', +- {found.error:.4f} s"
+    said = f"the tracker's clock runs {found.offset:.4f} s ahead of the video's, +- {found.error:.4f} s"
     print(f"sulcus overlay: {said}", file=sys.stderr)
     return found

@@ -76,12 +76,12 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
 
 
 def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> PatientSetup:
-    """Return the theatre that `add_theatre`'s arguments ask for, to play scenes of these names there.
+    """Open the anatomy and models requested by `add_theatre`'s arguments, for scenes of these names.
 
     Raises
     ------
     InputError
-        As `open_theatre`; a limit of guarded models not above 0.
+        See `open_theatre`; a limit of guarded models <= 0.
     """
     from ..play.deformers import open_theatre
 
@@ -94,12 +94,12 @@ def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> PatientSe
 
 
 def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientSetup) -> Scene:
-    """A scene by name, of the tissue and on the element that `add_theatre`'s arguments ask for, if they ask for any.
+    """Return a scene by name, with the tissue and element of `add_theatre`'s arguments if they are given.
 
     Raises
     ------
     InputError
-        As `find_scene`, `apply_tissue_options`, `read_markup` and `approach_of`.
+        See `find_scene`, `apply_tissue_options`, `read_markup` and `approach_of`.
     """
     from ..script.scene import find_scene
 
@@ -147,9 +147,9 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
         if args.deformer is None and not theatre.select_models(scene):
             from ..play.deformers import TRUTH
 
-            none = "none lies beside this anatomy; `sulcus train` makes them" if scene.sight is None else TRUTH
+            none = "no model exists next to this anatomy; `sulcus train` trains one" if scene.sight is None else TRUTH
             why = next(iter(theatre.list_rejections(scene).values()), none)
-            print(f"{args.program}: finite elements play {scene.name}, no learned model: {why}", file=sys.stderr)
+            print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {why}", file=sys.stderr)
         best = theatre.select_best(scene)
         if args.deformer is None and best in theatre.models:
             from surrogate.model.guarded import describe_error, get_held_out_error

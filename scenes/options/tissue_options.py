@@ -71,7 +71,7 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, d
 
 
 def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN) -> None:
-    """Declare --region, and say what the `default` is."""
+    """Declare --region; `default` describes the default."""
     parser.add_argument(
         "--region",
         action="append",
@@ -100,7 +100,7 @@ def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] =
 
 
 def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMENDED) -> None:
-    """Declare --element; None is what is `meant` in words, or p2 where the mesh brings mid-edge nodes of its own."""
+    """Declare --element; None means `meant`, or p2 if the mesh has mid-edge nodes."""
     parser.add_argument(
         "--element",
         choices=ELEMENTS,
@@ -110,12 +110,12 @@ def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMEND
 
 
 def parse_tissue(args: argparse.Namespace) -> Tissue:
-    """Return the tissue asked for.
+    """Return the requested tissue.
 
     Raises
     ------
     InputError
-        Constants that the law lacks or does not have, text of another form, constants that no tissue has.
+        Missing or unknown constants of the law, text with another format, or invalid constants.
     """
     tissue = _elastic(args)
     if args.young is not None:
@@ -132,7 +132,7 @@ def parse_tissue(args: argparse.Namespace) -> Tissue:
 
 
 def _elastic(args: argparse.Namespace) -> Material | Ogden:
-    """Return the tissue asked for, with the series that it has of its own."""
+    """Return the requested elastic tissue, with the Prony series of its preset."""
     known = MATERIALS[args.material].tissue if args.material in MATERIALS else None
     ours = {"--ogden": args.ogden, "--bulk": args.bulk}
     if args.material == Ogden.law or isinstance(known, Ogden):
@@ -160,12 +160,12 @@ def _elastic(args: argparse.Namespace) -> Material | Ogden:
 
 
 def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
-    """Return the tissue asked for, of a mesh and its regions.
+    """Return the requested tissue of a mesh and its regions.
 
     Raises
     ------
     InputError
-        As `parse_tissue` and `parse_region_tissues`.
+        See `parse_tissue` and `parse_region_tissues`.
     """
     tissue = parse_tissue(args)
     return Elasticity(tissue, parse_region_tissues(args.region, tissue, mesh))
@@ -190,12 +190,12 @@ def reject_option(given: Mapping[str, object], material: str, owner: str) -> Non
 def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: PatientSetup) -> Scene:
     """Return a scene with the requested tissue and element.
 
-    Regions that no --region names are those of the scene, or of `find_learned_regions`; the latter are reported.
+    Regions not set by --region have the tissue of the scene, or of `find_learned_regions`; the latter are reported.
 
     Raises
     ------
     InputError
-        As `parse_tissue`, `parse_region_tissues` and `Scene.made_of`.
+        See `parse_tissue`, `parse_region_tissues` and `Scene.made_of`.
     """
     from ..play.learned_regions import find_learned_regions
 
@@ -205,18 +205,18 @@ def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: Patien
     kept = find_learned_regions(here, theatre.learned_tissue, own)
     if own and kept:
         print(
-            f"{scene.name} keeps, as the models beside the anatomy have it: {Elasticity(None, kept)}", file=sys.stderr
+            f"{scene.name} keeps the tissue from the models' training data: {Elasticity(None, kept)}", file=sys.stderr
         )
     return made.replace_regions(dict(sorted({**own, **kept}.items())))
 
 
 def parse_region_tissues(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None) -> dict[int, Tissue]:
-    """Tissues by region label, of the law of `tissue`.
+    """Return tissues by region label, with the law of `tissue`.
 
     Raises
     ------
     InputError
-        As `parse_region`; a region that is given twice, or that a `mesh` does not have.
+        See `parse_region`; a region that is given twice, or is missing in `mesh`.
     """
     pairs = [parse_region(text, tissue) for text in texts]
     labels = [label for label, _ in pairs]

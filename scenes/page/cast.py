@@ -29,22 +29,22 @@ class SceneSolvers:
     """
 
     def __init__(self, theatre: PatientSetup, scene: Scene, deformer: str, turn: threading.Lock) -> None:
-        """Have the `deformer` of that name play. Finite elements are prepared one at a time, by who holds `turn`.
+        """Start with the `deformer` of that name. FEM solvers are built one at a time, under the lock `turn`.
 
         Raises
         ------
         InputError
-            A deformer that does not know the scene.
+            A deformer that does not support the scene.
         """
         self.theatre, self.turn = theatre, turn
-        # Not on a card: there, what is drawn while a solver's thread records a CUDA graph would be recorded with it.
+        # Not on a GPU: rendering while a solver's thread records a CUDA graph would be recorded, too.
         self.stages = {ALL: replace(theatre.build_stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
         self.filmed: dict[tuple[frozenset[str], str], Stage] = {}
         self.last: dict[str, Deformation] = {}
         self.sessions: dict[str, ReplaySession] = {}
         self.solvers: dict[frozenset[str], FemWorker] = {}
-        # The finite elements that are asked for what is shown next, and their question.
+        # FEM worker that computes the next displayed solution, and its request.
         self.seeking: tuple[FemWorker, Question] | None = None
         self.playable = deformer != "fem"
         if self.playable:
@@ -118,7 +118,7 @@ class SceneSolvers:
         Parameters
         ----------
         seen
-            A solution that is known already.
+            Solution that is already available.
         patience
             Maximum time to wait for another [s]; None is returned after it.
 
@@ -140,7 +140,7 @@ class SceneSolvers:
         return truth
 
     def _seek(self, solver: FemWorker, question: Question) -> None:
-        """Ask for what is shown next; what was asked before is not wanted any more."""
+        """Request the next displayed solution, and drop the previous request."""
         if self.seeking is not None and self.seeking[0] is not solver:
             self.seeking[0].drop()
         self.seeking = solver, question

@@ -146,10 +146,10 @@ class AccuracyTimeTable:
 
     @property
     def rows(self) -> list[ComparisonRow]:
-        """The deformers of which both are known, fastest first.
+        """Rows of the deformers with a time and an error, fastest first.
 
-        Where all of them were shown some of the same loads, those alone count, and the rows are ranked. Otherwise each
-        counts its own, and there is no ranking: a median over other loads is no comparison.
+        If all of them were shown some of the same loads, only those count, and the rows are ranked. Otherwise each row
+        uses its own loads, without ranking: medians over different loads are not comparable.
         """
         known = {name: self._took.get(name, {}).keys() & missed.keys() for name, missed in self._missed.items()}
         known = {name: loads for name, loads in known.items() if loads}

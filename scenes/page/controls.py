@@ -32,10 +32,10 @@ OWN_FILM = "your own video or camera"
 """Label of the note on own videos."""
 # Text of the note on own videos.
 ASKED = (  # Text of that note.
-    "<p>The same page shows your own video, or what a camera of this machine sees, with the tumour drawn into it:</p>"
+    "<p>The same page can show your own video, or a camera of this machine, with the tumour overlay:</p>"
     "<p><code>sulcus overlay VIDEO --page --camera K.yaml --registration R.json --tool T.json</code></p>"
     "<p>A camera's number instead of the video selects that camera. <code>sulcus film palpate --out film</code> makes "
-    "a video to try it on. <code>sulcus overlay --help</code> says which command makes each file.</p>"
+    "a test video. <code>sulcus overlay --help</code> lists the command that makes each file.</p>"
 )
 HANDS = "A slider takes the tool in your hand; 'script' gives it back."  # Hint on manual control.
 
@@ -98,7 +98,7 @@ def build_slice_control(now: str, choose: Callable[[str], None]) -> Dropdown:
 
 
 def list_switchable_effects(scene: Scene, site: CraniotomyFrame) -> list[str]:
-    """Effects that a scene can be without: all but those that make it a body at rest."""
+    """List effects that can be disabled: all except tissue and constraints."""
     kinds = (type(effect) for effect in scene.get_effects_on(site.anatomy))
     return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Bonded, Slide)]
 

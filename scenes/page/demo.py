@@ -188,7 +188,7 @@ class Demo:
         self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].stop_soon()
 
     def update_page(self, now: PageState) -> int:
-        """Bring the page nearer to what is wished; returns how many frames were drawn, 0 or 1."""
+        """Update the page towards the requested state; return the number of rendered frames, 0 or 1."""
         self.asked = self.wish.read_current()
         if self.asked == now.asked:
             self._arrive()
@@ -269,7 +269,7 @@ class Demo:
                 self.browser.put(label, value, wanted)
 
     def _restyle(self, now: PageState) -> None:
-        """Draw the same solution in another style."""
+        """Render the same solution in another style."""
         assert now.frame is not None and now.asked is not None
         frame, now.look = now.frame, self.wish.look
         player, seconds = self._seen(now.asked, now.look), frame.seconds["deform"]
@@ -284,12 +284,12 @@ class Demo:
         return replace(self.cast.get_player_on_path("fem" if off else name, off, path), style=style)
 
     def _beside(self, frame: Frame, player: Player) -> None:
-        """Show slices of a frame, and what was read lately, when there is time for it."""
+        """Show slices of a frame, and the chart of recent values, when there is time for it."""
         through, history = self.wish.through, self.history
         self.browser.show_beside(lambda: (render_slices(frame, player, through), history.draw_chart()))
 
     def _check(self, now: PageState) -> None:
-        """Show what the finite elements say of what is shown, and whether it is of the same load."""
+        """Show the FEM solution for the displayed frame, and whether it belongs to the same load."""
         assert now.frame is not None and now.asked is not None
         _, name, _, off = now.asked
         name = "fem" if off else name
@@ -361,7 +361,7 @@ class Demo:
             self.browser.put("tool", self.wish.tool)
 
     def _give(self, tool: str, **wishes: int) -> None:
-        """The menu, or the frame slider, gave the tool away; the menu says so after whatever is on its way to it."""
+        """Change the tool control by the menu or the frame slider; the menu is updated after pending messages."""
         if tool == HAND:
             self._start_hand()
         self.wish.set(tool=tool, holder=self._visitor() if tool == HAND else None, **wishes)

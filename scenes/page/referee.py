@@ -43,7 +43,7 @@ class FemWorker:
     """
 
     def __init__(self, theatre: PatientSetup, scene: Scene, turn: threading.Lock) -> None:
-        """Start the thread; it holds `turn` while it prepares, so that of several one does at a time."""
+        """Start the thread; it holds the lock `turn` while it builds the solver: only one is built at a time."""
         self.newest: Question | None = None
         self.truth: FemResult | None = None
         self.failure: Exception | None = None

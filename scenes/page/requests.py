@@ -79,16 +79,16 @@ class Requests:
 
 
 def describe_holder(visitor: int, holder: int | None, here: Collection[int]) -> str:
-    """Return the line that a visitor reads.
+    """Describe who controls the tool, for one client.
 
     Parameters
     ----------
     visitor
-        Whose line it is.
+        Number of the client that reads the text.
     holder
-        Who took the tool last; None where the script has it.
+        Number of the client that took the tool last; None if the script moves the tool.
     here
-        Who looks at the page.
+        Numbers of the connected clients.
     """
     if holder is None:
         held = "the script moves the tool"

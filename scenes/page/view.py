@@ -1,4 +1,4 @@
-"""The 3-D view of a page: which surfaces it shows, the patient's sides round them, and where it is seen from."""
+"""3-D view of a page: surfaces, orientation labels, and camera."""
 
 from __future__ import annotations
 

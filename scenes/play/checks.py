@@ -156,7 +156,7 @@ def measure(
 
 
 def _covered(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
-    """Share of frames whose ellipsoid, as it is drawn, holds the tumour's middle by the finite elements."""
+    """Compute the share of frames whose displayed ellipsoid contains the tumour's centre by FEM."""
     if not any(frame.estimate for frame in frames):
         return np.nan
     anatomy, held = player.site.anatomy, []
@@ -185,7 +185,7 @@ def _removed(player: Player, frames: Sequence[Frame], truth: Deformation) -> flo
 
 
 def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
-    """List frames whose solution, drawn or by FEM, has no good outcome, with the outcome."""
+    """List frames whose displayed or FEM solution is unreliable, with the outcome."""
     found = []
     for frame, true in zip(frames, truth.outcome, strict=True):
         outcomes = {"as drawn": frame.deformation.outcome[0], "by the finite elements": true}

@@ -102,12 +102,12 @@ class PatientSetup:
         return scene.sight is not None and (self.locator_file is None or not self.locator_file.is_file())
 
     def build_stage(self, scene: Scene) -> Stage:
-        """Return a scene's stage on this anatomy, drawn on this theatre's device.
+        """Build a scene's stage on this anatomy, rendered on this theatre's device.
 
         Raises
         ------
         InputError
-            A scene with a sight, on an anatomy without a locator, or with one that knows regions otherwise.
+            A scene with observations on an anatomy without a locator, or with a locator of other regions.
         """
         device = find_device(self.device, LIVE.precision).name
         if scene.sight is not None and (unlike := find_differing_regions(scene.elasticity, self.locator.regions)):
@@ -175,7 +175,7 @@ class PatientSetup:
         return name in self.models and not self.models[name].series
 
     def describe_deformer(self, name: str, scene: Scene) -> str:
-        """Return a deformer by name, in words: what solves, or what it learned from."""
+        """Describe a deformer by name: its FEM solver, or its training."""
         solver = describe_solver(self.choose_element(scene), scene.effects)
         if name == GUARDED:
             model, limit = self.models[self.select_best(scene)], 1e3 * self.limit_of(scene)
@@ -183,21 +183,21 @@ class PatientSetup:
         return solver if name == "fem" else self.models[name].source
 
     def build_fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | OperatedFem:
-        """Finite elements for a scene's effects, tissue and element; `live` as `Fem` has it."""
+        """Build FEM for a scene's effects, tissue and element; for `live` see `Fem`."""
         effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
         return build_fem(self.anatomy, effects, accuracy, self.device, batch, element, live)
 
     def choose_element(self, scene: Scene) -> str:
-        """Return the element of a scene, or the one that is recommended for the mesh."""
+        """Return the element of a scene, or the recommended one for the mesh."""
         return scene.element or recommend_element(self.anatomy.mesh)
 
     def build_deformer(self, name: str, scene: Scene) -> Deformer:
-        """Return a deformer by name; finite elements are made for the scene's accuracy.
+        """Build a deformer by name; FEM has the scene's accuracy.
 
         Raises
         ------
         InputError
-            A name that this theatre does not know; a model that learned from other effects, tissue or element.
+            An unknown name; a model that was trained with other effects, tissue or element.
         """
         if name == "fem":
             return self.build_fem(scene, scene.accuracy, live=True)
@@ -230,7 +230,7 @@ class PatientSetup:
         Raises
         ------
         InputError
-            As `deformer`; an anatomy without open cortex.
+            See `deformer`; an anatomy without open cortex.
         """
         return Player(
             self.build_stage(scene), self.build_deformer(name, scene), uncertainty=self.estimate_uncertainty(scene)
@@ -272,15 +272,15 @@ def to_model_path(anatomy: Path) -> Path:
 def open_theatre(
     anatomy: Path | None = None, model: Path | None = None, device: str = "auto", scenes: Sequence[str] = ()
 ) -> PatientSetup:
-    """Read an anatomy (default: the template that ships) with the files next to it: scan, models, uncertainties.
+    """Read an anatomy (default: the shipped template) with the files next to it: scan, models, uncertainties.
 
-    `scenes` are names of those that will play there.
+    `scenes`: names of the scenes that will be played.
 
     Raises
     ------
     InputError
-        As `check_scene_exists`, before anything is read. Files that are missing, unreadable, or do not belong together;
-        a device that is not there.
+        See `check_scene_exists`, before anything is read. Missing, unreadable or inconsistent files; an
+        unavailable device.
     """
     for name in scenes:
         check_scene_exists(name)

@@ -25,9 +25,9 @@ ALL = "all"  # Name of the run with all effects.
 
 @dataclass(frozen=True, eq=False)
 class AblationRun:
-    """A scene's frames by finite elements: displacements (F, V, 3) [m], NaN of what was cut out, and what they took.
+    """FEM solutions of a scene's frames: displacements (F, V, 3) [m], NaN for resected vertices, and their cost.
 
-    milliseconds, median a frame; held, bytes of the device arrays that are kept from frame to frame.
+    `milliseconds`: median per frame; `held`: size [bytes] of the device arrays kept from frame to frame.
     """
 
     displacement: np.ndarray
@@ -37,11 +37,11 @@ class AblationRun:
 
 @dataclass(frozen=True)
 class AblationRow:
-    """One effect: the scene with all of them, less the scene without it; `ALL` is the scene itself, less nothing.
+    """Row of one effect: differences of the full scene from the scene without it; `ALL`: values of the full scene.
 
-    Its figures: milliseconds a frame; megabytes that are kept on the device; and how far the means over the tumour's
-    and the open cortex's vertices move at most [mm]. `refused` says why the scene cannot be without the effect: then
-    there are no figures.
+    Values: time per frame [ms]; memory kept on the device [MB]; maximum over frames of the mean displacement of the
+    tumour's and the open cortex's vertices [mm]. `refused` is the reason why the effect cannot be removed: then
+    there are no values.
     """
 
     effect: str

@@ -12,10 +12,10 @@ from sim.material import Material, Ogden, Tissue
 def find_learned_regions(
     here: Elasticity, learned: Elasticity | None, named: Collection[int] = frozenset()
 ) -> dict[int, Tissue]:
-    """Tissues by label of the regions that a scene, whose tissue is `here`, leaves to the models.
+    """Return tissues by label of the regions that a scene with tissue `here` takes from the models.
 
-    These are the regions that models learned, that the scene gives no tissue, and that are not among the `named`. In
-    scenes of another brain they are as many times as stiff as it.
+    These are regions of the models' training without a tissue in the scene that are not among the `named`. Their
+    stiffness relative to the brain is kept.
     """
     brain = here.default
     if learned is None or brain is None or learned.default is None:

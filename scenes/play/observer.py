@@ -127,7 +127,7 @@ class TumourEstimate:
         return f"{len(self.observation.now)} points of the cortex{tip}; no force, no stiffness"
 
     def place_tumour(self, positions: np.ndarray) -> np.ndarray:
-        """Positions (V, 3) [m] with the tumour's vertices where they are believed to be."""
+        """Return positions (V, 3) [m] with the tumour's vertices at their estimated positions."""
         nodes, believed = self.anatomy.tumour_nodes, positions.copy()
         believed[nodes] = self.anatomy.mesh.nodes[nodes]
         if self.location is not None:
@@ -228,7 +228,7 @@ class RigidError:
     shift: np.ndarray
 
     def apply(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        """Points (n, 3) [m] as they are seen, turned about a middle (3,) [m]."""
+        """Apply the rigid error to points (n, 3) [m], with the rotation about a centre (3,) [m]."""
         return middle + Rotation.from_rotvec(self.turn).apply(points - middle) + self.shift
 
 

@@ -61,7 +61,7 @@ class Frame:
     Parameters
     ----------
     number, time
-        From 0; [s].
+        Frame number, from 0; time [s].
     touch, loads
         Requested tool input, and the resulting loads on the tissue.
     deformation
@@ -77,7 +77,7 @@ class Frame:
     taken, named
         (H, W) uint8: above 0 on lines and text; and true if a legend names the lines.
     distance
-        From the tool's tip to the tumour's predicted surface [m]; None without a tool.
+        Distance from the tool's tip to the tumour's predicted surface [m]; None without a tool.
     distance_error
         Bound on its difference from FEM [m]; None if unknown.
     inside
@@ -98,7 +98,7 @@ class Frame:
     head
         The lines at the top of the image: errors of model and tumour.
     remark
-        Further text in the image, such as of a tool that the bone stops; mostly empty.
+        Further text in the image, for example that the bone stops the tool; usually empty.
     seconds
         Wall time by stage, see `STAGES`; that of an estimate as "locate".
     estimate

@@ -19,9 +19,9 @@ TOGETHER = 16  # Number of frames that are solved together: small enough for reg
 
 
 def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | OperatedFem:
-    """Finite elements for the truth of many scenes alike: on a card of frames together, else frame after frame.
+    """Build FEM for reference solutions of a scene: batches of frames on a GPU, frame after frame on the CPU.
 
-    A frame that starts from the last one takes a quarter of the time of one that is solved apart.
+    A frame that starts from the last one takes a quarter of the time of a frame solved alone.
     """
     if find_device(theatre.device, TRAIN.precision).name != "cpu":
         return theatre.build_fem(scene, TRAIN, TOGETHER)

@@ -25,7 +25,7 @@ class ReplayOrder:
     Parameters
     ----------
     leap
-        Maximum number of frames of one step. Longer ways stop at its multiples.
+        Maximum number of frames of one step. Longer distances are split at its multiples.
     back
         True if a frame may be computed from a later one.
     kept
@@ -44,16 +44,16 @@ and ten times as much on quadratic elements.
 
 
 class FrameCache(Generic[T]):
-    """Frames of a run in any order. In order, frame n is what the straight run 0 ... n gives, whatever came before.
+    """Frames of a run in any order. Frame n equals that of the sequential run 0 ... n, regardless of earlier requests.
 
     Parameters
     ----------
     frames
-        How many there are.
+        Number of frames.
     step
-        A frame's number and the frame that it is found from (None: the state before the first) -> the frame.
+        Function from a frame's number and the preceding frame (None: the state before the first) to the frame.
     course
-        How a frame is reached.
+        Order in which frames are computed.
     """
 
     def __init__(self, frames: int, step: Callable[[int, T | None], T], course: ReplayOrder = IN_ORDER) -> None:
@@ -87,11 +87,9 @@ class FrameCache(Generic[T]):
 class ReplaySession:
     """FEM solutions for users who scrub through a script or control its tool.
 
-    With history-dependent solutions, a frame of the script is that of the straight run. Manual control continues from
-    the
-    last solution: each of its frames is one frame period later, whichever number it has. If the brain separates from
-    the
-    skull, a jump passes through frames in between.
+    With history-dependent solutions, a frame of the script is that of the sequential run. Manual control continues
+    from the last solution: each of its frames is one frame period later, regardless of its number. If the brain
+    separates from the skull, a jump passes through frames in between.
     """
 
     def __init__(self, player: Player) -> None:

@@ -72,9 +72,9 @@ class Cortex:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The drawn parts of a scene; positions are those of all mesh vertices (V, 3) [m].
+    """Rendered parts of a scene; positions are those of all mesh vertices (V, 3) [m].
 
-    `device` is the Warp device that draws; `observer` says where the tumour is in a scene with a sight.
+    `device`: Warp device for rendering; `observer`: estimates the tumour position in a scene with observations.
     """
 
     scene: Scene
@@ -86,11 +86,11 @@ class Stage:
 
     @property
     def anatomy(self) -> Anatomy:
-        """The body, as far as it is left."""
+        """Anatomy, without resected tissue."""
         return self.site.anatomy if self.left is None else self.left.anatomy
 
     def select_stage(self, loads: Loads) -> Stage:
-        """Return the stage as the first load case has it: after the steps of a resection that are done."""
+        """Return the stage of the first load case: after its completed resection steps."""
         cause = loads.get(Resected)
         return self if cause is None else self._after[int(cause.done[0])]
 
@@ -104,7 +104,7 @@ class Stage:
 
     @cached_property
     def nodes(self) -> np.ndarray:
-        """Sorted mesh vertices (n,) whose motion is drawn: open cortex and tumour."""
+        """Sorted mesh vertices (n,) whose motion is rendered: open cortex and tumour."""
         anatomy = self.anatomy
         return np.union1d(np.unique(anatomy.open_surface), anatomy.tumour_nodes)
 
@@ -121,10 +121,10 @@ class Stage:
         return self._cortex.build_layer(positions)
 
     def build_visible(self, positions: np.ndarray) -> Layer:
-        """The open cortex, and what lies just under the edge of the bone: it comes to light where the brain shifts.
+        """Build the open cortex, and the cortex just under the bone's edge, which becomes visible if the brain shifts.
 
-        Where the brain comes off the skull, what is beyond the drape's hole is drawn below it. The drape lies on the
-        scan, and a bump that slides by millimetres would come through where there was none.
+        If the brain separates from the skull, the surface beyond the drape's hole is rendered below it. The drape
+        follows the scan's surface, and a sliding gyrus would penetrate it.
         """
         layer = self._visible.build_layer(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):

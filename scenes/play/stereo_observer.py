@@ -42,7 +42,7 @@ class StereoObserver:
         Raises
         ------
         InputError
-            As `observe_points`, or `observe_point_cloud` without correspondences; as `observe_first`.
+            See `observe_points`, or `observe_point_cloud` without correspondences; see also `observe_first`.
         """
         site, sight = self.stage.site, self.sight
         if not sight.named:
@@ -68,12 +68,12 @@ class StereoObserver:
 
     @cached_property
     def first(self) -> First:
-        """The first pair: of the brain as the scan has it.
+        """First image pair: of the brain in the scan's configuration.
 
         Raises
         ------
         InputError
-            As `observe_first`.
+            See `observe_first`.
         """
         return observe_first(self.stage.site, self._first_shot, self.sight.points, self._tracked(0))
 
@@ -83,11 +83,11 @@ class StereoObserver:
 
     @cached_property
     def _stages(self) -> tuple[Stage, Stage]:
-        """One for each eye: a stage keeps what its last camera saw."""
+        """Stages of the two cameras: a stage caches the image of its last camera."""
         return replace(self.stage), replace(self.stage)
 
     def _noisy(self, picture: np.ndarray, number: int, eye: int) -> np.ndarray:
-        """Add the noise of an eye's camera to an image (H, W, 3) uint8; the right eye, 1, is darker."""
+        """Add camera noise to an image (H, W, 3) uint8; the image of the right camera (1) is darker."""
         random = np.random.default_rng([self.sight.seed, 2 + number, eye])
         noise = self.sight.noise * random.standard_normal(picture.shape, np.float32)
         lit = np.float32(1.0 - eye * self.sight.darker) * picture + noise
@@ -105,5 +105,5 @@ class TrackedMicroscope:
     middle: np.ndarray
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
-        """Places (n, 3) [m] as they are seen."""
+        """Return positions (n, 3) [m] with the tracking error."""
         return self.error.apply(places, self.middle)

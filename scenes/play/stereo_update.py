@@ -62,7 +62,7 @@ class StereoPair:
         Raises
         ------
         InputError
-            Eyes that are swapped, or one that sees nothing.
+            Swapped cameras, or a camera that does not see the opening.
         """
         masks = None if self.tool is None else tuple(compute_silhouette(camera, *self.tool) for camera in self.cameras)
         target = cast(tuple[float, float, float], tuple(site.origin.tolist()))
@@ -75,16 +75,16 @@ class StereoPair:
 
 @dataclass(frozen=True, eq=False)
 class First:
-    """The first pair.
+    """First image pair.
 
     Parameters
     ----------
     view
-        What was seen.
+        Rectified view of the pair.
     pixels, rest
-        Of points of the cortex (n, 2), and where the scan has them (n, 3) [m]. `asked` were looked for.
+        Pixels (n, 2) of cortex points, and their positions in the scan (n, 3) [m]. `asked`: number of searched points.
     around, still
-        Pixels (m, 2) of what lies round the opening, and where it is (m, 3) [m].
+        Pixels (m, 2) of the surroundings of the opening, and their positions (m, 3) [m].
     """
 
     view: StereoView
@@ -101,7 +101,7 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
     Raises
     ------
     InputError
-        As `StereoPair.seen`; too few points; points off the scan's cortex.
+        See `StereoPair.seen`; too few points; points off the scan's cortex.
     """
     view = shot.rectify(site)
     pixels = build_pixel_grid(site, view, count)
@@ -122,12 +122,12 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
 def observe_points(
     site: CraniotomyFrame, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray
 ) -> Observation:
-    """Points of the first pair, where a later one shows them; `tips` (k, 3) [m], where a tool touches.
+    """Track points of the first pair in a later pair; `tips` (k, 3) [m] are contact points of a tool.
 
     Raises
     ------
     InputError
-        As `StereoPair.seen`; too few points; surroundings that seem to move; motions larger than are searched for.
+        See `StereoPair.seen`; too few points; apparent motion of the surroundings; motions outside the search range.
     """
     view = shot.rectify(site)
     check_no_motion(first, view, rigid)
@@ -190,7 +190,7 @@ def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.
 
 
 def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (m, 2) of the left window that show what lies round the opening, and where that is (m, 3) [m]."""
+    """Return pixels (m, 2) of the left window that show surroundings of the opening, and their positions (m, 3) [m]."""
     ticks = np.linspace(0.0, view.geometry.size - 1.0, 40)
     pixels = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     found = triangulate_cloud(view, pixels)
@@ -200,7 +200,7 @@ def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarr
 
 
 def check_no_motion(first: First, view: StereoView, rigid: Rigid) -> None:
-    """Raise InputError where what lies round the opening seems to have moved since the first pair."""
+    """Raise InputError if the surroundings of the opening seem to have moved since the first pair."""
     which, there = follow_pixels(first.view, view, first.around)
     try:
         found = triangulate_cloud(view, there)
@@ -218,7 +218,7 @@ def check_no_motion(first: First, view: StereoView, rigid: Rigid) -> None:
 
 
 def find_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places of the scan's cortex nearest to points (n, 3) [m], and how far they are (n,) [m]."""
+    """Return the points of the scan's cortex nearest to points (n, 3) [m], and their distances (n,) [m]."""
     if not len(points):
         return points, np.zeros(0)
     anatomy = site.anatomy
@@ -227,12 +227,12 @@ def find_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarra
 
 
 def compute_deviations(sigma: np.ndarray) -> np.ndarray:
-    """Deviations (n,) [m] of errors that differ from point to point, as a locator takes them: with smooth ones."""
+    """Scale deviations (n,) [m] of independent errors to those of a locator, which include correlated errors."""
     return sigma * (SIGMA / WHITE)
 
 
 def require_points(count: int, asked: int, other_reason: str = "") -> None:
-    """Raise InputError where too few points are seen of those that were looked for; it may have another reason too."""
+    """Raise InputError if too few of the searched points are visible; `other_reason` is added to the message."""
     if count < FEWEST * asked:
         raise InputError(
             f"both eyes see {count} of {asked} places of the cortex surely: check light, focus and texture, and what "

@@ -1,4 +1,4 @@
-"""Say what is being waited for, once it has been waited for long enough to be noticed."""
+"""Notice about a task that takes a noticeable time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LOOK = 0.1  # Polling interval [s].
 
 
 class Busy:
-    """A thread that gives `say` what is being done and for how long, and an empty line when it is done."""
+    """Thread that passes the running task and its duration to `say`, and an empty line at its end."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say

@@ -23,9 +23,9 @@ SHARE = 0.2  # Removed share of the tumour's volume.
 
 
 def debulk_tumour(anatomy: Anatomy) -> Anatomy:
-    """Return the body without a fifth of its tumour, from the middle outwards.
+    """Return the anatomy without the central fifth of its tumour.
 
-    What no tetrahedron is left at is gone too.
+    Vertices without a tetrahedron are removed, too.
     """
     mesh = anatomy.mesh
     tumour = np.flatnonzero(anatomy.in_tumour)

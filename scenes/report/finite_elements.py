@@ -32,10 +32,10 @@ STANDARD = 1e-4  # Solver tolerance of data sets.
 
 @dataclass(frozen=True)
 class FemVariant:
-    """Finite elements; what is None is as the data's.
+    """FEM variant; None means the value of the data set.
 
-    mesh: `OWN`, `HALVED` (every edge), or the nodes wanted of the template. Without a precision it is single, or double
-    below what that reaches.
+    `mesh`: `OWN`, `HALVED` (every edge), or the number of nodes of the template. Default precision: single, or double
+    for tolerances that single precision cannot reach.
     """
 
     name: str

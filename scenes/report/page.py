@@ -36,9 +36,9 @@ def find_front(rows: Sequence[ReportRow]) -> frozenset[str]:
 
 
 def plot_error_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
-    """Error against time, (H, W, 3) uint8; the rows off the front pale. None without rows.
+    """Plot error against time, (H, W, 3) uint8; rows off the Pareto front are pale. None without rows.
 
-    What shows its tolerance alone would stand far below all others, and is left out.
+    Rows that show only their tolerance would be far below all others, and are omitted.
     """
     places = _places((row, row.reference) for row in rows if row.against != TOLERANCE_ALONE)
     group = {row.name: row.family if row.against == ERROR else DIFFERENT for row in rows}
@@ -103,28 +103,28 @@ figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption
 .wide { overflow-x: auto; }
 """
 NOTES = (  # Paragraphs below the tables.
-    "There are two errors, never mixed. The error against the reference says what a row is worth. The error against "
-    "its own finite elements, those that it was trained on, says what learning lost. A row of another law than "
-    "the reference's has a model difference instead of an error. The reference's own elements, less exactly solved, "
-    "show their tolerance alone and are not drawn.",
+    "Two errors are given. The error relative to the reference is the accuracy of a row. The error relative to "
+    "the FEM that it was trained on is the surrogate error. A row with another law than "
+    "the reference's has a model difference instead of an error. The reference's own elements with a looser tolerance "
+    "show only the error of that tolerance and are not plotted.",
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
-    "of those vertices. A row in bold, or full colour, is one that no other equals or beats in time and mean error.",
+    "of those vertices. A row in bold, or full colour, is Pareto-optimal in time and mean error.",
     "Worst vertex: of each load the vertex with the largest distance; mean, p95 and p99.9 are over the loads. "
     f"No p99.9 is given for fewer than {FEWEST_FOR_P999:,} loads.",
-    "Solves: all answers of finite elements that a row was given: loads, linear answers to unit forces at nodes of the "
-    "cortex, and terms of the power series. In discs: those of the tumour under loads inside the discs left out. "
-    "The linear answers of the cortex beside the tumour are given everywhere; the cortex is not compared. Minutes: of "
-    "these solves, on the machine that made them, and of fitting.",
-    "Time: one load at a time, from rest, learners on one core; median, and p99 where at least 1,000 were timed. It is "
-    "of the whole answer, its bound and limits included; beside it that of the model alone. "
-    "Set-up, compiling and warm-up are not in it. Memory: the largest resident size of the process that made and "
-    "played the row alone; card: what it took of the graphics card.",
-    "Bounds are promised for loads like those of the training. How often they hold in left-out discs of cortex, and "
-    "beyond the training range, is shown, but no model promises it. The share in discs is that of another model than "
-    "the figures beside it, because some of the loads calibrate its bounds.",
-    "Adapting: wall time until the row answers again after a fifth of the tumour is taken out of its middle. For "
-    "finite elements it is set-up and the first load; for a learner its solves and its fitting, all anew. In brackets "
-    "stands the mean error then [mm], on discs left out, against the debulked body's own finite elements.",
+    "Solves: all FEM solutions used by a row: loads, linear responses to unit forces at nodes of the "
+    "cortex, and terms of the power series. In discs: those of the tumour under loads inside the held-out discs. "
+    "The linear responses of the cortex are included in all; the cortex is not compared. Minutes: duration of "
+    "these solves, on the machine that ran them, and of training.",
+    "Time: one load at a time, from the undeformed state, trained models on one core; median; p99 of at least 1,000. "
+    "It includes bound and limits; the time of the model alone is next to it. "
+    "Set-up, compilation and warm-up are excluded. Memory: peak resident size of the process that built and "
+    "ran the row; card: peak GPU memory.",
+    "Bounds are guaranteed for loads distributed like the training loads. Their coverage in held-out discs, and "
+    "outside the training range, is shown, but not guaranteed. The coverage in discs belongs to another model than "
+    "the other numbers of the row, because some of the loads calibrate its bounds.",
+    "Adapting: wall time until a result is available again after the central fifth of the tumour is removed. For "
+    "FEM: set-up and the first load; for a trained model: new solves and training. In brackets: "
+    "mean error after that [mm], on held-out discs, relative to FEM of the debulked body.",
 )
 
 

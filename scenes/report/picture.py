@@ -31,7 +31,7 @@ YELLOW = (255, 215, 50)  # Colour of the reference's outline (RGB).
 def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     """Render the test load with the largest error, (H, W, 3) uint8.
 
-    answer (n, k, 3) [m]: a row's displacements of the tumour's vertices.
+    `answer` (n, k, 3) [m]: displacements of the tumour's vertices by a row.
     """
     truth, anatomy = get_reference(study), study.anatomy
     tumour = np.isin(study.drawn, anatomy.tumour_nodes)
@@ -57,7 +57,7 @@ def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
         shown, find_outlines(compute_silhouette(camera, reference.vertices, reference.triangles)), YELLOW, DASHED, 1
     )
     force = float(np.linalg.norm(pushed.force[worst]))
-    lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"off by up to {1e3 * distance[worst]:.3f} mm"]
+    lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"maximum error {1e3 * distance[worst]:.3f} mm"]
     return draw_text_panel(shown, lines)
 
 

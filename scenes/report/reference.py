@@ -37,9 +37,9 @@ class ReferenceSolutions:
 
 
 def solve_reference(study: ReportStudy, progress: Callable[[int], object], accuracy: Accuracy = REFERENCE) -> None:
-    """Solve the played loads with quadratic tetrahedra, and keep each at `study.drawn`.
+    """Solve the compared loads with quadratic tetrahedra, and store each at `study.drawn`.
 
-    `progress` is given how many more are done. What is kept already is not solved again.
+    `progress` receives the number of newly solved loads. Stored solutions are not solved again.
     """
 
     def made() -> tuple[Fem, Located]:
@@ -96,7 +96,7 @@ def _read(study: ReportStudy, kind: str, count: int) -> ReferenceSolutions:
     for row in range(count):
         path = _path(study, kind, row)
         with (
-            read_as(path, "an answer of the reference", REMADE),
+            read_as(path, "a solution of the reference", REMADE),
             path.open("rb") as raw,
         ):
             names = "displacement", "good", "seconds"

@@ -115,13 +115,13 @@ class ReportRow:
     name, family
         Name and family of the deformation model.
     state
-        "measured", or a sentence that says why not.
+        "measured", or the reason why not.
     against
-        `ERROR`; `DIFFERENCE` where its law is another; `TOLERANCE_ALONE` where its elements are the reference's own.
+        `ERROR`; `DIFFERENCE` for another law; `TOLERANCE_ALONE` for the reference's own elements.
     reference
-        Distances from the reference on the played loads.
+        Distances from the reference on the compared loads.
     own_fem
-        Distances from the finite elements that it was trained on, by set of loads: "discs", "sectors", "beyond".
+        Distances from the FEM that it was trained on, by set of loads: "discs", "sectors", "beyond".
     flagged
         Share of each set that it marks as extrapolated.
     covered
@@ -129,33 +129,33 @@ class ReportRow:
     failed
         Test loads without a solution; they are excluded from all figures.
     median, p99
-        Milliseconds a load, one at a time; p99 of at least 1,000.
+        Time per load [ms], one at a time; p99 only for at least 1,000.
     bare
-        Milliseconds a load of the trained model alone in NumPy: no bound, no limits, one kind of code for all learners.
+        Time per load [ms] of the trained model alone in NumPy: no bound, no limits, same kind of code for all.
     timed
         Number of timed loads.
     set_up
-        Seconds before the first load.
+        Time before the first load [s].
     memory, card
-        Of its process, and of the graphics card, at the peak [GiB].
+        Peak memory of its process, and of the GPU [GiB].
     loads, units, series
-        Solves of finite elements that it was given: loads, unit responses of the open cortex, terms of the series.
+        Numbers of FEM solves used: loads, unit responses of the open cortex, terms of the power series.
     inside
-        Those of them inside the discs left out that are about the tumour.
+        Number of those for the tumour inside held-out discs.
     solving
-        Seconds of all these solves, if the data say.
+        Duration of all these solves [s], if recorded.
     learning
-        Seconds of fitting; the solves' are not among them.
+        Duration of training [s], without the solves.
     adapt
-        Seconds to adapt to a tumour debulked by a fifth: set-up, or solves and fitting, again.
+        Time [s] to adapt to a tumour debulked by a fifth: set-up, or solves and fitting, again.
     adapted
-        Distances from the finite elements of the debulked body then, on discs left out; None of finite elements.
+        Distances from FEM of the debulked body after that, on held-out discs; None for FEM.
     curve
-        Distances from the finite elements that it was trained on, on the discs, by number of training loads.
+        Distances from the FEM that it was trained on, on the discs, by number of training loads.
     plan
-        Which solvers finite elements try for a load, in sentences.
+        Description of the solvers that FEM tries for a load.
     picture
-        PNG in the report's folder: the played load of the largest distance from the reference.
+        PNG in the report's folder: the compared load with the largest distance from the reference.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Rows of the report, each measured in a process of its own, by a run that resumes where it stopped."""
+"""Rows of the report, each measured in its own process, by a resumable run."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FAMILY = {FemVariant: "finite elements", LearnerSpec: "learnt"}  # Names of fami
 
 
 def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
-    """Import all that rows need, and start Warp without its notes; on a card also PyTorch, and what draws."""
+    """Import all modules that rows need, and start Warp silently; on a GPU also PyTorch and the renderer."""
     find_device("auto", "float32")
     if study.on_card:
         for name in ("torch", "scenes.report.picture"):
@@ -125,7 +125,7 @@ def measure_in_process(
         with process_pool(["cpu"], prepare_rows, replace(study)) as children, turn:
             return run_on_each(children, _measure, [(spec, picture)])[0]
     except LostError:
-        return ReportRow(spec.name, FAMILY[type(spec)], state="its process was ended, for want of memory most likely")
+        return ReportRow(spec.name, FAMILY[type(spec)], state="its process was killed, probably out of memory")
 
 
 def _measure(study: ReportStudy, task: tuple[Spec, Path]) -> ReportRow:
@@ -139,12 +139,12 @@ def measure_rows(
     cores: int | None = None,
     on_card: bool | None = None,
 ) -> Iterator[ReportRow]:
-    """Yield a row for each of the `specs`; those whose inputs are the same as before are read.
+    """Yield a row for each of the `specs`; rows with unchanged inputs are read from files.
 
-    A row is kept as soon as it is measured, unless it could not be. By default each has a process of its own. Finite
-    elements are measured one by one; of learners one for every `CORES` of the machine's cores. On a card, whose finite
-    elements take one of those, learners are measured beside them. What `run` measures in this process is measured one
-    by one, unless `cores` say otherwise.
+    Measured rows are stored immediately. By default each has its own process. FEM rows are measured one by
+    one; of trained models one for every `CORES` CPU cores. On a GPU, where FEM takes one of
+    those, trained models are measured at the same time. Rows that `run` measures in this process are measured one by
+    one, unless `cores` is given.
     """
     cores = cores or (1 if run else os.cpu_count() or 1)
     beside = cores >= 2 * CORES and (study.on_card if on_card is None else on_card)

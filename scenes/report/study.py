@@ -32,12 +32,12 @@ from ..script.shipped_files import get_template_path
 
 @dataclass(frozen=True)
 class ReportStudy:
-    """One data set, and how much of it is played.
+    """Data set of a report, and number of compared loads.
 
     Parameters
     ----------
     data
-        A data set of `sulcus simulate`: its anatomy, tissue, element and loads are the report's.
+        Data set of `sulcus simulate`, which defines anatomy, tissue, element and loads of the report.
     folder
         Folder of meshes and solutions.
     device
@@ -46,7 +46,7 @@ class ReportStudy:
         Held-out loads that are compared with the reference; loads beyond the training range; single loads that are
         timed.
     fine
-        Whether the reference's mesh has every edge halved.
+        True if the reference mesh is refined by halving every edge.
     """
 
     data: Path
@@ -226,7 +226,7 @@ def _beside(made: Path) -> Path:
 
 
 def tabulate_series(study: ReportStudy, progress: Callable[[int, int], object]) -> None:
-    """Make the table, if the data says of what tissue; `progress` hears the places that are done, and their number."""
+    """Compute the series table if the tissue is recorded; `progress` receives the numbers of places done and in all."""
     if "tissue" in study.dataset.provenance:
         replace(study.expansion, progress=progress).tabulated  # noqa: B018 (asking makes it)
 

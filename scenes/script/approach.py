@@ -33,7 +33,7 @@ class Approach:
     line: bool = False
 
     def follow(self, path: Path) -> Path:
-        """Return the same motion of the hand, begun at the entry instead of the middle, and along the trajectory."""
+        """Return the same tool path, starting at the entry instead of the centre, and along the trajectory."""
 
         def along(time: float) -> Touch:
             touch = path(time)
@@ -43,9 +43,9 @@ class Approach:
         return along
 
     def align_tool(self, tool: Instrument) -> Instrument:
-        """Return the same tool with its shaft along the line.
+        """Return the tool with its shaft along the line.
 
-        A blade, whose contact depends on its posture, keeps it.
+        A blade keeps its orientation, on which its contact depends.
         """
         if not (self.line and isinstance(tool, Probe)):
             return tool

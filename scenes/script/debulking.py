@@ -22,7 +22,7 @@ class Debulking:
     times
         Time of each step [s], in order: the corridor, then one share after another.
     corridor
-        Its radius [m]; wider where the mesh is coarser.
+        Radius of the corridor [m]; larger on coarse meshes.
     """
 
     times: tuple[float, ...]

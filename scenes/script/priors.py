@@ -29,15 +29,15 @@ class ParameterPrior:
     Parameters
     ----------
     name
-        As it is printed.
+        Printed name.
     law
         "normal" has mean 0 here.
     range
-        Least and greatest; of "normal" the deviation, twice.
+        Lower and upper limit; for "normal" the standard deviation, twice.
     what
-        What the number is, with its unit.
+        Meaning of the number, with its unit.
     source
-        Where it is from.
+        Source of the values.
     """
 
     name: str
@@ -119,7 +119,7 @@ class PatientSample:
         Young's modulus over the scene's; Poisson's ratio; the tumour's Young's modulus over the brain's, as a multiple
         of the scene's.
     skull
-        In [0, 1): selects one of the skull conditions that a scene may have.
+        Number in [0, 1) that selects one of the skull conditions that a scene may have.
     tip
         Position error of the tool (3,) [m]: to the right, up, and inwards.
     mesh

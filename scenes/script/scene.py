@@ -93,7 +93,7 @@ class Scene:
         Observation model of the open cortex, if the tumour position is estimated from observations; the deformer's
         solution is then the ground truth.
     element
-        One of `sim.elements.ELEMENTS`; None: the one that is recommended for the mesh.
+        Element, one of `sim.elements.ELEMENTS`; None: the recommended one for the mesh.
 
     Raises
     ------
@@ -160,7 +160,7 @@ class Scene:
         return next((effect for effect in self.effects if isinstance(effect, Elasticity)), Elasticity(None))
 
     def replace_regions(self, regions: Mapping[int, Tissue]) -> Scene:
-        """Return the scene with tissues of some regions by label, in place of those that it has of them."""
+        """Return the scene with the tissues of some regions replaced, by label."""
 
         def made(effect: Effect) -> Effect:
             own = isinstance(effect, Elasticity)
@@ -174,7 +174,7 @@ class Scene:
         return np.arange(round(self.duration * self.frames_per_second) + 1) / self.frames_per_second
 
     def get_effects_on(self, anatomy: Anatomy) -> tuple[Effect, ...]:
-        """Its effects, with those that depend on the body: from a skull that is held no brain comes off."""
+        """Return the effects on an anatomy: without skull contact if there is no skull, and with the resection."""
         gone = () if anatomy.slide_normal.any() else (SkullContact,)
         kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
         return kept if self.surgery is None else (*kept, _resection(self.surgery, anatomy))
@@ -196,7 +196,7 @@ class Scene:
         return site.clip_to_opening(asked, self.tool.radius)
 
     def describe_stop(self, site: CraniotomyFrame, touch: Touch) -> str:
-        """Say that the bone's edge stops the tool short of where a touch asks for it; empty where it does not."""
+        """Describe that the bone's edge stops the tool before the requested touch; empty if it does not."""
         if self.tool is None:
             return ""
         asked = site.origin + touch.x * site.right + touch.y * site.up

@@ -68,19 +68,19 @@ class Instrument(Protocol):
 
 @dataclass(frozen=True)
 class Probe:
-    """A palpation ball on a shaft.
+    """Palpation ball on a shaft.
 
     Parameters
     ----------
     radius
-        Of the ball, and of its footprint on the tissue [m].
+        Radius of the ball, and of its footprint on the tissue [m].
     shaft
         Radius of the shaft [m].
     length
-        Of the shaft [m].
+        Length of the shaft [m].
     lean, turn
-        Angle between the shaft and the outward normal, and that about the normal, of the direction in which it leans
-        [rad]: 0 is away from the line of sight.
+        Angle between the shaft and the outward normal, and azimuth of the shaft about the normal [rad]: 0 is away
+        from the line of sight.
     """
 
     radius: float = 7e-3
@@ -123,14 +123,14 @@ class Probe:
 
 @dataclass(frozen=True)
 class Blade:
-    """A brain spatula: a flat blade with a round edge, on an arm that goes up from one end.
+    """Brain spatula: a flat blade with a round edge, on an arm that goes up from one end.
 
     Parameters
     ----------
     width, length
-        Of the blade [m].
+        Width and length of the blade [m].
     edge
-        Radius of its edge [m]; it is twice as thick.
+        Radius of the edge [m]; the blade is twice as thick.
     arm
         Length of the arm [m].
     """

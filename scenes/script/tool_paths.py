@@ -48,7 +48,7 @@ def compute_lift(force: float) -> float:
 
 
 def smooth(t: float) -> float:
-    """From 0 to 1 while t goes from 0 to 1, at rest at both ends: 6 t^5 - 15 t^4 + 10 t^3, least jerk.
+    """Return the minimum-jerk polynomial 6 t^5 - 15 t^4 + 10 t^3, from 0 to 1 for t from 0 to 1, at rest at both ends.
 
     Flash, Hogan 1985, J. Neurosci. 5:1688-1703.
     """
@@ -62,7 +62,7 @@ def keep_idle(time: float) -> Touch:
 
 
 def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
-    """Press on one place up to `force` [N] within `rise` [s], hold [s], and let go as slowly."""
+    """Press one position up to `force` [N] within `rise` [s], hold [s], and release as slowly."""
 
     def path(time: float) -> Touch:
         return Touch(*at, force * (smooth(time / rise) - smooth((time - rise - hold) / rise)))
@@ -73,7 +73,7 @@ def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, f
 def slide(
     force: float, start: tuple[float, float], end: tuple[float, float], seconds: float, rise: float = 0.5
 ) -> Path:
-    """Press with `force` [N], move from `start` to `end` [m] within `seconds`, and let go."""
+    """Press with `force` [N], move from `start` to `end` [m] within `seconds`, and release."""
 
     def path(time: float) -> Touch:
         share = smooth((time - rise) / seconds)
@@ -84,7 +84,7 @@ def slide(
 
 
 def draw(force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
-    """Lay on, then draw the tissue aside: the force turns by `tilt` [rad] towards x while it rises; hold; let go."""
+    """Press, then draw the tissue aside: the force turns by `tilt` [rad] towards x while it rises; hold; release."""
 
     def path(time: float) -> Touch:
         drawn = smooth((time - 0.5 * rise) / rise)
@@ -97,7 +97,7 @@ def draw(force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tu
 def palpate(
     depth: float, start: tuple[float, float], end: tuple[float, float], seconds: float, rise: float = 0.8
 ) -> Path:
-    """Come down by `AIR` [m] and on to `depth` [m] within `rise` [s], slide from `start` to `end` [m], and lift off."""
+    """Lower by `AIR` [m] and on to `depth` [m] within `rise` [s], slide from `start` to `end` [m], and lift off."""
     stroke = slide(1.0, start, end, seconds, rise)
 
     def path(time: float) -> Touch:

@@ -39,7 +39,7 @@ class TumourError:
     largest
         Name of the largest contributor to `prior`.
     observed
-        The same bound with observations of the brain [m]; None without observations.
+        Bound with observations of the brain [m]; None without observations.
     moved
         The part of `prior` from errors of its motion since the scan: without registration and segmentation.
     guess
@@ -201,7 +201,7 @@ def _read(row: dict) -> Uncertainty:
 
 
 def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
-    """Add scenes to a file, in place of those of the same name."""
+    """Add scenes to a file; replace those with the same name."""
     scenes = read_uncertainties(path) | {one.scene: one for one in found}
     rows = {name: asdict(scenes[name]) for name in sorted(scenes)}
     stored = {"format": FORMAT, "unit": "m", "level": LEVEL, "scenes": rows}

@@ -17,16 +17,16 @@ from .site import CraniotomyFrame
 
 @dataclass(frozen=True)
 class Cottonoid:
-    """A square of wet cotton on the cortex, which moves with it.
+    """Square of wet cotton that moves with the cortex.
 
     Parameters
     ----------
     x, y
-        Its middle in the tangent plane of the open cortex [m].
+        Centre in the tangent plane of the open cortex [m].
     side
-        [m].
+        Side length [m].
     angle
-        By which it is turned in that plane [rad].
+        Rotation angle in that plane [rad].
     """
 
     x: float
@@ -37,22 +37,22 @@ class Cottonoid:
 
 @dataclass(frozen=True)
 class Appearance:
-    """Light, colour and what covers the cortex.
+    """Light, colour and occluders of the cortex.
 
     Parameters
     ----------
     lamp, ambient
-        Strengths of the lamp, and of the light from all sides, scene-linear.
+        Intensities of the lamp and of the ambient light, scene-linear.
     turn
-        Angle by which the lamp is turned about the axis of the opening [rad].
+        Rotation angle of the lamp about the axis of the opening [rad].
     tint
-        Multiplies the cortex's red, green and blue.
+        Factors for the cortex's red, green and blue.
     vessels
-        Seed of vessels that are drawn on the cortex; None: none but the scan's.
+        Seed of vessels rendered on the cortex; None: only those of the scan.
     cottonoids
-        What lies on the cortex.
+        Cottonoids on the cortex.
     finger
-        Direction in the tangent plane from which a gloved finger reaches over the opening's edge [rad]; None: none.
+        Direction in the tangent plane of a gloved finger that reaches over the opening's edge [rad]; None: no finger.
     """
 
     lamp: float = 1.0

@@ -27,9 +27,9 @@ class Agreement:
     Parameters
     ----------
     places
-        By the target's name: positions in the body's frame (n, 3) [m].
+        Positions in the body's frame (n, 3) [m], by the target's name.
     doubts
-        By the target's name: inconsistency of the poses with the last image that shows it; empty: none.
+        Inconsistency of the poses with the last image of the target, by its name; empty: none.
     """
 
     places: Mapping[str, np.ndarray] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Calibrations of real cameras as files: those of OpenCV and ROS, and how a camera lies in what it is fixed to."""
+"""Calibration files of real cameras: intrinsics of OpenCV and ROS, and hand-eye transforms."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ RIGID = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles
 def read_calibration(path: str | Path) -> Calibration:
     """Return the calibration in a YAML file of OpenCV, or of ROS's camera_info.
 
-    OpenCV's has image_width, image_height, camera_matrix and distortion_coefficients. ROS's has distortion_model too.
+    OpenCV: image_width, image_height, camera_matrix, distortion_coefficients. ROS: also distortion_model.
 
     Raises
     ------
     InputError
-        No such file, one that is too large or of another kind, or what `ar.optics.calibration.parse_calibration`
-        refuses.
+        A missing file, one that is too large or of another kind; input that `ar.optics.calibration.parse_calibration`
+        rejects.
     """
     path = to_path(path)
     with read_as(path, "a camera's calibration", WANTED):
@@ -112,14 +112,14 @@ def write_calibration(path: str | Path, calibration: Calibration, form: Literal[
 
 
 def read_hand_eye(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """X (4, 4) [m] with x_body = X x_camera, and a covariance (6, 6) of the camera's place [m] and turn [rad] about it.
+    """Read X (4, 4) [m] with x_body = X x_camera, and the covariance (6, 6) of the camera's position and rotation.
 
-    The residuals of the motions stand for deviations along and about each axis.
+    The residuals of the motions are used as standard deviations along [m] and about [rad] each axis.
 
     Raises
     ------
     InputError
-        A file that is missing or none such; a transform that is not rigid, or residuals that are none.
+        A missing or invalid file; a transform that is not rigid, or invalid residuals.
     """
     from ar.tracking.rigid import is_rigid
 

@@ -94,7 +94,7 @@ class CameraMount:
     T_body_camera
         (4, 4) [m]: from the camera to the body that it is fixed to.
     covariance
-        (6, 6) of a translation of the camera [m] and a small rotation about it [rad], in the axes of that body.
+        Covariance (6, 6) of a camera translation [m] and a small rotation about it [rad], in the axes of that body.
     body
         Poses of that body; None: the tracker's own frame.
     """
@@ -217,7 +217,7 @@ def estimate_video_clock(
     Raises
     ------
     ValueError
-        As `estimate_clock_by_motion` and `track_rows`.
+        See `estimate_clock_by_motion` and `track_rows`.
     """
     film_rows = track_rows(film, calibration, build_tool_cube().name, build_patient_reference().name)
     seen = [(row.time, row.pose) for row in film_rows if row.pose is not None]

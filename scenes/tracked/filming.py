@@ -111,11 +111,11 @@ class VideoFrame:
     time
         [s].
     colour
-        (H, W, 3) uint8.
+        Image (H, W, 3) uint8.
     T_camera_scan, T_scan_tool
-        (4, 4) [m].
+        Poses (4, 4) [m].
     displacement
-        (n, 3) [m] of the tumour's surface vertices, in the stage's order.
+        Displacements (n, 3) [m] of the tumour's surface vertices, in the stage's order.
     """
 
     time: float

@@ -73,11 +73,11 @@ class TrackingResult:
     camera
         Camera with T_camera_scan; None if the reference has been lost for longer than `HELD`.
     T_scan_tool, tip_covariance
-        (4, 4) [m] and (3, 3) [m^2], if the tool is visible.
+        Pose (4, 4) [m] and covariance (3, 3) [m^2], if the tool is visible.
     band
         95 % bound on the tumour's error across the line of sight [m]; None if unknown.
     parts
-        The same bound by source [m].
+        Contributions to the bound, by source [m].
     seen, felt
         Time of the last detection of the reference, and of the tool relative to it [s]; None: never.
     interval
@@ -130,7 +130,7 @@ class Follower:
     elsewhere
         Poses of an external tracker, which replace the cube's; with a tracked camera, the reference's, too.
     intrinsic
-        (9, 9), covariance of the camera's calibration, as of `ar.tracking.intrinsics.PARAMETERS`; None: not known.
+        Covariance (9, 9) of the camera's calibration, of `ar.tracking.intrinsics.PARAMETERS`; None: not available.
     """
 
     calibration: Calibration
@@ -152,7 +152,7 @@ class Follower:
         Raises
         ------
         ValueError
-            As `Tracker.track`.
+            See `Tracker.track`.
         """
         known = self._agreeing(self._looked(grey, time, before), before)
         if before is None:
@@ -162,7 +162,7 @@ class Follower:
         return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
 
     def _agreeing(self, known: TrackingResult, before: TrackingResult | None) -> TrackingResult:
-        """With what printed targets say of another tracker's poses, which may make the tumour's place not known."""
+        """Check external poses against printed targets; if inconsistent, the tumour position is unreliable."""
         if self.elsewhere is None:
             return known
         agreement = Agreement() if before is None else before.agreement
@@ -216,7 +216,7 @@ class Follower:
         return doubt, near
 
     def _without_reference(self, tracked: TrackedTargets, time: float, before: TrackingResult | None) -> TrackingResult:
-        """Return the reference is not seen: for a moment the overlay stays where it was."""
+        """Return the result without a visible reference: the overlay keeps its position for a short time."""
         seen = None if before is None else before.seen
         motion = self.motion.rest if before is None else before.motion
         held = before is not None and seen is not None and 0.0 <= time - seen < HELD + ROUNDING

@@ -52,7 +52,7 @@ class OverlayPage:
     frames
         Number of images of the video; 0: it is a camera.
     origins
-        Further addresses of the page, as `ar.page.browser.Browser` takes them.
+        Further addresses of the page, see `ar.page.browser.Browser`.
     """
 
     follower: Follower

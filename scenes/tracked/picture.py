@@ -41,9 +41,9 @@ class Painter:
     tool
         Tool that occludes the tumour; None: no tool.
     style
-        As of `ar.overlay.composite.composite`.
+        See `ar.overlay.composite.composite`.
     device
-        A Warp device.
+        Warp device.
     """
 
     stage: Stage
@@ -93,7 +93,7 @@ class Painter:
         return [*self.stage.build_layers(known.motion.positions, None), *([] if tool is None else [tool])]
 
     def build_tool_layer(self, known: TrackingResult, cubed: bool = True) -> Layer | None:
-        """Return the tool where it is seen, with its cube or without."""
+        """Return the tool's surface if its pose is available, with or without its cube."""
         pose = known.T_scan_tool
         if self.tool is None or pose is None:
             return None

@@ -19,7 +19,7 @@ FAR = 1.0  # Largest distance of a laid-down tool from the head [m]: beyond, no 
 
 
 def describe_implausible(registration: Registration, stage: Stage, camera: Camera) -> str:
-    """Say what is wrong with where a registration has the opening, as a camera sees it; empty: nothing."""
+    """Describe why the opening's position in a registration is implausible for a camera; empty: plausible."""
     opening = stage.site.origin
     middle = 0.5 * np.array([*build_patient_reference().faces[0].size, 0.0])
     away = float(np.linalg.norm(registration.point(opening)[0] - middle))
@@ -37,7 +37,7 @@ def from_head(tip: np.ndarray, stage: Stage) -> float:
 
 
 def describe_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
-    """Say that a tool at a pose (4, 4) [m] is where none can be, with its tip or its markers deep inside; empty: no."""
+    """Describe a tool pose (4, 4) [m] whose tip or markers are deep in the brain; empty: plausible."""
     mesh = stage.anatomy.mesh
     corners = mesh.nodes[mesh.surface]
     for what, place in (("tip", np.zeros(3)), ("markers", np.linalg.inv(tool.T_cube_tool)[:3, 3])):
@@ -51,9 +51,9 @@ def describe_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stag
 def describe_misplaced_tool(
     tool: TrackedTool | None, T_scan_tool: np.ndarray, stage: Stage, near: bool, theirs: str
 ) -> tuple[str, bool]:
-    """Say why a tool's pose (4, 4) [m] can be none on this patient, if so; and whether the tool has been near the head.
+    """Describe why a tool pose (4, 4) [m] is implausible; and return True if the tool has been near the head.
 
-    `near` says whether it was before, and `theirs` asks what may be wrong.
+    `near`: True if it was near before; `theirs`: question about the possible cause.
     """
     away = from_head(T_scan_tool[:3, 3], stage)
     near = near or away <= NEAR

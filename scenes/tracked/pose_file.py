@@ -66,14 +66,14 @@ def read_numbered_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def read_stream(path: str | Path) -> PoseStream:
-    """Read the poses of an external tracker, in a file as of `read_poses`, whose clock may restart at midnight.
+    """Read the poses of an external tracker, in a file of `read_poses`; its clock may restart at midnight.
 
-    Covariances are read where there are columns `cov_00` to `cov_55`, as `write_poses` has them; elsewhere `USUAL`.
+    Covariances are read from the columns `cov_00` to `cov_55`, as written by `write_poses`; default: `USUAL`.
 
     Raises
     ------
     InputError
-        As `read_poses`; no pose, or an invalid covariance.
+        See `read_poses`; no pose, or an invalid covariance.
     """
     times, poses, covariances = _read(path)
     kept = ~np.isnan(poses[:, 0, 0])

@@ -76,14 +76,14 @@ def describe_scan(anatomy: Anatomy) -> Scanned:
 
 
 def describe_other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -> str:
-    """Say that a registration in a file was made for another mesh of the same scan, or that it does not say for which.
+    """Describe a registration that was made for another mesh of the same scan, or without a record of its mesh.
 
-    Empty where it was made for this one.
+    Empty if it was made for this mesh.
 
     Raises
     ------
     InputError
-        One that was made for another body: its bounds or its tumour lie more than 5 mm from the anatomy's.
+        A registration for another anatomy: its bounds or its tumour differ by more than 5 mm from the anatomy's.
     """
     made, here = registration.scanned, describe_scan(anatomy)
     if made is None:

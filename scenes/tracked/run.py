@@ -40,7 +40,7 @@ class Shown:
     known
         Drawn tracking result.
     colour
-        (H, W, 3) uint8.
+        Image (H, W, 3) uint8.
     seconds
         Processing time from the image's arrival [s].
     middle
@@ -137,7 +137,7 @@ def draw_overlays(film: Iterator[Timed], follower: Follower, painter: Painter, l
     Raises
     ------
     ValueError
-        As `Follower.step`, and of the video.
+        See `Follower.step`; also errors of the video.
     """
     known: TrackingResult | None = None
     for taken, begun in pace_images(film) if live else ((each, None) for each in film):
@@ -151,12 +151,12 @@ def overlay_one(
 ) -> Shown:
     """Compute one image with its overlay, from the result `before`.
 
-    `begun` is the moment [s] of the images' time 0, if they are live: an old one is stale.
+    `begun` is the clock time [s] of the images' time 0, if they are live: old images are marked stale.
 
     Raises
     ------
     ValueError
-        As `Follower.step`.
+        See `Follower.step`.
     """
     arrived, picture = clock.perf_counter(), taken.picture
     assert picture.colour is not None

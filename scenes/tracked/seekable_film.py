@@ -18,7 +18,7 @@ class SeekableFilm:
     Parameters
     ----------
     path
-        Path, with errors, as of `ar.tracking.pictures.read_video`.
+        Path; for errors see `ar.tracking.pictures.read_video`.
     rate
         Frame rate of a folder [1/s].
     count

@@ -27,7 +27,7 @@ FARTHEST = 1.0  # Largest distance of a tool's tip from its cube [m].
 
 
 def build_nominal_cube() -> np.ndarray:
-    """T_cube_tool (4, 4) of a cube whose axes are the tool's, the tip below its middle."""
+    """Build T_cube_tool (4, 4) of a cube whose axes are the tool's, with the tip below its centre."""
     T = np.eye(4)
     T[2, 3] = -TIP
     return T
@@ -35,16 +35,16 @@ def build_nominal_cube() -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class TrackedTool:
-    """A tool with the printed cube on its shaft.
+    """Tool with the printed cube on its shaft.
 
     Parameters
     ----------
     shape
-        What of it touches tissue.
+        Part of the tool that touches tissue.
     T_cube_tool
-        (4, 4) [m]: from the tool's own frame, whose origin is its lowest point, to the cube's.
+        Transform (4, 4) [m] from the tool's frame, whose origin is its lowest point, to the cube's.
     tip_covariance
-        (3, 3) [m^2] of that origin in the cube's frame, as calibrated.
+        Calibration covariance (3, 3) [m^2] of that origin in the cube's frame.
     """
 
     shape: BuiltIn
@@ -83,12 +83,12 @@ def _cube() -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_tool(path: str | Path) -> TrackedTool:
-    """Return the tool in a JSON file, whose lengths are millimetres.
+    """Read the tool in a JSON file with lengths in millimetres.
 
     Raises
     ------
     InputError
-        A file that is missing or no such tool; a shape that is none, or a transform that is not rigid.
+        A missing or invalid file; an invalid shape, or a transform that is not rigid.
     """
     path = to_path(path)
     with read_as(path, "a tracked tool", WANTED):

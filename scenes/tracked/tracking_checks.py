@@ -105,7 +105,7 @@ def build_default_pipeline(film: DrawnFilm, style: Style = "window") -> tuple[Fo
 
 
 def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> TrackingFigures:
-    """Track a video, draw the results, and detect in the images what they show."""
+    """Track a video, draw the results, and measure what the images show."""
     known: TrackingResult | None = None
     confident, unsaid, waits, worst, waiting, count = 0, 0, [0], 0.0, True, 0
     for event in replay_events(film):

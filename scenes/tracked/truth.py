@@ -38,11 +38,11 @@ class VideoGroundTruth:
     anatomy
         Digest of the anatomy in the video.
     times
-        (F,) [s].
+        Times (F,) [s].
     T_camera_scan, T_scan_tool
-        (F, 4, 4) [m].
+        Poses (F, 4, 4) [m].
     displacement
-        (F, n, 3) [m] of the vertices of the tumour's surface, sorted by their numbers in the mesh.
+        Displacements (F, n, 3) [m] of the vertices of the tumour's surface, sorted by their numbers in the mesh.
     """
 
     anatomy: str

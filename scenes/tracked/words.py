@@ -1,4 +1,4 @@
-"""The words of an overlay's page, as HTML: what is drawn, why it is not to be relied on, and both errors."""
+"""Text of an overlay's page, as HTML: overlay state, reasons of unreliable results, and both errors."""
 
 from __future__ import annotations
 

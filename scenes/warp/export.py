@@ -58,12 +58,12 @@ def write_warp(
 ) -> dict[str, Any]:
     """Write a moment into the folder of `write_folder_atomically`, and moments of a `sequence` with their times [s].
 
-    Returns the figures.
+    Returns the summary.
 
     Raises
     ------
     InputError
-        As `compute_fields`; a sequence that is too long.
+        See `compute_fields`; a sequence that is too long.
     """
     begun = process_time()
     fields = compute_fields(moment, asked.spacing, asked.step)

@@ -41,7 +41,7 @@ TOGETHER = 8  # Number of slices processed together: limits memory.
 
 
 def measure_shown_share(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
-    """Return the share by volume of a brain that lies within voxels (I, J, K), whose affine leads to metres (RAS)."""
+    """Return the volume share of a brain inside the grid of voxels (I, J, K) with an affine to metres (RAS)."""
     _, inside = _voxels(affine, shape, _middles(anatomy))
     return float(np.average(inside, weights=anatomy.mesh.volumes))
 
@@ -57,8 +57,8 @@ def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy:
     turned = _is_turned(values, affine, labels, middles, volumes)
     if turned:
         found.append(
-            f"fits the brain in {turned[0]:.0%} of its volume as it is, but in {turned[1]:.0%} with x and y negated: "
-            "it may be LPS that is stated as RAS"
+            f"fits the brain in {turned[0]:.0%} of its volume, but in {turned[1]:.0%} with x and y negated: "
+            "it may be LPS marked as RAS"
         )
     elif not labels and 1.0 - empty < ENOUGH[1]:
         found.append(
@@ -81,7 +81,7 @@ def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy:
 def _is_turned(
     values: np.ndarray, affine: np.ndarray, labels: bool, middles: np.ndarray, volumes: np.ndarray
 ) -> tuple[float, float] | None:
-    """Shares of the brain on bright voxels as they are, and with x and y negated, where the latter are far more."""
+    """Return shares of the brain on bright voxels, unchanged and with x and y negated, if the latter is much larger."""
     part = np.nan_to_num(values[::SAMPLED, ::SAMPLED, ::SAMPLED].astype(float))
     air = 0.0 if labels else DARK * float(np.percentile(part[part > 0.0], BRIGHTEST)) if (part > 0.0).any() else 0.0
     shares = []
@@ -123,7 +123,7 @@ def index_of(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class PatientImage:
-    """An image of a patient: its file, itself as NIfTI, its values (I, J, K) and their place; what seems wrong."""
+    """Image of a patient: file, NIfTI image, values (I, J, K) with their affine, and warnings."""
 
     path: Path
     image: nibabel.Nifti1Image
@@ -143,12 +143,12 @@ class Warped:
 
 
 def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> PatientImage:
-    """Read an image, or a label map, that shows the brain of an anatomy.
+    """Read an image or a label map of the brain of an anatomy.
 
     Raises
     ------
     InputError
-        As `read_volume`; an image that shows none of this brain; labels that are not whole numbers.
+        See `read_volume`; an image that does not overlap this brain; non-integer labels.
     """
     volume = read_volume(path, Voxels(axes=axes), finite=False)
     image = _as_nifti(path, volume)
@@ -166,9 +166,9 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> 
 
 
 def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
-    """Return the image as its NIfTI file has it.
+    """Return the NIfTI image of a file.
 
-    Of another format, the same values in the same place, whole ones whole.
+    Other formats are converted: same values and positions, integers as integers.
     """
     if path.name.lower().endswith((".nii", ".nii.gz")):
         return load_nifti(path)
@@ -188,10 +188,10 @@ def to_warped_name(path: Path) -> str:
 
 
 def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order: str) -> Warped:
-    """Write an image as the brain is now, with its own header: type, scale, sform and qform stay as they are.
+    """Write an image of the deformed brain, with the original header: type, scale, sform and qform.
 
-    Label maps have the nearest voxel's label. Voxels whose source lies outside the image, or in tissue that was cut
-    away, are 0.
+    Label maps use nearest-neighbour interpolation. Voxels whose source is outside the image, or in resected
+    tissue, are 0.
     """
     image, shape = picture.image, picture.volume.values.shape
     proxy, slope, shift = image.dataobj, 1.0, 0.0
@@ -224,9 +224,9 @@ class Counts:
 
 
 def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, order: int) -> tuple[np.ndarray, Counts]:
-    """Values (I, J, K), whose affine leads to metres (RAS), as the fields move them, of the same type.
+    """Warp values (I, J, K) with an affine to metres (RAS) by the fields; the type is kept.
 
-    Voxels that do not move keep their value exactly.
+    Voxels without displacement keep their exact value.
     """
     source = values if order == 0 else np.nan_to_num(values.astype(np.float32), posinf=0.0, neginf=0.0)
     if order > 1:

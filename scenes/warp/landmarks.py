@@ -28,7 +28,7 @@ ROUNDING = 1e-9  # Tolerance within which a point belongs to a tetrahedron [m].
 
 @dataclass(frozen=True, eq=False)
 class Landmark:
-    """A point of tissue: its name, where it is in the scan (3,) [m], and where it is now (3,) [m]."""
+    """Point of tissue: name, position in the scan (3,) [m], and deformed position (3,) [m]."""
 
     name: str
     rest: np.ndarray

@@ -88,15 +88,15 @@ class DeformedAnatomy:
     cause
         Cause of the displacement.
     anatomy, left
-        The body, and what is left of it where some was cut.
+        Anatomy, and its remaining part after a resection.
     displacement
-        (V, 3) [m].
+        Displacement of the vertices (V, 3) [m].
     converged
-        Whether the solution is reliable.
+        True if the solution is reliable.
     bound, bound_words
-        95 % bound of the tumour's surface error [m], None if not known; and its description.
+        95 % bound of the tumour's surface error [m], None if not available; and its description.
     tip
-        Of the tool (3,) [m]; None without one.
+        Tip of the tool (3,) [m]; None without a tool.
     """
 
     cause: Cause
@@ -114,9 +114,9 @@ class DeformedAnatomy:
         return self.anatomy.mesh.nodes + self.displacement
 
     def find_gap(self) -> tuple[np.ndarray, float] | None:
-        """Return the tumour's point (3,) [m] nearest to the tip, and how far it is [m], 0 inside.
+        """Return the tumour's point (3,) [m] nearest to the tip, and its distance [m], 0 inside.
 
-        None where there is none.
+        None without a tip or a tumour.
         """
         triangles = self.left.tumour_surface
         if self.tip is None or not len(triangles):
@@ -175,7 +175,7 @@ def read_moment(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
     Raises
     ------
     InputError
-        As `read_mesh`; a mesh without `displacement` (V, 3), or of another body.
+        See `read_mesh`; a mesh without `displacement` (V, 3), or of another body.
     """
     file = read_mesh(path)
     moved = file.point_data.get("displacement")

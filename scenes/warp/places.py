@@ -35,16 +35,16 @@ TIMES = 3  # Maximum number of trials in the search for a spacing.
 
 @dataclass(frozen=True, eq=False)
 class SamplePlaces:
-    """Vertices of a body, then places in its tetrahedra and on its open cortex, then its landmarks.
+    """Sample points: vertices of a mesh, points in its tetrahedra and on its open cortex, and landmarks.
 
     Parameters
     ----------
     rest, moved
-        Where they are in the scan, and by how much they are displaced (n, 3) [m].
+        Positions in the scan, and displacements (n, 3) [m].
     tumour, cortex, landmarks
-        Whether each is of the tumour, of the open cortex, and one of the landmarks (n,).
+        Masks (n,): True for points of the tumour, of the open cortex, and for landmarks.
     marks
-        Those landmarks, in the order of their places.
+        Landmarks, in the order of their points.
     """
 
     rest: np.ndarray
@@ -83,9 +83,9 @@ def list_places(moment: DeformedAnatomy) -> SamplePlaces:
 
 @dataclass(frozen=True)
 class Folded:
-    """Tetrahedra that meet and lie inside out: how many, their middle in the scan [m, RAS] and their volume there [m3].
+    """Connected inverted tetrahedra: number, centre in the scan [m, RAS] and volume in the scan [m3].
 
-    `off` is by how much the fields are off the finite elements there [m]: no field can follow a fold.
+    `off`: error of the fields relative to FEM there [m]; no field can represent a fold.
     """
 
     tetrahedra: int

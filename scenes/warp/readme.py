@@ -90,7 +90,7 @@ def write_readme(report: dict, images: Sequence[Warped]) -> str:
         landmarks=error["landmarks_worst"],
         bound=_bound(report),
     )
-    failed = [] if report["converged"] else ["THE ANSWER DID NOT CONVERGE: do not rely on it."]
+    failed = [] if report["converged"] else ["THE SOLUTION DID NOT CONVERGE: do not rely on it."]
     trust = "\n".join([*failed, *(f"WARNING: {warning}" for warning in report["warnings"])])
     start = INTRODUCTION.format(words=report["moved_by"], trust=trust, **report["anatomy"])
     return start + FILES.format(sequence=sequence, images=lines, surfaces=surfaces) + limits

@@ -34,11 +34,11 @@ class Patch:
     Parameters
     ----------
     nodes
-        (m,) sorted mesh vertices of the patch: those that a footprint inside it loads.
+        Sorted mesh vertices (m,) of the patch: those that a footprint inside it loads.
     triangles
-        (S, 3) positions in `nodes`, outwards.
+        Triangles (S, 3) of positions in `nodes`, oriented outwards.
     points
-        (m, 3) [m], RAS.
+        Positions (m, 3) [m], RAS.
     """
 
     nodes: np.ndarray

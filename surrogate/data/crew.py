@@ -30,7 +30,7 @@ class LazyFem:
     Parameters
     ----------
     anatomy, effects, accuracy, element, batch, device
-        As in `Fem`.
+        See `Fem`.
     loads
         Number of loads that will be solved.
     share
@@ -78,15 +78,15 @@ class Solver:
 
 @contextmanager
 def open_solvers(asked: LazyFem, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
-    """Open FEM solvers on each of the devices; with one device it is in this process.
+    """Open FEM solvers on each of the devices; with one device the solver is in this process.
 
-    Without a `batch` it is as large as fits. With several GPUs each then gets the same number of batches. `said` first
+    Without `batch`, the largest size that fits is used. Several GPUs then get equal numbers of batches. `said` first
     receives the required memory of each GPU.
 
     Raises
     ------
     InputError
-        As `Fem`; a GPU with too little memory.
+        See `Fem`; a GPU with too little memory.
     LostError
         A process that was killed.
     """

@@ -58,7 +58,7 @@ class Dataset:
     outcome
         n outcomes; the rows of failed cases hold no equilibrium under the whole load.
     iterations, residual
-        (n,).
+        Iterations and residual of each load (n,).
     unit_good
         (3 m,) bool: the unit responses that converged.
     provenance
@@ -157,7 +157,7 @@ class Dataset:
         Raises
         ------
         InputError
-            As `displacement`.
+            See `displacement`.
         """
         return self._rows("unit", nodes, self.unit_good, FAINTEST)
 

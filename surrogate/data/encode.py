@@ -101,9 +101,9 @@ class Basis:
     Parameters
     ----------
     nodes
-        (n,) mesh vertices.
+        Mesh vertices (n,).
     modes
-        (r, 3 n) float32.
+        Modes (r, 3 n) float32.
     """
 
     nodes: np.ndarray

@@ -75,13 +75,13 @@ class SimulationWork:
     Parameters
     ----------
     anatomy
-        The body.
+        Anatomy to solve.
     loads
-        As in `simulate`.
+        See `simulate`.
     nodes
-        (m,) vertices with a unit force; none if the loads are poses.
+        Vertices (m,) with a unit force; none if the loads are poses.
     batch
-        Rows that are solved together.
+        Number of rows that are solved together.
     """
 
     anatomy: Anatomy
@@ -212,9 +212,9 @@ def _fill(
 
 
 def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
-    """Compute wall seconds a solve, of each kind that was solved now; of others as in the finished file.
+    """Compute the wall time per solve [s] of each newly solved kind; other kinds keep the value of the finished file.
 
-    All of one width, so that files made in one run or in several have the same size.
+    All texts have the same width, so that the file size does not depend on the number of runs.
     """
     before: dict[str, str] = {}
     if path.exists():

@@ -30,13 +30,13 @@ class DiscSplit:
     Parameters
     ----------
     centres
-        (k, 3) [m].
+        Centres of the discs (k, 3) [m].
     radius
-        Of each disc [m].
+        Radius of each disc [m].
     disc
-        (B,) number of the disc that a load's point is in, -1 for the training loads, -2 for unused ones.
+        Number (B,) of the disc that contains a load's point, -1 for the training loads, -2 for unused ones.
     share
-        Part of the patch's area that the discs cover.
+        Share of the patch's area that the discs cover.
     """
 
     centres: np.ndarray

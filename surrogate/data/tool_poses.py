@@ -43,23 +43,23 @@ def choose_ball(preset: str) -> Ball:
 
 
 def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: BuiltIn | None = None) -> Loads:
-    """Sample `count` poses of a tool, pressed into the open cortex; load i depends as in `surrogate.draw`.
+    """Sample `count` poses of a tool, pressed into the open cortex; load i depends on the same as in `surrogate.draw`.
 
     Positions are uniform by area, and the tool's end is inside the edge. For a ball, positions and directions are those
-    of the preset's forces. Depths are uniform from 0.05 to 0.9 of the radius, and no deeper than the preset's tool
-    goes. Rods and blades move straight along their shaft from the first contact. They are turned at random about their
-    shaft. Rods tilt as the preset's tool does, and go to two radii. Blades tilt by up to 20 degrees, and go to two
-    thirds of their width.
+    of the preset's forces. Depths are uniform from 0.05 to 0.9 of the radius, and limited to the depth of the preset's
+    tool. Rods and blades move straight along their shaft from the first contact. The rotation about the shaft is
+    random. Rods tilt as the preset's tool, with depths of up to two radii. Blades tilt by up to 20 degrees, with
+    depths of up to two thirds of their width.
 
     Parameters
     ----------
     tool
-        By default the ball that represents the preset.
+        Tool; default: the ball that represents the preset.
 
     Raises
     ------
     InputError
-        As `draw` and `choose_ball`.
+        See `draw` and `choose_ball`.
     """
     tool, patch = choose_ball(preset) if tool is None else tool, open_patch(anatomy)
     source = np.random.Generator(np.random.Philox(key=seed))

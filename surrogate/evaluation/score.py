@@ -32,10 +32,10 @@ class SolveCounts:
     series
         Linear solves of the power series: places x radii x terms.
     inside
-        Those of them inside held-out discs that are of the tumour.
+        Number of those for the tumour inside held-out discs.
     seconds
-        Of all these solves, on the machine that ran them; None if the data do not record it, or if an interrupted run
-        was resumed.
+        Duration of all these solves [s], on the machine that ran them; None if it is not recorded, or if an
+        interrupted run was resumed.
     """
 
     loads: int
@@ -62,17 +62,17 @@ class ForceScore:
     Parameters
     ----------
     loads
-        n.
+        Number n of loads.
     force
         Mean of the FEM forces [N].
     mean
         Mean error [N].
     mean_percent, p95_percent
-        Of each error divided by its load's force [%].
+        Mean and 95th percentile of the errors divided by the load's force [%].
     held
-        Empirical coverage of the bound, as in `Coverage`; None without a bound.
+        Empirical coverage of the bound, see `Coverage`; None without a bound.
     bound
-        Median of the bound at the first level [N]; None as above.
+        Median of the bound at the first level [N]; None without a bound.
     """
 
     loads: int
@@ -141,15 +141,15 @@ class Score:
     name
         Name of the deformer.
     mean_mm, p95_mm, p999_mm, max_mm
-        [mm]; each p999 is None for fewer than `FEWEST_FOR_P999` loads.
+        Mean, percentiles and maximum [mm]; p999 is None for fewer than `FEWEST_FOR_P999` loads.
     mean_percent, p95_percent, p999_percent, max_percent
-        Each error divided by its load's motion, which is the mean displacement of the vertices in the reference [%].
+        The same of errors divided by the load's motion, the mean displacement of the vertices in the reference [%].
     worst_mean_mm, worst_p95_mm, worst_p999_mm
-        Of the maximum vertex error of each load, over the loads [mm]; the largest is `max_mm`.
+        Mean and percentiles over loads of the maximum vertex error of each load [mm]; the largest is `max_mm`.
     microseconds
-        Median wall time of `deform` for one load at a time, its bound and limits included, warm-up excluded.
+        Median wall time of `deform` for one load at a time [us], its bound and limits included, warm-up excluded.
     bare_microseconds
-        Median wall time of the model alone in NumPy, which compares model types; None for other deformers.
+        Median wall time of the model alone in NumPy [us], which compares model types; None for other deformers.
     solves
         Number of FEM solves that the deformer depends on, if known.
     """
@@ -235,7 +235,7 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
         "          mm, all vertices                | mm, a load's worst vertex  | % of motion                 "
         "| us, NumPy model\n"
         "learner      mean     p95   p99.9     max |    mean     p95   p99.9    |   mean    p95  p99.9    max "
-        "|      | us, answer with bound"
+        "|      | us, result with bound"
     )
     rows = [
         f"{row.name:<10}{row.mean_mm:7.4f} {row.p95_mm:7.4f} {_known(row.p999_mm, '7.4f')} {row.max_mm:7.4f} | "

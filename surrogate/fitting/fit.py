@@ -140,13 +140,13 @@ def fit_tissue(
 ) -> FittedTissue:
     """Estimate the tissue of a locator's anatomy from some frames.
 
-    Points that no other supports are removed: `left_out`, or those found now. FEM results in `folder` are read.
+    Points without support by others are removed: `left_out`, or those found now. FEM results in `folder` are read.
     `progress` receives a stage, the number of its parts done, and their total.
 
     Raises
     ------
     InputError
-        As `check_frames` and `find_unsupported`.
+        See `check_frames` and `find_unsupported`.
     """
     anatomy = locator.anatomy
     check_frames(anatomy, frames)

@@ -37,7 +37,7 @@ class Tool:
     Parameters
     ----------
     tip
-        (3,) [m], RAS: contact position.
+        Contact position (3,) [m], RAS.
     radius
         [m] of the disc on which it presses.
     force, sigma

@@ -45,9 +45,9 @@ class Responses:
     Parameters
     ----------
     nodes
-        (n,) sorted mesh vertices.
+        Sorted mesh vertices (n,).
     motion
-        By skull: (poissons, ratios, loads, n, 3) [m], of tissue as stiff as that of `locating.causes`.
+        Displacements by skull (poissons, ratios, loads, n, 3) [m], with the tissue stiffness of `locating.causes`.
     regions
         Known regions that were included.
     """

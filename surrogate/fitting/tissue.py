@@ -37,9 +37,9 @@ class FittedTissue:
     frames
         Number of frames.
     probability
-        (skulls, poissons, ratios), which sum to 1: of `sim.effects.SKULLS`, `FINE_POISSONS` and `FINE_RATIOS`.
+        Probability (skulls, poissons, ratios), with sum 1, of `sim.effects.SKULLS`, `FINE_POISSONS` and `FINE_RATIOS`.
     young
-        (k,) samples of the brain's Young's modulus [Pa], equally probable; empty if no force was measured.
+        Samples (k,) of the brain's Young's modulus [Pa], equally probable; empty if no force was measured.
     """
 
     anatomy: str

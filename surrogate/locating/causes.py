@@ -98,7 +98,7 @@ class Group:
     number
         Number from 0; samples depend on it and the seed alone.
     skull
-        One of `sim.effects.SKULLS`.
+        Skull model, one of `sim.effects.SKULLS`.
     poisson, ratio, exponent
         Poisson's ratio of the brain; tumour stiffness over the brain's; -m of Ogden's law, by which both stiffen.
     regions
@@ -202,9 +202,9 @@ class Presses:
     Parameters
     ----------
     points
-        (p, 3) [m] on the open cortex.
+        Positions (p, 3) [m] on the open cortex.
     motion
-        By name of the skull: (tissues, p, 3, V, 3) float32 [m], for a force along each axis.
+        Displacements (tissues, p, 3, V, 3) float32 [m] by name of the skull, for a force along each axis.
     """
 
     points: np.ndarray

@@ -61,9 +61,9 @@ class Ensemble:
     anatomy
         The body.
     motion
-        (N, V, 3) float32 [m].
+        Displacements (N, V, 3) float32 [m].
     kind, skull, group
-        (N,) indices into `KINDS` and into the names of `sim.effects.SKULLS`; number of the group.
+        Indices (N,) into `KINDS` and into the names of `sim.effects.SKULLS`; number of the group.
     """
 
     anatomy: Anatomy

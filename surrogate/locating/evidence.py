@@ -39,15 +39,15 @@ class Evidence:
     place
         Material points of the rows, in the mesh.
     at
-        (m, 3) [m] undeformed positions.
+        Undeformed positions (m, 3) [m].
     axis
-        (m, 3) unit vectors.
+        Unit vectors (m, 3).
     value
         (m,) [m].
     sigma
         (m,) [m]: standard deviation of the non-rigid error.
     point
-        (m,) number of the observed point that each row belongs to.
+        Number (m,) of the observed point of each row.
     shift
         [m]: standard deviation of the rigid error's translation along each axis.
     """

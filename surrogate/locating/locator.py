@@ -48,7 +48,7 @@ class RigidAlone:
     share
         Share of the observation, in mean square, that it explains.
     shift, turn
-        Its size [m], [rad].
+        Size of the rigid error [m], [rad].
     """
 
     share: float
@@ -300,7 +300,7 @@ def compute_radius(covariance: np.ndarray) -> float:
 
 @cache
 def _normal() -> np.ndarray:
-    """Sample standard normal numbers (DRAWS, 3), the same each time."""
+    """Sample standard normal numbers (DRAWS, 3) with a fixed seed."""
     return np.random.default_rng(0).standard_normal((DRAWS, 3))
 
 

@@ -61,7 +61,7 @@ def read_columns(
     Raises
     ------
     InputError
-        As `read_observation`.
+        See `read_observation`.
     """
     path = to_path(path)
     known = " or ".join(",".join(names) for names in sorted(allowed))

@@ -155,11 +155,11 @@ class ObservedPrior:
     rows
         Whitened effect of unit weights, and of a rigid error of one standard deviation, on the observation.
     odds
-        As `MotionPrior.odds`.
+        See `MotionPrior.odds`.
     slip
-        As `Evidence.slip`.
+        See `Evidence.slip`.
     named
-        True if points have correspondences. A cloud excludes oedema: its errors look like it.
+        True if points have correspondences. Oedema is excluded for point clouds: their errors resemble it.
     """
 
     prior: MotionPrior

@@ -52,9 +52,9 @@ class Hypothesis:
     Parameters
     ----------
     rows
-        (k,) of the prior's shapes.
+        Rows (k,) of the prior's shapes.
     size
-        (k,) standard deviations of their weights, as shares of the observed motion.
+        Standard deviations (k,) of their weights, as shares of the observed motion.
     rigid
         Size of the rigid error relative to the reported one; inf for a slipped registration.
     places
@@ -74,13 +74,13 @@ class PriorTables:
     Parameters
     ----------
     rows
-        (s, k) of the prior's shapes. A skull with fewer of a kind is padded with row 0, of size 0.
+        Rows (s, k) of the prior's shapes. A skull with fewer of a kind is padded with row 0, of size 0.
     size
-        (s, k), as in `Hypothesis`.
+        Sizes (s, k), see `Hypothesis`.
     kind
         (k,) of the columns; tools all over the cortex.
     places
-        (s, p, q), as in `Hypothesis`.
+        Rows (s, p, q), see `Hypothesis`.
     """
 
     rows: np.ndarray
@@ -101,13 +101,13 @@ class MotionPrior:
         (r, n, 3) float32 [m] at `nodes`. Those of one kind, skull and place together, with weights of variance 1, move
         the open cortex or the tumour by 1 mm in root mean square.
     kind, skull
-        (r,) indices into `KINDS` and into the names of `sim.effects.SKULLS`.
+        Indices (r,) into `KINDS` and into the names of `sim.effects.SKULLS`.
     place
-        (r,) number of the place under the tool, or `NOWHERE`.
+        Number (r,) of the position under the tool, or `NOWHERE`.
     centre
-        (p, 3) [m] undeformed positions of these places.
+        Undeformed coordinates (p, 3) [m] of these positions.
     nodes
-        (n,) sorted mesh vertices of the shapes; None: all.
+        Sorted mesh vertices (n,) of the shapes; None: all.
     """
 
     anatomy: Anatomy

@@ -24,9 +24,9 @@ class Region:
     label
         Label in the mesh.
     ratio
-        Its Young's modulus over the brain's.
+        Young's modulus relative to the brain's.
     poisson
-        Its Poisson's ratio; None: the brain's.
+        Poisson's ratio; None: the brain's.
 
     Raises
     ------

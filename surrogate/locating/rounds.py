@@ -19,12 +19,12 @@ STEADY = 0.2e-3  # Motion of the tumour's centroid below which the iteration end
 def match_and_update(prior: MotionPrior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
     """Compute the posterior of an observation, and the numbers (k,) of its points near the cortex.
 
-    The rigid error may be `free`, as in `condition_prior`.
+    The rigid error may be `free`, see `condition_prior`.
 
     Raises
     ------
     InputError
-        As `to_evidence`.
+        See `to_evidence`.
     """
     anatomy, tips, count = prior.anatomy, observation.tips, len(observation.now)
     evidence = to_evidence(anatomy, observation)

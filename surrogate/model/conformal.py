@@ -42,15 +42,15 @@ class Bound:
     Parameters
     ----------
     mean, deviation
-        (f,) of the scale's features.
+        Mean and standard deviation (f,) of the scale's features.
     weights
-        (t,) of the monomials up to the second degree of standardised features; their sum is the logarithm of the scale.
+        Weights (t,) of monomials up to degree two of standardised features; their sum is the logarithm of the scale.
     edges
-        (k - 1,) forces [N] between the k classes.
+        Limits (k - 1,) [N] between the k force classes.
     quantile
         (2, k): of error over scale, for `LEVELS` and each class.
     growth, near
-        () [1/m] growth with the distance from the nearest training load, and () [m] the distance from which it grows.
+        Growth () [1/m] with the distance from the nearest training load, and distance () [m] from which it grows.
     """
 
     mean: np.ndarray
@@ -91,13 +91,13 @@ def fit_bound(
     seen
         Features (m, f) and largest errors (m,) [m] of loads that are not in the model's training.
     features, force, error
-        (n, f), (n,) [N] and largest errors (n,) [m], of the calibration loads.
+        Features (n, f), forces (n,) [N] and maximum errors (n,) [m] of the calibration loads.
     each
         Minimum number of calibration loads in a class of force: fewer than 99 give no guarantee at 0.99.
     curved
         True if the scale's logarithm is quadratic in the load's features, given `BENDS` seen loads; else linear.
     away, growth
-        (n,) [m] distances of the calibration loads from the nearest training load; growth of the bound with it [1/m].
+        Distances (n,) [m] of the calibration loads from the nearest training load; growth of the bound with it [1/m].
     """
     mean, deviation = compute_standardisation(seen[0])
     used = _used(len(mean), LOAD if curved and len(seen[1]) >= BENDS else 0)

@@ -162,8 +162,8 @@ class Learned:
     def _demand_answerable(self, pushed: Pushed, doubtful: np.ndarray) -> None:
         """Raise InputError for loads off the open cortex, or far beyond the training range.
 
-        Checks the `doubtful` (k,) rows alone: a load inside the envelope is neither, unless its radius is below the
-        reach.
+        Checks only the `doubtful` (k,) rows: a load inside the training range is accepted, unless its radius is too
+        small.
         """
         if not len(doubtful):
             return

@@ -74,7 +74,7 @@ class Archive:
         Raises
         ------
         InputError
-            As `arrays`; one whose content has another digest.
+            See `arrays`; an array whose content has another digest.
         """
         found = self.read_arrays(digests)
         for name, array in found.items():
@@ -88,7 +88,7 @@ class Archive:
         Raises
         ------
         InputError
-            As `arrays`; header or arrays that do not match the seal.
+            See `arrays`; header or arrays that do not match the seal.
         """
         found = self.read_arrays(names)
         if compute_seal(header, found) != header["seal"]:

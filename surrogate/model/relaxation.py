@@ -56,7 +56,7 @@ def follow_relaxation(
     pushed
         Indentations of B tools.
     times
-        (B,) [s].
+        Times (B,) [s].
     start
         Result of a model of the same series, at earlier or the same times.
     shallowest

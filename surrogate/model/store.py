@@ -133,7 +133,7 @@ def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None
     Raises
     ------
     InputError
-        As `read_reported_errors`; an invalid tissue.
+        See `read_reported_errors`; an invalid tissue.
     """
     with _described_in(path) as header:
         if header["anatomy"] != anatomy.digest:

@@ -25,7 +25,7 @@ class Distance:
     Parameters
     ----------
     value
-        (B,) [m].
+        Distances (B,) [m].
     bound
         (2, B) [m]: error bound relative to FEM, with probability 0.95 and 0.99; NaN without a guarantee.
     """

@@ -52,7 +52,7 @@ class Envelope:
     Parameters
     ----------
     points
-        (n, 3) points of the training loads [m].
+        Points (n, 3) of the training loads [m].
     reach
         Largest distance of a training point from its nearest neighbour [m]: how densely they cover the cortex.
     overhang

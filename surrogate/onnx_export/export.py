@@ -112,7 +112,7 @@ def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False
     Raises
     ------
     InputError
-        As `onnx_model`; a path that does not end in .onnx, or a folder that cannot be written.
+        See `onnx_model`; a path that does not end in .onnx, or a folder that cannot be written.
     """
     graph = build_onnx_model(name, model, cortex)
     with write_atomically(path, ".onnx") as partial:

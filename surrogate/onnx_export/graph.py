@@ -49,9 +49,9 @@ class Wire(NDArrayOperatorsMixin):
     sheet
         Graph that it belongs to.
     name
-        Its name there.
+        Name in the graph.
     sample
-        Its value for a batch of sample loads: its type and shape are NumPy's own. No formula may depend on the length
+        Value for a batch of sample loads: type and shape are NumPy's. No formula may depend on the length
         of the batch, which differs in use.
     """
 

@@ -26,12 +26,12 @@ class Pcr(Stored):
 
     Jolliffe 2002, "Principal Component Analysis", chapter 8. The features are not scaled, so they must share one unit
     (forces at the nodes). Components are kept until they explain `share` of the features' variance: others would be
-    fitted to places that few loads touch.
+    fitted to positions that few loads touch.
 
     Parameters
     ----------
     share
-        Of the variance, in (0, 1].
+        Share of the variance, in (0, 1].
     """
 
     kept = ("mean", "map", "offset")
@@ -135,13 +135,13 @@ class Ann:
     Parameters
     ----------
     hidden
-        Units in each layer.
+        Number of units in each layer.
     decay
-        Weight of the summed squared weights against the summed squared error of outputs whose total variance is one.
+        Weight of the sum of squared weights over the summed squared error of outputs whose total variance is one.
     steps
-        L-BFGS iterations.
+        Number of L-BFGS iterations.
     seed
-        Of the first weights.
+        Seed of the initial weights.
     """
 
     hidden: int = 64

@@ -51,11 +51,11 @@ class Series:
     Parameters
     ----------
     corners
-        (V, 3) [m], of the open cortex.
+        Vertices (V, 3) [m] of the open cortex.
     triangles
         (S, 6): three corners, then the midpoints of the opposite edges, as numbers of places.
     radii
-        (R,) [m], increasing.
+        Footprint radii (R,) [m], increasing.
     table
         (places R, 19 r): coefficients of the basis's modes.
     """
@@ -236,11 +236,11 @@ def fill_table(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> n
     Parameters
     ----------
     points
-        (P, 3) [m].
+        Positions (P, 3) [m].
     table
-        (P, ...) of any unit.
+        Table (P, ...) in any unit.
     left_out
-        (P,) bool.
+        Mask (P,) bool of held-out positions.
 
     Raises
     ------

@@ -34,11 +34,11 @@ class Gp(Stored):
     Parameters
     ----------
     rows, most
-        Cost grows with their cubes.
+        Maximum numbers of rows of the likelihood and of the conditioning; the cost is cubic in them.
     strongest
         Number of outputs of largest variance in the likelihood, each in units of its own variance.
     seed
-        Of the subsets.
+        Seed of the subsets.
     """
 
     kept = ("mean", "deviation", "offset", "length", "noise", "scaled", "dual")

@@ -70,11 +70,11 @@ class RigidContact:
     Parameters
     ----------
     points
-        (k, 3) [m] of the nodes that a tool may touch.
+        Positions (k, 3) [m] of the nodes that a tool may touch.
     triangles
-        (S, 3) positions in `points`.
+        Triangles (S, 3) of positions in `points`.
     compliance
-        (3 k, 3 k) [m/N] float32.
+        Compliance matrix (3 k, 3 k) [m/N] float32.
     answers
         (3 k, r) [1/N] float32: coefficients of the basis's modes by unit forces.
     line

@@ -88,7 +88,7 @@ class Missed:
     pushed, known, outside
         B loads, and their position relative to the model's training range.
     features
-        (B, f), of the scale of its bounds.
+        Features (B, f) of the scale of its bounds.
     error
         (B,) [m]: maximum over the tumour's vertices, or of the distance; [N]: of the tool's force.
     """
@@ -202,15 +202,15 @@ class TrainingSolutions:
     Parameters
     ----------
     loads, pushed
-        As in the data set, and as input of a model.
+        Loads as in the data set, and as input of a model.
     patch, nodes
         Open cortex, and the tumour's vertices (n,).
     tumour, cortex
         Displacements (B, n, 3) and (B, c, 3) [m].
     distances
-        From tip to tumour.
+        Distances from tip to tumour.
     force
-        (B, 3) [N] of a tool moved by pose; None if not available.
+        Force (B, 3) [N] of a tool moved by pose; None if not available.
     """
 
     loads: Loads

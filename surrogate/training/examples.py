@@ -25,7 +25,7 @@ class Examples:
     tumour, cortex
         Displacements (B, n, 3) [m].
     force
-        (B, 3) [N] of a tool moved by pose, if available.
+        Force (B, 3) [N] of a tool moved by pose, if available.
     """
 
     loads: Pushed

@@ -66,7 +66,7 @@ class Expansion:
     Parameters
     ----------
     data
-        Its anatomy, tissue and element; its loads give the widths of tools.
+        Data set with anatomy, tissue and element; its loads give the widths of tools.
     device
         Device of the FEM.
     progress
@@ -324,7 +324,7 @@ class Tabulated:
     Parameters
     ----------
     bases
-        One, or two.
+        One basis, or two.
     table
         (P, R, 19, r) float32: coefficients of the bases' modes, one after the other.
     pairs, second, pair_basis

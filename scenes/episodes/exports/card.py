@@ -37,14 +37,14 @@ LICENCE = f"""# Licence of this data set
 These data are licensed under the Creative Commons Attribution 4.0 International licence (CC BY 4.0).
 Its text: https://creativecommons.org/licenses/by/4.0/legalcode
 
-In plain words, which do not replace that text:
+Summary, which does not replace that text:
 
 - You may copy, share and change these data, also to earn money with them.
-- You must name who made them, link to the licence, and say whether you changed anything.
-- You may not suggest that who made them stands behind you or what you do.
+- You must name the authors, link to the licence, and indicate whether you changed anything.
+- You may not suggest that the authors endorse you or your use.
 - There is no warranty. They are simulated, and are not fit for decisions about patients.
 
-If an anatomy in `bodies` was made from somebody's scan, this licence gives no right to that scan. Ask who holds it.
+If an anatomy in `bodies` was made from a person's scan, this licence gives no right to that scan. Ask its owner.
 The program that made the data, sulcus, has its own licence: Apache 2.0.
 """
 
@@ -57,7 +57,7 @@ def write_card(
 ) -> dict[str, Any]:
     """Write `episodes.csv`, `croissant.json`, `DATASHEET.md` and `LICENSE.md` into a data set's folder.
 
-    Each appears whole, and an earlier card is replaced. `contents` are those of its episodes, where they are known.
+    Files are written atomically and replace an earlier card. `contents`: contents of its episodes, if already read.
 
     Raises
     ------
@@ -78,8 +78,8 @@ def write_card(
     notes = [*missing, *describe_weak(list_model_errors(folder))]
     sheet = write_datasheet(folder.resolve().name, episodes, rows, notes, run_of(folder))
     description = (
-        f"{len(rows)} episodes of scripted surgery on simulated brains with a tumour: pictures, depth, poses of camera "
-        "and tool, forces, and where the tumour is by finite elements."
+        f"{len(rows)} episodes of scripted surgery on simulated brains with a tumour: images, depth, poses of camera "
+        "and tool, forces, and tumour positions by FEM."
     )
     date = max(str(one.said.get("date", ""))[:10] for one in episodes) or datetime.now(UTC).date().isoformat()
     described = build_croissant_metadata(
@@ -98,14 +98,14 @@ def keep_card(
 ) -> str | None:
     """Rewrite the card of a run's folder if it does not match the episodes; return the reason if this failed.
 
-    Nothing is written if no episode is complete. Files that are of no card stay.
+    Nothing is written if no episode is complete. Files that do not belong to a card are kept.
 
     Parameters
     ----------
     numbers
-        Of the episodes that are there.
+        Numbers of the existing episodes.
     changed
-        Whether episodes were made, or failed, since the card was written.
+        True if episodes were made, or failed, since the card was written.
     """
     if not numbers or not (changed or _differs(folder, {to_episode_name(number) for number in numbers})):
         return None
@@ -141,7 +141,7 @@ def list_card_files(folder: Path) -> dict[str, int]:
 
 
 def run_of(folder: Path) -> RunSettings | None:
-    """Return the run whose folder it is; None of a folder that is no run's, or whose note of it cannot be read."""
+    """Return the settings of the run in a folder; None without a run, or if its settings cannot be read."""
     try:
         return read_run(folder)
     except InputError:

@@ -1,4 +1,4 @@
-"""What exports take of an episode: its task and whether it is held out, pictures, the rate of frames, numbers."""
+"""Columns of exports: task, held-out flag, images, frame rate and numbers of an episode."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ..reading.schema import PICTURES
 from ..reading.windows import read_numbers
 
 TASKS = {  # Descriptions of tasks, by family.
-    "press": "Press on one place of the open cortex, hold, and let go.",
-    "slide": "Press, slide along a straight line over the open cortex, and let go.",
+    "press": "Press one position of the open cortex, hold, and release.",
+    "slide": "Press, slide along a straight line over the open cortex, and release.",
     "draw": "Lay the tool on the open cortex, and draw the tissue aside.",
-    "reach": "Touch several places of the open cortex in turn, by smooth motions.",
-    "walk": "Wander over the open cortex at random, always in contact.",
-    "palpate": "Move a ball by its pose over the open cortex, to palpate it at several places.",
+    "reach": "Touch several positions of the open cortex one after another, with smooth motions.",
+    "walk": "Move over the open cortex at random, always in contact.",
+    "palpate": "Move a ball by its pose over the open cortex, to palpate it at several positions.",
     "retract": "Draw the cortex aside with a spatula, and hold it while the tissue relaxes.",
     "drain": "Drain fluid and turn the head, while the brain sinks.",
-    "debulk": "Cut the tumour out in shares.",
+    "debulk": "Resect the tumour in steps.",
 }
 HELD_OUT = 10  # One in this many bodies (or episodes, if there are fewer bodies) is held out.
 
@@ -76,7 +76,7 @@ def list_shared_images(episodes: Sequence[EpisodeContents], wanted: Sequence[str
     for one in episodes:
         if one.size != episodes[0].size:
             sizes = " and ".join(f"{width} x {height}" for width, height in (episodes[0].size, one.size))
-            raise InputError(f"{one.path}: pictures of {sizes} pixels do not go into one set: convert them apart.")
+            raise InputError(f"{one.path}: images of {sizes} pixels cannot be in one set: convert them separately.")
     return tuple(name for name in wanted if all(name in one.shapes for one in episodes))
 
 

@@ -36,22 +36,22 @@ CONTEXT: Mapping[str, Any] = {
 """The specification's own context."""
 COLUMNS: Mapping[str, tuple[str, str]] = {
     "file": ("sc:Text", "The episode's HDF5 file."),
-    "family": ("sc:Text", "What happens in it."),
-    "task": ("sc:Text", "The same as a sentence."),
-    "frames": ("sc:Integer", "How many frames it has."),
-    "solved": ("sc:Integer", "How many of them finite elements solved."),
-    "seconds": ("sc:Float", "How long it lasts [s]."),
-    "width": ("sc:Integer", "Of its pictures [pixel]."),
-    "height": ("sc:Integer", "Of its pictures [pixel]."),
-    "seed": ("sc:Text", "What its draws began from; empty where nothing was drawn."),
+    "family": ("sc:Text", "Scenario of the episode."),
+    "task": ("sc:Text", "Description of the scenario."),
+    "frames": ("sc:Integer", "Number of frames."),
+    "solved": ("sc:Integer", "Number of frames that FEM solved."),
+    "seconds": ("sc:Float", "Duration [s]."),
+    "width": ("sc:Integer", "Width of the images [pixel]."),
+    "height": ("sc:Integer", "Height of the images [pixel]."),
+    "seed": ("sc:Text", "Seed of the sampled parameters; empty if nothing was sampled."),
     "anatomy": ("sc:Text", "Digest of the anatomy."),
-    "deformer": ("sc:Text", "What moved the tissue in the pictures."),
+    "deformer": ("sc:Text", "Model that deformed the tissue in the images."),
     "largest_error_mm": (
         "sc:Float",
-        "Of the predicted tumour against finite elements, where they solved [mm]; empty where no model played.",
+        "Maximum error of the predicted tumour relative to FEM in solved frames [mm]; empty if FEM was displayed.",
     ),
     "bytes": ("sc:Integer", "Size of the file."),
-    "sha256": ("sc:Text", "Checksum that the file states of its arrays; empty where it states none."),
+    "sha256": ("sc:Text", "Checksum in the file of its arrays; empty if there is none."),
 }
 """Columns of the table of episodes: type and meaning."""
 

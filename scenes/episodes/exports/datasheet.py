@@ -30,7 +30,7 @@ def read_parameters(contents: EpisodeContents) -> dict[str, Any]:
 
 
 def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
-    """Lines of two tables: ranges of numbers and how often each text came; what is the same wherever it is."""
+    """Yield lines of two tables: varied parameters (ranges, or counts of texts), and constant parameters."""
     values: dict[str, list[Any]] = {}
     for one in episodes:
         for key, value in read_parameters(one).items():
@@ -108,19 +108,19 @@ def has_template(episodes: Sequence[EpisodeContents]) -> bool:
 
 
 def format_origins(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
-    """Lines of the data sheet."""
+    """Yield lines on the source of the anatomies."""
     for origin, count in Counter(find_origin(one) for one in episodes).most_common():
         if origin in (TEMPLATE, DRAWN):
-            tumour = "one and the same" if origin == TEMPLATE else "drawn"
+            tumour = "the same in all" if origin == TEMPLATE else "sampled"
             yield (
                 f"- In {count} episodes the brain is the ICBM 152 template's of 2009 (MNI152), as nilearn "
-                "ships it, scaled to a person's. It is an average of 152 healthy adults, and nobody's own. "
-                f"Tumour and opening were put into it; they are {tumour}."
+                "ships it, scaled to a person's. It is an average of 152 healthy adults, not of a single person. "
+                f"Tumour and opening are synthetic; they are {tumour}."
             )
         elif origin == UNSTATED:
-            yield f"- In {count} episodes the files do not say whose brain it is: write it here."
+            yield f"- In {count} episodes the files do not give the source of the brain: write it here."
         else:
-            yield f"- In {count} episodes the anatomy is the maker's own, `{origin}`. Write here whose it is."
+            yield f"- In {count} episodes the anatomy is a custom one, `{origin}`. Write its source here."
 
 
 MARK = "<!-- sulcus card 1 -->"  # Line that marks a generated data sheet.
@@ -135,9 +135,9 @@ def write_datasheet(
     notes: Sequence[str] = (),
     run: RunSettings | None = None,
 ) -> str:
-    """Return the sheet as Markdown, of what the files say: `rows` are those of the table of episodes.
+    """Return the data sheet as Markdown, from the files' attributes; `rows` are those of the table of episodes.
 
-    `notes` are sentences on what is missing or weak; `run` is the run whose folder it is.
+    `notes` are sentences on missing or weak parts; `run` is the run of the folder.
     """
     parts = (
         f"# Data sheet: {name}\n\n{MARK}\n",
@@ -148,12 +148,12 @@ def write_datasheet(
         describe_collection(episodes, run),
         UNKNOWN,
         "## Preprocessing\n\nColour is JPEG, depth PNG of 16 bits and labels PNG of 8 bits. Nothing else was changed. "
-        "`sulcus validate` compares pictures, arrays and checksums.\n",
-        "## Uses\n\nTo train and test methods that follow tools, estimate deformation or plan motion, before real data "
+        "`sulcus validate` compares images, arrays and checksums.\n",
+        "## Uses\n\nTo train and test methods that track tools, estimate deformation or plan motion, before real data "
         "are used. Not for decisions about patients: nothing here was measured on one.\n",
-        "## Distribution\n\nUnder CC BY 4.0, as `LICENSE.md` says in plain words.\n",
-        "## Maintenance\n\nWhoever gives these data out answers for them: write here who, and where errors are "
-        "reported. The plan below and the seeds above make them anew.\n",
+        "## Distribution\n\nUnder CC BY 4.0, see the summary in `LICENSE.md`.\n",
+        "## Maintenance\n\nThe publisher of these data is responsible for them: write the contact for error "
+        "reports here. The plan below and the seeds above reproduce them.\n",
         *format_plans(episodes),
     )
     return "\n".join(parts)
@@ -178,23 +178,23 @@ def describe_composition(
             sum(row[key] for row in those) for key in ("frames", "solved", "seconds", "bytes")
         )
         lines.append(f"| {family or 'all'} | {len(those)} | {frames} | {solved} | {seconds:.1f} | {size / 1e9:.3f} |")
-    lines.append(f"\n*Solved* are frames that finite elements answered. {describe_bodies(episodes)}")
+    lines.append(f"\n*Solved*: frames that FEM solved. {describe_bodies(episodes)}")
     lines += [*notes, ""]
     lines += ["| array | unit | in episodes |", "|---|---|---|"]
     counts = Counter(name for one in episodes for name in one.shapes)
     for key, count in sorted(counts.items()):
-        unit = "picture" if key in PICTURES else ARRAYS[key].unit or ""
+        unit = "image" if key in PICTURES else ARRAYS[key].unit or ""
         lines.append(f"| `{key}` | {unit} | {count} |")
     worst = [row["largest_error_mm"] for row in rows if row["largest_error_mm"] != ""]
     if worst:
         lines.append(
-            f"\nThe largest distance of a predicted tumour vertex from the finite elements' is {max(worst):#.3g} mm, "
-            "in the frames that they solved. That is an error of the model, not of the tumour in a patient."
+            f"\nThe maximum tumour vertex error relative to FEM is {max(worst):#.3g} mm, "
+            "in the solved frames. It is a model error, not the error of the tumour position in a patient."
         )
     played = sum(row["deformer"] == "fem" for row in rows)
     if played:
-        lines.append(f"\nFinite elements played {played} of the episodes: no model predicted anything there.")
-    lines.append("Attributes of each array say what it means, and the file formats of sulcus describe them.\n")
+        lines.append(f"\nFEM was used directly in {played} of the episodes: they contain no model prediction.")
+    lines.append("The attributes of each array describe it; see also the page on file formats of sulcus.\n")
     return "\n".join(lines)
 
 
@@ -203,16 +203,16 @@ def describe_bodies(episodes: Sequence[EpisodeContents]) -> str:
     bodies = len({one.said.get("anatomy") for one in episodes})
     sizes = sorted({one.size for one in episodes})
     said_sizes = ", ".join(f"{width} x {height}" for width, height in sizes)
-    return "\n".join([f"Anatomies: {bodies}. Pictures: {said_sizes} pixels.\n", *format_origins(episodes)])
+    return "\n".join([f"Anatomies: {bodies}. Images: {said_sizes} pixels.\n", *format_origins(episodes)])
 
 
 def describe_collection(episodes: Sequence[EpisodeContents], run: RunSettings | None) -> str:
     """Describe the collection process, and the random variation."""
-    lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera drew what it would see.\n"]
-    tools = [str(tool).partition("(")[0] for tool in format_value(episodes, "tool")]  # sizes are among what was drawn
-    lines += [*format_counts("what moved the tissue", format_value(episodes, "answered_by"))]
+    lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera view was rendered.\n"]
+    tools = [str(tool).partition("(")[0] for tool in format_value(episodes, "tool")]  # sizes are sampled parameters
+    lines += [*format_counts("deformation model", format_value(episodes, "answered_by"))]
     lines += [
-        *format_counts("what solved it", format_value(episodes, "finite_elements")),
+        *format_counts("FEM solver", format_value(episodes, "finite_elements")),
         *format_counts("tool", tools),
     ]
     versions = sorted(set(map(str, format_value(episodes, "sulcus_version"))))
@@ -231,7 +231,7 @@ def describe_collection(episodes: Sequence[EpisodeContents], run: RunSettings | 
 
 
 def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
-    """Lines of how often there is what; of many different ones, those that are there most often."""
+    """Yield lines with the number of occurrences of each text; at most the `MOST_LISTED` most frequent."""
     often = Counter(map(str, texts)).most_common()
     yield from (f"- {title}: {text} (in {count})" for text, count in often[:MOST_LISTED])
     if often[MOST_LISTED:]:
@@ -245,17 +245,17 @@ def format_value(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
 
 
 def format_plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
-    """Yield the plans, as they stand in the files."""
+    """Yield the plans that the files contain."""
     for text in dict.fromkeys(map(str, format_value(episodes, "plan"))):
         yield f"## Plan\n\n```toml\n{text.strip()}\n```\n"
 
 
 # Section on limitations.
-UNKNOWN = """## What is not known
+UNKNOWN = """## Limitations
 
-- How near the simulated motion is to a patient's. Finite elements and models agree with each other, not with a patient.
-- The tissue of the person whose brain it is: stiffness, and how the skull and the fluid hold it, are assumed.
-- What light, blood, smoke, instruments of other makes and hands do to pictures: none of it is drawn.
-- Forces of real tools: they follow from the assumed tissue.
-- Whether what a method learns here carries over to real pictures. That needs real ones.
+- The error of the simulated motion relative to a patient is unknown. Models are compared with FEM, not with a patient.
+- Tissue stiffness and the constraints by skull and fluid are assumed, not measured.
+- The images show no blood, smoke, other instruments or hands; the light is idealised.
+- Tool forces follow from the assumed tissue; real forces may differ.
+- Transfer of trained methods to real images is not tested. It requires real images.
 """

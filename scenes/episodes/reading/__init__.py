@@ -1,1 +1,1 @@
-"""Episodes out of files: what each array is, windows of frames, and the same for PyTorch."""
+"""Reading of episode files: array specifications, windows of frames, and PyTorch data sets."""

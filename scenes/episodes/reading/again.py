@@ -31,9 +31,9 @@ MOST_BYTES = 8 * 1024**3  # Maximum memory for the examination of one file [byte
 
 
 def solve_again(report: Report, count: int, device: str = "auto") -> Report:
-    """Return a report with what solving `count` of its frames again found: where the tumour comes to lie elsewhere.
+    """Return a report extended by solving `count` of its frames again: differences of the tumour position.
 
-    Frames are spread evenly. Where the past matters, all that were solved before them are solved too, in their order.
+    Frames are spread evenly. For history-dependent solutions, all solved frames before them are solved too, in order.
     """
     try:
         with read_as(report.path, "an episode", REMEDY), h5py.File(report.path, "r") as file:
@@ -43,7 +43,7 @@ def solve_again(report: Report, count: int, device: str = "auto") -> Report:
                 return _skipped(report, f"frames solved again: it states no {(*missing, 'tumour_fem')[0]}")
             place = to_body_path(report.path.parent, int(contents.said["body"]))
             if not place.is_dir():
-                return _skipped(report, "frames solved again: its body is not beside it")
+                return _skipped(report, "frames solved again: its body is not next to it")
             frames, found = _answers(contents.said, open_body(place, device), contents.fem_frames, count)
             stored = read_numbers(file, contents, "tumour_fem")[frames]
             rest = read_numbers(file, contents, "tumour_rest")
@@ -52,7 +52,7 @@ def solve_again(report: Report, count: int, device: str = "auto") -> Report:
         return replace(report, problems=[*report.problems, words])
     off = 1e3 * np.linalg.norm(rest + found - stored, axis=2).max(axis=1)
     allowed = LIVE_MM if contents.said.get("deformer") == "fem" else SAME_MM
-    wrong = [f"frame {frame}, solved again, is {far:.3f} mm off." for frame, far in zip(frames, off, strict=True)]
+    wrong = [f"frame {frame}, solved again: {far:.3f} mm error." for frame, far in zip(frames, off, strict=True)]
     broken = [words for words, far in zip(wrong, off, strict=True) if not far <= allowed]
     return replace(report, problems=[*report.problems, *broken], again_mm=float(off.max()), again=len(frames))
 
@@ -78,9 +78,9 @@ def _answers(said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count:
 def validate_files(
     paths: Sequence[Path], workers: int, look: Callable[[Path], Report] = validate_episode
 ) -> Iterator[Report]:
-    """Yield a report of each file, as they come; `workers` processes at a time.
+    """Yield a report of each file, in order of completion; `workers` processes at a time.
 
-    What a process that was lost had begun is looked at again, each file alone.
+    Files that a lost process had begun are checked again, each on its own.
     """
     left = list(dict.fromkeys(paths))
     look_at = partial(_looked_at, look)
@@ -93,7 +93,7 @@ def validate_files(
             try:
                 yield from (report for _, report in map_apart(look_at, [path]))
             except LostError:
-                yield Report(path, ["it ends the process that reads it: it is damaged. Make it anew, or leave it out."])
+                yield Report(path, ["reading it crashes the process: it is damaged. Make it again, or leave it out."])
 
 
 def _looked_at(look: Callable[[Path], Report], path: Path) -> Report:

@@ -1,4 +1,4 @@
-"""What one episode file holds, found out before any of it is believed; a bounded number of files is held open."""
+"""Contents of an episode file, checked before use; the number of open files is bounded."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from sim.runtime.outside_files import read_as, to_path
 
 from .schema import ARRAYS, FORMATS, FRAMES, NEEDED, PICTURES, SOLVED, Array
 
-HINT = "`sulcus validate` says more; "  # Hint in error messages.
-REMEDY = f"{HINT}make it anew, or leave it out."  # Remedy in error messages.
+HINT = "`sulcus validate` gives details; "  # Hint in error messages.
+REMEDY = f"{HINT}make it again, or leave it out."  # Remedy in error messages.
 
 
 def open_episode(path: Path) -> h5py.File:
@@ -97,7 +97,7 @@ class EpisodeContents:
     shapes
         Shapes of all known arrays, by name; images without the group's name.
     fem_frames
-        (F,) sorted numbers of the frames that finite elements solved.
+        Sorted numbers (F,) of the frames that FEM solved.
     """
 
     path: Path
@@ -127,13 +127,13 @@ class EpisodeContents:
 
 
 def read_contents(path: str | Path) -> EpisodeContents:
-    """Find out what an episode holds.
+    """Read the contents of an episode file.
 
     Raises
     ------
     InputError
-        No such file, or none of an episode. Links to other files; arrays of other shapes or kinds than ours, or larger
-        than the file can hold.
+        A missing file, or not an episode. Links to other files; arrays of unexpected shapes or kinds, or larger
+        than the file.
     """
     path = to_path(path)
     with read_as(path, "an episode", REMEDY), h5py.File(path, "r") as file:
@@ -146,7 +146,7 @@ def inspect_contents(file: h5py.File, path: Path) -> EpisodeContents:
     Raises
     ------
     InputError
-        As `read_contents`.
+        See `read_contents`.
     """
     said = read_attributes(file)
     if said.get("format") not in FORMATS:
@@ -157,7 +157,7 @@ def inspect_contents(file: h5py.File, path: Path) -> EpisodeContents:
     if missing:
         raise InputError(f"it has no {missing[0]!r}. {REMEDY}")
     if not all(0 < int(said[name]) <= LARGEST_SIDE for name in ("width", "height")):
-        raise InputError(f"its pictures have {said['width']} x {said['height']} pixels. {REMEDY}")
+        raise InputError(f"its images have {said['width']} x {said['height']} pixels. {REMEDY}")
     shapes = _checked(arrays)
     return EpisodeContents(path, said, shapes, _solved(arrays, shapes))
 
@@ -168,7 +168,7 @@ def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
     Raises
     ------
     InputError
-        One that is larger than any of ours.
+        An array that is larger than the limit.
     """
     found = {}
     for name in item.attrs:
@@ -182,7 +182,7 @@ def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
 
 
 def get_array(group: h5py.Group, name: str) -> h5py.Dataset:
-    """Return an array by its name; InputError of what is none."""
+    """Return an array by its name; raise InputError if it is not an array."""
     found = group[name]
     if not isinstance(found, h5py.Dataset):
         raise InputError(f"{name!r} is no array. {REMEDY}")
@@ -220,7 +220,7 @@ def _demand_inside(name: str, array: h5py.Dataset) -> None:
 
 
 def _checked(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ...]]:
-    """Shapes of the arrays that are known; InputError where they do not fit one another."""
+    """Return the shapes of the known arrays; raise InputError if they are inconsistent."""
     sizes: dict[str, int] = {}
     if "fem_frames" not in arrays:
         sizes[SOLVED] = arrays["time"].shape[0] if arrays["time"].ndim else 0

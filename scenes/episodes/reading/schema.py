@@ -12,20 +12,20 @@ FRAMES, SOLVED = "frames", "solved"  # Names of array axes: frames, frames solve
 
 @dataclass(frozen=True)
 class Array:
-    """One array of an episode.
+    """Specification of an array of an episode.
 
     Parameters
     ----------
     axes
-        A length, or the name of one that all arrays share; `None` last: as many axes more as there are.
+        Lengths, or names of lengths that arrays share; `None` at the end: any number of further axes.
     kind
         Allowed letters of NumPy's `dtype.kind`; "O" for texts or images.
     unit
-        As the array's own attribute has it; None: no unit is asked for.
+        Unit in the array's attribute; None: no unit is required.
     known
-        Whether every number must be known; NaN says that it is not.
+        True if NaN (not available) is not allowed.
     limited
-        Whether every number must be finite or NaN; a bound of loads that a model was not trained on is infinite.
+        True if infinite values are not allowed; the bound of a load outside the training range is infinite.
     """
 
     axes: tuple[int | str | None, ...]

@@ -28,7 +28,7 @@ class EpisodeDataset(Dataset[dict[str, Any]]):
         stride: int = 1,
         most_open: int = 16,
     ) -> None:
-        """Find out what the files hold; InputError as `read_episodes`."""
+        """Read the contents of the files; raises InputError, see `read_episodes`."""
         self.episodes: Episodes = read_episodes(paths, keys, window, step, stride, most_open)
 
     def __len__(self) -> int:

@@ -42,7 +42,7 @@ def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy |
     if missing:
         return [], [f"silhouettes: there is no {missing[0]!r}"]
     if anatomy is None:
-        return [], ["silhouettes: its anatomy is neither the template nor in `bodies` beside it"]
+        return [], ["silhouettes: its anatomy is neither the template nor in `bodies` next to it"]
     nodes = read_numbers(file, contents, "tumour_nodes")
     triangles = find_surface_rows(anatomy.tumour_surface, nodes)
     if len(triangles) < len(anatomy.tumour_surface):
@@ -88,20 +88,20 @@ class Report:
     Parameters
     ----------
     path
-        The file.
+        Path of the file.
     problems
         Faults; none if the file is complete.
     skipped
         Skipped checks, and the reasons.
     frames, solved
-        How many there are, and how many of them finite elements solved.
+        Number of frames, and of those that FEM solved.
     unsolved
-        Of those, how many did not converge.
+        Number of FEM solutions that did not converge.
     error_mm
-        Of predicted tumour vertices against the finite elements' where they solved: mean and largest [mm]; None where
-        nothing was solved, or finite elements played.
+        Mean and maximum error of predicted tumour vertices relative to FEM in solved frames [mm]; None if there
+        are none, or if FEM was used directly.
     again, again_mm
-        How many frames were solved again here, and how far the tumour then lay from where the file has it [mm].
+        Number of frames solved again here, and maximum difference of tumour positions from the file [mm].
     """
 
     path: Path
@@ -200,10 +200,10 @@ def check_images(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
             try:
                 picture = read_one_image(file, contents, name, frame)
             except InputError as error:
-                yield format_finding(error, contents.path).removesuffix(" Make the episode anew.")
+                yield format_finding(error, contents.path).removesuffix(" Make the episode again.")
                 break
             if kind == LABELS and not (found := set(np.unique(picture).tolist())) <= allowed:
-                yield f"the picture {name!r} of frame {frame} has labels {sorted(found - allowed)} that nothing names."
+                yield f"the image {name!r} of frame {frame} has labels {sorted(found - allowed)} without a name."
                 break
 
 

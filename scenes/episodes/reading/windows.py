@@ -27,13 +27,13 @@ def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: ran
 
     An array without frames is read whole.
 
-    Colour is (frames, H, W, 3) uint8 sRGB, depth (frames, H, W) float32 [m], labels (frames, H, W) uint8. What finite
-    elements did not solve is NaN, or an empty text.
+    Colour is (frames, H, W, 3) uint8 sRGB, depth (frames, H, W) float32 [m], labels (frames, H, W) uint8. Frames
+    not solved by FEM are NaN, or an empty text.
 
     Raises
     ------
     InputError
-        A picture that cannot be decoded, or is of another size than the file says; a file that is damaged.
+        An image that cannot be decoded, or whose size differs from the file's attributes; a damaged file.
     """
     frames = range(contents.frames) if frames is None else frames
     if name in PICTURES:
@@ -56,7 +56,7 @@ def read_one_image(file: h5py.File, contents: EpisodeContents, name: str, frame:
     Raises
     ------
     InputError
-        As `read_rows`.
+        See `read_rows`.
     """
     code = read_image_bytes(file, contents, name, frame)
     width, height = contents.size
@@ -68,7 +68,7 @@ def read_one_image(file: h5py.File, contents: EpisodeContents, name: str, frame:
         return decode_labels(code, width, height)
     except ValueError as error:
         raise InputError(
-            f"{contents.path}: the picture {name!r} of frame {frame} cannot be decoded: {error}. Make the episode anew."
+            f"{contents.path}: the image {name!r} of frame {frame} cannot be decoded: {error}. Make the episode again."
         ) from error
 
 
@@ -113,7 +113,7 @@ def list_episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
     Raises
     ------
     InputError
-        Nothing there, or a folder without episodes.
+        A missing path, or a folder without episodes.
     """
     paths: list[Path] = []
     for one in [given] if isinstance(given, str | Path) else given:
@@ -136,22 +136,22 @@ def list_episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
 
 @dataclass(frozen=True, eq=False)
 class Episodes(Sequence[dict[str, Any]]):
-    """Windows of frames, each a dictionary by key: (T, ...) arrays, or what an episode has once.
+    """Windows of frames, each a dictionary by key: (T, ...) arrays, or per-episode values.
 
     Images are decoded: colour (T, H, W, 3) uint8, depth (T, H, W) float32 [m], segmentation (T, H, W) uint8. Rows of
-    finite elements are NaN where they solved nothing, and `fem_known` (T,) says where. `episode` and `frame` (T,) are
-    there always. Files are opened when they are read, in each process its own.
+    FEM are NaN if not solved, as given by `fem_known` (T,). `episode` and `frame` (T,) are
+    always present. Each process opens its files on first use.
 
     Parameters
     ----------
     contents
-        Of each episode, as `read_episodes` finds it.
+        Contents of each episode, as `read_episodes` reads them.
     keys
-        Arrays and pictures to read.
+        Arrays and images to read.
     window, step, stride
-        Frames of a window, from one of them to the next, and from one window's first to the next one's.
+        Frames of a window, distance between its frames, and distance between the starts of windows [frames].
     files
-        Which holds the open files.
+        Cache of open files.
     """
 
     contents: tuple[EpisodeContents, ...]
@@ -221,12 +221,12 @@ class Episodes(Sequence[dict[str, Any]]):
         return {**found, "episode": episode, "frame": np.asarray(frames)}
 
     def iterate_batches(self, size: int, seed: int | None = None) -> Iterator[dict[str, Any]]:
-        """Windows stacked, `size` at a time and fewer at the end; with a `seed` in an order that it shuffles.
+        """Yield batches of `size` stacked windows (the last may be smaller); shuffled if a `seed` is given.
 
         Raises
         ------
         InputError
-            As `at`; a size below 1, or rows of different sizes, as those of tumours of two bodies are.
+            See `at`; a size below 1, or rows of different sizes (for example tumours of two bodies).
         """
         if size < 1:
             raise InputError(f"batches of {size}: give a whole number of windows, 1 or more.")
@@ -253,14 +253,14 @@ def read_episodes(
     keys
         Arrays and images by name; None: all numbers and images that every episode has.
     window, step, stride
-        As of `Episodes`.
+        See `Episodes`.
     most_open
-        Files that a process holds open.
+        Maximum number of open files of a process.
 
     Raises
     ------
     InputError
-        As `list_episode_paths`, `read_contents` and `Episodes`.
+        See `list_episode_paths`, `read_contents` and `Episodes`.
     """
     contents = tuple(read_contents(path) for path in list_episode_paths(paths))
     if keys is None:
