@@ -136,7 +136,7 @@ def compile_problem(
             case Pulsation() | ToolDisplacement():
                 pass  # Elasticity includes the swelling; tool displacement is a constraint, see `_impose`.
             case Resection():
-                raise InputError("Resection changes the body: make its solver with `sim.finite_elements`.")
+                raise InputError("Resection changes the body: make its solver with `sim.build_fem`.")
             case OwnEffect():
                 own.append(effect.term(Body(anatomy, space, skin, device)))
             case _:

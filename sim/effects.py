@@ -170,7 +170,7 @@ class Resection:
     """Removal of tissue in steps; `Resected` loads give the number of steps done, by default all.
 
     The cavity wall is free surface. Pieces without a face in common with fixed tissue are removed as
-    well. `sim.finite_elements` builds the solver.
+    well. `sim.build_fem` builds the solver.
 
     The remaining tissue keeps its history. Not modelled: residual stress in the scan, so without
     other loads nothing moves.

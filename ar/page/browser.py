@@ -70,7 +70,7 @@ class Browser:
         """Start the server; if `port` is taken, the next free one is used, see `address`.
 
         `words` is HTML under the image, `size` the image's width and height [pixel] until the first arrives. `origins`
-        are further addresses of the page, of a proxy or another port, in the form of `ar.page.guard.origin_of`.
+        are further addresses of the page, of a proxy or another port, in the form of `ar.page.guard.format_origin`.
 
         Raises
         ------

@@ -73,7 +73,7 @@ class UnguardedError(RuntimeError):
 class AccessPolicy:
     """Access policy: `host` that the page is bound to, `token` (None: any program of this machine may connect).
 
-    `origins` are further addresses of the page, by a proxy or another port, in the form of `origin_of`.
+    `origins` are further addresses of the page, by a proxy or another port, in the form of `format_origin`.
     """
 
     host: str

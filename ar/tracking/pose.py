@@ -85,7 +85,7 @@ def find_pose(
     camera
         Camera that took the image; its pose is ignored.
     corners
-        Corners of `target`, from `Detector.seen`; None: none.
+        Corners of `target`, from `Detector.detect`; None: none.
     before
         Previous T_camera_target (4, 4), if it was certain.
     """

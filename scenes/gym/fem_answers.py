@@ -27,7 +27,7 @@ from .touched import TissueRequest, Touched
 class PosedElements:
     """FEM in contact with a rigid tool.
 
-    The pressure under a ball is that of Hertz under its force; under a blade it is the highest of `sim.pressure`.
+    The pressure under a ball is Hertz's at its force; under a blade it is the maximum of `sim.compute_pressure`.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class PosedElements:
     together: bool = False
 
     def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Solve as `TissueModel.answer`; environments at the start of an episode form a separate batch."""
+        """Solve as `TissueModel.compute_responses`; environments at the start of an episode form a separate batch."""
         found: dict[int, Touched] = {}
         begin = [row for row, each in enumerate(asked) if each.last is None]
         going = [row for row, each in enumerate(asked) if each.last is not None]
@@ -110,7 +110,7 @@ class CutElements:
     _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
 
     def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Solve as `TissueModel.answer`; earlier requests have no influence, because levels are solved in one order."""
+        """Solve as `TissueModel.compute_responses`; independent of earlier requests, as levels have one order."""
         return [self._touched(each) for each in asked]
 
     def _touched(self, asked: TissueRequest) -> Touched:

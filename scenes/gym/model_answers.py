@@ -98,7 +98,7 @@ class PressedModel:
         return open_patch(self.site.anatomy)
 
     def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Predict as `TissueModel.answer`."""
+        """Predict as `TissueModel.compute_responses`."""
         poses = np.stack([each.pose for each in asked])
         parts = [poses] if self.together else np.split(poses, len(poses))
         return [touched for part in parts for touched in self._answered(part)]
@@ -174,7 +174,7 @@ class PosedModel:
     ball: Hertz | None
 
     def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Predict as `TissueModel.answer`, one by one.
+        """Predict as `TissueModel.compute_responses`, one by one.
 
         If the model rejects a pose, the tissue stays and is marked unreliable.
         """

@@ -50,7 +50,7 @@ def place_camera(
 ) -> CameraPlacement | str:
     """Interpolate a camera's pose at an image's time stamp, from its poses, the newest last; or return a reason.
 
-    Between two poses, and just after the newest, it is interpolated as by `PoseStream.at`. The error is the camera's
+    Between two poses, and just after the newest, see `PoseStream.interpolate`. The error is the camera's
     possible acceleration between them, at a position (3,) [m] in the reference's frame. Otherwise, and with fewer than
     three poses, it is the newest pose, and the position's motion in the image since. Without stamps, arrival times of
     messages are used. A reason has {name} instead of the transform's name.

@@ -54,11 +54,11 @@ class PoseResponderLike(Protocol):
     def compute_result(
         self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
     ) -> PoseResult:
-        """Compute the result, as `PoseResponder.answer`."""
+        """Compute the result, as `PoseResponder.compute_result`."""
         ...
 
     def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
-        """Return the scan's pose, as `PoseResponder.camera`."""
+        """Return the scan's pose, as `PoseResponder.find_camera`."""
         ...
 
 
@@ -66,19 +66,19 @@ class MessageWriter(Protocol):
     """Interface of an encoder of results."""
 
     def build_scan(self, stamp: int) -> bytes:
-        """Build the scan's message, as `Outgoing.scan`."""
+        """Build the scan's message, as `Outgoing.build_scan`."""
         ...
 
     def build_messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
-        """Build the messages, as `Outgoing.messages`."""
+        """Build the messages, as `Outgoing.build_messages`."""
         ...
 
     def build_status(self, answer: PoseResult, refused: str) -> bytes:
-        """Build the STATUS, as `Outgoing.status`."""
+        """Build the STATUS, as `Outgoing.build_status`."""
         ...
 
     def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
-        """Attach points, as `Outgoing.placed`."""
+        """Attach points, as `Outgoing.attach_points`."""
         ...
 
 

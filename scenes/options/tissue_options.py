@@ -195,7 +195,7 @@ def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: Patien
     Raises
     ------
     InputError
-        See `parse_tissue`, `parse_region_tissues` and `Scene.made_of`.
+        See `parse_tissue`, `parse_region_tissues` and `Scene.replace_tissue`.
     """
     from ..play.learned_regions import find_learned_regions
 

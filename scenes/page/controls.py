@@ -50,7 +50,7 @@ def build_controls(
 ) -> list[Slider | Dropdown | Toggle | Fold | Note]:
     """Build all controls of a scene that these deformers support.
 
-    `give` receives who gets the tool, `take` numbers of its touch, as `Requests.hand` does.
+    `give` receives who gets the tool, `take` numbers of its touch, as `Requests.take_over` does.
     """
     cameras = "scene default", STAYS, *PATHS
 

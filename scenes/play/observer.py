@@ -156,7 +156,7 @@ class Sees(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """Observer that samples the points of a `Sight`, with its errors, and calls a locator. Loads are not used."""
+    """Observer that samples the points of a `PointObservation`, with its errors, and calls a locator without loads."""
 
     site: CraniotomyFrame
     locator: Locator

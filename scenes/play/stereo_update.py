@@ -101,7 +101,7 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
     Raises
     ------
     InputError
-        See `StereoPair.seen`; too few points; points off the scan's cortex.
+        See `StereoPair.rectify`; too few points; points off the scan's cortex.
     """
     view = shot.rectify(site)
     pixels = build_pixel_grid(site, view, count)
@@ -127,7 +127,7 @@ def observe_points(
     Raises
     ------
     InputError
-        See `StereoPair.seen`; too few points; apparent motion of the surroundings; motions outside the search range.
+        See `StereoPair.rectify`; too few points; apparent motion of the surroundings; motions outside the search range.
     """
     view = shot.rectify(site)
     check_no_motion(first, view, rigid)

@@ -84,7 +84,7 @@ class Nearest:
         )
 
     def to(self, core: PlacedBox, corners: np.ndarray) -> NearestPlaces:
-        """Return the points as `PlacedBox.nearest`; overwrites the previous result."""
+        """Return the points as `PlacedBox.find_nearest`; overwrites the previous result."""
         if self._launch is None:  # no triangles
             return self._found
         self._corners[:] = corners

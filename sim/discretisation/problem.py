@@ -77,7 +77,7 @@ class Problem:
         return any(isinstance(term, Paced) for term in self.terms)
 
     def find_overlaps(self, u: wp.array) -> np.ndarray:
-        """Return a mask (2, b) of load cases with overlaps in any barrier, as `Barrier.overlaps`."""
+        """Return a mask (2, b) of load cases with overlaps in any barrier, as `Barrier.find_overlaps`."""
         none = np.zeros((2, u.shape[1]), bool)
         return np.logical_or.reduce([none, *(term.find_overlaps(u) for term in self.barriers)])
 

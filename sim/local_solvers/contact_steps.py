@@ -129,7 +129,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
 def read_step_result(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return length, slope ahead [J], residual [N] and its scale [N] of a step, (1,) each, from `ContactSteps` output.
 
-    `square` (1,) is `Judge.square`.
+    `square` (1,) is `ResidualEvaluator.square`.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         free = np.sqrt(said[[FREE_SUM]])

@@ -70,7 +70,7 @@ class LbfgsState:
 
 
 def allocate_state(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> LbfgsState:
-    """Build the state of `width` load cases on memory that `allocate_ground` made for at least this width."""
+    """Build the state of `width` load cases on memory that `allocate_memory` made for at least this width."""
     columns: dict[str, wp.array] = {}
     together: dict[str, wp.array] = {}
     for kind, (_, moved, written) in describe_layout(problem).items():
@@ -92,7 +92,7 @@ class Workspace:
     width
         Capacity [load cases].
     ground
-        Memory from `allocate_ground`, for at least this width.
+        Memory from `allocate_memory`, for at least this width.
     """
 
     def __init__(self, problem: Problem, preconditioner: Preconditioner, width: int, ground: Mapping[str, wp.array]):

@@ -29,7 +29,7 @@ class ResidualArrays:
 
 
 def allocate_balance(problem: Problem, count: int) -> ResidualArrays:
-    """Allocate the arrays of a `Balance` for `count` load cases."""
+    """Allocate the arrays of a `ResidualArrays` for `count` load cases."""
     device = problem.device
     sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
     return ResidualArrays(device.allocate(problem.rows, count), device.allocate(problem.rows, count), sums, own)

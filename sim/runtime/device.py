@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+import sys
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from multiprocessing import parent_process
 from threading import Lock
 from typing import Any
 
@@ -17,6 +21,7 @@ from .kernel_cache import ensure_writable_cache
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 """`wp.kernel` without adjoint, which is not used, and launched without grid-stride loop, which saves registers."""
 
+STDERR = 2  # File descriptor of the error output.
 EVERY = "all"
 """Name of all GPUs in a list of devices."""
 
@@ -140,12 +145,31 @@ def parse_device_names(words: str) -> tuple[str, ...]:
 
 
 def _present() -> list[str]:
+    _start_warp()
+    return [device.alias for device in wp.get_devices()]
+
+
+@cache
+def _start_warp() -> None:
+    """Start Warp; where no CUDA driver can be loaded, one line replaces the warning of its native code."""
     if wp.config.log_level == wp.LOG_INFO:  # its start-up notes would mix with a command's output
         wp.config.log_level = wp.LOG_ERROR
     if wp.config.kernel_cache_dir is None:
         ensure_writable_cache()
-    wp.init()
-    return [device.alias for device in wp.get_devices()]
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+        return wp.init()
+    except OSError:
+        shown = os.dup(STDERR)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), STDERR)
+    try:
+        wp.init()
+    finally:
+        os.dup2(shown, STDERR)
+        os.close(shown)
+    if parent_process() is None:
+        os.write(STDERR, b"No CUDA GPU found: using the CPU.\n")
 
 
 def _no_card() -> str:

@@ -160,7 +160,7 @@ def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes =
 
 
 def build_swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
-    """Build loads of these volume changes; `Group.effects` must have been given the same ones."""
+    """Build loads of these volume changes; `Group.build_effects` must have been given the same ones."""
     # The wave gives the time at which each volume change is reached.
     time = np.arcsin(np.array(shares) / max(map(abs, shares))) / (2.0 * np.pi * RISE.frequency)
     return Loads((_idle(anatomy, len(time)), _posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)

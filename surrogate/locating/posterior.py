@@ -155,7 +155,7 @@ class ObservedPrior:
     rows
         Whitened effect of unit weights, and of a rigid error of one standard deviation, on the observation.
     odds
-        See `MotionPrior.odds`.
+        See `MotionPrior.compute_log_odds`.
     slip
         See `Evidence.slip`.
     named

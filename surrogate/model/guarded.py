@@ -134,7 +134,7 @@ def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> 
     """Compute the tool's mean pressure (B, k) [Pa] at each vertex of the bare surface: force by area.
 
     Contact forces are those on linear tissue, scaled so that their sum is the model's predicted force. Areas are thirds
-    of the deformed surface's triangles at a vertex, as in `sim.contact_pressure.pressure`.
+    of the deformed surface's triangles at a vertex, as in `sim.contact_pressure.compute_pressure`.
 
     Parameters
     ----------

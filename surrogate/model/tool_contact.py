@@ -53,7 +53,7 @@ def compute_wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.nda
 
 
 HELD = "where a blade touches"
-"""Key of the contact in the warm data of a result: rows of `RigidContact.held`."""
+"""Key of the contact in the warm data of a result: rows of `RigidContact.compute_warm_start`."""
 
 
 def build_warm_encoders(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping[str, Encoder]:

@@ -107,12 +107,12 @@ def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelPr
 
 
 def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False) -> None:
-    """Write `onnx_model` atomically.
+    """Write `build_onnx_model` atomically.
 
     Raises
     ------
     InputError
-        See `onnx_model`; a path that does not end in .onnx, or a folder that cannot be written.
+        See `build_onnx_model`; a path that does not end in .onnx, or a folder that cannot be written.
     """
     graph = build_onnx_model(name, model, cortex)
     with write_atomically(path, ".onnx") as partial:

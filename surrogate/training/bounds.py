@@ -275,7 +275,7 @@ def read_solutions(data: Dataset, shared: Expansion) -> TrainingSolutions:
 
 
 def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
-    """Convert loads of a data set to a model's input, like `Learned.asked`."""
+    """Convert loads of a data set to a model's input, like `Learned.to_input`."""
     if data.tool is not None:
         pushed, series = to_indentation(loads, data.tool, patch), read_series(data.provenance)
         if not series:

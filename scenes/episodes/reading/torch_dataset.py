@@ -39,7 +39,7 @@ class EpisodeDataset(Dataset[dict[str, Any]]):
         return {name: _tensor(value) for name, value in self.episodes[index].items()}
 
     def get_window(self, episode: int, first: int) -> dict[str, Any]:
-        """Return the window of an episode that begins at a frame; InputError as `Episodes.at`."""
+        """Return the window of an episode that begins at a frame; InputError as `Episodes.get_window`."""
         return {name: _tensor(value) for name, value in self.episodes.get_window(episode, first).items()}
 
     at = get_window  # Former names, for one release.

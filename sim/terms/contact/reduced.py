@@ -50,7 +50,7 @@ class Reduced:
         return build_functions(self._device, self._nodes)
 
     def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
-        """Return the structs as `Reduction.stage`."""
+        """Return the structs as `Reduction.build_stage`."""
         return self._term.build_stage(columns)
 
     def slope(self, w: Any) -> Any:

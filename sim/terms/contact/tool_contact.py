@@ -95,7 +95,7 @@ class ToolContactTerm:
         self._single: list[Tools] = []
 
     def compute_stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """Return the path fraction as `ToolPath.stride`, given each tool's clearance from the surface."""
+        """Return the path fraction as `ToolPath.compute_stride`, given each tool's clearance from the surface."""
         way = self._way(cases)
         if way is None:
             return np.ones(len(cases.loads))
@@ -121,7 +121,7 @@ class ToolContactTerm:
         return find_enclosing_columns(self._device, np.concatenate(points, axis=1), self._surface.rest, self._closed, u)
 
     def find_overlaps(self, u: wp.array) -> np.ndarray:
-        """Return overlaps as `Barrier.overlaps`, for penetration deeper than the gap."""
+        """Return overlaps as `Barrier.find_overlaps`, for penetration deeper than the gap."""
         if self._pose is None:
             return np.zeros((2, u.shape[1]), bool)
         dim, found = (len(self._owner), u.shape[1]), []
@@ -184,7 +184,7 @@ class ToolContactTerm:
         return np.unique(self._triangles)
 
     def select_nodes(self, most: int) -> np.ndarray:
-        """Return nodes as `Local.around`."""
+        """Return nodes as `Local.select_nodes`."""
         own = self.touchable
         far, _ = KDTree(self._nodes[own]).query(self._nodes)
         far[own] = -1.0
@@ -203,7 +203,7 @@ class ToolContactTerm:
         return term, Reduced(term, len(nodes), own.shape[1], exact)
 
     def reduce(self, columns: np.ndarray) -> Reduced | None:
-        """Return the reduced barrier as `Local.reduced`."""
+        """Return the reduced barrier as `Local.reduce`."""
         if self._pose is None:
             return None
         term, reduced = self._alone
@@ -212,7 +212,7 @@ class ToolContactTerm:
         return reduced
 
     def get_pressed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return active nodes and their tangent stiffness as `Local.pressed`."""
+        """Return active nodes and their tangent stiffness as `Local.get_pressed`."""
         barrier = self.reduce(np.zeros(1, int))
         if barrier is None:
             return np.zeros(0, int), np.zeros((0, 0))
@@ -259,7 +259,7 @@ class ToolContactTerm:
         return out
 
     def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
-        """Return the structs as `DenseTerm.stage`."""
+        """Return the structs as `DenseTerm.build_stage`."""
         if self._pose is None:
             raise ValueError("no tool is there")
         out, near, name = ContactStage(), NearPairs(), self._device.name
