@@ -17,7 +17,7 @@ loads = push(place.point, 0.1 * np.array([place.inward, aside]), footprint=7e-3)
 
 
 def motion(skull: Bonded | Slide) -> np.ndarray:
-    """The tumour's mean motion (loads, 3) [m]."""
+    """Compute the tumour's mean motion (loads, 3) [m]."""
     fem = Fem(anatomy, [Elasticity(), Held(), skull, ToolForce()], element="smoothed")
     answer = fem.deform(loads, at=anatomy.tumour_nodes)
     assert all(outcome.good for outcome in answer.outcome)

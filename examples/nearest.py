@@ -35,12 +35,12 @@ class Nearest:
         return np.einsum("bk,bkr->br", weight, self.Y_[near]).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
-        """What it knows, as plain arrays: a model file holds nothing else."""
+        """Return the state as plain arrays: a model file stores nothing else."""
         return {"mean": self.mean_, "deviation": self.deviation_, "X": self.X_, "Y": self.Y_}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """The one that `state` came from."""
+        """Rebuild the regressor from `state`."""
         model = cls()
         model.mean_, model.deviation_, model.X_, model.Y_ = (state[name] for name in ("mean", "deviation", "X", "Y"))
         return model

@@ -31,7 +31,7 @@ def linear(weights):
 
 
 def played(policy, seed):
-    """Returns (n,) of one episode in each environment, and in how many steps of it a limit was exceeded (n,)."""
+    """Play one episode per environment; return returns (n,) and the number of steps beyond a limit (n,)."""
     states, _ = vector.reset(seed=seed)
     total, over, live = np.zeros(DRAWN), np.zeros(DRAWN), np.ones(DRAWN, bool)
     while live.any():

@@ -24,7 +24,7 @@ LOOKS = {
 
 
 def find_moved_nodes(kind, name):
-    """The node of a class and a name; it is made if there is none."""
+    """Return the node of a class and a name; create it if missing."""
     found = slicer.util.getFirstNodeByClassByName(kind, name)
     return found or slicer.mrmlScene.AddNewNodeByClass(kind, name)
 

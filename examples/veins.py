@@ -157,7 +157,7 @@ class VeinsTerm:
         """Nothing depends on the loads."""
 
     def keep(self, columns: np.ndarray) -> None:
-        """What was linearised of the others is dropped."""
+        """Keep the linearisation of some load cases only."""
         if self._at is not None:
             self._at = gather_columns(self._device, self._at, columns)
 
@@ -166,11 +166,11 @@ class VeinsTerm:
         self._launch(self._kernels.add_energy, [u], out, u.shape[1])
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
-        """Forces of taut veins."""
+        """Add the forces of taut veins."""
         self._launch(self._kernels.add_gradient, [u], out, u.shape[1])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """The solver moves u on: keep a copy."""
+        """Linearise at a copy of u, which the solver changes in place."""
         self._at = wp.clone(u)
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:

@@ -89,7 +89,7 @@ class Yeoh:
         return self.coefficients_at(*self.lame)
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
-        """The same at other Lamé constants [Pa]: c2 goes with the shear modulus."""
+        """Return the law with other Lamé constants [Pa]; c2 scales with the shear modulus."""
         return mu / 2.0, self.c2 * mu / self.lame[0], lam + 2.0 * mu / 3.0
 
 

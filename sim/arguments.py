@@ -82,7 +82,7 @@ def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
     Raises
     ------
     InputError
-        As `check_whole_numbers`; a vertex that the mesh does not have.
+        See `check_whole_numbers`; a vertex that the mesh does not have.
     """
     vertices = check_whole_numbers(name, values)
     beyond = vertices[(vertices < 0) | (vertices >= count)]

@@ -223,7 +223,7 @@ class Fem:
         Raises
         ------
         InputError
-            As `deform`; effects with inertia, whose solutions are time steps.
+            See `deform`; effects with inertia, whose solutions are time steps.
         """
         self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.memory))
@@ -261,7 +261,7 @@ class Fem:
         Raises
         ------
         InputError
-            As `deform`; loads with prescribed motion, which are not proportional to a force, or an incomplete group.
+            See `deform`; loads with prescribed motion, which are not proportional to a force, or an incomplete group.
             A solver in float32, whose round-off would dominate the higher orders.
         """
         check_causes(self.effects, loads)

@@ -265,7 +265,7 @@ def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) ->
     Raises
     ------
     InputError
-        As `Loads`.
+        See `Loads`.
     """
     rows = _repeated("Pushed", point=(point, (3,)), force=(force, (3,)), footprint=(footprint, ()))
     return Loads((Pushed(**rows),))
@@ -277,7 +277,7 @@ def build_posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads
     Raises
     ------
     InputError
-        As `Loads`.
+        See `Loads`.
     """
     rows = _repeated("Posture", direction=(direction, (3,)), csf_level=(csf_level, ()), share=(1.0, ()))
     return Loads((Posture(**rows),))

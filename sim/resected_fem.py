@@ -71,7 +71,7 @@ class OperatedFem:
         Raises
         ------
         InputError
-            As `Fem.deform`; more steps than there are.
+            See `Fem.deform`; more steps than there are.
         """
         check_loads(loads)
         if start is not None:
@@ -178,7 +178,7 @@ def build_fem(
     Raises
     ------
     InputError
-        As `Fem`; steps that cannot be done.
+        See `Fem`; steps that cannot be done.
     """
     effects = tuple(effects)
     cuts = [effect for effect in effects if isinstance(effect, Resection)]

@@ -144,7 +144,7 @@ def read_tool_statement(text: str | None, ball: object) -> BuiltIn | None:
     Raises
     ------
     InputError
-        As `parse_tool`.
+        See `parse_tool`.
     """
     if text is None and ball is None:
         return None

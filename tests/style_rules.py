@@ -30,13 +30,28 @@ HISTORY = re.compile(
     r"\b(?:earlier (?:than|versions?|runs?)|formerly|used to|until 20\d\d|was aimed|was tried|no longer)\b"
 )
 """Words of history, for which user pages have no room."""
-QUOTED = re.compile(r"``[^`]+``|`[^`]+`|\$[^$]+\$|\"[^\"]*\"")
-"""Code, formulas and titles of cited works."""
+QUOTED = re.compile(
+    r"``[^`]+``|`[^`]+`|\$[^$]+\$|\"[^\"]*\"|<code>[^<]*</code>|--[\w-]+|\b\w+:[\w-]+|^  [^\n]*$", re.MULTILINE
+)
+"""Code, commands, formulas and titles of cited works."""
+FOREIGN = re.compile(r"[{};]\n(?:.*\n)*?.*[{};]$", re.MULTILINE)
+"""Ends of lines in strings of JavaScript, CSS or C."""
 NAMES = re.compile(r"^[\w*, ]+\n {4}(?=(\S.*)$)", re.MULTILINE)
 """Names of parameters above their description, whose first line is the group."""
 VERBS = frozenset((Path(__file__).parent / "data/verbs.txt").read_text().split())
 """Verbs that public functions begin with, next to `is`, `has`, `can`, `to`, `from` and `as`."""
 OPENERS = VERBS | {"is", "has", "can", "to", "from", "as"}
+GIVEN = set(
+    re.findall(
+        r"\w+",
+        """
+    main readinto data_received isOpened astype argmin min max
+    energy gradient residual curvature slope rest_curvature curvature_at_pace second_order longest_step elements_on
+    coefficients_at term pose state restored
+""",
+    )
+)
+"""Functions without a verb: of other libraries; quantities in mathematics; methods that extensions implement."""
 
 
 class Text(NamedTuple):
@@ -108,7 +123,7 @@ def begins_well(text: str) -> bool:
 
 def find_banned(text: str) -> list[str]:
     """Banned words of a text, outside code, formulas, titles and names of parameters."""
-    return BANNED.findall(QUOTED.sub("x", NAMES.sub("", text)))
+    return [] if FOREIGN.search(text) else BANNED.findall(QUOTED.sub("x", NAMES.sub("", text)))
 
 
 def find_functions(path: Path) -> Iterator[str]:
@@ -117,7 +132,7 @@ def find_functions(path: Path) -> Iterator[str]:
         for node in owner.body:
             if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
                 marks = {ast.unparse(mark).partition("(")[0].rpartition(".")[2] for mark in node.decorator_list}
-                if not marks & {"property", "cached_property", "setter", "func", "kernel", "overload", "override"}:
+                if not marks & {"property", "cached_property", "setter", "func", "func_native", "kernel", "overload"}:
                     yield node.name
 
 

@@ -4,6 +4,7 @@ import re
 
 import pytest
 from style_rules import (
+    GIVEN,
     HISTORY,
     OPENERS,
     begins_well,
@@ -28,13 +29,13 @@ def check(found, most):
     assert len(found) <= most, f"{len(found)} places, at most {most}: {found[:20]}"
 
 
-@pytest.mark.parametrize(("kind", "most"), [("docstring", 424), ("comment", 59), ("help", 0)])
+@pytest.mark.parametrize(("kind", "most"), [("docstring", 0), ("comment", 0), ("help", 0)])
 def test_first_words(kind, most):
     texts = (text for path in PACKAGED for text in find_texts(path) if text.kind == kind)
     check([f"{one.place} {one.text[:40]}" for one in texts if not begins_well(one.text)], most)
 
 
-@pytest.mark.parametrize(("kind", "most"), [("docstring", 470), ("comment", 54), ("help", 6), ("message", 216)])
+@pytest.mark.parametrize(("kind", "most"), [("docstring", 0), ("comment", 0), ("help", 0), ("message", 0)])
 def test_banned_words(kind, most):
     texts = (text for path in PACKAGED for text in find_texts(path) if text.kind == kind)
     check([f"{one.place} {word}" for one in texts for word in find_banned(one.text)], most)
@@ -61,12 +62,12 @@ def test_user_pages_are_short():
 
 
 def test_class_names_are_unique():
-    check([f"{name} ({count})" for name, count in count_classes(PACKAGED).items() if count > 1], 1)
+    check([f"{name} ({count})" for name, count in count_classes(PACKAGED).items() if count > 1], 0)
 
 
 def test_public_functions_begin_with_a_verb():
     names = {name for path in PACKAGED for name in find_functions(path)}
-    check(sorted(name for name in names if name.partition("_")[0] not in OPENERS), 311)
+    check(sorted(name for name in names if name not in GIVEN and name.partition("_")[0] not in OPENERS), 0)
 
 
 def test_names_of_tests_are_short():

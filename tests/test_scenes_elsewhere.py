@@ -368,16 +368,13 @@ def test_calibration_error_in_band_unless_reference_absorbs_it(follower, stage, 
             follower.calibration, focal=(*(focal + step[:2]),), principal=(*(principal + step[2:4]),), lens=lens
         )
         pixels = other.build_camera(reference).project(corners)[0]
-        tumour = np.linalg.inv(reference) @ [
-            *known.camera.to_camera_frame(stage.tumour_at_rest.vertices.mean(axis=0)[None])[0],
-            1.0,
-        ]
+        middle = known.camera.to_camera_frame(stage.tumour_at_rest.vertices.mean(axis=0)[None])[0]
+        tumour = np.linalg.inv(reference) @ [*middle, 1.0]
         camera = follower.calibration.build_camera(np.eye(4))
         fitted = fit(camera, corners, pixels, reference)
-        apart = (
-            camera.project((fitted @ tumour)[None, :3])[0] - other.build_camera(reference).project(tumour[None, :3])[0]
-        )
-        off.append(apart[0] * (fitted @ tumour)[2] / focal)
+        seen, turned = fitted @ tumour, other.build_camera(reference)
+        apart = camera.project(seen[None, :3])[0] - turned.project(tumour[None, :3])[0]
+        off.append(apart[0] * seen[2] / focal)
     assert known.parts["camera"] == pytest.approx(
         2.448 * np.linalg.svd(np.cov(np.transpose(off)))[1][0] ** 0.5, rel=0.25
     )

@@ -9,7 +9,7 @@ from surrogate.data.array_meanings import MEANINGS as DATASET
 
 
 def dataset_table() -> str:
-    """Groups and arrays of a data set."""
+    """Return the groups and arrays of a data set."""
     groups = [f"| `{name}/` | {text} |" for name, text in GROUPS.items()]
     arrays = [f"| `{name}` | {_unit(of.unit)} | {of.axes} | {of.text} |" for name, of in DATASET.items()]
     return _lines(

@@ -59,7 +59,7 @@ def _section(name: str, parser: argparse.ArgumentParser, level: str) -> Iterator
 
 
 def _row(action: argparse.Action, formatter: HelpFormatter) -> str | None:
-    """A name and what it means, as a definition; None of `--help`, which all have."""
+    """Return an argument and its help as a definition; None of `--help`."""
     if isinstance(action, argparse._HelpAction | argparse._SubParsersAction) or action.help == argparse.SUPPRESS:
         return None
     names = formatter._format_action_invocation(action).replace(", ", "`, `")

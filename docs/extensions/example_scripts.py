@@ -10,7 +10,7 @@ from plain_docstrings import structured
 
 
 def gallery_script(text: str) -> str:
-    """The same script, whose docstring has a title: its first paragraph up to a colon, or to a full stop.
+    """Return the script with a title in its docstring: the first paragraph up to a colon or a full stop.
 
     What a colon ends is said again below the title, where it begins a sentence.
     """

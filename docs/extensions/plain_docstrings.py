@@ -32,7 +32,7 @@ def _each(app: Sphinx, kind: Any, name: str, member: object, settings: object, l
 
 
 def structured(lines: Sequence[str]) -> list[str]:
-    """The same text as reStructuredText: marks lose their meaning, formulas that stand indented keep their shape."""
+    """Convert text to reStructuredText: marks are escaped, indented formulas keep their shape."""
     found: list[str] = []
     plain: list[str] = []
     inside = described = False

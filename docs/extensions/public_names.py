@@ -34,13 +34,13 @@ def page_of(package: str, name: str) -> str:
 
 
 def name_page(package: str, name: str) -> str:
-    """What a name is, from its docstring."""
+    """Build the page of a name from its docstring."""
     title = f"{package}.{name}"
     return "\n".join([title, "=" * len(title), "", f".. currentmodule:: {package}", "", *_entry(package, name)])
 
 
 def package_page(package: str) -> str:
-    """What the package is, and tables of its names by topic.
+    """Build the page of a package: its purpose, and tables of its names by topic.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def _entry(package: str, name: str) -> list[str]:
 
 
 def _described(package: str, name: str) -> list[str]:
-    """The words below a constant, in the module that the package's stub has it from."""
+    """Return the docstring of a constant in the module from which the package's stub imports it."""
     stub = ast.parse(Path(str(importlib.import_module(package).__file__)).with_suffix(".pyi").read_text())
     (home,) = (
         node.module

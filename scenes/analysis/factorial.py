@@ -101,7 +101,7 @@ def compute_variance_shares(found: Sequence[Cell], what: str = "force") -> dict[
 
 
 def build_panels(found: Sequence[Cell]) -> list[ChartPanel]:
-    """The motion over the tumour's depth, a panel for each opening: skulls, and Poisson's ratios of the default one."""
+    """Plot the motion over the tumour's depth, one panel per craniotomy: skulls, Poisson's ratios of the default."""
     chosen = [{**DEFAULT, "nu": nu} for nu in _levels(found, "nu")]
     chosen += [{**DEFAULT, "skull": skull} for skull in _levels(found, "skull") if skull != DEFAULT["skull"]]
     motions = [cell.force for cell in found if np.isfinite(cell.force)]

@@ -22,7 +22,7 @@ WIDE = (0.45, 0.8)  # Range of the board's width relative to the image width.
 
 
 def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
-    """The covariance (9, 9) of intrinsics, in the order of `ar.tracking.intrinsics.PARAMETERS`, of a good calibration.
+    """Return the covariance (9, 9) of the intrinsics of a good calibration, ordered as `intrinsics.PARAMETERS`.
 
     It has 24 views of the printed board, tilted by up to 35 degrees to all sides, near and far, all over the image.
     """

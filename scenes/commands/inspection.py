@@ -102,7 +102,7 @@ class Inspection:
         return f"a region of its own, {self.regions[part]}" if part in self.regions else f"{around} like the rest"
 
     def to_json(self) -> dict[str, Any]:
-        """The same as JSON, with units in the names: volumes to a microlitre, lengths to 0.1 mm, voxels to 1 um."""
+        """Convert to JSON, with units in the names: volumes to a microlitre, lengths to 0.1 mm, voxels to 1 um."""
         pieces = [{"ml": round(volume, 3), "side": place} for volume, place in self.pieces]
         return {
             "brain_ml": round(self.brain, 3),

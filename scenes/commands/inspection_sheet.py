@@ -230,7 +230,7 @@ def _framed(colour: np.ndarray, view: InspectionView) -> np.ndarray:
 
 
 def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
-    """The numbers, the warnings and the colours, in the column on the right."""
+    """Draw numbers, warnings and colours in the right column."""
     left, top = 2 * SIDE + PAD, PAD
     rows: list[tuple[str, Colour]] = [("What would be made", TEXT)]
     for text in found.format_lines():

@@ -180,7 +180,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
 
 
 def _physics(args: argparse.Namespace) -> str:
-    """The options with which a scene is played as these data are: tissue, element, and the planned trajectory."""
+    """Return the options that a scene needs to match these data: tissue, element and planned trajectory."""
     tissue = "" if args.material == BRAIN.law else f" --material {args.material}"
     element = "" if args.element in (None, RECOMMENDED) else f" --element {args.element}"
     trajectory = get_trajectory_option(args)

@@ -158,7 +158,7 @@ def mark_failed(folder: Path, failure: Failure) -> None:
 
 
 def unmark(folder: Path, number: int) -> None:
-    """An episode is there after all."""
+    """Remove the failure of an episode that was completed later."""
     _failed_path(folder, number).unlink(missing_ok=True)
 
 

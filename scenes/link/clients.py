@@ -231,7 +231,7 @@ class LinkClients:
             self.reject(client.number, code, str(error).partition(":")[0], f"{_named(header)} is rejected: {error}")
 
     def _ask(self, client: Client, header: Header) -> None:
-        """A client that asks, or wants no stream, is sent what it asks for and nothing else."""
+        """Send a client without stream its requested messages only."""
         client.asks = header.kind.startswith(ASKING)
         client.spoke.set()
         if header.kind.startswith("STP_"):

@@ -369,7 +369,7 @@ class Demo:
             self.browser.put("tool", tool)
 
     def _take(self, **values: float) -> None:
-        """A slider was moved: the tool is in the visitor's hand."""
+        """Switch to manual control after a slider was moved."""
         self._start_hand()
         self.wish.set(holder=self._visitor())
         self.wish.take_over(**values)

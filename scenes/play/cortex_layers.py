@@ -135,7 +135,7 @@ def build_squares(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> Squ
 
 
 def build_finger(site: CraniotomyFrame, angle: float) -> Layer:
-    """A gloved finger that stands still over the edge of the opening, from a direction in the tangent plane [rad]."""
+    """Build a motionless gloved finger over the craniotomy edge, from a direction in the tangent plane [rad]."""
     out = np.cos(angle) * site.right + np.sin(angle) * site.up
     tip = site.origin + (site.clearance - OVER) * out - HIGH * site.axis
     way = normalise_vectors((out - 0.35 * site.axis)[None])[0]

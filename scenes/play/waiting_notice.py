@@ -31,7 +31,7 @@ class Busy:
             self._since = clock.perf_counter() if self._since is None else self._since
 
     def end_work(self) -> None:
-        """The work is done."""
+        """Mark the end of the work."""
         with self._lock:
             self._since = None
             if self.noticed:

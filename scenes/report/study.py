@@ -190,7 +190,7 @@ def _angle(patch: Patch, pushed: Pushed) -> float:
 
 
 def _tilted(direction: np.ndarray, normal: np.ndarray, angle: float, more: np.ndarray) -> np.ndarray:
-    """Unit directions (B, 3) turned off `normal` (B, 3) by `angle` [rad] and `more` (B,) [degrees], at most 85."""
+    """Tilt `normal` (B, 3) by `angle` [rad] and `more` (B,) [degrees], at most 85; return unit directions (B, 3)."""
     along = direction - np.einsum("bi,bi->b", direction, normal)[:, None] * normal
     length = np.linalg.norm(along, axis=1, keepdims=True)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])

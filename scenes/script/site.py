@@ -24,7 +24,7 @@ class CraniotomyFrame(OpenCortex):
         return max(0.0, HOLE * self.clearance - radius)
 
     def clip_to_opening(self, point: np.ndarray, radius: float) -> np.ndarray:
-        """The point (3,) [m], brought back across the axis to where the bone stops a tool of this `radius` [m]."""
+        """Move a point (3,) [m] towards the axis, to where the bone stops a tool of this `radius` [m]."""
         arm = point - self.origin
         aside = arm - (arm @ self.axis) * self.axis
         length = float(np.linalg.norm(aside))

@@ -324,7 +324,7 @@ def compute_tip_covariance(registration: Registration, tool: TrackedTool, beside
 
 
 def compute_radius_across(covariance: np.ndarray, sight: np.ndarray) -> float:
-    """The radius [m] that holds 95 % of an error of covariance (3, 3) [m^2] across a line of sight along (3,)."""
+    """Return the radius [m] of 95 % of an error with covariance (3, 3) [m^2] across a line of sight along (3,)."""
     ray = sight / np.linalg.norm(sight)
     plane = np.eye(3) - np.outer(ray, ray)
     largest = float(np.linalg.eigvalsh(plane @ covariance @ plane)[-1])

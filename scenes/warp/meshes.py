@@ -37,7 +37,7 @@ class NamedSurface:
 def build_surface_mesh(
     name: str, triangles: np.ndarray, nodes: np.ndarray, moved: np.ndarray, colour: tuple[float, float, float, float]
 ) -> NamedSurface:
-    """The surface of some triangles of a body's nodes (V, 3) [m], moved by (V, 3) [m], without other vertices."""
+    """Build the surface of some triangles of nodes (V, 3) [m], displaced by (V, 3) [m], without other vertices."""
     used, numbers = np.unique(triangles, return_inverse=True)
     return NamedSurface(name, nodes[used] + moved[used], moved[used], numbers.reshape(-1, 3), colour)
 

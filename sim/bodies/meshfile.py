@@ -215,7 +215,7 @@ def read_anatomy(path: str | Path) -> Anatomy:
     Raises
     ------
     InputError
-        As `read_mesh`; a mesh without `held`, `slide_normal` or `craniotomy`, or with non-finite values there. A
+        See `read_mesh`; a mesh without `held`, `slide_normal` or `craniotomy`, or with non-finite values there. A
         body outside the size limits for coordinates in metres.
     """
     with warnings.catch_warnings():

@@ -123,7 +123,7 @@ def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Place
     Raises
     ------
     InputError
-        As `find_opening_at`; an outline that is not at the surface.
+        See `find_opening_at`; an outline that is not at the surface.
     """
     apart = float(KDTree(cortex).query(outline)[0].max())
     if apart > settings.near:

@@ -45,7 +45,7 @@ def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[
     Raises
     ------
     InputError
-        As `compute_remains`.
+        See `compute_remains`.
     """
     effects = tuple(effects)
     cut = next(effect for effect in effects if isinstance(effect, Resection))

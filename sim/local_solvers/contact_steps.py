@@ -144,7 +144,7 @@ class ContactSteps:
     Parameters
     ----------
     problem, preconditioner
-        As in `ContactDescent`.
+        See `ContactDescent`.
     barrier
         Tool barrier of the problem.
     compliance

@@ -61,7 +61,7 @@ def write_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Itera
     Raises
     ------
     InputError
-        As `check_output`; and if writing fails.
+        See `check_output`; and if writing fails.
     """
     path = check_output(path, suffix, sweep=sweep)
     partial = to_partial_path(path)
@@ -142,7 +142,7 @@ def write_stream_atomically(path: str | Path, suffix: str, sweep: bool = True) -
     Raises
     ------
     InputError
-        As `write_atomically`.
+        See `write_atomically`.
     """
     with write_atomically(path, suffix, sweep) as partial, partial.open("w+b", buffering=0) as raw:
         stream = Stream(raw)

@@ -75,7 +75,7 @@ def map_apart(function: Callable[[Task], Any], tasks: Sequence[Task], count: int
     Raises
     ------
     InputError, LostError
-        As `map_unordered`.
+        See `map_unordered`.
     """
     with process_pool(["cpu"] * min(count, len(tasks)), _second, function) as children:
         yield from map_unordered(children, _call, tasks)
@@ -129,7 +129,7 @@ def run_on_each(children: Sequence[Child], work: Callable[[Any, Task], Any], tas
     Raises
     ------
     InputError, LostError
-        As `map_unordered`.
+        See `map_unordered`.
     """
     for child, task in zip(children, tasks, strict=True):
         with suppress(BrokenPipeError, ConnectionResetError):
