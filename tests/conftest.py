@@ -92,7 +92,7 @@ class Pretender:
 
     def deform(self, loads, start=None, at=None):
         mesh = self.anatomy.mesh
-        pushed, nodal = loads.of(Pushed), loads.of(Nodal)
+        pushed, nodal = loads.get(Pushed), loads.get(Nodal)
         force = np.zeros((len(loads), len(mesh.nodes), 3)) if nodal is None else nodal.force
         if pushed is not None:
             weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()

@@ -30,7 +30,7 @@ class Recorded:
     deeper: float = 0.0
 
     def deform(self, loads, start=None, at=None):
-        cause = loads.only(Touching)
+        cause = loads.get_only(Touching)
         row = np.abs(self.poses[:, :3, 3] - cause.pose[0, 0, :3, 3]).max(axis=1).argmin()
         return build_prediction(
             self.displacement[row][None], self.vertices, loads, [False], 0.0, np.full((2, 1), np.nan), ""

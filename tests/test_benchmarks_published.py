@@ -171,7 +171,7 @@ class Spy:
 
 def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
     monkeypatch.setitem(models.MACHINES, "published-svr", Spy)
-    pushed, seen = loads.of(Pushed), []
+    pushed, seen = loads.get(Pushed), []
     with threadpool_limits(2, "blas"):
         model = trained_in_turn("published-svr", box, loads, truth, lambda: seen.append(1))
     assert 2 <= len(model.positions) <= 11 and len(seen) == len(model.positions) * len(truth[0])
@@ -190,8 +190,8 @@ def test_a_position_left_out_is_never_shown(box, loads, truth, monkeypatch):
 def test_it_learns_what_bodies_do(name, box, loads, truth):
     """At positions that it saw, and better than motion itself at one that it did not."""
     rows = np.arange(len(loads))
-    model = published_model(name, box, loads.rows(rows[::2]), truth[::2])
-    miss = np.linalg.norm(model.deform(loads.rows(rows[1::2])).displacement - truth[1::2], axis=2).mean()
+    model = published_model(name, box, loads.select(rows[::2]), truth[::2])
+    miss = np.linalg.norm(model.deform(loads.select(rows[1::2])).displacement - truth[1::2], axis=2).mean()
     assert miss < {"published-ann": 0.1, "published-svr": 0.25}[name] * np.linalg.norm(truth, axis=2).mean()
 
 
@@ -199,10 +199,10 @@ def test_it_is_a_deformer(model, box, loads, truth):
     answer = model.deform(loads)
     assert isinstance(model, Deformer) and model.anatomy is box and np.array_equal(model.nodes, published_nodes(box))
     assert answer.displacement.shape == truth.shape and answer.cost.total > 0.0
-    assert np.array_equal(answer.reaction[:, 0, :3], loads.of(Pushed).force)
+    assert np.array_equal(answer.reaction[:, 0, :3], loads.get(Pushed).force)
     # Each load is answered by a model that has no training load at its position.
     assert set(answer.outcome) == {Outcome.EXTRAPOLATED}
-    single = np.concatenate([model.deform(loads.rows(slice(k, k + 1))).displacement for k in range(5)])
+    single = np.concatenate([model.deform(loads.select(slice(k, k + 1))).displacement for k in range(5)])
     assert np.allclose(single, answer.displacement[:5], atol=1e-8)
     some = model.nodes[[1, 0]]
     assert np.array_equal(model.deform(loads, at=some).displacement, answer.displacement[:, [1, 0]])
@@ -210,8 +210,8 @@ def test_it_is_a_deformer(model, box, loads, truth):
 
 
 def test_no_force_is_answered_and_too_much_is_said(model, loads):
-    assert np.isfinite(model.deform(loads.scaled(0.0)).displacement).all()
-    assert set(model.deform(loads.scaled(20.0)).outcome) == {Outcome.EXTRAPOLATED}
+    assert np.isfinite(model.deform(loads.scale(0.0)).displacement).all()
+    assert set(model.deform(loads.scale(20.0)).outcome) == {Outcome.EXTRAPOLATED}
 
 
 def test_what_it_does_not_know_is_refused(model, box, loads, truth):

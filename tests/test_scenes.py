@@ -76,9 +76,9 @@ class TestSite:
         nodes = site.anatomy.mesh.nodes
         contact = site.find_contact(0.006, -0.004, 0.007)
         assert contact.weights.sum() == pytest.approx(1.0) and contact.weights.min() >= 0.0
-        assert np.allclose(contact.carried(nodes), contact.point)
+        assert np.allclose(contact.locate(nodes), contact.point)
         turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-        assert np.allclose(contact.carried(nodes @ turn.T + [0.1, 0.0, 0.2]), turn @ contact.point + [0.1, 0.0, 0.2])
+        assert np.allclose(contact.locate(nodes @ turn.T + [0.1, 0.0, 0.2]), turn @ contact.point + [0.1, 0.0, 0.2])
         place = contact.point - site.origin
         assert place @ site.right == pytest.approx(0.006, rel=0.15)
         assert place @ site.up == pytest.approx(-0.004, rel=0.15)
@@ -87,7 +87,7 @@ class TestSite:
         for x, y in ((0.1, 0.0), (-0.03, 0.03), (0.0, -0.02)):
             point = site.find_contact(x, y, 0.007).point[None]
             assert open_patch(site.anatomy).compute_edge_distance(point)[0] > 0.007 * 0.999
-            assert site.across(point)[0] > 0.95 * site.compute_reach(0.007)
+            assert site.compute_axis_distance(point)[0] > 0.95 * site.compute_reach(0.007)
         assert np.allclose(site.find_contact(0.1, 0.1, 1.0).point, site.origin, atol=1e-9)
 
     def test_direction_tilts_as_asked(self, site):

@@ -254,7 +254,7 @@ def test_a_bad_outcome_fails_on_either_side(play, frames, truth):
 
 
 def test_nothing_but_idle_frames_prove_nothing(play, frames, truth):
-    assert about(broken(play, frames[:1], truth.rows(np.array([0])))[0], "never moves")
+    assert about(broken(play, frames[:1], truth.select(np.array([0])))[0], "never moves")
 
 
 @pytest.fixture(scope="module")

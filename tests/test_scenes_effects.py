@@ -183,7 +183,7 @@ class TestBrainShift:
         assert (np.diff(shift) > 0.3).all() and 5.0 < shift[2] < 8.0
         assert 1.2 < shift[2] / tumour[2] < 1.8
         # It sinks along gravity where it can, and turns with the head.
-        turned = fem.deform(lying[6.0], answer.rows(np.array([2])))
+        turned = fem.deform(lying[6.0], answer.select(np.array([2])))
         way = [each.displacement[-1, cortex].mean(axis=0) for each in (answer, turned)]
         assert turned.outcome[0].good and way[0][1] < -0.8 * np.linalg.norm(way[0])
         assert way[1][0] < way[0][0] - 5e-4

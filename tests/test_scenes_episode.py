@@ -139,7 +139,7 @@ class TestEpisode:
             assert np.array_equal(file["tip"][frame.number], frame.tip)
             assert np.allclose(file["force"][frame.number], frame.touch.force * play.site.axis)
             assert np.allclose(file["contact"][frame.number], play.site.origin)
-            guess = rest + frame.deformation.at(nodes).displacement[0]
+            guess = rest + frame.deformation.restrict(nodes).displacement[0]
             assert np.allclose(file["tumour_predicted"][frame.number], guess, atol=1e-12)
         alone = (
             player(theatre, short(), "fem").draw(3, 0.1, short().path(0.1)).deformation.restrict(nodes).displacement[0]

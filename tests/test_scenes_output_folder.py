@@ -109,7 +109,7 @@ def test_what_comes_from_outside_or_was_cut_is_zero_and_counted(box, fields):
     affine[:3, 3] = [-10e-3, -10e-3, -8e-3]  # its top lies below what is pushed into it
     out, counts = warp_values(np.full((20, 20, 6), 9, np.uint8), affine, fields, 1)
     assert counts.outside > 200 and (out[counts.blank] == 0).all() and (out[~counts.blank] == 9).all()
-    cut = warp_fields(box, dimple(box.mesh.nodes), 2e-3, box.without(np.flatnonzero(box.mesh.region == 2)))
+    cut = warp_fields(box, dimple(box.mesh.nodes), 2e-3, box.remove_elements(np.flatnonzero(box.mesh.region == 2)))
     affine[2, 3] = -40e-3
     out, counts = warp_values(np.full((20, 20, 36), 9, np.uint8), affine, cut, 0)
     assert counts.gone > 1000 and (out == 0).sum() == counts.gone + counts.outside
@@ -168,7 +168,7 @@ def test_what_makes_no_sense_is_refused(words, reason, folder, capsys):
 
 
 def test_foreign_results_and_unknown_labels_are_rejected(folder, box, capsys):
-    other = box.without(np.arange(5)).mesh
+    other = box.remove_elements(np.arange(5)).mesh
     write_mesh(folder / "other.vtu", other, {"displacement": dimple(other.nodes)})
     for name, reason in (("other.vtu", "another mesh"), ("box.vtu", "no point data `displacement`")):
         assert warp(folder, "--located", folder / name, out="refused") == 2

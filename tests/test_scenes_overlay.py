@@ -104,7 +104,7 @@ def test_it_is_no_farther_off_than_it_says(shown, truth, calibration, stage):
 def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth, stage):
     class Falling(Recorded):
         def deform(self, loads, start=None, at=None):
-            depth = (loads.only(Touching).pose[0, 0, :3, 3] - truth.T_scan_tool[5, :3, 3]) @ stage.site.axis
+            depth = (loads.get_only(Touching).pose[0, 0, :3, 3] - truth.T_scan_tool[5, :3, 3]) @ stage.site.axis
             moved = np.full((1, len(self.vertices), 3), 0.2 * depth / np.sqrt(3.0))
             return build_prediction(moved, self.vertices, loads, [False], 0.0, np.full((2, 1), np.nan), "")
 

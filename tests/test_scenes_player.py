@@ -54,7 +54,7 @@ def test_a_place_under_the_bone_is_refused_said_and_shown(play, way):
     frame = play.draw(0, 0.0, Touch(way * 0.1, way * 0.1, force=0.1))
     assert frame.remark.startswith("the bone's edge stops the tool ") and frame.remark.endswith(" mm short")
     assert says(frame.shown, frame.remark)
-    assert play.site.across(frame.tip[None])[0] <= play.site.compute_reach(radius) + CARRIED
+    assert play.site.compute_axis_distance(frame.tip[None])[0] <= play.site.compute_reach(radius) + CARRIED
     inside = play.draw(0, 0.0, Touch(force=0.1))
     assert inside.remark == "" and not says(inside.shown, frame.remark)
 

@@ -60,7 +60,7 @@ def test_its_effects_and_causes_are_the_body_s(theatre, scene):
     assert [type(effect) for effect in scene.get_effects_on(theatre.anatomy)][-1] is Resection
     loads = scene.build_loads(theatre.site, Touch(), 0.12)
     assert [type(cause) for cause in loads.causes] == [Posture, Resected]
-    assert loads.of(Resected).done.tolist() == [2] and "resection: 2 steps done" in format_acting(
+    assert loads.get(Resected).done.tolist() == [2] and "resection: 2 steps done" in format_acting(
         loads, guess(np.zeros((1, 3, 3))), theatre.site.anatomy.mesh.nodes
     )
     assert theatre.list_deformers(scene) == ("fem",)

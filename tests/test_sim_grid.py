@@ -178,7 +178,7 @@ def test_what_is_filled_in_is_no_larger_than_what_is_known():
 
 def test_tissue_that_was_cut_away_is_known_to_be_gone(box, moved):
     cut = np.flatnonzero(box.mesh.region == 2)
-    found = warp_fields(box, moved, 2e-3, box.without(cut))
+    found = warp_fields(box, moved, 2e-3, box.remove_elements(cut))
     middle = box.mesh.nodes[box.mesh.tets[cut]].mean(axis=(0, 1))
     place = tuple(np.rint(found.grid.index(middle)).astype(int))
     assert found.gone[place] and not found.folds

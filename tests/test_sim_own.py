@@ -114,7 +114,7 @@ class TestEffect:
 
             def term(self, body):
                 made = super().term(body)
-                made.begin = lambda cases: seen.append(cases.loads.of(Pull).share)
+                made.begin = lambda cases: seen.append(cases.loads.get(Pull).share)
                 return made
 
         loads = Loads((*PRESS.causes, Pull(np.array([1.0, 2.0]))))

@@ -35,8 +35,8 @@ def pushes(share):
 
 def series(fem, loads, orders, nodes, sizes=1):
     """(terms, G, n, 3)."""
-    reading = fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
-    found = fem.series(loads, orders, reading, sizes)
+    reading = fem.build_reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
+    found = fem.compute_series(loads, orders, reading, sizes)
     return np.moveaxis(found.reshape(*found.shape[:2], len(nodes), 3), 1, 0)
 
 

@@ -100,11 +100,11 @@ def test_seeds_vary_the_lobed_shape_but_not_its_volume():
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(50_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    np.testing.assert_array_equal(first.radius(directions), again.radius(directions))
-    assert np.abs(first.radius(directions) - other.radius(directions)).max() > 1e-3
+    np.testing.assert_array_equal(first.compute_radius(directions), again.compute_radius(directions))
+    assert np.abs(first.compute_radius(directions) - other.compute_radius(directions)).max() > 1e-3
     for shape in (first, other):
-        assert (shape.radius(directions) ** 3).mean() == pytest.approx(0.012**3, rel=5e-3)
-        assert np.ptp(shape.radius(directions)) > 3e-3
+        assert (shape.compute_radius(directions) ** 3).mean() == pytest.approx(0.012**3, rel=5e-3)
+        assert np.ptp(shape.compute_radius(directions)) > 3e-3
 
 
 def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):

@@ -35,7 +35,7 @@ def test_what_is_written_is_read(tmp_path, box, pretender, loads):
     assert (said.loads, said.units) == (len(loads), units) and min(said.unit_seconds, said.load_seconds) > 0.0
     assert solved == len(loads) + units and seen[-1] == (solved, solved) and not list(tmp_path.glob("*.partial"))
     assert data.anatomy.digest == box.digest and data.provenance["preset"] == "palpation"
-    assert np.array_equal(data.loads.get(Pushed).force, loads.of(Pushed).force)
+    assert np.array_equal(data.loads.get(Pushed).force, loads.get(Pushed).force)
     whole = pretender.deform(loads).displacement
     assert np.allclose(data.read_displacement(np.arange(len(box.mesh.nodes))), whole, rtol=0, atol=1e-7 * whole.max())
     assert np.array_equal(
@@ -69,17 +69,17 @@ def test_unit_responses_superpose_to_small_loads(tmp_path, box, pretender, loads
     from surrogate.data.encode import compute_nodal_shares
 
     simulate(tmp_path / "data.h5", pretender, loads, SAID)
-    small = loads.scaled(1e-4)
+    small = loads.scale(1e-4)
     table = read_dataset(tmp_path / "data.h5").compute_unit_response(box.tumour_nodes)
-    shares = compute_nodal_shares(open_patch(box), small.of(Pushed))
-    size = np.linalg.norm(small.of(Pushed).force, axis=1)
+    shares = compute_nodal_shares(open_patch(box), small.get(Pushed))
+    size = np.linalg.norm(small.get(Pushed).force, axis=1)
     predicted = size[:, None, None] * np.einsum("bf,fni->bni", shares, table)
     truth = pretender.deform(small, at=box.tumour_nodes).displacement
     assert np.linalg.norm(predicted - truth) < 1e-3 * np.linalg.norm(truth)
 
 
 def test_failed_cases_stay_marked(tmp_path, pretender, loads):
-    size = np.linalg.norm(loads.of(Pushed).force, axis=1)
+    size = np.linalg.norm(loads.get(Pushed).force, axis=1)
     limit = np.median(size)
     simulate(tmp_path / "data.h5", type(pretender)(pretender.anatomy, limit), loads, SAID)
     data = read_dataset(tmp_path / "data.h5")

@@ -44,7 +44,7 @@ def unrounded(table):
 
 
 def every_motion(fem, nodes):
-    return fem.reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
+    return fem.build_reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
 
 
 def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
@@ -106,7 +106,7 @@ def trained(data, expansion):
 
 
 def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, patch):
-    pushed = data.loads.of(Pushed)
+    pushed = data.loads.get(Pushed)
     some = np.flatnonzero(data.good)[:90]
     loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
     nodes = (expansion.tumour, expansion.cortex)

@@ -82,7 +82,7 @@ def opened(graph):
 
 def asked(session, loads, patch):
     """The answer of a graph, and the loads as they were asked: in single precision."""
-    pushed = loads.of(Pushed)
+    pushed = loads.get(Pushed)
     given = {name: getattr(pushed, name).astype(np.float32) for name in ("point", "force", "footprint")}
     heard = push(given["point"], given["force"], given["footprint"])
     if "weight" in {port.name for port in session.get_inputs()}:
@@ -120,9 +120,9 @@ def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
     assert {"point", "force", "footprint", *(["weight"] if tables else [])} == {p.name for p in session.get_inputs()}
     assert ("pressed" in answer) == tables and (not tables or np.array_equal(answer["pressed"], patch.nodes))
     for row in (0, 12):
-        alone, _ = asked(session, loads.rows(slice(row, row + 1)), patch)
+        alone, _ = asked(session, loads.select(slice(row, row + 1)), patch)
         assert alone["displacement"].shape == (1, len(wanted.nodes), 3) and alone["bound"].shape == (1, 2)
-        assert_alike(alone, wanted.rows(np.array([row])))
+        assert_alike(alone, wanted.select(np.array([row])))
 
 
 def test_a_graph_is_the_formula_that_numpy_runs(models, block, loads, monkeypatch):

@@ -73,7 +73,7 @@ def test_each_load_is_judged_by_its_own_bound(guarded, loads, predicted, solved)
     handed = some.find_unreliable(predicted)
     assert 0 < handed.sum() < len(loads)
     answer = some.deform(loads, at=nodes)
-    expected = np.where(handed[:, None, None], solved.at(nodes).displacement, predicted.at(nodes).displacement)
+    expected = np.where(handed[:, None, None], solved.restrict(nodes).displacement, predicted.restrict(nodes).displacement)
     assert answer.displacement == pytest.approx(expected, abs=1e-9) and answer.nodes.tolist() == nodes.tolist()
     assert f"for {handed.sum()} of {len(loads)} loads" in answer.source
 
@@ -85,7 +85,7 @@ def test_model_stands_with_bound_where_fem_fails(guarded, loads, predicted, box)
 
 
 def test_frames_start_from_the_last_solved_one(guarded, loads):
-    one, strict = loads.rows(np.array([0])), replace(guarded, limit=0.0)
+    one, strict = loads.select(np.array([0])), replace(guarded, limit=0.0)
     first = strict.deform(one)
     again = strict.deform(one, start=first)
     assert again.iterations[0] < first.iterations[0]

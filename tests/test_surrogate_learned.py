@@ -60,19 +60,19 @@ def test_every_model_is_a_deformer(model, box, fresh):
     assert isinstance(model, Deformer) and model.anatomy.digest == box.digest
     assert np.array_equal(answer.nodes, np.union1d(box.tumour_nodes, open_patch(box).nodes))
     assert answer.displacement.shape == (60, len(answer.nodes), 3) and np.isnan(answer.residual).all()
-    assert np.array_equal(answer.reaction[:, 0, :3], fresh.of(Pushed).force)
+    assert np.array_equal(answer.reaction[:, 0, :3], fresh.get(Pushed).force)
     assert np.array_equal(model.deform(fresh).displacement, answer.displacement)
     some = np.array([box.tumour_nodes[3], open_patch(box).nodes[2], box.tumour_nodes[0]])
-    assert np.allclose(model.deform(fresh, at=some).displacement, answer.at(some).displacement, atol=1e-9)
-    single = np.concatenate([model.deform(fresh.rows(slice(k, k + 1))).displacement for k in range(5)])
+    assert np.allclose(model.deform(fresh, at=some).displacement, answer.restrict(some).displacement, atol=1e-9)
+    single = np.concatenate([model.deform(fresh.select(slice(k, k + 1))).displacement for k in range(5)])
     assert np.allclose(single, answer.displacement[:5], atol=1e-8)
 
 
 def test_no_force_no_motion_and_weak_loads_in_proportion(model, fresh):
-    assert not model.deform(stack([fresh.scaled(0.0), fresh.scaled(1e-200)])).displacement.any()  # 1e-400 is zero
-    weak = fresh.scaled(1e-6)
-    assert np.allclose(3.0 * model.deform(weak).displacement, model.deform(weak.scaled(3.0)).displacement, rtol=1e-5)
-    assert model.deform(fresh.scaled(0.0)).outcome[0] is Outcome.PREDICTED
+    assert not model.deform(stack([fresh.scale(0.0), fresh.scale(1e-200)])).displacement.any()  # 1e-400 is zero
+    weak = fresh.scale(1e-6)
+    assert np.allclose(3.0 * model.deform(weak).displacement, model.deform(weak.scale(3.0)).displacement, rtol=1e-5)
+    assert model.deform(fresh.scale(0.0)).outcome[0] is Outcome.PREDICTED
 
 
 def test_learners_are_as_near_as_they_were(trained):
@@ -130,7 +130,7 @@ def test_no_answer_that_calibrates_reaches_a_model(trained, data, tmp_path):
 
 
 def test_what_is_used_was_trained_on_the_discs_too(trained, scored, data):
-    held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
+    held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test])
     truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
     for name in ("ann", "svr", "gp", "residual"):
         both = (trained.models[name], scored.models[name])
@@ -145,7 +145,7 @@ def test_bounds_are_calibrated_on_untrained_loads(trained, data, fresh, pretende
     assert (trained.split.disc[-trained.calibrated :] == -2).all()
     for name, model in trained.models.items():
         points = model.envelope.points
-        assert not np.isin(data.loads.of(Pushed).point[apart, 0].astype(np.float32), points[:, 0]).any(), name
+        assert not np.isin(data.loads.get(Pushed).point[apart, 0].astype(np.float32), points[:, 0]).any(), name
         answer = model.deform(fresh, at=model.anatomy.tumour_nodes)
         truth = pretender.deform(fresh, at=model.anatomy.tumour_nodes).displacement
         worst = np.linalg.norm(answer.displacement - truth, axis=2).max(axis=1)
@@ -156,9 +156,9 @@ def test_bounds_are_calibrated_on_untrained_loads(trained, data, fresh, pretende
 
 def test_held_out_coverage_is_reported(trained, scored, data):
     """Recomputed: the scored model, bounds from the loads that are apart and outside every disc."""
-    good = data.loads.rows(np.flatnonzero(data.good))
+    good = data.loads.select(np.flatnonzero(data.good))
     truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good]
-    place = np.linalg.norm(good.of(Pushed).point[:, None] - trained.split.centres, axis=2).min(axis=1)
+    place = np.linalg.norm(good.get(Pushed).point[:, None] - trained.split.centres, axis=2).min(axis=1)
     apart = np.arange(len(good)) >= len(good) - trained.calibrated
     beside = np.flatnonzero(apart & (place > trained.split.radius))
     assert 38 <= len(beside) < trained.calibrated
@@ -167,16 +167,16 @@ def test_held_out_coverage_is_reported(trained, scored, data):
         model = scored.models[name]
 
         def seen(rows, model=model):
-            loads = good.rows(rows)
+            loads = good.select(rows)
             answer = model.deform(loads, at=data.anatomy.tumour_nodes).displacement
             error = np.linalg.norm(answer - truth[rows], axis=2).max(axis=1)
-            return collect_missed(model, open_patch(data.anatomy), loads.of(Pushed), error)
+            return collect_missed(model, open_patch(data.anatomy), loads.get(Pushed), error)
 
         near, held, alone, stated = seen(beside), [], [], trained.models[name].left_out
         for disc in range(len(split.centres)):
             here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
             bounds = bound_by(near, TUMOUR, compute_growth(near, seen(others), TUMOUR))
-            bounded, asked = replace(model, bounds=bounds), good.rows(here)
+            bounded, asked = replace(model, bounds=bounds), good.select(here)
             answer = bounded.deform(asked, at=data.anatomy.tumour_nodes)
             held.append(seen(here).error <= answer.bound)
             off, moved = np.linalg.norm([answer.displacement - truth[here], truth[here]], axis=3).mean(axis=2)
@@ -214,7 +214,7 @@ def test_scores_are_the_errors_of_the_held_out_loads(trained, scored, data, box)
     truth = data.read_displacement(box.tumour_nodes)[held_out].astype(float)
     miss, motion = [], []
     for number, load_case in enumerate(held_out):
-        answer = model.deform(data.loads.rows(np.array([load_case]))).at(box.tumour_nodes).displacement[0]
+        answer = model.deform(data.loads.select(np.array([load_case]))).restrict(box.tumour_nodes).displacement[0]
         miss.append(np.sqrt(((answer - truth[number]) ** 2).sum(axis=1)))
         motion.append(np.sqrt((truth[number] ** 2).sum(axis=1)).mean())
     miss, motion = np.array(miss), np.array(motion)
@@ -240,7 +240,7 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
     assert found.bound_mm == pytest.approx(1e3 * np.median(answer.bound[0]))
     assert found.error_mm == pytest.approx(1e3 * np.median(miss), rel=1e-4)
     assert found.extrapolated == answer.outcome.count(Outcome.EXTRAPOLATED) and found.loads == len(fresh)
-    weakest = np.argsort(np.linalg.norm(fresh.of(Pushed).force, axis=1))
+    weakest = np.argsort(np.linalg.norm(fresh.get(Pushed).force, axis=1))
     assert found.tenths == tuple((weakest[k : k + 6] % 4 == 0).mean() for k in range(0, 60, 6))
     some = measure_covered(np.ones(20), np.full(20, 3e-3), np.array([np.full(20, 4e-3), np.full(20, np.inf)]), 0)
     assert some.held == (1.0, None) and "100.0 % at 95 %, no guarantee at 99 %;" in str(some)
@@ -249,8 +249,8 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
 
 
 def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh):
-    size = np.linalg.norm(fresh.of(Pushed).force, axis=1)
-    within = fresh.rows((size >= model.envelope.force[0]) & (size <= model.envelope.force[1]))
+    size = np.linalg.norm(fresh.get(Pushed).force, axis=1)
+    within = fresh.select((size >= model.envelope.force[0]) & (size <= model.envelope.force[1]))
     wanted = model.deform(within, at=box.tumour_nodes).displacement
     assert np.allclose(
         model.predict_motion(model.to_input(within), box.tumour_nodes), wanted, atol=1e-5 * np.abs(wanted).max()
@@ -306,12 +306,12 @@ def test_what_has_no_answer_is_refused_alone_and_among_others(trained, box, name
 @pytest.mark.parametrize("name", ["linear", "residual", "ann", "svr", "gp"])
 def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
     """Each begins with nothing prepared, and presses the cortex elsewhere than the others do at the same time."""
-    wanted = [trained.models[name].deform(fresh.rows(slice(k, k + 1))).displacement for k in range(60)]
+    wanted = [trained.models[name].deform(fresh.select(slice(k, k + 1))).displacement for k in range(60)]
     model, ready = replace(trained.models[name]), threading.Barrier(4)
 
     def work(thread):
         ready.wait()
-        return [model.deform(fresh.rows(slice(k, k + 1))).displacement for k in range(thread, 60, 4)]
+        return [model.deform(fresh.select(slice(k, k + 1))).displacement for k in range(thread, 60, 4)]
 
     with ThreadPoolExecutor(4) as pool:
         answers = pool.map(work, range(4))
@@ -321,7 +321,7 @@ def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
 def test_test_loads_are_inside_and_held_out_outside(trained, scored, data, fresh):
     inside = [outcome is Outcome.PREDICTED for outcome in trained.models["linear"].deform(fresh).outcome]
     assert np.mean(inside) > 0.9  # a few exceed the extremes in training, or lie in a gap
-    held_out = data.loads.rows(np.flatnonzero(data.good)[trained.split.test])
+    held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test])
     strange = [outcome is Outcome.EXTRAPOLATED for outcome in scored.models["linear"].deform(held_out).outcome]
     assert np.mean(strange) > 0.3
 

@@ -185,7 +185,7 @@ def test_a_model_learns_a_rod_and_keeps_it(tmp_path, data, model, elements, box)
     assert data.tool == model.tool == ROD_OF_4
     fresh, nodes = draw_poses("dissector", box, 30, 77, ROD_OF_4), box.tumour_nodes
     truth, found = elements.deform(fresh), model.deform(fresh)
-    moved = truth.at(nodes).displacement
+    moved = truth.restrict(nodes).displacement
     assert compute_point_errors(model, fresh, moved, nodes).mean() < 0.01 * np.linalg.norm(moved, axis=2).mean()
     size = np.linalg.norm(truth.reaction[:, 0, :3], axis=1)
     assert (np.linalg.norm((found.reaction - truth.reaction)[:, 0, :3], axis=1) < 0.02 * size).all()

@@ -65,7 +65,7 @@ def fresh(pretender, gauge):
     """Loads that no model saw, and the truth."""
     loads = draw("palpation", pretender.anatomy, 300, 7)
     answer = pretender.deform(loads)
-    return loads, gauge.distances(loads, answer.displacement, answer.nodes)
+    return loads, gauge.compute_distances(loads, answer.displacement, answer.nodes)
 
 
 def surface(positions, triangles):
@@ -76,8 +76,8 @@ def test_distance_is_measured_from_resting_ball(box, pretender, gauge):
     loads = draw("palpation", box, 6, 3)
     answer = pretender.deform(loads)
     pushed, axis = get_only_pushes(loads), open_cortex(box).axis
-    found = gauge.distances(loads, answer.displacement, answer.nodes)
-    lifted = gauge.distances(loads, answer.displacement, answer.nodes, lift=2e-3)
+    found = gauge.compute_distances(loads, answer.displacement, answer.nodes)
+    lifted = gauge.compute_distances(loads, answer.displacement, answer.nodes, lift=2e-3)
     for row in range(6):
         moved = box.mesh.nodes + answer.displacement[row]
         cortex = surface(box.mesh.nodes, box.open_surface)
@@ -105,16 +105,16 @@ def test_of_a_pose_the_tip_is_where_the_pose_has_it(box, gauge):
     pose = touching.pose[:, 0]
     tip = pose[:, :3, 3] + 6e-3 * pose[:, :3, 2] + 6e-3 * open_cortex(box).axis
     away = trimesh.proximity.closest_point_naive(surface(box.mesh.nodes, box.tumour_surface), tip)[1]
-    assert gauge.distances(loads, still, gauge.nodes, Ball(6e-3)) == pytest.approx(away, abs=1e-12)
+    assert gauge.compute_distances(loads, still, gauge.nodes, Ball(6e-3)) == pytest.approx(away, abs=1e-12)
     with pytest.raises(InputError, match="no tip"):
-        gauge.distances(loads, still, gauge.nodes)
+        gauge.compute_distances(loads, still, gauge.nodes)
 
 
 def test_what_it_needs_it_asks_for(box, gauge, fresh):
-    loads = fresh[0].rows(slice(0, 1))
+    loads = fresh[0].select(slice(0, 1))
     nodes = box.tumour_nodes
     with pytest.raises(InputError, match="request the open cortex and the tumour"):
-        gauge.distances(loads, np.zeros((1, len(nodes), 3)), nodes)
+        gauge.compute_distances(loads, np.zeros((1, len(nodes), 3)), nodes)
     whole = replace(box, mesh=replace(box.mesh, region=np.ones(len(box.mesh.tets), int)))
     with pytest.raises(InputError, match="has no tumour"):
         build_tip_gauge(whole).compute_distances(
@@ -136,7 +136,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
     def known(count, seed):
         loads = draw("palpation", pretender.anatomy, count, seed)
         answer = pretender.deform(loads)
-        return KnownDistances(loads, gauge.distances(loads, answer.displacement, answer.nodes))
+        return KnownDistances(loads, gauge.compute_distances(loads, answer.displacement, answer.nodes))
 
     def seen(some):
         return collect_missed(
@@ -151,14 +151,14 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
 
 def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
     """Recomputed: the scored model, a bound from the loads that are apart and outside every disc."""
-    good, split = data.loads.rows(np.flatnonzero(data.good)), trained.split
-    distance = gauge.distances(good, data.read_displacement(gauge.nodes)[data.good], gauge.nodes)
+    good, split = data.loads.select(np.flatnonzero(data.good)), trained.split
+    distance = gauge.compute_distances(good, data.read_displacement(gauge.nodes)[data.good], gauge.nodes)
     place = np.linalg.norm(get_only_pushes(good).point[:, None] - split.centres, axis=2).min(axis=1)
     beside = np.flatnonzero((np.arange(len(good)) >= len(good) - trained.calibrated) & (place > split.radius))
     scored = train(data, ["linear"], split=split).models["linear"]
 
     def seen(rows):
-        loads = good.rows(rows)
+        loads = good.select(rows)
         error = np.abs(scored.predict_distance(loads).value - distance[rows])
         return collect_missed(scored, open_patch(data.anatomy), get_only_pushes(loads), error)
 
@@ -167,7 +167,7 @@ def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
         here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
         bound = bound_by(near, TIP, compute_growth(near, seen(others), TIP))
         bounded = replace(scored, tip=replace(scored.tip, bound=bound))
-        held.append(seen(here).error <= bounded.predict_distance(good.rows(here)).bound)
+        held.append(seen(here).error <= bounded.predict_distance(good.select(here)).bound)
     found = trained.distance_left_out["linear"]
     held = np.concatenate(held, axis=1)
     assert found.loads == held.shape[1] == split.test.sum() and found.held == (held[0].mean(), None)
@@ -181,17 +181,17 @@ def test_the_correction_brings_distances_nearer(model, fresh):
 
 
 def test_no_push_gives_zero_and_far_bound_is_wide(model, fresh):
-    loads = fresh[0].rows(slice(0, 20))
-    idle = model.predict_distance(loads.scaled(0.0))
+    loads = fresh[0].select(slice(0, 20))
+    idle = model.predict_distance(loads.scale(0.0))
     still = np.zeros((20, len(model.nodes), 3))
     assert np.array_equal(idle.value, build_tip_gauge(model.anatomy).compute_distances(loads, still, model.nodes))
     assert (idle.bound == 0.0).all()
-    strong = model.predict_distance(loads.scaled(2.5))
+    strong = model.predict_distance(loads.scale(2.5))
     assert (strong.bound[0] > 2.0 * model.predict_distance(loads).bound[0]).all() and (strong.value >= 0.0).all()
 
 
 def test_an_answer_at_hand_is_taken(model, fresh):
-    loads = fresh[0].rows(slice(0, 3))
+    loads = fresh[0].select(slice(0, 3))
     answer = model.deform(loads, at=build_tip_gauge(model.anatomy).nodes)
     given, asked = model.predict_distance(loads, answer), model.predict_distance(loads)
     assert given.value == pytest.approx(asked.value, abs=1e-9) and np.array_equal(given.bound, asked.bound)
@@ -223,15 +223,15 @@ def test_shipped_models_bound_strong_press_distance():
 
 
 def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender, gauge, fresh):
-    loads, tool = fresh[0].rows(slice(2, 3)), Probe()
+    loads, tool = fresh[0].select(slice(2, 3)), Probe()
     answer, truth = model.deform(loads), pretender.deform(loads)
     predicted = model.predict_distance(loads)
-    apart = gauge.distances(loads, answer.displacement, answer.nodes)[0]
+    apart = gauge.compute_distances(loads, answer.displacement, answer.nodes)[0]
     assert read_tip_distance(model, loads, answer, tool, apart) == TipDistance(
         predicted.value[0], predicted.bound[0, 0]
     )
     assert read_tip_distance(pretender, loads, truth, tool, fresh[1][2]) == TipDistance(fresh[1][2], None)
-    high = gauge.distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
+    high = gauge.compute_distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
     assert drawn_distance(model.anatomy, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
     assert read_tip_distance(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(
         predicted.value[0] + 2e-3
