@@ -62,7 +62,9 @@ def test_the_tool_enters_there_and_pushes_along_it(site, tmp_path, right, up, ti
     entry, way, line = planned(site, right, up, tilt)
     approach = approach_of(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
     touch = approach.follow(press(0.3))(2.0)
-    assert np.linalg.norm(site.find_nearest(site.origin + touch.x * site.right + touch.y * site.up).point - entry) < 1e-4
+    assert (
+        np.linalg.norm(site.find_nearest(site.origin + touch.x * site.right + touch.y * site.up).point - entry) < 1e-4
+    )
     np.testing.assert_allclose(site.compute_direction(touch), way, atol=1e-9)
     assert touch.force == pytest.approx(0.3)
     aside = approach.follow(lambda time: Touch(2e-3, 1e-3, tilt=(0.2, 0.0)))(0.0)

@@ -54,7 +54,10 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
     scene = demo.stage.scene
     loads = scene.build_loads(theatre.site, scene.path(scene.times[truth.number]), scene.times[truth.number])
     assert np.array_equal(loads.causes[0].force, truth.loads.causes[0].force)
-    off = theatre.models["linear"].deform(loads, at=nodes).displacement[0] - truth.deformation.restrict(nodes).displacement[0]
+    off = (
+        theatre.models["linear"].deform(loads, at=nodes).displacement[0]
+        - truth.deformation.restrict(nodes).displacement[0]
+    )
     assert f"mean {1e3 * np.linalg.norm(off, axis=1).mean():.3f}" in text
     assert demo.browser.shown[1].shape == (240, 320, 3)
     assert len(np.unique(demo.browser.shown[1])) > 50

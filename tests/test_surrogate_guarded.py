@@ -73,7 +73,9 @@ def test_each_load_is_judged_by_its_own_bound(guarded, loads, predicted, solved)
     handed = some.find_unreliable(predicted)
     assert 0 < handed.sum() < len(loads)
     answer = some.deform(loads, at=nodes)
-    expected = np.where(handed[:, None, None], solved.restrict(nodes).displacement, predicted.restrict(nodes).displacement)
+    expected = np.where(
+        handed[:, None, None], solved.restrict(nodes).displacement, predicted.restrict(nodes).displacement
+    )
     assert answer.displacement == pytest.approx(expected, abs=1e-9) and answer.nodes.tolist() == nodes.tolist()
     assert f"for {handed.sum()} of {len(loads)} loads" in answer.source
 
