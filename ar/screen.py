@@ -119,8 +119,8 @@ def check_size(colour: np.ndarray, size: tuple[int, ...] | None) -> None:
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"  # First bytes of a PNG and of a JPEG.
 PNG_END, JPEG_END = b"IEND\xaeB`\x82", b"\xff\xd9"  # Last bytes of a PNG and of a JPEG.
 # Markers of a JPEG's frame header, which holds its size; the markers of coding tables in that range are excluded.
-SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION
+SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+IGNORE_ORIENTATION = cv2.IMREAD_IGNORE_ORIENTATION
 """Flag to ignore EXIF orientation: the camera matrix is for unrotated images."""
 
 
@@ -146,7 +146,7 @@ def read_image_size(code: bytes) -> tuple[int, int]:
             mark, kind, length = struct.unpack_from(">BBH", code, place)
             if mark != 0xFF or length < 2:
                 raise ValueError("its header is damaged")
-            if kind in SIZED:
+            if kind in SIZE_MARKERS:
                 height, width = struct.unpack_from(">HH", code, place + 5)
                 return width, height
             place += 2 + length
@@ -162,7 +162,7 @@ def decode_colour(code: bytes, width: int, height: int) -> np.ndarray:
     ValueError
         Bytes that are not such an image, or one of another size.
     """
-    return _decoded(code, (height, width, 3), cv2.IMREAD_COLOR_RGB | AS_STORED, np.uint8)
+    return _decode_image(code, (height, width, 3), cv2.IMREAD_COLOR_RGB | IGNORE_ORIENTATION, np.uint8)
 
 
 def decode_depth(code: bytes, width: int, height: int, scale: float) -> np.ndarray:
@@ -173,7 +173,7 @@ def decode_depth(code: bytes, width: int, height: int, scale: float) -> np.ndarr
     ValueError
         See `decode_colour`.
     """
-    steps = _decoded(code, (height, width), cv2.IMREAD_UNCHANGED | AS_STORED, np.uint16)
+    steps = _decode_image(code, (height, width), cv2.IMREAD_UNCHANGED | IGNORE_ORIENTATION, np.uint16)
     return steps * np.float32(scale)
 
 
@@ -185,10 +185,10 @@ def decode_labels(code: bytes, width: int, height: int) -> np.ndarray:
     ValueError
         See `decode_colour`.
     """
-    return _decoded(code, (height, width), cv2.IMREAD_UNCHANGED | AS_STORED, np.uint8)
+    return _decode_image(code, (height, width), cv2.IMREAD_UNCHANGED | IGNORE_ORIENTATION, np.uint8)
 
 
-def _decoded(code: bytes, shape: tuple[int, ...], flag: int, kind: type) -> np.ndarray:
+def _decode_image(code: bytes, shape: tuple[int, ...], flag: int, kind: type) -> np.ndarray:
     width, height = read_image_size(code)
     if (height, width) != shape[:2]:
         raise ValueError(f"it has {width} x {height} pixels in place of {shape[1]} x {shape[0]}")

@@ -16,7 +16,7 @@ from sim.runtime.user_script import run_script
 from sim.runtime.versions import get_version
 
 from .commands.guidance import format_guidance
-from .commands.interrupt import INTERRUPTED
+from .commands.interrupt import INTERRUPTED_CODE
 from .options.help import CommandParser, replace_former
 
 # Commands with their descriptions, by section. A command's module is imported only when it is called: `sulcus solve`
@@ -73,17 +73,17 @@ GROUPS = {
 # Descriptions of all commands, by name.
 COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}
 
-MAKING = ("train", "patient")  # Commands that make models; their learners may be user-defined.
+MODEL_MAKING_COMMANDS = ("train", "patient")  # Commands that make models; their learners may be user-defined.
 # Commands that read models; their learners may be user-defined.
-READING = (
+MODEL_READING_COMMANDS = (
     "judge", "export", "scenes", "effects", "demo", "render", "film", "overlay", "link", "collect", "sensitivity",
     "uncertainty", "budget", "check",
 )  # fmt: skip
 
 
-MOST_THREADS = 4  # Maximum number of threads of a library: BLAS does not scale on these small products.
+MAX_THREADS = 4  # Maximum number of threads of a library: BLAS does not scale on these small products.
 
-POINT = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+(?:,[^,]+)?")
+POINT_PATTERN = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+(?:,[^,]+)?")
 """A point, or a load there, whose first coordinate is negative: argparse would take it for an option."""
 
 
@@ -113,13 +113,13 @@ def run_command(args: argparse.Namespace, package: str) -> int:
         return 2
     except KeyboardInterrupt:
         print(f"{args.program}: stopped", file=sys.stderr)
-        return INTERRUPTED
+        return INTERRUPTED_CODE
 
 
 def limit_threads() -> None:
     """Limit libraries that are not loaded yet to `MOST_THREADS`, here and in child processes, unless already set."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, str(min(MOST_THREADS, os.cpu_count() or 1)))
+        os.environ.setdefault(name, str(min(MAX_THREADS, os.cpu_count() or 1)))
 
 
 def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
@@ -136,7 +136,7 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
         if name in asked:
             command.epilog = format_guidance(name)
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
-            if name in MAKING + READING:
+            if name in MODEL_MAKING_COMMANDS + MODEL_READING_COMMANDS:
                 add_plugin(command)
     return parser, dict(commands.choices)
 
@@ -166,7 +166,7 @@ def join_points(arguments: Sequence[str]) -> list[str]:
     """Return the arguments, with a point joined to the option before it: `--opening-at=-3,4,5`."""
     joined: list[str] = []
     for argument in arguments:
-        if joined and joined[-1].startswith("--") and POINT.fullmatch(argument):
+        if joined and joined[-1].startswith("--") and POINT_PATTERN.fullmatch(argument):
             joined[-1] += f"={argument}"
         else:
             joined.append(argument)

@@ -10,7 +10,7 @@ from .arguments import check_at_least
 from .errors import InputError
 
 Precision = Literal["float32", "float64"]  # scalar types of a solver
-FLOOR: dict[str, float] = {"float32": 2e-5, "float64": 1e-11}
+MIN_TOLERANCE: dict[str, float] = {"float32": 2e-5, "float64": 1e-11}
 """Smallest relative residual that each scalar type reaches reliably (round-off of the internal forces)."""
 
 
@@ -57,9 +57,9 @@ class Accuracy:
         return self.outer * (1 + self.steps)
 
     def __post_init__(self) -> None:
-        if self.precision not in tuple(FLOOR):  # tuple, since `precision` may be unhashable
-            raise InputError(f"no precision is called {self.precision!r}: choose one of {', '.join(FLOOR)}.")
-        floor = FLOOR[self.precision]
+        if self.precision not in tuple(MIN_TOLERANCE):  # tuple, since `precision` may be unhashable
+            raise InputError(f"no precision is called {self.precision!r}: choose one of {', '.join(MIN_TOLERANCE)}.")
+        floor = MIN_TOLERANCE[self.precision]
         if not isinstance(self.tolerance, Real):
             raise InputError(f"tolerance is {self.tolerance!r:.80}: give a number from {floor:g} to 1.")
         if not floor <= self.tolerance < 1.0:
@@ -83,7 +83,7 @@ Maximum error of 60 such frames: 0.026 mm in palpation, and 0.019 mm under a spa
 """
 TRAIN = Accuracy(tolerance=1e-4, precision="float32")
 """For training data sets: the default of `Fem`."""
-STRAINED = replace(TRAIN, limit_strain=False)
+NO_STRAIN_LIMIT = replace(TRAIN, limit_strain=False)
 """`TRAIN` for comparisons of solvers and models, which include equilibria of overstrained tissue."""
 REFERENCE = Accuracy(tolerance=1e-8)
 """For reference solutions; in double precision, which power series require too."""

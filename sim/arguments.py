@@ -9,7 +9,7 @@ import numpy as np
 from .errors import InputError
 
 # Upper limit of any length, force or time in SI units; its fourth power is finite in double precision.
-LARGEST = 1e30
+MAX_MAGNITUDE = 1e30
 
 
 def is_all_finite(array: np.ndarray) -> bool:
@@ -33,7 +33,7 @@ def as_array(name: str, values: object) -> np.ndarray:
         ) from error
 
 
-def check_numbers_array(name: str, values: object, largest: float = LARGEST) -> np.ndarray:
+def check_numbers_array(name: str, values: object, largest: float = MAX_MAGNITUDE) -> np.ndarray:
     """Return real, finite numbers as float64, in any shape; `name` identifies them in messages.
 
     Raises

@@ -89,7 +89,7 @@ def compile_problem(
         Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not fixed. A
         user-defined effect that does not return a term, or whose name is in use.
     """
-    effects = _compatible(effects)
+    effects = _check_compatible(effects)
     space = space or discretise(anatomy.mesh, "p1")
     skin = skin or ContactSurface(space.nodes, space.surface, device)
     terms: list[Term] = []
@@ -100,7 +100,7 @@ def compile_problem(
     for effect in effects:
         match effect:
             case Elasticity():
-                terms += _elasticity(effect, space, device, pulsation=pulsation)
+                terms += _build_elasticity(effect, space, device, pulsation=pulsation)
             case Held():
                 held = held | anatomy.held
             case Bonded():
@@ -128,11 +128,11 @@ def compile_problem(
             case ToolContact() | Retraction():
                 from .terms.contact.tool_contact import build_tool_contact
 
-                barriers.append(build_tool_contact(effect, anatomy, space, _shear(effects), device))
+                barriers.append(build_tool_contact(effect, anatomy, space, _compute_min_shear(effects), device))
             case SkullContact():
                 from .terms.contact.skull_contact import build_skull
 
-                barriers.append(build_skull(effect, anatomy, space, _shear(effects), device))
+                barriers.append(build_skull(effect, anatomy, space, _compute_min_shear(effects), device))
             case Pulsation() | ToolDisplacement():
                 pass  # Elasticity includes the swelling; tool displacement is a constraint, see `_impose`.
             case Resection():
@@ -150,11 +150,11 @@ def compile_problem(
     constraint = Constraint(space.extend_held(held), space.extend_normals(normal, held), device)
     elastic = all(term.constant for term in own)
     return Problem(
-        (*terms, *own, *barriers), constraint, device, partial(_impose, space, skin), tuple(barriers), elastic
+        (*terms, *own, *barriers), constraint, device, partial(_build_imposed, space, skin), tuple(barriers), elastic
     )
 
 
-def _compatible(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+def _check_compatible(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     """Return the effects as a tuple, if they are compatible."""
     effects = tuple(effects)
     for effect in effects:
@@ -183,7 +183,7 @@ def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:
         taken.add(term.name)
 
 
-def _shear(effects: Iterable[Effect]) -> float:
+def _compute_min_shear(effects: Iterable[Effect]) -> float:
     """Return the shear modulus [Pa] of the softest tissue."""
     effect = next(effect for effect in effects if isinstance(effect, Elasticity))
     return min(tissue.lame[0] for tissue in (effect.default, *effect.regions.values()) if tissue is not None)
@@ -207,7 +207,7 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
             raise InputError(f"loads hold {type(cause).__name__}, which no effect uses: add the effect {needed}.")
 
 
-def _impose(space: Discretisation, skin: ContactSurface, loads: Loads) -> Imposed:
+def _build_imposed(space: Discretisation, skin: ContactSurface, loads: Loads) -> Imposed:
     prescribed, displaced = loads.get(Prescribed), loads.get(Displaced)
     value = None
     if prescribed is not None:
@@ -233,14 +233,14 @@ def compile_part(
     """Compile the elasticity of the `chosen` tetrahedra (T,) bool alone, on their `nodes` (n,), ascending."""
     effect = next(effect for effect in effects if isinstance(effect, Elasticity))
     constraint = Constraint(whole.constraint.held[nodes], whole.constraint.normal[nodes], whole.device)
-    return Problem(tuple(_elasticity(effect, space, whole.device, chosen, nodes)), constraint, whole.device)
+    return Problem(tuple(_build_elasticity(effect, space, whole.device, chosen, nodes)), constraint, whole.device)
 
 
 def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
     """Return a part with a surrounding stiffness (m, m) [N/m] on its rows (m,) of 3n."""
     from .terms.schur_stiffness import Exterior
 
-    return _loaded(replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, part.device))))
+    return _build_local_problem(replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, part.device))))
 
 
 def compile_clamped_part(
@@ -251,14 +251,14 @@ def compile_clamped_part(
     Also return a function for its tangent stiffness (3n, 3n) [N/m] at the last linearisation of a single load case.
     """
     effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), whole.device
-    terms = _elasticity(effect, space, device, chosen, nodes)
+    terms = _build_elasticity(effect, space, device, chosen, nodes)
     rim = np.isin(nodes, space.table[~chosen])[:, None]
     held, normal = whole.constraint.held[nodes] | rim, np.where(rim, 0.0, whole.constraint.normal[nodes])
-    part = _loaded(Problem(tuple(terms), Constraint(held, normal, device), device))
+    part = _build_local_problem(Problem(tuple(terms), Constraint(held, normal, device), device))
     return part, lambda: reduce(add, [term.curvature() for term in terms])
 
 
-def _loaded(problem: Problem) -> LocalProblem:
+def _build_local_problem(problem: Problem) -> LocalProblem:
     from .terms.dead_force import DeadForce, Forces
 
     device = problem.device
@@ -267,7 +267,7 @@ def _loaded(problem: Problem) -> LocalProblem:
     return LocalProblem(problem, lambda force: load.take(None if force is None else Forces(nodes, force)))
 
 
-def _elasticity(
+def _build_elasticity(
     effect: Elasticity,
     space: Discretisation,
     device: Device,
@@ -310,11 +310,11 @@ def _elasticity(
             which = np.searchsorted(list(obeying), mesh.region[part.elements.owner])
             elements = part.elements if nodes is None else part.elements.restrict(nodes)
             swelling = None if pulsation is None else (pulsation, swell[part.elements.owner])
-            terms.append(_obeying(list(obeying.values()), which, elements, part.carries, device, swelling))
+            terms.append(_build_law_term(list(obeying.values()), which, elements, part.carries, device, swelling))
     return terms
 
 
-def _obeying(
+def _build_law_term(
     tissues: Sequence[Tissue],
     which: np.ndarray,
     elements: Elements,

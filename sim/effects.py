@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from .discretisation.term import Term
 
 # With these amplitudes of `Pulsation`, the exposed cortex of the template moves as observed in patients.
-CARDIAC = 4.5e-4  # amplitude of the heartbeat [volume fraction]
-RESPIRATORY = 4.5e-4  # amplitude of respiration [volume fraction]
-LARGEST_WAVE = 0.3  # maximum amplitude [volume fraction]
+CARDIAC_AMPLITUDE = 4.5e-4  # amplitude of the heartbeat [volume fraction]
+RESPIRATORY_AMPLITUDE = 4.5e-4  # amplitude of respiration [volume fraction]
+MAX_WAVE_AMPLITUDE = 0.3  # maximum amplitude [volume fraction]
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Elasticity:
 
     def get_law(self, label: int) -> Tissue | None:
         """Return the law of a region, or None."""
-        return self.regions.get(label, self.regions.get(_around(label), self.default))
+        return self.regions.get(label, self.regions.get(_get_enclosing_region(label), self.default))
 
     def restrict(self, labels: Iterable[int]) -> Elasticity:
         """Return the effect for a body with these regions, without laws of others."""
-        obeyed = {each for label in labels for each in (label, _around(label))}
+        obeyed = {each for label in labels for each in (label, _get_enclosing_region(label))}
         return replace(self, regions={label: law for label, law in self.regions.items() if label in obeyed})
 
     def __str__(self) -> str:
@@ -63,7 +63,7 @@ class Elasticity:
     of, on = get_law, restrict  # Former names, for one release.
 
 
-def _around(label: int) -> int:
+def _get_enclosing_region(label: int) -> int:
     """Return the region that contains a region, or itself."""
     return TUMOUR_LABEL if label == NECROSIS_LABEL else label
 
@@ -232,9 +232,9 @@ class Wave:
     def __post_init__(self) -> None:
         if not 0.0 < self.frequency < math.inf:
             raise InputError(f"Wave.frequency is {self.frequency} Hz: give a positive number.")
-        if not 0.0 <= self.amplitude <= LARGEST_WAVE:
+        if not 0.0 <= self.amplitude <= MAX_WAVE_AMPLITUDE:
             raise InputError(
-                f"Wave.amplitude is {self.amplitude}: must be a volume fraction from 0 to {LARGEST_WAVE}; "
+                f"Wave.amplitude is {self.amplitude}: must be a volume fraction from 0 to {MAX_WAVE_AMPLITUDE}; "
                 "typical for brain: 0.0005."
             )
 
@@ -261,8 +261,8 @@ class Pulsation:
         An empty tuple of regions.
     """
 
-    cardiac: Wave = Wave(1.0, CARDIAC)
-    respiratory: Wave = Wave(0.2, RESPIRATORY)
+    cardiac: Wave = Wave(1.0, CARDIAC_AMPLITUDE)
+    respiratory: Wave = Wave(0.2, RESPIRATORY_AMPLITUDE)
     regions: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -378,10 +378,10 @@ def build_push_effects(anatomy: Anatomy, tissue: Tissue | Elasticity, skull: str
 
 def remember(effects: Iterable[Effect]) -> bool:
     """Return True if a solution depends on the previous one: tool path, velocities, relaxation or resection."""
-    return any(map(_remembers, effects))
+    return any(map(_is_history_dependent, effects))
 
 
-def _remembers(effect: Effect) -> bool:
+def _is_history_dependent(effect: Effect) -> bool:
     match effect:
         case Inertia() | ToolContact() | Retraction() | Resection():
             return True

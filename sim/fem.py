@@ -28,7 +28,7 @@ from .errors import InputError
 from .linalg.preconditioner import choose_preconditioner
 from .linalg.rest_solver import RestStiffnessSolver
 from .loads import Displaced, Loads, Nodal, Pushed
-from .minimisers.lbfgs import CARRIED
+from .minimisers.lbfgs import MAX_CARRIED
 from .minimisers.power_series import SeriesReading, count_terms, expand_taylor, list_factors
 from .minimisers.residual import measure_residual
 from .runtime.columns import unstack_columns
@@ -41,10 +41,10 @@ from .strategy.extrapolation import as_pushes, compute_directions, extrapolate_s
 from .strategy.frame_sequence import FrameSequence, build_frame_sequence
 from .strategy.plan import SolverPlan, SolverStep, build_local_solvers, plan_for
 from .strategy.strategy import SolverResult, Strategy
-from .strategy.time_steps import KEPT, NoMotionStep, group_alike
+from .strategy.time_steps import MAX_PRECONDITIONERS, NoMotionStep, group_alike
 
 # Key in the memory: displacements (B, E, 3) [m] of mid-edge nodes relative to the centres of their edges.
-MIDDLES = "mid-edge nodes"
+MID_EDGE_KEY = "mid-edge nodes"
 
 
 class Fem:
@@ -107,7 +107,7 @@ class Fem:
         self._skin = ContactSurface(self.space.nodes, self.space.surface, find_device(device, accuracy.precision))
         problem = compile_problem(self.effects, anatomy, self._skin.device, self.space, self._skin)
         shared = stiff_as and stiff_as.strategy.preconditioner
-        preconditioner = shared or choose_preconditioner(problem, self.space, self._unsmoothed)
+        preconditioner = shared or choose_preconditioner(problem, self.space, self._build_linear_stiffness)
         if batch is None:
             batch = choose_batch_size(problem.rows, problem.device, measure_free_bytes(problem.device))
         plan = plan_for(problem, preconditioner, self.space, accuracy, check_at_least("batch", batch, 1), live, avoid)
@@ -118,7 +118,7 @@ class Fem:
         inversion = Inversion(self.space, problem.device, problem.bounded)
         self.strategy = Strategy(problem, preconditioner, inversion, accuracy, plan, *parts)
         """Solvers of the plan, applied in order."""
-        self._paced = lru_cache(KEPT)(self._strategy_over)
+        self._paced = lru_cache(MAX_PRECONDITIONERS)(self._build_strategy)
         self._resting = RestStiffnessSolver(problem, preconditioner, accuracy.inner)
 
     @property
@@ -160,7 +160,7 @@ class Fem:
             exceeds the memory; a vertex that the mesh does not have.
         """
         check_causes(self.effects, loads)
-        at = None if at is None else self._vertices(at)
+        at = None if at is None else self._check_vertices(at)
         if start is not None and self.following is not None:
             answer = self.following.solve_frame(loads, start, lambda: self.guess(loads, start))
             if answer is not None:
@@ -172,25 +172,25 @@ class Fem:
             before = last.T.reshape(len(loads), self.space.count, 3)
             cases = Cases(loads, start.time, start.memory, before, warm=start.warm)
         some = group_alike(cases.steps, self.batch) if self.problem.paced else None
-        batches = some or [(math.inf, rows) for rows in self._batches(len(loads))]
+        batches = some or [(math.inf, rows) for rows in self._iterate_batches(len(loads))]
         parts = []
         for step, rows in batches:
             guess = None if last is None else last[:, rows]
-            parts.append(self._solve(self._strategy_at(step), cases.select(rows), guess, at))
-        answer = _joined(parts)
+            parts.append(self._solve(self._get_strategy(step), cases.select(rows), guess, at))
+        answer = _join_batches(parts)
         return answer.select(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
-    def _strategy_at(self, step: float) -> Strategy | NoMotionStep:
+    def _get_strategy(self, step: float) -> Strategy | NoMotionStep:
         """Return the strategy with a preconditioner for a time step [s]; an infinite step is static."""
         if step == 0.0 or step == math.inf:
             return self.strategy if step else NoMotionStep(self.problem, self.strategy.inversion)
         return self._paced(step)
 
-    def _strategy_over(self, step: float) -> Strategy:
-        preconditioner = choose_preconditioner(self.problem, self.space, self._unsmoothed, step)
+    def _build_strategy(self, step: float) -> Strategy:
+        preconditioner = choose_preconditioner(self.problem, self.space, self._build_linear_stiffness, step)
         return Strategy(self.problem, preconditioner, self.strategy.inversion, self.accuracy, self.plan)
 
-    def _batches(self, count: int) -> Iterator[slice]:
+    def _iterate_batches(self, count: int) -> Iterator[slice]:
         """Iterate over the row slices of the batches, at least one."""
         return (slice(first, first + self.batch) for first in range(0, max(count, 1), self.batch))
 
@@ -203,7 +203,7 @@ class Fem:
             self.strategy, self.space, self._skin, self._diagnostics, self.lock, self.description
         )
 
-    def _vertices(self, at: np.ndarray) -> np.ndarray:
+    def _check_vertices(self, at: np.ndarray) -> np.ndarray:
         return check_vertex_numbers("at", at, len(self._anatomy.mesh.nodes))
 
     def _check_static(self, loads: Loads) -> None:
@@ -211,7 +211,7 @@ class Fem:
         if self.problem.paced:
             raise InputError("solutions under Inertia are time steps without static equilibrium: remove Inertia.")
 
-    def _unsmoothed(self, step: float) -> sp.csc_array:
+    def _build_linear_stiffness(self, step: float) -> sp.csc_array:
         """Return the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, for a time step [s]."""
         linear = discretise(self._anatomy.mesh, "p1")
         return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature(step)
@@ -238,11 +238,11 @@ class Fem:
         InputError
             A vertex that the mesh does not have; a problem that exceeds the memory.
         """
-        nodes = self._vertices(nodes)
+        nodes = self._check_vertices(nodes)
         device, rows = self.problem.device, (3 * nodes[:, None] + np.arange(3)).ravel()
         check_fits(self.problem.rows, self.batch, len(modes), device, self.strategy.held)
         answers = np.empty((len(modes), self.problem.rows))
-        for some in self._batches(len(modes)):
+        for some in self._iterate_batches(len(modes)):
             force = np.zeros((self.problem.rows, len(modes[some])))
             force[rows] = modes[some].reshape(-1, len(rows)).T
             on_device = device.upload(force)
@@ -295,8 +295,10 @@ class Fem:
         vertices = len(self._anatomy.mesh.nodes)
         check_start(start, len(loads), vertices)
         full = self.space.interpolate_field(start.restrict(np.arange(vertices)).displacement)
-        if len(self.space.edges) and MIDDLES in start.memory:
-            full[:, vertices:] += Cases(loads, start.time, start.memory).get_past(MIDDLES, (len(self.space.edges), 3))
+        if len(self.space.edges) and MID_EDGE_KEY in start.memory:
+            full[:, vertices:] += Cases(loads, start.time, start.memory).get_past(
+                MID_EDGE_KEY, (len(self.space.edges), 3)
+            )
         return full.reshape(len(loads), self.problem.rows).T
 
     def _solve(
@@ -306,10 +308,10 @@ class Fem:
         guesses = () if last is None else (extrapolate_start(cases.loads, last, cases.warm), last)
         found = solve_off_bone(strategy, cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
-        way = compute_directions(as_pushes(cases.loads), last, cases.warm) if len(cases.loads) <= CARRIED else {}
-        return self._answered(cases, found, way, at, seconds)
+        way = compute_directions(as_pushes(cases.loads), last, cases.warm) if len(cases.loads) <= MAX_CARRIED else {}
+        return self._build_deformation(cases, found, way, at, seconds)
 
-    def _answered(
+    def _build_deformation(
         self,
         cases: Cases,
         found: SolverResult,
@@ -325,12 +327,12 @@ class Fem:
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
         on_footprint = self.problem.constraint.compute_footprint_force(held) if displaced else None
         touching = [term.compute_reaction(found.u) for term in self.problem.barriers]
-        reaction = np.concatenate([self._reaction(cases.loads, on_footprint), *touching], axis=1)
+        reaction = np.concatenate([self._compute_reactions(cases.loads, on_footprint), *touching], axis=1)
         nodes = np.arange(len(self._anatomy.mesh.nodes)) if at is None else at
         if at is None and len(self.space.edges):
             whole = unstack_columns(self.problem.device, found.u, np.arange(self.space.count))
             displacement = np.ascontiguousarray(whole[:, : len(nodes)])
-            memory[MIDDLES] = whole[:, len(nodes) :] - self.space.interpolate_field(displacement)[:, len(nodes) :]
+            memory[MID_EDGE_KEY] = whole[:, len(nodes) :] - self.space.interpolate_field(displacement)[:, len(nodes) :]
         else:
             displacement = unstack_columns(self.problem.device, found.u, nodes)
         fields = self._diagnostics.compute_fields(found.u, held)
@@ -351,7 +353,7 @@ class Fem:
             source=self.description,
         )
 
-    def _reaction(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:
+    def _compute_reactions(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:
         """Return force and moment about its point that each tool exerts [N, N m]: (B, tools, 6)."""
         rows = []
         for cause in loads.causes:
@@ -366,7 +368,7 @@ class Fem:
     reading, series = build_reading, compute_series  # Former names, for one release.
 
 
-def _joined(parts: list[Deformation]) -> Deformation:
+def _join_batches(parts: list[Deformation]) -> Deformation:
     """Concatenate batches to one deformation; their warm-start data are dropped, as they may differ."""
     return parts[0] if len(parts) == 1 else join_deformations([replace(part, warm={}) for part in parts])
 

@@ -114,12 +114,12 @@ MAGNITUDE = {
 }
 # arrays with one number per load case
 SCALARS = ("footprint", "csf_level", "share", "done")
-SMALLEST_FOOTPRINT = 1e-4  # minimum footprint radius [m], below a needle's tip
-LARGEST_FOOTPRINT = 0.1  # maximum footprint radius [m], covers a brain
+MIN_FOOTPRINT = 1e-4  # minimum footprint radius [m], below a needle's tip
+MAX_FOOTPRINT = 0.1  # maximum footprint radius [m], covers a brain
 # Minimum length of a vector, so that its square does not underflow.
-SHORTEST = 1e-100
+MIN_VECTOR_LENGTH = 1e-100
 # Maximum deviation of a pose's 3 x 3 block from a rotation.
-RIGID = 1e-6
+ROTATION_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ class Loads:
             raise InputError(
                 f"loads have the causes {names}: give at least one, or a time, and each kind but Pushed once."
             )
-        object.__setattr__(self, "causes", tuple(_checked(cause) for cause in self.causes))
+        object.__setattr__(self, "causes", tuple(_check_cause(cause) for cause in self.causes))
         rows = {len(array) for cause in self.causes for array in vars(cause).values()}
         time = np.zeros(max(rows)) if self.time is None else check_numbers_array("Loads.time", self.time)
         if time.ndim != 1:
@@ -267,7 +267,7 @@ def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) ->
     InputError
         See `Loads`.
     """
-    rows = _repeated("Pushed", point=(point, (3,)), force=(force, (3,)), footprint=(footprint, ()))
+    rows = _repeat_rows("Pushed", point=(point, (3,)), force=(force, (3,)), footprint=(footprint, ()))
     return Loads((Pushed(**rows),))
 
 
@@ -279,7 +279,7 @@ def build_posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads
     InputError
         See `Loads`.
     """
-    rows = _repeated("Posture", direction=(direction, (3,)), csf_level=(csf_level, ()), share=(1.0, ()))
+    rows = _repeat_rows("Posture", direction=(direction, (3,)), csf_level=(csf_level, ()), share=(1.0, ()))
     return Loads((Posture(**rows),))
 
 
@@ -295,7 +295,7 @@ def check_field(name: str, field: np.ndarray, vertices: int) -> None:
         raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {vertices}.")
 
 
-def _repeated(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, np.ndarray]:
+def _repeat_rows(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, np.ndarray]:
     """Return the arrays of a cause, each given with its shape per load case; single values apply to all cases."""
     arrays = {}
     for key, (values, shape) in given.items():
@@ -318,7 +318,7 @@ def _repeated(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, n
     }
 
 
-def _checked(cause: Cause) -> Cause:
+def _check_cause(cause: Cause) -> Cause:
     name = type(cause).__name__
     if not isinstance(cause, BuiltIn) and not (is_dataclass(cause) and hasattr(cause, "magnitude")):
         allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
@@ -341,14 +341,14 @@ def _checked(cause: Cause) -> Cause:
             raise InputError(f"{name}.{key} has shape {array.shape}: give {want}.")
         if key == "footprint" and len(array):
             for radius in (array.min(), array.max()):
-                if not SMALLEST_FOOTPRINT <= radius <= LARGEST_FOOTPRINT:
+                if not MIN_FOOTPRINT <= radius <= MAX_FOOTPRINT:
                     raise InputError(
                         f"{name}.{key} has a radius of {radius:g} m: give positive radii in metres, from "
-                        f"{SMALLEST_FOOTPRINT:g} to {LARGEST_FOOTPRINT:g} (7 mm are 0.007)."
+                        f"{MIN_FOOTPRINT:g} to {MAX_FOOTPRINT:g} (7 mm are 0.007)."
                     )
         if key == "done" and ((array < 0.0) | (array % 1.0 != 0.0)).any():
             raise InputError(f"{name}.{key} is {array}: must be numbers of completed steps, integers >= 0.")
-        if key == "direction" and not (np.abs(array).max(axis=1) >= SHORTEST).all():
+        if key == "direction" and not (np.abs(array).max(axis=1) >= MIN_VECTOR_LENGTH).all():
             raise InputError(f"{name}.{key} has a row of zeros: give the direction of gravity for every load case.")
     return type(cause)(**arrays)
 
@@ -361,7 +361,7 @@ def _check_poses(name: str, pose: np.ndarray, axes: int) -> None:
         )
     turn = pose[..., :3, :3]
     off = np.abs(turn @ turn.swapaxes(-1, -2) - np.eye(3)).max(initial=0.0)
-    if off > RIGID or (np.linalg.det(turn) < 0.0).any() or (pose[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
+    if off > ROTATION_TOLERANCE or (np.linalg.det(turn) < 0.0).any() or (pose[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
         raise InputError(
             f"{name}.pose has a matrix that is no rigid motion: give rotations of determinant 1, lengths in metres, "
             "and 0 0 0 1 as the last row."

@@ -88,7 +88,7 @@ class Material:
     @property
     def functions(self) -> Law:
         """Warp functions of the law, imported on first use."""
-        return _built_in(self.law)
+        return _load_law(self.law)
 
 
 @dataclass(frozen=True)
@@ -156,10 +156,10 @@ class Ogden:
     @property
     def functions(self) -> Law:
         """Warp functions of the law, imported on first use."""
-        return _built_in(self.law)
+        return _load_law(self.law)
 
 
-def _built_in(law: str) -> Law:
+def _load_law(law: str) -> Law:
     return importlib.import_module(f".terms.laws.{law.replace('-', '_')}", __package__).LAW
 
 
@@ -286,7 +286,7 @@ def read_tissue_json(text: str) -> Tissue:
 
 
 # Ratio lambda / mu of elements that carry shape only, a Poisson's ratio of 0.3.
-SOFT = 1.5
+MAX_LAME_RATIO = 1.5
 
 
 def get_portion(tissue: Tissue, carries: str) -> tuple[float, float]:
@@ -295,7 +295,7 @@ def get_portion(tissue: Tissue, carries: str) -> tuple[float, float]:
     The two portions add up to the whole; in every law lambda multiplies the square of a volume measure.
     """
     mu, lam = tissue.lame
-    soft = min(lam, SOFT * mu)
+    soft = min(lam, MAX_LAME_RATIO * mu)
     return {"whole": (mu, lam), "shape": (mu, soft), "volume": (0.0, lam - soft)}[carries]
 
 

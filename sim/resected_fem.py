@@ -16,14 +16,14 @@ from .discretisation.resected_body import RemainingBody, list_remaining_bodies
 from .discretisation.term import Remembering
 from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
-from .fem import MIDDLES, Fem
+from .fem import MID_EDGE_KEY, Fem
 from .loads import Loads, Resected, check_loads
 from .runtime.exclusive import lock_method
 
 # Key in the memory: number of completed steps (B,).
-DONE = "resection"
+DONE_KEY = "resection"
 # shape of a tool pose
-POSE = (4, 4)
+POSE_SHAPE = (4, 4)
 
 
 class OperatedFem:
@@ -50,8 +50,8 @@ class OperatedFem:
         self.lock = RLock()
         self._bodies = bodies
         self._solver = lru_cache(len(bodies) if ahead else kept)(lambda done: make(bodies[done].anatomy))
-        self._rows = lru_cache(None)(lambda done: _rows(self._solver(done)))
-        self._place = lru_cache(None)(lambda done, name: _found(self._rows(0)[name][0], self._rows(done)[name][0]))
+        self._rows = lru_cache(None)(lambda done: _list_memory_rows(self._solver(done)))
+        self._place = lru_cache(None)(lambda done, name: _find_rows(self._rows(0)[name][0], self._rows(done)[name][0]))
         for done in range(len(bodies) if ahead else 0):
             self._solver(done)
 
@@ -76,50 +76,58 @@ class OperatedFem:
         check_loads(loads)
         if start is not None:
             check_start(start, len(loads), len(self.anatomy.mesh.nodes))
-        done, most = self._done(loads), len(self._bodies) - 1
+        done, most = self._get_steps_done(loads), len(self._bodies) - 1
         if (done > most).any():
             raise InputError(f"Resected.done is {done.max()}, but Resection has {most} steps: give at most that.")
-        same = np.zeros(len(done), bool) if start is None or DONE not in start.memory else start.memory[DONE] == done
+        same = (
+            np.zeros(len(done), bool)
+            if start is None or DONE_KEY not in start.memory
+            else start.memory[DONE_KEY] == done
+        )
         order, parts, stages = [], [], []
         for stage, stays in sorted(set(zip(done.tolist(), same.tolist(), strict=True))) or [(most, False)]:
             rows = np.flatnonzero((done == stage) & (same == stays))
-            begun = None if start is None else self._begun(start.select(rows), stage, stays)
+            begun = None if start is None else self._convert_to_stage(start.select(rows), stage, stays)
             answer = self._solver(stage).deform(loads.drop(Resected).select(rows), begun, at)
             order.append(rows)
             stages.append(stage)
-            parts.append(self._ended(answer, stage))
-        return self._together(parts, stages).select(np.argsort(np.concatenate(order))) if len(parts) > 1 else parts[0]
+            parts.append(self._convert_from_stage(answer, stage))
+        return (
+            self._join_stages(parts, stages).select(np.argsort(np.concatenate(order))) if len(parts) > 1 else parts[0]
+        )
 
-    def _done(self, loads: Loads) -> np.ndarray:
+    def _get_steps_done(self, loads: Loads) -> np.ndarray:
         cause = loads.get(Resected)
         return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
 
-    def _begun(self, start: Deformation, stage: int, stays: bool) -> Deformation:
+    def _convert_to_stage(self, start: Deformation, stage: int, stays: bool) -> Deformation:
         """Return a solution of the whole body as one of a stage; `stays` if it had the same number of steps."""
-        memory = dict(start.memory) if stays else self._lasting(start.memory, stage)
-        memory.pop(DONE, None)
-        for name, place in self._places(memory, stage).items():
-            if memory[name].shape[1:] == self._shape(name):  # a mismatch is rejected where the memory is read
+        memory = dict(start.memory) if stays else self._filter_memory(start.memory, stage)
+        memory.pop(DONE_KEY, None)
+        for name, place in self._index_memories(memory, stage).items():
+            if memory[name].shape[1:] == self._get_shape(name):  # a mismatch is rejected where the memory is read
                 memory[name] = memory[name][place]
-        return replace(start, displacement=self._masked(start, stage), memory=memory, warm=start.warm if stays else {})
+        return replace(
+            start, displacement=self._mask_orphans(start, stage), memory=memory, warm=start.warm if stays else {}
+        )
 
-    def _ended(self, answer: Deformation, stage: int) -> Deformation:
+    def _convert_from_stage(self, answer: Deformation, stage: int) -> Deformation:
         """Return a solution of a stage as one of the whole body, marked with its number of steps."""
-        memory = {**answer.memory, DONE: np.full(len(answer), float(stage))}
-        for name, place in self._places(memory, stage).items():
+        memory = {**answer.memory, DONE_KEY: np.full(len(answer), float(stage))}
+        for name, place in self._index_memories(memory, stage).items():
             own = memory[name]
-            memory[name] = np.zeros((len(own), *self._shape(name)), own.dtype)
+            memory[name] = np.zeros((len(own), *self._get_shape(name)), own.dtype)
             memory[name][place] = own
-        return replace(answer, displacement=self._masked(answer, stage), memory=memory)
+        return replace(answer, displacement=self._mask_orphans(answer, stage), memory=memory)
 
-    def _masked(self, answer: Deformation, stage: int) -> np.ndarray:
+    def _mask_orphans(self, answer: Deformation, stage: int) -> np.ndarray:
         """Return the displacements of a solution, with zero at orphaned vertices."""
         orphaned = self._bodies[stage].anatomy.orphaned[answer.nodes]
         return np.where(orphaned[:, None], 0.0, answer.displacement)
 
-    def _together(self, parts: list[Deformation], stages: list[int]) -> Deformation:
+    def _join_stages(self, parts: list[Deformation], stages: list[int]) -> Deformation:
         """Join solutions of several stages; memories that a stage lacks are zero."""
-        memories = [self._lasting(part.memory, stage) for part, stage in zip(parts, stages, strict=True)]
+        memories = [self._filter_memory(part.memory, stage) for part, stage in zip(parts, stages, strict=True)]
         shapes = {name: value.shape[1:] for memory in memories for name, value in memory.items()}
         whole = [
             {name: np.zeros((len(part), *shape)) for name, shape in shapes.items()} | memory
@@ -129,14 +137,18 @@ class OperatedFem:
             [replace(part, memory=memory, warm={}) for part, memory in zip(parts, whole, strict=True)]
         )
 
-    def _lasting(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
+    def _filter_memory(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
         """Return the memories that are valid for another body: of elements and nodes, tool poses, steps done."""
         rows = self._rows(stage)
         return {
-            name: value for name, value in memory.items() if name in rows or name == DONE or value.shape[2:] == POSE
+            name: value
+            for name, value in memory.items()
+            if name in rows or name == DONE_KEY or value.shape[2:] == POSE_SHAPE
         }
 
-    def _places(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, tuple[slice, np.ndarray, slice]]:
+    def _index_memories(
+        self, memory: Mapping[str, np.ndarray], stage: int
+    ) -> dict[str, tuple[slice, np.ndarray, slice]]:
         """Return the index of a stage's rows in the whole body's memories of elements and nodes, by name.
 
         Rows are shorter if the removed tissue had a longer Prony series.
@@ -144,19 +156,19 @@ class OperatedFem:
         rows = self._rows(stage) if stage else {}
         return {name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in memory if name in rows}
 
-    def _shape(self, name: str) -> tuple[int, int]:
+    def _get_shape(self, name: str) -> tuple[int, int]:
         """Return rows and row length of a memory of the whole body's elements or nodes."""
         marks, width = self._rows(0)[name]
         return len(marks), width
 
 
-def _rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
+def _list_memory_rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
     """Return unique keys (n, k) and row length of each memory of elements or nodes, by name."""
     terms = [term for term in fem.problem.terms if isinstance(term, Remembering)]
-    return {MIDDLES: (fem.space.edges, 3)} | {term.name: (term.marks, term.width) for term in terms}
+    return {MID_EDGE_KEY: (fem.space.edges, 3)} | {term.name: (term.marks, term.width) for term in terms}
 
 
-def _found(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
+def _find_rows(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
     """Return the index (n,) of some rows (n, k) in the whole (m, k)."""
     _, number = np.unique(np.concatenate([whole, some]), axis=0, return_inverse=True)
     known, asked = np.split(number.ravel(), [len(whole)])
@@ -188,12 +200,12 @@ def build_fem(
     others = [effect for effect in effects if not isinstance(effect, Resection | Held)]
 
     def make(body: Anatomy) -> Fem:
-        return Fem(body, (*_of(others, anatomy, body), Held()), accuracy, device, batch, element, live)
+        return Fem(body, (*_restrict_effects(others, anatomy, body), Held()), accuracy, device, batch, element, live)
 
     return OperatedFem(list_remaining_bodies(anatomy, effects), make, ahead=live)
 
 
-def _of(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
+def _restrict_effects(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
     """Return the effects without references to regions that are completely removed."""
     present = set(body.mesh.region.tolist())
     gone = set(whole.mesh.region.tolist()) - present

@@ -122,9 +122,9 @@ def solve_with_debonding(
         body = replace(anatomy, held=held, slide_normal=np.where(sliding[:, None], anatomy.slide_normal, 0.0))
         fem = Fem(body, (*others, Slide()), accuracy, device, element=element)
         last = fem.deform(loads, start=last)
-        force = _reaction(fem, loads, last)
-        share = _shares(skull, anatomy, fem, bonded, force, tearing.around)
-        pull = (_at_vertices(fem, force) * anatomy.slide_normal).sum(axis=1)
+        force = _compute_reactions(fem, loads, last)
+        share = _compute_traction_ratios(skull, anatomy, fem, bonded, force, tearing.around)
+        pull = (_sum_at_vertices(fem, force) * anatomy.slide_normal).sum(axis=1)
         holding = bonded & (share <= 1.0)
         pressed = (bonded & ~holding | sliding) & (pull <= tearing.pull * -pull.min())
         passing = (last.displacement[0] * anatomy.slide_normal).sum(axis=1) > tearing.through
@@ -140,14 +140,14 @@ def solve_with_debonding(
     )
 
 
-def _reaction(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
+def _compute_reactions(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
     """Return the gradient of the energy, the reaction forces (3N, 1) [N]."""
     problem = fem.problem
     problem.begin(Cases(loads, answer.time, answer.memory))
     return problem.gradient(problem.device.upload(fem.guess(loads, answer)))
 
 
-def _shares(
+def _compute_traction_ratios(
     skull: Bonded, anatomy: Anatomy, fem: Fem, bonded: np.ndarray, force: wp.array, around: float
 ) -> np.ndarray:
     """Return the traction ratio (V,) of each bonded vertex: mean traction around it / strength.
@@ -162,7 +162,7 @@ def _shares(
     return out
 
 
-def _at_vertices(fem: Fem, force: wp.array) -> np.ndarray:
+def _sum_at_vertices(fem: Fem, force: wp.array) -> np.ndarray:
     """Return nodal forces (V, 3) [N], those of mid-edge nodes divided between the ends."""
     whole = force.numpy().reshape(-1, 3).astype(np.float64)
     count = len(fem.anatomy.mesh.nodes)

@@ -18,7 +18,7 @@ import numpy as np
 from .errors import InputError
 
 # Sine of the angle below which an edge counts as perpendicular to a direction.
-SQUARE = 1e-6
+PERPENDICULAR_TOLERANCE = 1e-6
 
 
 def _check(tool: object) -> None:
@@ -210,15 +210,15 @@ def find_foremost_points(tool: BuiltIn, pose: np.ndarray, direction: np.ndarray)
     If an edge or a face is perpendicular to the direction, it is its centre.
     """
     core, local = get_core(tool), np.einsum("bji,j->bi", pose[:, :3, :3], direction)
-    corner = core.centre + np.where(np.abs(local) < SQUARE, 0.0, np.sign(local)) * core.half
+    corner = core.centre + np.where(np.abs(local) < PERPENDICULAR_TOLERANCE, 0.0, np.sign(local)) * core.half
     return pose[:, :3, 3] + np.einsum("bij,bj->bi", pose[:, :3, :3], corner) + core.radius * direction
 
 
 def compute_distances(tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return signed distances (n,) [m] of points (n, 3) [m] from a tool at T_world_tool `pose` (4, 4): < 0 inside."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
-    return np.min([_distances(core, local - core.centre) for core in list_cores(tool)], axis=0)
+    return np.min([_compute_core_distances(core, local - core.centre) for core in list_cores(tool)], axis=0)
 
 
-def _distances(core: Core, local: np.ndarray) -> np.ndarray:
+def _compute_core_distances(core: Core, local: np.ndarray) -> np.ndarray:
     return np.linalg.norm(local - np.clip(local, -core.half, core.half), axis=1) - core.radius

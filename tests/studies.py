@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import msgspec
 
-from scenes.commands.report import QUICK
+from scenes.commands.report import QUICK_COUNTS
 from scenes.report.finite_elements import FemVariant
 from scenes.report.learner import LearnerSpec
 from scenes.report.reference import solve_beyond, solve_reference
@@ -31,7 +31,7 @@ def study_of(folder, box, count):
     fem = Fem(box, (*build_push_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     said = {"tissue": to_tissue_json(TISSUE), "element": "p1", "preset": "palpation"}
     simulate(folder / "data.h5", fem, draw("palpation", box, count, 0), said)
-    study = ReportStudy(folder / "data.h5", folder, "cpu", loads=2, beyond=QUICK[2], timed=30)
+    study = ReportStudy(folder / "data.h5", folder, "cpu", loads=2, beyond=QUICK_COUNTS[2], timed=30)
     solve_reference(study, nothing)
     solve_beyond(study, nothing)
     return study

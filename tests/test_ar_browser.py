@@ -10,10 +10,10 @@ import pytest
 from visitor import Visitor, free_port, wait_for
 
 from ar.page.browser import Browser
-from ar.page.elements import PICTURE, SAID, SLICES, STYLE, keep_together, to_data_url
-from ar.page.guard import LIMITS, ConnectionLimits
+from ar.page.elements import PICTURE, SAID, SLICES, STYLE_KEY, keep_together, to_data_url
+from ar.page.guard import DEFAULT_LIMITS, ConnectionLimits
 from ar.page.parts import Dropdown, Fold, Note, Playback, SceneSurface, SceneViewpoint, Sign, Slider, Toggle
-from ar.page.recording import RECORDS, STOPS
+from ar.page.recording import RECORD_LABEL, STOP_LABEL
 from ar.page.style import NOTE, PAGE, STATUS, build_style
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
@@ -24,7 +24,9 @@ def heard():
     return {"force": [], "deformer": [], "play": [], "frame": []}
 
 
-def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1", limits: ConnectionLimits = LIMITS) -> Browser:
+def open_page(
+    heard: dict[str, list], port: int, host: str = "127.0.0.1", limits: ConnectionLimits = DEFAULT_LIMITS
+) -> Browser:
     bodies = [
         SceneSurface("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
         SceneSurface("brain", TRIANGLE, np.array([[0, 1, 2]]), opacity=0.3),
@@ -34,7 +36,7 @@ def open_page(heard: dict[str, list], port: int, host: str = "127.0.0.1", limits
         SceneViewpoint(np.array([0.0, -0.3, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0])),
         Playback(100, heard["play"].append, heard["frame"].append),
         [
-            Dropdown("deformer", ("FEM", "ANN"), "ANN", heard["deformer"].append, key=STYLE),
+            Dropdown("deformer", ("FEM", "ANN"), "ANN", heard["deformer"].append, key=STYLE_KEY),
             Slider("force [N]", 0.0, 1.0, 0.01, 0.2, heard["force"].append),
         ],
         host=host,
@@ -211,12 +213,12 @@ def test_a_recording_is_one_whole_film_as_long_as_it_took(page, monkeypatch):
     visitor, button = Visitor(page, 1200), page.recorder.button
     assert wait_for(lambda: page.visitors == 1) and button is not None
     visitor.set(button, True)
-    assert wait_for(lambda: button.label == STOPS)
+    assert wait_for(lambda: button.label == STOP_LABEL)
     for number in range(10):
         page.show(number, np.full((48, 64, 3), 20 * number, np.uint8), "")
         time.sleep(0.1)
     visitor.set(button, True)
-    assert wait_for(lambda: len(sent) == 1 and button.label == RECORDS)
+    assert wait_for(lambda: len(sent) == 1 and button.label == RECORD_LABEL)
     name, film = sent[0]
     assert name == "sulcus.mp4" and b"ftyp" in film[:16]
     visitor.set(button, True)
@@ -224,7 +226,7 @@ def test_a_recording_is_one_whole_film_as_long_as_it_took(page, monkeypatch):
     visitor.wire.close()
     assert wait_for(lambda: page.visitors == 0)
     page.show(3, np.full((48, 64, 3), 3, np.uint8), "")
-    assert wait_for(lambda: page.recorder.recording is None and button.label == RECORDS) and len(sent) == 1
+    assert wait_for(lambda: page.recorder.recording is None and button.label == RECORD_LABEL) and len(sent) == 1
 
 
 def test_slices_and_history_arrive_together_at_limited_rate(page):
@@ -243,7 +245,7 @@ def test_slices_and_history_arrive_together_at_limited_rate(page):
         page.show_beside(lambda number=number: draw(number))
         time.sleep(0.02)
     assert wait_for(lambda: "seconds of 39" in page.beside.content)
-    assert drawn[-1] == 39 and len(drawn) <= 2 + LIMITS.asides * (time.monotonic() - begun)
+    assert drawn[-1] == 39 and len(drawn) <= 2 + DEFAULT_LIMITS.asides * (time.monotonic() - begun)
     assert to_data_url(np.full((20, 60, 3), 39, np.uint8)) in page.beside.content and SLICES in page.beside.content
     visitor.wire.close()
 

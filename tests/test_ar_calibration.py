@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from ar.optics.calibration import LONGEST_TEXT, Calibration, parse_calibration, to_opencv_text, to_ros_text
+from ar.optics.calibration import MAX_TEXT_LENGTH, Calibration, parse_calibration, to_opencv_text, to_ros_text
 from ar.optics.lens import Lens
 
 SOME = Calibration((820.5, 818.25), (321.0, 236.5), 640, 480, Lens(-0.31, 0.12, 1e-3, -2e-3, -0.02), "left/1")
@@ -161,7 +161,7 @@ def changed(old, new, text=ROS):
         "other size": (changed("640", "100"), "principal point .* far outside an image of 100 x 480"),
         "name": (changed("narrow_stereo/left", "[1]"), "camera_name must be text"),
         "long name": (changed("narrow_stereo/left", "x" * 300), "at most 256 characters"),
-        "long": (ROS + "#" * LONGEST_TEXT, "more than"),
+        "long": (ROS + "#" * MAX_TEXT_LENGTH, "more than"),
         "deep": ("a: " + "[" * 30000 + "]" * 30000, "nested too deeply"),
         "deep maps": ("a: " + "{a: " * 9000, "nested too deeply"),
         "deep lists": ("a: " + "- " * 30000, "nested too deeply"),

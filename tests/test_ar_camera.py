@@ -25,7 +25,7 @@ from ar.rendering.renderer import Lamp, Renderer, render
 from scenes.play.player import Player
 from scenes.script.camera_paths import HandHeld
 from scenes.script.scene import find_scene
-from scenes.tracked.filming import USUAL, VIEW, Taking, mount_targets, register_with_error, render_shots
+from scenes.tracked.filming import USUAL_CALIBRATION, VIEW, Taking, mount_targets, register_with_error, render_shots
 from scenes.tracked.follower import Follower, TumourState
 from scenes.tracked.tool_motion import ToolMotion
 from sim.anatomy import Anatomy
@@ -270,19 +270,19 @@ def test_fixed_camera_has_one_row_band():
 
 def test_files_have_the_readout_and_others_stay_as_they_were():
     for text in (to_opencv_text, to_ros_text):
-        assert parse_calibration(text(replace(USUAL, readout=0.0125))).readout == 0.0125
-        assert "readout" not in text(USUAL) and parse_calibration(text(USUAL)).readout == 0.0
+        assert parse_calibration(text(replace(USUAL_CALIBRATION, readout=0.0125))).readout == 0.0125
+        assert "readout" not in text(USUAL_CALIBRATION) and parse_calibration(text(USUAL_CALIBRATION)).readout == 0.0
         with pytest.raises(ValueError, match="readout_time must be a number"):
-            parse_calibration(text(USUAL) + 'readout_time: "fast"\n')
+            parse_calibration(text(USUAL_CALIBRATION) + 'readout_time: "fast"\n')
         with pytest.raises(ValueError, match="read in 0 to 1 s"):
-            parse_calibration(text(USUAL) + "readout_time: -1\n")
-    assert replace(USUAL, readout=0.02).resize_calibration(640, 480, scale=True).readout == 0.02
+            parse_calibration(text(USUAL_CALIBRATION) + "readout_time: -1\n")
+    assert replace(USUAL_CALIBRATION, readout=0.02).resize_calibration(640, 480, scale=True).readout == 0.02
 
 
 @pytest.fixture(scope="module")
 def player():
     theatre = template_theatre()
-    small = replace(USUAL.resize_calibration(800, 600, scale=True), readout=READOUT)
+    small = replace(USUAL_CALIBRATION.resize_calibration(800, 600, scale=True), readout=READOUT)
     view = replace(VIEW.calibrate(small), path=HandHeld(0))
     return Player(
         theatre.build_stage(replace(find_scene("palpate"), viewpoint=view, duration=0.1)), Still(theatre.anatomy)

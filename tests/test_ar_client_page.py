@@ -7,7 +7,7 @@ from contextlib import closing
 import pytest
 from test_ar_guard import Page
 
-from ar.page.client_page import SCRIPT, WITHOUT, build_document
+from ar.page.client_page import NO_WEBGL_CLASS, SCRIPT, build_document
 from ar.page.style import build_style
 
 
@@ -27,4 +27,4 @@ def test_page_has_own_title_icon_and_script(encoding):
 
 def test_unknown_document_is_left_as_it_is():
     assert build_document(b"<p>none</p>", False) == b"<p>none</p>"
-    assert f":root.{WITHOUT} canvas" in build_style(1.3)
+    assert f":root.{NO_WEBGL_CLASS} canvas" in build_style(1.3)

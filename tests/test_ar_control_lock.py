@@ -1,6 +1,6 @@
 """Who leads a page."""
 
-from ar.page.control_lock import IDLE, ControlLock
+from ar.page.control_lock import MAX_IDLE_TIME, ControlLock
 
 
 class TestLead:
@@ -26,5 +26,5 @@ class TestLead:
         lead = ControlLock()
         lead.see({1, 2}, 0.0)
         lead.act(1, 10.0)
-        lead.ask(2, 10.0 + IDLE)
+        lead.ask(2, 10.0 + MAX_IDLE_TIME)
         assert lead.leader == 2 and lead.asking == ()

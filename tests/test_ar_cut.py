@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from test_ar_styles import CAMERA, CORTEX, GREEN, seen, tumour
 
-from ar.overlay.cut import EMPTY, CutPlane, build_plane, compute_profile, draw_section
+from ar.overlay.cut import EMPTY_COLOUR, CutPlane, build_plane, compute_profile, draw_section
 from ar.overlay.hud import WHITE
 from ar.overlay.outlines import compute_ink, find_ink, to_key
-from ar.overlay.window import SHUT, Roles
+from ar.overlay.window import CLOSED_GROUND, Roles
 
 
 def test_a_cut_holds_camera_tip_and_middle():
@@ -30,13 +30,13 @@ def test_cut_shows_surface_section_and_no_air():
     places, what = compute_profile(CAMERA, plane, picture.depth, roles, 0.04)
     assert np.abs(plane.to_world(places)[:, 2]).max() < 2e-4  # the sheet lies at z = 0
     right = plane.to_world(places)[:, 0] > 5e-4
-    assert (what[right] == SHUT).all() and not what[plane.to_world(places)[:, 0] < -5e-4].any()
+    assert (what[right] == CLOSED_GROUND).all() and not what[plane.to_world(places)[:, 0] < -5e-4].any()
     ink = to_key(compute_ink(GREEN))
     inset = draw_section(CAMERA, at, plane, (places, what), (240, 180), ink)
     bar = np.flatnonzero((inset[-6] == np.asarray(WHITE, np.uint8)).all(axis=1))
     scale = (np.ptp(bar) - 1) / 0.01  # the bar is 10 mm
     assert find_ink(inset, ink).sum() == pytest.approx(np.pi * (0.012 * scale) ** 2, rel=0.1)
-    assert find_ink(inset, EMPTY)[:8].mean() > 0.8 and not find_ink(inset, EMPTY)[-60:-20].any()
+    assert find_ink(inset, EMPTY_COLOUR)[:8].mean() > 0.8 and not find_ink(inset, EMPTY_COLOUR)[-60:-20].any()
 
 
 @pytest.mark.parametrize("error", [2e-3, 6e-3])

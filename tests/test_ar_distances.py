@@ -5,9 +5,16 @@ import numpy as np
 from test_ar_styles import CAMERA, seen, tumour
 
 from ar.overlay.composite import composite
-from ar.overlay.distances import RING, RINGS, build_tree, compute_seen_distance, draw_rings, separate_rings
-from ar.overlay.hud import FINE, FONT
-from ar.overlay.window import DARK
+from ar.overlay.distances import (
+    RING_COLOUR,
+    RING_DISTANCES,
+    build_tree,
+    compute_seen_distance,
+    draw_rings,
+    separate_rings,
+)
+from ar.overlay.hud import FONT, TEXT_SCALE
+from ar.overlay.window import BORDER_COLOUR
 
 
 def test_rings_lie_where_the_distance_is_what_they_say():
@@ -21,7 +28,7 @@ def test_rings_lie_where_the_distance_is_what_they_say():
     rows, columns = np.nonzero(sheet[..., 3] == 255)
     points = CAMERA.unproject(np.stack([columns, rows], axis=1).astype(float), picture.depth[rows, columns])
     distance = np.linalg.norm(points - [0.0, 0.0, -0.014], axis=1) - 0.012
-    off = np.abs(distance[:, None] - np.array(RINGS)).min(axis=1)
+    off = np.abs(distance[:, None] - np.array(RING_DISTANCES)).min(axis=1)
     assert len(off) > 1000 and np.percentile(off, 80) < 0.5e-3  # the others are of numbers
     shown = composite(picture, CAMERA, at, style="rings").colour
     assert (shown != composite(picture, CAMERA, at, style="contour").colour).any(axis=2).sum() > 1000
@@ -29,9 +36,9 @@ def test_rings_lie_where_the_distance_is_what_they_say():
 
 def written(sheet, number):
     """How often a ring's number stands in a sheet of rings."""
-    (wide, tall), _ = cv2.getTextSize(number, FONT, FINE, 1)
-    stamp = np.full((tall + 3, wide + 3, 3), np.array(DARK), np.uint8)
-    cv2.putText(stamp, number, (2, tall + 2), FONT, FINE, RING, 1, cv2.LINE_AA)
+    (wide, tall), _ = cv2.getTextSize(number, FONT, TEXT_SCALE, 1)
+    stamp = np.full((tall + 3, wide + 3, 3), np.array(BORDER_COLOUR), np.uint8)
+    cv2.putText(stamp, number, (2, tall + 2), FONT, TEXT_SCALE, RING_COLOUR, 1, cv2.LINE_AA)
     return int((cv2.matchTemplate(sheet[..., :3].copy(), stamp, cv2.TM_CCOEFF_NORMED) > 0.9).sum())
 
 

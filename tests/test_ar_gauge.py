@@ -5,7 +5,7 @@ import pytest
 from test_ar_styles import CAMERA, seen, tumour
 
 from ar.overlay.composite import composite
-from ar.overlay.gauge import GAUGE, Gauge, format_gauge
+from ar.overlay.gauge import NUMBER_SCALE, Gauge, format_gauge
 from ar.overlay.marks import Marks
 from ar.overlay.outlines import find_text, has_text
 
@@ -15,7 +15,7 @@ def test_the_number_stands_beside_the_tip_inside_the_frame(tip):
     picture = seen()
     gauge = Gauge(np.array([*tip, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
     shown = composite(picture, CAMERA, tumour(), marks=Marks(gauge=gauge)).colour
-    found = find_text(shown, str(gauge), GAUGE)
+    found = find_text(shown, str(gauge), NUMBER_SCALE)
     assert found is not None
     left, top, right, foot = found
     assert left >= 4 and top >= 4 and right <= 636 and foot <= 476
@@ -28,5 +28,7 @@ def test_a_tip_inside_is_said_to_be():
     assert format_gauge(2.1e-3, 1e-3, False) == "2.1 +- 1.0 mm"
     gauge = Gauge(np.array([0.0, 0.0, -0.02]), np.array([0.0, 0.0, -0.008]), inside=True)
     assert has_text(
-        composite(seen(), CAMERA, tumour(), marks=Marks(gauge=gauge)).colour, "inside, 12.0 mm from its edge", GAUGE
+        composite(seen(), CAMERA, tumour(), marks=Marks(gauge=gauge)).colour,
+        "inside, 12.0 mm from its edge",
+        NUMBER_SCALE,
     )

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from ar.page.history import SPAN, History, Line, Sample, round_up_scale
+from ar.page.history import TIME_SPAN, History, Line, Sample, round_up_scale
 
 
 class TestHistory:
@@ -13,7 +13,7 @@ class TestHistory:
         history = History((Line("distance", "mm", "#fff"), Line("force", "N", "#f00")))
         for time in np.arange(0.0, 60.0, 0.1):
             history.add(Sample(float(time), (10.0, None), (2.0 if time < 50.0 else None, None)))
-        assert history.samples[0].time >= 59.9 - SPAN - 1e-9
+        assert history.samples[0].time >= 59.9 - TIME_SPAN - 1e-9
         chart = history.draw_chart()
         (band,) = re.findall(r'<polygon points="([^"]*)"', chart)
         heights = {float(point.split(",")[1]) for point in band.split()}

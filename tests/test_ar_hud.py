@@ -6,10 +6,10 @@ import pytest
 
 from ar.optics.camera import look_at
 from ar.overlay.hud import (
-    BREAK,
-    FINE,
+    BREAK_PATTERN,
     FONT,
-    NEAR,
+    MAX_TEXT_SHIFT,
+    TEXT_SCALE,
     Below,
     draw_orientation_labels,
     draw_text_panel,
@@ -20,7 +20,7 @@ from ar.overlay.hud import (
     wrap_line,
 )
 from ar.overlay.outlines import find_text
-from ar.overlay.places import PAD
+from ar.overlay.places import BORDER_DISTANCE
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_panel_drops_lines_that_do_not_fit():
     lines = ["first", "second", "third", "fourth", "fifth"]
     few = draw_text_panel(plain, lines, below=30)
     kept = next(count for count in range(1, 6) if np.array_equal(few, draw_text_panel(plain, lines[:count], below=30)))
-    assert 1 < kept < 4 and (few[:30] == 90).all() and (few[-PAD:] == 90).all()
+    assert 1 < kept < 4 and (few[:30] == 90).all() and (few[-BORDER_DISTANCE:] == 90).all()
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_labels_take_place_and_optional_ones_drop():
     lay(colour, taken, ["first"], (0, 100))
     (low,) = np.nonzero(taken.any(axis=1))[0][[-1]]
     lay(colour, taken, ["second", "and its next line"], (0, 100))
-    assert low == 100 - PAD - 1 and np.nonzero(taken.any(axis=1))[0][0] < low - 40 and colour.any()
+    assert low == 100 - BORDER_DISTANCE - 1 and np.nonzero(taken.any(axis=1))[0][0] < low - 40 and colour.any()
     # What is written is inside what is taken, but for the halo.
     assert not colour[cv2.dilate(taken, np.ones((9, 9), np.uint8)) == 0].any()
     full, blank = np.ones((100, 200), np.uint8), np.zeros((100, 200, 3), np.uint8)
@@ -120,9 +120,9 @@ def test_labels_take_place_and_optional_ones_drop():
 def test_a_folded_line_keeps_its_words_and_its_room(room):
     text = "the bone's edge stops the tool 17.5 mm short"
     lines = wrap_line(text, room)
-    wide = [cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines]
+    wide = [cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines]
     assert " ".join(lines) == text
-    assert all(width <= room or not BREAK.search(line) for width, line in zip(wide, lines, strict=True))
+    assert all(width <= room or not BREAK_PATTERN.search(line) for width, line in zip(wide, lines, strict=True))
     assert (len(lines) == 1) is (room == 1000.0) and (room != 150.0 or max(wide) < 1.4 * min(wide))
 
 
@@ -167,5 +167,5 @@ def test_labels_may_cover_thin_lines():
         colour, taken = np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.uint8)
         taken[:200, ::20] = 1
         lay(colour, taken, ["8.7 +- 8.0 mm"], (150, 60), below=Below(thin=None if thin is None else taken > 0))
-        _, rows[name], _, _ = find_text(colour, "8.7 +- 8.0 mm", FINE)
-    assert rows["near"] < 60 + NEAR < 200 < rows["far"]
+        _, rows[name], _, _ = find_text(colour, "8.7 +- 8.0 mm", TEXT_SCALE)
+    assert rows["near"] < 60 + MAX_TEXT_SHIFT < 200 < rows["far"]

@@ -4,8 +4,8 @@ import numpy as np
 from test_ar_styles import CAMERA, DRAPE, GREEN, OPENING, seen, tumour
 
 from ar.overlay.composite import composite
-from ar.overlay.hud import HEAD
-from ar.overlay.legend import SHEET, LegendNames
+from ar.overlay.hud import HEAD_ROW
+from ar.overlay.legend import SHEET_VALUE, LegendNames
 from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.outlines import compute_ink, find_ink
 
@@ -35,4 +35,4 @@ def test_a_cut_leaves_the_foot_to_its_words():
     over = composite(
         seen(0.01), CAMERA, tumour((0.0, 0.0, -0.014)), style="cut", cover=Cover(opening=OPENING, covered=covered)
     )
-    assert (over.taken == SHEET).any() and not (over.taken[-HEAD:] == SHEET).any()
+    assert (over.taken == SHEET_VALUE).any() and not (over.taken[-HEAD_ROW:] == SHEET_VALUE).any()

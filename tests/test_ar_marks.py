@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from ar.optics.camera import Camera, look_at
-from ar.overlay.composite import SEEN, composite, draw_points
-from ar.overlay.hud import FINE
+from ar.overlay.composite import POINT_COLOUR, composite, draw_points
+from ar.overlay.hud import TEXT_SCALE
 from ar.overlay.marks import Marks, Trace, Words
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text, measure_outline_gap
 from ar.rendering.layer import Layer
@@ -50,7 +50,7 @@ def test_traces_lie_under_outline_with_given_motion():
     assert measure_outline_gap(shown, ink, wrong, own, 32) > 5.0
     column, row = here.project(trace.dot[None])[0][0].round().astype(int)
     assert shown[row, column] == pytest.approx([153, 178, 255], abs=1)  # paler than the ink
-    assert has_text(shown, "moved 2.0 +- 1.3 mm", FINE) and has_text(plain, "moved 0.0 mm", FINE)
+    assert has_text(shown, "moved 2.0 +- 1.3 mm", TEXT_SCALE) and has_text(plain, "moved 0.0 mm", TEXT_SCALE)
 
 
 def test_fewer_pixels_than_are_asked_for_are_no_outline():
@@ -72,5 +72,5 @@ def test_points_are_drawn_where_they_are_in_sight_and_on_no_line():
     over.taken[pixels[2, 1], pixels[2, 0]] = 1
     before = over.colour.copy()
     draw_points(over, here, points, where)
-    dotted = [(over.colour[row, column] == SEEN).all() for column, row in pixels]
+    dotted = [(over.colour[row, column] == POINT_COLOUR).all() for column, row in pixels]
     assert dotted == [True, False, False] and 0 < (over.colour != before).any(axis=2).sum() < 30

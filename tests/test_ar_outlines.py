@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from ar.optics.camera import look_at
-from ar.overlay.composite import DOUBTFUL, WARNING, composite, format_warning
-from ar.overlay.gauge import GAUGE, Gauge
-from ar.overlay.hud import FINE, HEAD, ROW, draw_text_panel, write
-from ar.overlay.marks import BEFORE, Cover, Marks, Words
+from ar.overlay.composite import DOUBTFUL_COLOUR, WARNING_COLOUR, composite, format_warning
+from ar.overlay.gauge import NUMBER_SCALE, Gauge
+from ar.overlay.hud import HEAD_ROW, LINE_SPACING, TEXT_SCALE, draw_text_panel, write
+from ar.overlay.marks import BEFORE_COLOUR, Cover, Marks, Words
 from ar.overlay.outlines import compute_ink, compute_iou, compute_silhouette, has_text, measure_outline_gap
 from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, build_lamp, render
@@ -190,9 +190,9 @@ def test_lines_at_the_head_stand_there_whatever_the_style():
             marks=Marks(before=tumour((0.01, 0.0, -0.02))),
             words=Words(head=["one", "two"]),
         )
-        assert has_text(said.colour[HEAD : HEAD + 2 * ROW], "one", FINE)
-        assert has_text(said.colour[HEAD + ROW - 4 : HEAD + 3 * ROW], "two", FINE)
-        assert said.taken[HEAD + ROW, 8:20].all()
+        assert has_text(said.colour[HEAD_ROW : HEAD_ROW + 2 * LINE_SPACING], "one", TEXT_SCALE)
+        assert has_text(said.colour[HEAD_ROW + LINE_SPACING - 4 : HEAD_ROW + 3 * LINE_SPACING], "two", TEXT_SCALE)
+        assert said.taken[HEAD_ROW + LINE_SPACING, 8:20].all()
 
 
 def test_a_deeper_tumour_shines_less():
@@ -215,15 +215,17 @@ def test_the_picture_says_how_far_the_tumour_moved():
     far = np.linspace(0.002, 0.004, len(now.vertices))[:, None] * [1.0, 0.0, 0.0]
     margin = np.linspace(0.0005, 0.0015, len(now.vertices))
     before = replace(now, vertices=now.vertices - far)
-    assert has_text(composite(picture, here, now, marks=Marks(margin, before=before)).colour, "moved 3.0 mm", FINE)
-    assert has_text(composite(picture, here, now, marks=Marks(before=before)).colour, "moved 3.0 mm", FINE)
+    assert has_text(
+        composite(picture, here, now, marks=Marks(margin, before=before)).colour, "moved 3.0 mm", TEXT_SCALE
+    )
+    assert has_text(composite(picture, here, now, marks=Marks(before=before)).colour, "moved 3.0 mm", TEXT_SCALE)
 
 
 def test_the_arrow_points_to_where_the_tumour_is_now():
     here, before, now = camera(400, 300), tumour((-0.012, 0.0, -0.02), 0.006), tumour((0.012, 0.0, -0.02), 0.006)
     picture = render(here, [cortex()], LAMP)
     shown = composite(picture, here, now, style="contour", marks=Marks(before=before)).colour
-    grey = np.argwhere((np.abs(shown.astype(int) - compute_ink(BEFORE)) <= 2).all(axis=2))[:, ::-1]
+    grey = np.argwhere((np.abs(shown.astype(int) - compute_ink(BEFORE_COLOUR)) <= 2).all(axis=2))[:, ::-1]
     near = [
         np.count_nonzero(np.linalg.norm(grey - here.project(np.array([x, 0.0, -0.02]))[0], axis=1) < 8)
         for x in (-0.012, 0.012)
@@ -238,9 +240,11 @@ def test_motion_and_doubt_stand_on_lines_of_their_own():
     before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
     doubt = "outside what the model learned: do not rely on it"
     shown = composite(picture, here, now, marks=Marks(np.nan, before=before), words=Words(doubt)).colour
-    assert has_text(shown, "moved 3.0 mm", FINE)
-    assert all(has_text(shown, line, FINE, compute_ink(WARNING)) for line in format_warning(doubt, 400))
-    assert has_text(composite(picture, here, now, marks=Marks(np.nan, before=before)).colour, "moved 3.0 mm", FINE)
+    assert has_text(shown, "moved 3.0 mm", TEXT_SCALE)
+    assert all(has_text(shown, line, TEXT_SCALE, compute_ink(WARNING_COLOUR)) for line in format_warning(doubt, 400))
+    assert has_text(
+        composite(picture, here, now, marks=Marks(np.nan, before=before)).colour, "moved 3.0 mm", TEXT_SCALE
+    )
 
 
 def test_of_what_may_not_be_relied_on_nothing_is_promised():
@@ -249,18 +253,20 @@ def test_of_what_may_not_be_relied_on_nothing_is_promised():
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
     sure = composite(picture, here, tumour(), marks=Marks(0.004, gauge=gauge)).colour
-    assert has_text(sure, "8.0 +- 1.2 mm", GAUGE) and not has_text(
-        sure, "do not rely on it", FINE, compute_ink(WARNING)
+    assert has_text(sure, "8.0 +- 1.2 mm", NUMBER_SCALE) and not has_text(
+        sure, "do not rely on it", TEXT_SCALE, compute_ink(WARNING_COLOUR)
     )
     unsure, plain = (
         composite(picture, here, tumour(), marks=Marks(margin, gauge=gauge), words=Words("do not rely on it")).colour
         for margin in (0.004, 0.0)
     )
-    assert has_text(unsure, "8.0 mm", GAUGE) and has_text(unsure, "do not rely on it", FINE, compute_ink(WARNING))
+    assert has_text(unsure, "8.0 mm", NUMBER_SCALE) and has_text(
+        unsure, "do not rely on it", TEXT_SCALE, compute_ink(WARNING_COLOUR)
+    )
     assert np.array_equal(unsure, plain)
     amber, green = (
         (np.abs(unsure.astype(int) - ink) <= 2).all(axis=2).sum()
-        for ink in map(compute_ink, (DOUBTFUL, (0.2, 0.9, 0.3)))
+        for ink in map(compute_ink, (DOUBTFUL_COLOUR, (0.2, 0.9, 0.3)))
     )
     assert amber > 20 and green == 0
 
@@ -282,7 +288,9 @@ def test_without_overlay_a_doubt_is_all_that_is_drawn():
         ).colour
         for doubt in ("", "do not rely on it")
     )
-    assert np.array_equal(bare, picture.colour) and has_text(unsure, "do not rely on it", FINE, compute_ink(WARNING))
+    assert np.array_equal(bare, picture.colour) and has_text(
+        unsure, "do not rely on it", TEXT_SCALE, compute_ink(WARNING_COLOUR)
+    )
     rows, columns = np.nonzero((unsure != picture.colour).any(axis=2))
     assert rows.min() > 270 and columns.max() < 120
 

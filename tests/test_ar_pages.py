@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from ar.tracking.pages import Page, build_printed_pages, describe_targets, to_face_name, to_pdf, to_png
-from ar.tracking.targets import BORDER, build_calibration_board, build_patient_reference, build_tool_cube
+from ar.tracking.targets import BORDER_WIDTH, build_calibration_board, build_patient_reference, build_tool_cube
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_sides_that_touch_on_paper_touch_on_the_cube(pages):
     """Corners of the faces' borders: what is one place on the net is one place in space; the tab joins the rest."""
     spots = []
     for each in pages[0].placed:
-        T, size, border = each.face.T_target_face, each.face.size, BORDER
+        T, size, border = each.face.T_target_face, each.face.size, BORDER_WIDTH
         square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (size + 2.0 * border) - border
         space = 1e3 * (square @ T[:3, :2].T + T[:3, 3])
         assert abs(space).max() == pytest.approx(24.0)
@@ -132,8 +132,8 @@ def test_cut_lines_go_round_the_borders(pages):
     """Most of each outer side of the net and of the plate is drawn, and nothing of the white between."""
     for page, names in ((pages[0], "+z"), (pages[1], "-z")):
         (each,) = [each for each in page.placed if to_face_name(each.face) == names]
-        left, top = (round(20.0 * (at - 1e3 * BORDER)) for at in (each.left, each.top))
-        wide = round(2e4 * (each.face.size[0] + 2.0 * BORDER))
+        left, top = (round(20.0 * (at - 1e3 * BORDER_WIDTH)) for at in (each.left, each.top))
+        wide = round(2e4 * (each.face.size[0] + 2.0 * BORDER_WIDTH))
         side = page.pixels[top : top + wide, left - 2 : left + 3] == 0
         assert 0.4 < side.any(axis=1).mean() < 0.7
         assert (page.pixels[top + 200 : top + wide - 5, left + 5 : left + 75] == 255).all()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ar.overlay.places import ASIDE, CLEAR, PAD, STEP, find_free_place
+from ar.overlay.places import BORDER_DISTANCE, GRID_SPACING, SIDEWAYS_WEIGHT, TEXT_DISTANCE, find_free_place
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -14,15 +14,24 @@ def test_the_free_place_is_the_nearest(seed):
     for row, column in rng.integers(0, (120, 160), (14, 2)):
         taken[row : row + 12, column : column + 12] = 1
     size, wish = (30, 12), tuple(rng.integers(-20, 180, 2).tolist())
-    there = min(max(wish[0], PAD), 160 - PAD - 30), min(max(wish[1], PAD), 120 - PAD - 12)
+    there = (
+        min(max(wish[0], BORDER_DISTANCE), 160 - BORDER_DISTANCE - 30),
+        min(max(wish[1], BORDER_DISTANCE), 120 - BORDER_DISTANCE - 12),
+    )
 
     def free(column, row):
-        return not taken[row - CLEAR : row + 12 + CLEAR, column - CLEAR : column + 30 + CLEAR].any()
+        return not taken[
+            row - TEXT_DISTANCE : row + 12 + TEXT_DISTANCE, column - TEXT_DISTANCE : column + 30 + TEXT_DISTANCE
+        ].any()
 
     def far(column, row):
-        return (ASIDE * (column - there[0])) ** 2 + (row - there[1]) ** 2
+        return (SIDEWAYS_WEIGHT * (column - there[0])) ** 2 + (row - there[1]) ** 2
 
-    grid = [(c, r) for r in range(PAD, 120 - PAD - 12 + 1, STEP) for c in range(PAD, 160 - PAD - 30 + 1, STEP)]
+    grid = [
+        (c, r)
+        for r in range(BORDER_DISTANCE, 120 - BORDER_DISTANCE - 12 + 1, GRID_SPACING)
+        for c in range(BORDER_DISTANCE, 160 - BORDER_DISTANCE - 30 + 1, GRID_SPACING)
+    ]
     places = [place for place in grid if free(*place)]
     found = find_free_place(taken, size, wish)
     assert places and found is not None and free(*found)
@@ -31,7 +40,7 @@ def test_the_free_place_is_the_nearest(seed):
 
 def test_without_room_there_is_no_place():
     taken = np.zeros((100, 200), np.uint8)
-    assert find_free_place(taken, (184, 84), (0, 0)) == (PAD, PAD)
+    assert find_free_place(taken, (184, 84), (0, 0)) == (BORDER_DISTANCE, BORDER_DISTANCE)
     assert find_free_place(taken, (185, 84), (0, 0)) is None and find_free_place(taken, (20, 85), (0, 0)) is None
     taken[::10] = 1
     assert find_free_place(taken, (20, 12), (50, 50)) is None

@@ -12,7 +12,7 @@ from ar.optics.lens import Lens
 from ar.tracking.drawn import render_targets
 from ar.tracking.pose import Tracker, Verdict, find_pose
 from ar.tracking.targets import (
-    TIP,
+    TIP_DISTANCE,
     DetectedCorners,
     Detector,
     Target,
@@ -24,7 +24,7 @@ from ar.tracking.targets import (
 CUBE, PLATE = build_tool_cube(), build_patient_reference()
 K = np.array([[1000.0, 0.0, 410.0], [0.0, 1000.0, 295.0], [0.0, 0.0, 1.0]])
 CAMERA = Camera(K, np.eye(4), 800, 600, Lens(-0.15, 0.03, 1e-3, -5e-4))
-TIP_AT = np.array([0.0, 0.0, -TIP])
+TIP_AT = np.array([0.0, 0.0, -TIP_DISTANCE])
 
 
 def looking(degrees: tuple[float, float, float], at: tuple[float, float, float]) -> np.ndarray:
@@ -131,7 +131,7 @@ def test_a_pose_beside_another_target_has_the_errors_of_both():
     """The tip in the patient's frame, many times: what noise does to both poses is what the covariance says."""
     rng, T = np.random.default_rng(6), looking((10.0, 5.0, -20.0), (0.0, 0.02, 0.3))
     plate = flat((30.0, 20.0, 0.0), (-0.1, 0.0, 0.3))
-    true = (np.linalg.inv(plate) @ T @ [0.0, 0.0, -TIP, 1.0])[:3]
+    true = (np.linalg.inv(plate) @ T @ [0.0, 0.0, -TIP_DISTANCE, 1.0])[:3]
     found = []
     for _ in range(150):
         tool = find_pose(CAMERA, CUBE, is_seen_from_front(T, 0.2, rng, CUBE))[1]

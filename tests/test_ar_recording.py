@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ar.page.elements import to_data_url
-from ar.page.recording import LONGEST, RATE, PageRecording, replay_images
+from ar.page.recording import FRAME_RATE, MAX_DURATION, PageRecording, replay_images
 
 
 class TestRecording:
@@ -18,11 +18,11 @@ class TestRecording:
         recording = PageRecording(0.0)
         for number in range(20):
             recording.take(to_data_url(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
-        recording.take(to_data_url(np.zeros((48, 64, 3), np.uint8)), LONGEST + 1.0)
-        assert len(recording.taken) == 20 and recording.is_full(LONGEST)
+        recording.take(to_data_url(np.zeros((48, 64, 3), np.uint8)), MAX_DURATION + 1.0)
+        assert len(recording.taken) == 20 and recording.is_full(MAX_DURATION)
         (tmp_path / "film.mp4").write_bytes(recording.encode_video(2.0))
         film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
-        assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 * RATE
+        assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 * FRAME_RATE
         assert film.read()[1].shape == (48, 64, 3)
 
     def test_of_nothing_there_is_no_film(self):

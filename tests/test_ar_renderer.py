@@ -12,10 +12,10 @@ from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import composite
 from ar.overlay.marks import Cover
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
-from ar.rendering.rasteriser import NOTHING, allocate_z_buffer, keep_nearest, rasterise_surface
+from ar.rendering.rasteriser import EMPTY_PIXEL, allocate_z_buffer, keep_nearest, rasterise_surface
 from ar.rendering.raycast import raycast
 from ar.rendering.renderer import Lamp, Picture, Pictures, Renderer, as_light, build_tone_curve, render
-from ar.rendering.shade import BRIGHTEST
+from ar.rendering.shade import WHITE_LEVEL
 
 FLOOR, BALL, EGG = 1, 2, 3
 LAMP = Lamp(np.array([-0.15, 0.1, 0.3]), np.zeros(3), 0.08)
@@ -94,7 +94,7 @@ def test_colours_follow_the_shading_formulas():
         light.ambient * (0.35 + 0.65 * dot(n, view).clip(0.0)) + arriving * (dot(n, ray) + 0.2).clip(0.0) * 0.83333
     )
     out = out + 0.4 * arriving * fresnel * lobe
-    wanted = build_tone_curve()[(np.clip(out / float(BRIGHTEST), 0.0, 1.0) * 4095.0).astype(int)]
+    wanted = build_tone_curve()[(np.clip(out / float(WHITE_LEVEL), 0.0, 1.0) * 4095.0).astype(int)]
     inside = cv2.erode(on.astype(np.uint8), np.ones((3, 3), np.uint8))[on] > 0
     assert inside.sum() > 1000 and agree(picture.colour[on][inside], wanted[inside]) > 0.999
 
@@ -151,7 +151,7 @@ def test_rows_shared_by_threads_give_the_same_depths():
         inputs = [whole.points, whole.triangles, 0, wp.float64(1e-3), begin, end, parts, 64]
         wp.launch(keep_nearest, size, inputs, [shared], device="cpu")
         assert np.array_equal(shared.numpy()[0, begin:end], whole.nearest.numpy()[0, begin:end])
-        assert (shared.numpy()[0, :begin] == np.uint64(NOTHING)).all()
+        assert (shared.numpy()[0, :begin] == np.uint64(EMPTY_PIXEL)).all()
 
 
 @pytest.mark.parametrize(

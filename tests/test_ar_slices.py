@@ -3,11 +3,21 @@
 import numpy as np
 import pytest
 
-from ar.page.slices import PLANES, REACH, SIDE, Cut, cut_surface, draw_slices, find_pixels_within, resample_view, view
+from ar.page.slices import (
+    HALF_VIEW,
+    PLANES,
+    VIEW_SIDE,
+    Cut,
+    cut_surface,
+    draw_slices,
+    find_pixels_within,
+    resample_view,
+    view,
+)
 from ar.rendering.layer import Layer, Solid
 from scenes.script.tool import build_sphere
 
-PITCH = 2.0 * REACH / SIDE
+PITCH = 2.0 * HALF_VIEW / VIEW_SIDE
 
 
 def ball(radius: float, middle=(0.0, 0.0, 0.0), colour=(0.3, 0.95, 0.55)) -> Layer:
@@ -53,7 +63,7 @@ class TestViews:
 
     def test_the_band_is_as_wide_as_the_error(self):
         inside = find_pixels_within(PLANES[0], np.zeros(3), ball(15e-3), 5e-3)
-        row = np.flatnonzero(inside[SIDE // 2])
+        row = np.flatnonzero(inside[VIEW_SIDE // 2])
         widths = [len(part) * PITCH for part in np.split(row, np.flatnonzero(np.diff(row) > 1) + 1)]
         assert widths == pytest.approx([10e-3, 10e-3], abs=1e-3)
 
@@ -70,7 +80,7 @@ class TestViews:
             Cut(ball(12e-3), ball(12e-3), 1e-3, tip=np.zeros(3), others=[ball(3e-3)]),
             Cut(none, ball(1e-2), 1e-3),
         ):
-            assert draw_slices(None, np.zeros(3), cut).shape == (SIDE, 3 * SIDE, 3)
+            assert draw_slices(None, np.zeros(3), cut).shape == (VIEW_SIDE, 3 * VIEW_SIDE, 3)
 
 
 OFF = np.array([[0, 0, 0, 5e-2], [0, 0, 0, 5e-2], [0, 0, 0, 5e-2], [0, 0, 0, 0.0]])

@@ -9,15 +9,15 @@ import trimesh
 
 from ar.optics.camera import look_at
 from ar.overlay.composite import composite, format_head_lines
-from ar.overlay.distances import RING, build_tree, compute_signed_distance
-from ar.overlay.gauge import GAUGE, Gauge
-from ar.overlay.hud import FINE, FONT, ROW, WHITE, draw_text_panel, wrap_line
-from ar.overlay.legend import SHEET
+from ar.overlay.distances import RING_COLOUR, build_tree, compute_signed_distance
+from ar.overlay.gauge import NUMBER_SCALE, Gauge
+from ar.overlay.hud import FONT, LINE_SPACING, TEXT_SCALE, WHITE, draw_text_panel, wrap_line
+from ar.overlay.legend import SHEET_VALUE
 from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.measured import Measure
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, find_text, has_text, measure_outline_gap
 from ar.overlay.styles import STYLES, Opening
-from ar.overlay.window import DARK, Roles
+from ar.overlay.window import BORDER_COLOUR, Roles
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, render
 
@@ -55,7 +55,7 @@ def test_every_style_has_the_outline_in_register_and_a_band(style):
     shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
     mask = compute_silhouette(CAMERA, at.vertices, at.triangles)
     words = (shown == np.asarray(WHITE, np.uint8)).all(axis=2)
-    others = words | find_ink(shown, RING)
+    others = words | find_ink(shown, RING_COLOUR)
     assert measure_outline_gap(shown, compute_ink(GREEN), mask, others) < 1.5
     assert measure_outline_gap(shown, compute_ink(GREEN), np.roll(mask, 5, axis=1), others) > 3.0
     wide = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING), marks=Marks(0.004)).colour
@@ -95,7 +95,7 @@ def test_outline_under_drape_is_broken(style):
     within = cv2.erode((mask & shut).astype(np.uint8), np.ones((13, 13))) > 0
     unchanged = (shown == picture.colour).all(axis=2)
     assert unchanged[within].mean() > 0.6  # all but words
-    assert all(has_text(shown, line, FINE) for line in ("partly under", "the drape"))
+    assert all(has_text(shown, line, TEXT_SCALE) for line in ("partly under", "the drape"))
     open_to_all = composite(picture, CAMERA, at, style=style).colour
     assert (find_ink(open_to_all, compute_ink(GREEN)) & (outline > 0))[(outline > 0) & shut].mean() > 0.95
 
@@ -181,7 +181,7 @@ def test_words_at_the_head_are_broken_beside_a_tool():
     tool[:200, 330:390] = True
     lines = format_head_lines(texts, tool)
     assert len(lines) > 2 and " ".join(lines) == " ".join(texts)
-    assert max(cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines) < 330
+    assert max(cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines) < 330
     tool[:, 40:] = True
     assert format_head_lines(texts, tool) == texts  # there is no room beside it
 
@@ -194,12 +194,12 @@ def test_a_ring_s_number_keeps_off_the_line_from_the_tip():
     measure = Measure("rings", seen(), CAMERA, at, roles)
     measure.draw(plain, np.zeros_like(plain), box)
     line = np.zeros_like(plain)
-    number = (plain[..., :3] == np.array(DARK, np.uint8)).all(axis=2) & (plain[..., 3] > 0)
+    number = (plain[..., :3] == np.array(BORDER_COLOUR, np.uint8)).all(axis=2) & (plain[..., 3] > 0)
     boxes = cv2.erode(number.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # more than a line's rim
     assert boxes.any()
     line[boxes, 3] = 255
     measure.draw(crossed, line, box)
-    again = (crossed[..., :3] == np.array(DARK, np.uint8)).all(axis=2) & (crossed[..., 3] > 0)
+    again = (crossed[..., :3] == np.array(BORDER_COLOUR, np.uint8)).all(axis=2) & (crossed[..., 3] > 0)
     assert not (cv2.erode(again.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)[boxes].any()
 
 
@@ -215,11 +215,16 @@ def test_ring_caption_keeps_clear_of_tip_number():
         cover=Cover(opening=OPENING),
         marks=Marks(gauge=Gauge(tip, at.vertices[0])),
     ).colour
-    number = find_text(shown, str(Gauge(tip, at.vertices[0])), GAUGE)
-    caption = find_text(shown, wrap_line(said, 0.3 * 640)[0], FINE)
+    number = find_text(shown, str(Gauge(tip, at.vertices[0])), NUMBER_SCALE)
+    caption = find_text(shown, wrap_line(said, 0.3 * 640)[0], TEXT_SCALE)
     assert number is not None and caption is not None
     left, top, right, foot = number
-    assert caption[1] > foot + ROW or caption[3] < top - ROW or caption[0] > right + ROW or caption[2] < left - ROW
+    assert (
+        caption[1] > foot + LINE_SPACING
+        or caption[3] < top - LINE_SPACING
+        or caption[0] > right + LINE_SPACING
+        or caption[2] < left - LINE_SPACING
+    )
 
 
 @pytest.mark.parametrize(("covered", "middle"), [(460, -0.014), (640, -0.014), (0, 0.3)])
@@ -229,4 +234,4 @@ def test_a_cut_is_drawn_where_nothing_is_seen_along_it(covered, middle):
     hand[:, :covered] = True
     at = tumour((0.0, 0.0, middle))
     over = composite(seen(0.01), CAMERA, at, style="cut", cover=Cover(opening=OPENING, covered=hand))
-    assert (over.taken == SHEET).any() == (covered < 640)
+    assert (over.taken == SHEET_VALUE).any() == (covered < 640)

@@ -8,7 +8,7 @@ import warp as wp
 from test_ar_renderer import EGG, LAMP, agree, ball, camera, floor
 
 from ar.overlay.outlines import find_pixel_box
-from ar.overlay.window import FADE, SURROUND, Lines, Roles, compute_chamfer_distance, draw_overlay
+from ar.overlay.window import FADE_DEPTH, SOFT_EDGE_WIDTH, Lines, Roles, compute_chamfer_distance, draw_overlay
 from ar.rendering.layer import compute_vertex_normals
 from ar.rendering.rasteriser import rasterise_surface
 from ar.rendering.raycast import raycast
@@ -23,9 +23,9 @@ def test_the_rim_is_as_wide_by_kernels_as_by_opencv():
     beside = 1 - mask
     known = cv2.distanceTransform(beside, cv2.DIST_L2, cv2.DIST_MASK_3)
     found = compute_chamfer_distance(wp.array(beside, dtype=wp.uint8, device="cpu"), "cpu").numpy()
-    near = known < float(SURROUND)
+    near = known < float(SOFT_EDGE_WIDTH)
     assert 0 < near.sum() < near.size and np.abs(found - known)[near].max() < 2e-3
-    assert found[~near].min() > float(SURROUND) - 1e-3
+    assert found[~near].min() > float(SOFT_EDGE_WIDTH) - 1e-3
 
 
 def test_the_window_is_what_its_formula_says():
@@ -41,13 +41,13 @@ def test_the_window_is_what_its_formula_says():
     shown, taken = draw_overlay(
         picture.drawn, box, part, hidden, found, Roles(), "window", Lines((0.0, 0.0, 0.0), solid=False)
     )
-    away = cv2.distanceTransform((~cast.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3) / float(SURROUND)
+    away = cv2.distanceTransform((~cast.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3) / float(SOFT_EDGE_WIDTH)
     window = np.clip(1.25 - 1.25 * away, 0.0, 1.0)[..., None]
     wanted = picture.colour * (1.0 - 0.62 * window**2 * (3.0 - 2.0 * window))
     normals = cast.interpolate(hidden.triangles, compute_vertex_normals(hidden.vertices, hidden.triangles))
     facing = normals @ here.T_camera_world[2, :3]
     under = np.where(picture.depth > 0.0, (cast.depth - picture.depth).clip(0.0), 0.0)
-    shine = 1.1 * (0.25 + 0.75 * np.abs(facing)) * np.exp(-under / float(FADE)) * cast.mask
+    shine = 1.1 * (0.25 + 0.75 * np.abs(facing)) * np.exp(-under / float(FADE_DEPTH)) * cast.mask
     wanted = np.clip(wanted + shine[..., None] * 255.0 * np.array(hidden.colour[0]), 0.0, 255.0).astype(np.uint8)
     assert found.mask.sum() > 300 and agree(shown, wanted) > 0.999
     assert agree(shown, picture.colour) < 0.95 and not taken.any()

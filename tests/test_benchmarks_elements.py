@@ -19,7 +19,7 @@ from sim.bodies.refine import refine
 from sim.deformation import Outcome
 from sim.effects import Elasticity, Held, Slide, ToolForce
 from sim.material import Material
-from sim.runtime.journal import MARK
+from sim.runtime.journal import RECORD_MARK
 
 
 @pytest.fixture(scope="module")
@@ -119,8 +119,8 @@ def test_an_interrupted_trial_goes_on(tmp_path, capsys):
     assert sum(item["converged"] for item in sets) == 12
     whole, rows = out.read_text().splitlines(), out.with_suffix(".rows")
     # The header, and the first seven loads: the rest is solved again, with the load whose record a kill tore.
-    kept = rows.read_bytes().split(MARK)
-    rows.write_bytes(MARK.join(kept[:9]) + MARK + kept[9][:40])
+    kept = rows.read_bytes().split(RECORD_MARK)
+    rows.write_bytes(RECORD_MARK.join(kept[:9]) + RECORD_MARK + kept[9][:40])
     assert main([*words, "--out", str(out)]) == 0
     again = out.read_text().splitlines()
     assert again[:8] == whole[:8]

@@ -37,7 +37,7 @@ from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.material import Material
 from surrogate.locating import locator_store
 from surrogate.locating.locator import Locator
-from surrogate.locating.prior import NOWHERE, MotionPrior, compute_middle
+from surrogate.locating.prior import NO_PLACE, MotionPrior, compute_middle
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +53,8 @@ def tumour(body):
 @pytest.fixture(scope="module")
 def locator(body):
     """Smooth shapes of every cause in every skull, and of a tool that presses on one of two places."""
-    labels = [(kind, skull, NOWHERE) for kind in (1, 2, 3) for skull in (0, 1, 2) for _ in range(2)]
-    labels += [(0, skull, place) for skull in (0, 1) for place in (NOWHERE, 0, 1) for _ in range(3)]
+    labels = [(kind, skull, NO_PLACE) for kind in (1, 2, 3) for skull in (0, 1, 2) for _ in range(2)]
+    labels += [(0, skull, place) for skull in (0, 1) for place in (NO_PLACE, 0, 1) for _ in range(3)]
     random, nodes = np.random.default_rng(0), body.mesh.nodes
     source = random.choice(nodes[np.unique(body.open_surface)], len(labels)) - random.uniform(
         0.0, 0.02, (len(labels), 3)

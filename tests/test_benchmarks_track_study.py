@@ -9,7 +9,7 @@ from benchmarks.__main__ import main
 from benchmarks.studies.track_study import (
     AWAY,
     LEANING,
-    TIP,
+    TIP_DISTANCE,
     TURNED,
     Shot,
     between,
@@ -52,9 +52,9 @@ def test_poses_are_those_of_the_protocols():
     pixels = camera.project(np.array([T[:3, 3] for T in evenly]))[0]
     assert (pixels > 0.0).all() and (pixels < [camera.width, camera.height]).all()
     once, often = (np.array(list(calibrate_pivot(20, 0, point))) for point in (np.zeros(3), None))
-    tips = once[:, :3, :3] @ [0.0, 0.0, -TIP] + once[:, :3, 3]
+    tips = once[:, :3, :3] @ [0.0, 0.0, -TIP_DISTANCE] + once[:, :3, 3]
     np.testing.assert_allclose(tips, tips[:1].repeat(20, axis=0), atol=1e-12)
-    assert np.ptp(often[:, :3, :3] @ [0.0, 0.0, -TIP] + often[:, :3, 3], axis=0).min() > 0.03
+    assert np.ptp(often[:, :3, :3] @ [0.0, 0.0, -TIP_DISTANCE] + often[:, :3, 3], axis=0).min() > 0.03
     for poses, most in ((evenly, TURNED), (once, LEANING)):
         cosine = [0.5 * (np.trace(T[:3, :3] @ first_turn(poses).T) - 1.0) for T in poses]
         assert np.degrees(np.arccos(min(cosine))) <= 2.0 * most

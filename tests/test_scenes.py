@@ -13,8 +13,8 @@ from scenes.script.head_posture import HeadPose
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.site import build_craniotomy_frame
 from scenes.script.tool import Probe
-from scenes.script.tool_paths import AIR, Touch, compute_lift
-from scenes.script.viewpoint import UNDER, Viewpoint
+from scenes.script.tool_paths import IDLE_HEIGHT, Touch, compute_lift
+from scenes.script.viewpoint import TARGET_DEPTH, Viewpoint
 from sim.compile import check_causes
 from sim.errors import InputError
 from surrogate.data.cortex_patch import open_patch
@@ -128,13 +128,13 @@ class TestCamera:
     def test_looks_at_the_open_cortex_from_outside(self, site):
         camera = Viewpoint().build_camera(site)
         assert (camera.centre - site.origin) @ site.axis < -0.1
-        middle = project_cv2(camera, (site.origin + UNDER * site.axis)[None])[0]
+        middle = project_cv2(camera, (site.origin + TARGET_DEPTH * site.axis)[None])[0]
         assert np.allclose(middle, [319.5, 239.5], atol=1e-6)
         a, b, c = (site.anatomy.mesh.nodes[site.anatomy.open_surface[:, k]] for k in range(3))
         facing = np.einsum("si,si->s", np.cross(b - a, c - a), camera.centre - a) > 0.0
         assert facing.mean() > 0.97
         above, aside = (
-            project_cv2(camera, (site.origin + UNDER * site.axis + 0.01 * way)[None])[0]
+            project_cv2(camera, (site.origin + TARGET_DEPTH * site.axis + 0.01 * way)[None])[0]
             for way in (site.up, site.right)
         )
         assert above[1] < middle[1] - 10.0 and aside[0] > middle[0] + 10.0
@@ -142,7 +142,7 @@ class TestCamera:
     @pytest.mark.parametrize("tilt", [-0.35, 0.0, 0.5])
     def test_it_stands_as_far_and_as_high_as_asked(self, site, tilt):
         camera = Viewpoint(distance=0.15, tilt=tilt, fov=0.4, width=200, height=100).build_camera(site)
-        away = camera.centre - site.origin - UNDER * site.axis
+        away = camera.centre - site.origin - TARGET_DEPTH * site.axis
         along = [away @ way for way in (-site.axis, site.up, site.right)]
         assert along == pytest.approx([0.15 * np.cos(tilt), 0.15 * np.sin(tilt), 0.0], abs=1e-12)
         assert (camera.vertical_fov, camera.width, camera.height) == (pytest.approx(0.4), 200, 100)
@@ -201,4 +201,4 @@ def test_an_unknown_scene_is_named_with_the_known_ones():
 
 
 def test_no_force_is_seen_to_act_through_the_air():
-    assert compute_lift(0.0) == AIR and compute_lift(0.005) == compute_lift(0.3) == 0.0
+    assert compute_lift(0.0) == IDLE_HEIGHT and compute_lift(0.005) == compute_lift(0.3) == 0.0

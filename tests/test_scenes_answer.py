@@ -7,7 +7,7 @@ import pytest
 from links import NAMES, NOW, corners_of, in_mm, linked, peers, played
 
 from ar.overlay.gauge import Gauge
-from scenes.link.answer import NOT_SEEN, PoseResult, add_lateness
+from scenes.link.answer import NO_TARGETS, PoseResult, add_lateness
 from scenes.link.messages import encode_points, transform
 from scenes.tracked.follower import TrackingResult, TumourState
 from scenes.tracked.tool_motion import BrainMotion
@@ -122,7 +122,7 @@ def test_distant_tool_is_marked_unreliable(follower, registration, beside):
 
 @pytest.mark.parametrize("state", [TumourState.GOOD, TumourState.UNSURE])
 def test_an_answer_with_a_bound_is_stale_when_it_is_old(stage, state):
-    known = TrackingResult(0.0, state, "words", NOT_SEEN, BrainMotion(stage.anatomy.mesh.nodes), band=1e-3)
+    known = TrackingResult(0.0, state, "words", NO_TARGETS, BrainMotion(stage.anatomy.mesh.nodes), band=1e-3)
     assert add_lateness(PoseResult(NOW, known), 0.2, 0.3).known is known
     old = add_lateness(PoseResult(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
     assert (

@@ -16,7 +16,7 @@ from scenes.episodes.make import make_body, to_body_path
 from scenes.episodes.plan import load_plan
 from sim.anatomy import PART_LABELS, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
-from surrogate.model.left_out import LIMIT, HeldOutError, LeftOut
+from surrogate.model.left_out import MAX_VERTEX_ERROR, HeldOutError, LeftOut
 from surrogate.model.store import load, read_reported_errors
 
 PLAN = """title = "A box"
@@ -92,8 +92,8 @@ def test_a_model_is_weak_by_what_it_states():
         return HeldOutError(1.0, LeftOut(mean, 0.0, p999, 0.0))
 
     assert (
-        not HeldOutError(LIMIT, None).weak
-        and HeldOutError(1.1 * LIMIT, None).weak
+        not HeldOutError(MAX_VERTEX_ERROR, None).weak
+        and HeldOutError(1.1 * MAX_VERTEX_ERROR, None).weak
         and HeldOutError(math.nan, None).weak
     )
     assert not left_out(0.01).weak and left_out(0.02).weak and left_out(0.01, 3e-4).weak
@@ -115,7 +115,10 @@ def test_files_say_what_their_models_state(made):
     path = to_body_path(folder, 0) / "anatomy.model.npz"
     (model,) = load(path, anatomy).values()
     (to_body_path(folder, 1)).mkdir()  # of a body that plays by another's model there is none
-    assert read_reported_errors(path) == {"linear": HeldOutError(model.bound, model.left_out)} and model.bound > LIMIT
+    assert (
+        read_reported_errors(path) == {"linear": HeldOutError(model.bound, model.left_out)}
+        and model.bound > MAX_VERTEX_ERROR
+    )
     assert list_model_errors(folder) == {0: HeldOutError(model.bound, None)}
     to_body_path(folder, 1).rmdir()
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from ar.optics.calibration import LONGEST_TEXT, Calibration
+from ar.optics.calibration import MAX_TEXT_LENGTH, Calibration
 from ar.optics.lens import Lens
 from scenes.tracked.calibration_file import read_calibration, write_calibration
 from sim.errors import InputError
@@ -34,7 +34,7 @@ def test_files_that_are_none_are_refused(tmp_path):
     for content, reason in (
         (b"\xff\xfe\x00\x01", "it is no text in UTF-8. Give YAML"),
         (b"", r"wrong\.yaml: image_width is missing. Give YAML"),
-        (b"#" * (4 * LONGEST_TEXT + 10), r"wrong\.yaml: it has more than"),
+        (b"#" * (4 * MAX_TEXT_LENGTH + 10), r"wrong\.yaml: it has more than"),
         (b"camera_matrix: [" + b"[" * 20000, r"wrong\.yaml: its lists are nested too deeply"),
     ):
         wrong.write_bytes(content)

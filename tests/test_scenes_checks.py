@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ar.overlay.composite import DOUBTFUL, composite
-from ar.overlay.gauge import GAUGE, Gauge
-from ar.overlay.legend import SHEET
-from ar.overlay.marks import BEFORE, Cover, Marks
+from ar.overlay.composite import DOUBTFUL_COLOUR, composite
+from ar.overlay.gauge import NUMBER_SCALE, Gauge
+from ar.overlay.legend import SHEET_VALUE
+from ar.overlay.marks import BEFORE_COLOUR, Cover, Marks
 from ar.overlay.outlines import compute_ink, find_text
 from ar.overlay.styles import STYLES
 from scenes.cli import main
@@ -22,7 +22,13 @@ from scenes.play.stage import CORTEX_COLOUR, DRAPE, DRAPE_COLOUR, OPENING, TOOL,
 from scenes.script.scene import Bounds, find_scene
 from sim.geometry.surface import is_enclosing
 
-LINES = {"tumour": TUMOUR_COLOUR, "doubt": DOUBTFUL, "scan": BEFORE, "truth": TRUTH_COLOUR, "middle": ELLIPSOID_COLOUR}
+LINES = {
+    "tumour": TUMOUR_COLOUR,
+    "doubt": DOUBTFUL_COLOUR,
+    "scan": BEFORE_COLOUR,
+    "truth": TRUTH_COLOUR,
+    "middle": ELLIPSOID_COLOUR,
+}
 GROUNDS = {"cortex": CORTEX_COLOUR, "drape": DRAPE_COLOUR}
 # Machado, Oliveira & Fernandes 2009, severity 1: of linear RGB.
 EYES = {
@@ -126,7 +132,7 @@ def test_what_the_drape_covers_must_be_drawn_so():
 def test_the_number_must_be_whole_and_near_the_tip():
     frame, play = build_tool_frame(), player((640, 360))
     text = str(Gauge(frame.tip, frame.tip, frame.distance, frame.tumour_error.bound))
-    left, top, right, foot = find_text(frame.shown, text, GAUGE)
+    left, top, right, foot = find_text(frame.shown, text, NUMBER_SCALE)
     box, wide = np.s_[top - 3 : foot + 3, left - 3 : right + 3], right - left
     for to in (np.s_[-60 - (foot - top) - 6 : -60, 4 : wide + 10], None):
         shown = frame.shown.copy()
@@ -148,7 +154,7 @@ def test_a_panel_hides_neither_a_scale_nor_a_legend():
     for size in ((640, 360), (640, 480)):
         frame = build_tool_frame(size, "depth")
         changed = (add_cost_label(frame, "series-gp") != frame.shown).any(axis=2)
-        assert (frame.taken == SHEET).any() and changed.any() and not changed[frame.taken == SHEET].any()
+        assert (frame.taken == SHEET_VALUE).any() and changed.any() and not changed[frame.taken == SHEET_VALUE].any()
 
 
 def test_a_tip_in_the_tumour_is_found_to_be():

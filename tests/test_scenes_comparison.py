@@ -6,7 +6,7 @@ from dataclasses import replace
 from theatres import short
 
 from scenes.page.comparison import (
-    RECENT,
+    MAX_RECENT_LOADS,
     AccuracyTimeTable,
     Comparison,
     ComparisonRow,
@@ -56,11 +56,11 @@ def test_without_a_common_load_nobody_is_ranked():
 
 def test_repeated_load_counts_once_and_old_ones_expire():
     tally = AccuracyTimeTable()
-    for load in range(RECENT):
+    for load in range(MAX_RECENT_LOADS):
         shown(tally, "a", [str(load)], 9.0, 9.0)
-    for load in (*range(1000, 1000 + RECENT - 1), 1000, 1000):
+    for load in (*range(1000, 1000 + MAX_RECENT_LOADS - 1), 1000, 1000):
         shown(tally, "a", [str(load)], 4.0, 1.0)
-    assert tally.rows == [ComparisonRow("a", 4.0, 1.0, RECENT, None)]
+    assert tally.rows == [ComparisonRow("a", 4.0, 1.0, MAX_RECENT_LOADS, None)]
 
 
 def test_an_error_too_small_to_print_is_not_reported_as_none():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from visitor import Visitor, report, run_until, wait_for
 
-from ar.overlay.hud import FINE
+from ar.overlay.hud import TEXT_SCALE
 from ar.overlay.outlines import has_text
 from ar.page.browser import Browser
 from scenes.page.comparison import PageState
@@ -84,7 +84,7 @@ def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):
     assert len({number for number, _, _ in shown}) > 3
     pictures = {}
     for number, colour, words in shown:
-        assert f"frame {number} of" in words and has_text(colour, f"frame {number}", FINE)
+        assert f"frame {number} of" in words and has_text(colour, f"frame {number}", TEXT_SCALE)
         assert pictures.setdefault(number, colour) is colour
 
 

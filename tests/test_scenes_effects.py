@@ -21,7 +21,7 @@ from scenes.play.reference import solve_reference_frames
 from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import CORTEX, TOOL, Stage
 from scenes.script.scene import Bounds, find_scene
-from scenes.script.site import HOLE
+from scenes.script.site import HOLE_RATIO
 from scenes.script.tool_paths import Touch
 from sim.accuracy import TRAIN
 from sim.deformation import guess
@@ -193,7 +193,7 @@ class TestBrainShift:
         site, held = theatre.site, replace(scene, effects=(Elasticity(), Held()))
         moved = theatre.anatomy.mesh.nodes + 8e-3 * site.right
         drawn, true = (Stage(each, site).build_visible(moved).vertices for each in (scene, held))
-        beyond = site.compute_axis_distance(true) - HOLE * site.clearance
+        beyond = site.compute_axis_distance(true) - HOLE_RATIO * site.clearance
         low = (drawn - true) @ site.axis
         assert (low[beyond < 0.0] == 0.0).all() and (low[beyond > 2e-3] > 5e-3).all() and (beyond > 2e-3).sum() > 20
 

@@ -20,10 +20,10 @@ from scenes.analysis.error_budget import (
     sample_errors,
 )
 from scenes.analysis.tracking_errors import change_calibration, sample_usual_covariance
-from scenes.script.priors import OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
+from scenes.script.priors import REGISTRATION, REGISTRATION_PRIOR, SEGMENTATION, SEGMENTATION_PRIOR
 from scenes.script.site import build_craniotomy_frame
 from scenes.script.uncertainty import SURROGATE
-from scenes.tracked.filming import USUAL, VIEW, place_reference
+from scenes.tracked.filming import USUAL_CALIBRATION, VIEW, place_reference
 from sim.errors import InputError
 
 COUNT = 200
@@ -49,7 +49,7 @@ def filmed(box):
     bodies = 1e-3 * rng.normal(size=(100, 1, 3)) + np.zeros_like(rest)
     return Filmed(
         site=site, viewpoint=VIEW, duration=2.0, T_scan_patient=place_reference(site, VIEW.build_camera(site)),
-        covariance=sample_usual_covariance(USUAL), time=1.0, rest=rest,
+        covariance=sample_usual_covariance(USUAL_CALIBRATION), time=1.0, rest=rest,
         field=0.002 * site.axis + np.zeros_like(rest), normals=ball, velocity=np.zeros_like(rest), bodies=bodies,
         meshes=0.2 * DEVIATES, own_mesh=0.05 * DEVIATES, surrogate=0.3e-3,
     )  # fmt: skip
@@ -63,10 +63,10 @@ def test_nothing_is_off_where_nobody_contributes(filmed):
 
 def test_error_sources_have_their_stated_size(filmed):
     moved = sample_errors(filmed, [REGISTRATION], COUNT)
-    assert np.sqrt(np.mean(moved.middle**2)) == pytest.approx(np.sqrt(3.0) * OF_REGISTRATION.range[1], rel=0.1)
-    assert np.sqrt(np.mean(moved.along**2)) == pytest.approx(OF_REGISTRATION.range[1], rel=0.15)
+    assert np.sqrt(np.mean(moved.middle**2)) == pytest.approx(np.sqrt(3.0) * REGISTRATION_PRIOR.range[1], rel=0.1)
+    assert np.sqrt(np.mean(moved.along**2)) == pytest.approx(REGISTRATION_PRIOR.range[1], rel=0.15)
     wide = sample_errors(filmed, [SEGMENTATION], COUNT)
-    assert np.quantile(wide.worst, 0.68) == pytest.approx(OF_SEGMENTATION.range[1], rel=0.15)
+    assert np.quantile(wide.worst, 0.68) == pytest.approx(SEGMENTATION_PRIOR.range[1], rel=0.15)
     assert np.quantile(sample_errors(filmed, [SURROGATE], COUNT).worst, 0.95) == pytest.approx(0.3e-3, rel=0.15)
     off = 0.002 * np.abs(DEVIATES).max()
     assert sample_errors(filmed, [MESH], COUNT).worst.max() == pytest.approx(0.05 * off, rel=0.02)
@@ -136,7 +136,7 @@ def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
 
 
 def test_rolling_shutter_error_from_camera_motion(filmed):
-    calibration = replace(USUAL, readout=0.02)
+    calibration = replace(USUAL_CALIBRATION, readout=0.02)
     moving = replace(filmed, viewpoint=replace(VIEW, calibration=calibration, path=sideways), duration=0.1)
     camera, middle = VIEW.build_camera(moving.site), (filmed.rest + filmed.field).mean(axis=0)
     rows = [
@@ -166,7 +166,7 @@ def test_doubled_corner_noise_doubles_tumour_error(filmed):
 def test_calibration_covariance_and_wrong_images_raise_error(filmed):
     deviations = np.sqrt(np.diag(filmed.covariance))
     assert (deviations[:4] > 0.05).all() and (deviations[:4] < 3.0).all()
-    assert change_calibration(USUAL, np.arange(9.0)).focal == (1400.0, 1401.0)
+    assert change_calibration(USUAL_CALIBRATION, np.arange(9.0)).focal == (1400.0, 1401.0)
     exact = replace(filmed, covariance=np.zeros((9, 9)))  # as of a film of `sulcus film`
     assert np.abs(sample_errors(exact, TECHNICAL[:1], 20).worst).max() < 1e-9
     worse = sample_errors(replace(filmed, covariance=100.0 * filmed.covariance), TECHNICAL[:1], 50)

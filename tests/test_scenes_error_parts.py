@@ -18,7 +18,7 @@ from scenes.script.scene import find_scene
 from scenes.tracked.elsewhere import CameraMount, ExternalTracker
 from scenes.tracked.follower import TumourState
 from scenes.tracked.run import Shown, write_rows
-from scenes.tracked.tool_motion import UNBOUND, BrainMotion, ToolMotion
+from scenes.tracked.tool_motion import NO_ERROR_WARNING, BrainMotion, ToolMotion
 from scenes.tracked.truth import OverlayError
 from sim.loads import Touching
 from surrogate.model.learned import build_prediction
@@ -97,7 +97,7 @@ def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
     assert sinking.starts[0] is None and sinking.starts[2] is first.answer
 
 
-@pytest.mark.parametrize(("bound", "expected", "doubt"), [(3e-4, 3e-4, ""), (np.inf, 0.0, UNBOUND)])
+@pytest.mark.parametrize(("bound", "expected", "doubt"), [(3e-4, 3e-4, ""), (np.inf, 0.0, NO_ERROR_WARNING)])
 def test_model_error_without_a_bound_is_the_models_own(bound, expected, doubt, monkeypatch):
     model = SimpleNamespace(bound=bound)
     monkeypatch.setattr("scenes.tracked.tool_motion.find_first_model", lambda deformer, answer: model)

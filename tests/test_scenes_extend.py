@@ -17,7 +17,7 @@ import pytest
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import get_template_path
 from sim import Bonded, Elasticity, Fem, Held, ToolForce, open_cortex, push, read_anatomy
-from surrogate.model.own_learners import GROUP
+from surrogate.model.own_learners import ENTRY_POINT_GROUP
 
 HOUSE = Path(__file__).parents[1]
 PAGE = (HOUSE / "docs/extend.md").read_text()
@@ -68,7 +68,7 @@ def test_the_package_of_a_learner_has_a_whole_project_file():
     (text,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     project = tomllib.loads(text)["project"]
     assert project["name"] and project["version"]
-    assert project["entry-points"][GROUP] == {"nearest": "my_package.nearest"}
+    assert project["entry-points"][ENTRY_POINT_GROUP] == {"nearest": "my_package.nearest"}
 
 
 def test_a_mesh_from_elsewhere_becomes_an_anatomy(tmp_path, monkeypatch, box):

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.tracking.drawn import CELL, WIDTH, read_stamp, stamp_time
+from ar.tracking.drawn import CELL_SIDE, STRIP_WIDTH, read_stamp, stamp_time
 from ar.tracking.pictures import read_video
 from scenes.cli import main
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_intrinsic_covariance, write_calibration
-from scenes.tracked.filming import USUAL
+from scenes.tracked.filming import USUAL_CALIBRATION
 from scenes.tracked.registration_file import read_registration
 from scenes.tracked.tracked_tool import read_tool
 from scenes.tracked.truth import read_truth
 from sim.errors import InputError
 from sim.tools import Ball
 
-SMALL = USUAL.resize_calibration(800, 600, scale=True)
+SMALL = USUAL_CALIBRATION.resize_calibration(800, 600, scale=True)
 
 
 def test_stamp_survives_noise_and_is_not_invented():
@@ -29,12 +29,14 @@ def test_stamp_survives_noise_and_is_not_invented():
     assert read_stamp(picture) is None and read_stamp(picture[:4]) is None
     for time in (0.0, 1.2345, 86_400.0):
         written = stamp_time(picture, time)
-        np.testing.assert_array_equal(written[CELL:], picture[CELL:])
+        np.testing.assert_array_equal(written[CELL_SIDE:], picture[CELL_SIDE:])
         worn = cv2.GaussianBlur(written, (0, 0), 1.0) + random.normal(0.0, 10.0, written.shape)
         assert read_stamp(np.clip(worn, 0, 255).astype(np.uint8)) == pytest.approx(time)
     for cell in range(4, 44):  # a bit that is read wrongly is noticed
         broken = stamp_time(picture, 1.2345)
-        part = broken[:CELL, -WIDTH + CELL * cell : broken.shape[1] - WIDTH + CELL * (cell + 1)]
+        part = broken[
+            :CELL_SIDE, -STRIP_WIDTH + CELL_SIDE * cell : broken.shape[1] - STRIP_WIDTH + CELL_SIDE * (cell + 1)
+        ]
         part[:] = 255 - part
         assert read_stamp(broken) is None
     with pytest.raises(ValueError, match="0 to"):

@@ -13,10 +13,18 @@ from ar.tracking.targets import Detector, build_patient_reference, build_tool_cu
 from scenes.play.deformers import AtRest
 from scenes.play.player import Player
 from scenes.script.scene import find_scene
-from scenes.tracked.filming import USUAL, VIEW, Taking, Trouble, mount_targets, register_with_error, render_shots
+from scenes.tracked.filming import (
+    USUAL_CALIBRATION,
+    VIEW,
+    Taking,
+    Trouble,
+    mount_targets,
+    register_with_error,
+    render_shots,
+)
 from sim.errors import InputError
 
-SMALL = USUAL.resize_calibration(800, 600, scale=True)
+SMALL = USUAL_CALIBRATION.resize_calibration(800, 600, scale=True)
 
 
 TARGETS = (build_tool_cube(), build_patient_reference())

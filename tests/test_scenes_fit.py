@@ -14,7 +14,7 @@ from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 from sim.loads import Pushed
 from surrogate.fitting import fit
-from surrogate.fitting.responses import LINEAR, Responses
+from surrogate.fitting.responses import SOLVED_SKULLS, Responses
 from surrogate.fitting.tissue import FittedTissue, load_tissue, save_tissue
 from surrogate.locating.locator import find_observed_nodes
 from surrogate.locating.locator_store import save_locator
@@ -40,7 +40,7 @@ def by_formula(body, loads, *_):
     count = len(loads.causes[0].point)
     motion = {
         name: np.array([[[dent(body, random)[nodes] for _ in range(count)] for _ in range(4)] for _ in range(3)])
-        for name in LINEAR
+        for name in SOLVED_SKULLS
     }
     return Responses(nodes, motion)
 

@@ -7,7 +7,7 @@ import warp as wp
 
 from benchmarks.__main__ import BENCHMARKS, make_parser
 from scenes.cli import COMMANDS, join_points, main, make_parsers
-from scenes.commands.guidance import EXAMPLES, NAMES, PLAYING
+from scenes.commands.guidance import EXAMPLES, NAMES, PLAYING_COMMANDS
 from scenes.script.scene import SCENES
 from sim.errors import InputError
 from sim.runtime.device import find_device
@@ -53,7 +53,7 @@ def test_every_help_has_examples_that_parse_and_says_what_next(name, capsys, mon
     for words in examples:
         monkeypatch.setattr(f"scenes.commands.{words[0]}.run", lambda args: 0)
         assert main(words) == 0
-    assert (NAMES in text) == (name in PLAYING)
+    assert (NAMES in text) == (name in PLAYING_COMMANDS)
 
 
 def test_scenes_are_those_that_there_are():

@@ -10,7 +10,7 @@ from test_sim_necrosis import hollowed
 from theatres import short, small
 
 from scenes.analysis.uncertainty import apply_sample, get_tissue
-from scenes.builtin.retract import RELAXING
+from scenes.builtin.retract import RELAXING_BRAIN
 from scenes.options.tissue_options import add_element_argument, add_tissue_arguments, apply_tissue_options
 from scenes.play.deformers import open_theatre
 from scenes.script.priors import PatientSample
@@ -73,8 +73,8 @@ class TestScenes:
 
     def test_that_relax_do_so_in_every_region(self, theatre):
         found = asked(theatre, find_scene("retract")).elasticity
-        assert found.default == RELAXING
-        assert found.get_law(NECROSIS_LABEL) == replace(SOFT, prony=RELAXING.prony)
+        assert found.default == RELAXING_BRAIN
+        assert found.get_law(NECROSIS_LABEL) == replace(SOFT, prony=RELAXING_BRAIN.prony)
 
     def test_keep_what_they_say_themselves(self, theatre):
         own = find_scene("sag").elasticity

@@ -17,7 +17,7 @@ from sim.material import Material
 from surrogate.data.answer_rows import describe_tissue_source
 from surrogate.locating.causes import KINDS
 from surrogate.locating.locator_store import load_locator, save_locator
-from surrogate.locating.observation import MOST, Observation, choose_points, to_evidence
+from surrogate.locating.observation import MAX_POINTS, Observation, choose_points, to_evidence
 from surrogate.locating.regions import Region
 from surrogate.model.store import save
 
@@ -196,7 +196,7 @@ def test_of_very_many_points_some_are_looked_at(files, body, named):
     locator = load_locator(folder / "box.locator.npz", body)
     rest, motion = seen_dent(body, truth, 20_000)
     some, now = choose_points(len(rest)), rest + motion  # one is off by half a kilometre, and makes no line of them
-    assert len(some) == MOST and some[0] == 0 and some[-1] == len(rest) - 1
+    assert len(some) == MAX_POINTS and some[0] == 0 and some[-1] == len(rest) - 1
     rest[some[7]] = now[some[7]] = now[some[7]] + [0.0, 0.0, 500.0]
     alone = locator.locate(Observation(now[some], rest[some] if named else None))
     found = locator.locate(Observation(now, rest if named else None))

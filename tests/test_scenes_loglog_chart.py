@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from scenes.analysis.loglog_chart import HEIGHT, PALE, WIDTH, ChartPanel, Curve, Dot, draw_panels
+from scenes.analysis.loglog_chart import HEIGHT, PALE_OPACITY, WIDTH, ChartPanel, Curve, Dot, draw_panels
 from scenes.cli import main
 
 FULL = np.array([31, 119, 180])
@@ -50,7 +50,7 @@ def test_dots_lie_where_curves_do_and_pale_ones_are_pale():
     points = ((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))
     dots = tuple(Dot("", "", x, y, pale=x == 1e2) for x, y in points)
     picture = draw_panels([ChartPanel("title", "x", "y", dots=dots)])
-    full, pale = ink(picture, FULL), ink(picture, PALE * FULL + (1.0 - PALE) * 255.0)
+    full, pale = ink(picture, FULL), ink(picture, PALE_OPACITY * FULL + (1.0 - PALE_OPACITY) * 255.0)
     centre = (full.min(axis=0) + full.max(axis=0)) / 2.0
     assert np.allclose(np.median(pale, axis=0), centre, atol=1.5)
     assert full[:, 0].min() < centre[0] - 50

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from gym_examples import DOWN, made
 
-from scenes.gym.observation import FELT, TRACKED
+from scenes.gym.observation import FORCE_NOISE, POSITION_NOISE
 from scenes.gym.tasks import PALPATE
 
 
@@ -20,6 +20,6 @@ def test_what_is_observed_is_the_truth_with_its_noise():
         off.append((*(1e-2 * states[:3] - place), *(PALPATE.force * states[9:12] - force)))
     assert np.linalg.norm(force) > 0.05
     deviation = np.std(off, axis=0)
-    assert deviation[:3] == pytest.approx(np.full(3, TRACKED), rel=0.35)
-    assert deviation[3:] == pytest.approx(np.full(3, FELT), rel=0.35)
-    assert np.abs(np.mean(off, axis=0)[3:]).max() < FELT
+    assert deviation[:3] == pytest.approx(np.full(3, POSITION_NOISE), rel=0.35)
+    assert deviation[3:] == pytest.approx(np.full(3, FORCE_NOISE), rel=0.35)
+    assert np.abs(np.mean(off, axis=0)[3:]).max() < FORCE_NOISE

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from links import NAMES, NOW, linked, peers, played
 
-from scenes.link.answer import NOT_SEEN, PoseResult
+from scenes.link.answer import NO_TARGETS, PoseResult
 from scenes.link.frame import HEADER
 from scenes.link.messages import encode_points, read_points, transform
 from scenes.link.outgoing import Outgoing
@@ -24,7 +24,7 @@ def test_places_inside_the_tumour_move_with_its_volume(stage):
     at = rest[tets[np.isin(tets, inner).any(axis=1)][:3]].mean(axis=1)
     # A stretch is no rigid motion and is linear: the volume's interpolation is exact, a surface point's is not.
     stretched = stage.nodes, 0.3 * (rest[stage.nodes] - rest[stage.nodes].mean(axis=0))
-    moved = TrackingResult(0.0, TumourState.GOOD, "", NOT_SEEN, motion_of(rest, *stretched), band=1e-3)
+    moved = TrackingResult(0.0, TumourState.GOOD, "", NO_TARGETS, motion_of(rest, *stretched), band=1e-3)
     assert len(at) == 3
     body = outgoing.build_messages(PoseResult(NOW, moved), outgoing.attach_points(["a", "b", "c"], at))[-2]
     found = 1e-3 * read_points(body[HEADER.size :])[1]

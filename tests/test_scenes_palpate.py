@@ -13,7 +13,7 @@ from scenes.episodes.episode import collect
 from scenes.play.frame_text import format_acting
 from scenes.play.player import Player
 from scenes.script.scene import Scene, Viewpoint, find_scene
-from scenes.script.tool_paths import AIR, Touch
+from scenes.script.tool_paths import IDLE_HEIGHT, Touch
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
 from sim.deformation import Outcome
@@ -64,7 +64,7 @@ class TestPalpate:
         depth = np.array([frame.touch.depth for frame in palpated])
         assert all(frame.deformation.outcome[0].good for frame in palpated)
         assert (reads[depth > 2e-3] > 0.02).all() and (reads[depth < -2e-3] == 0.0).all()
-        assert depth.min() == -AIR and depth.max() == pytest.approx(4e-3)
+        assert depth.min() == -IDLE_HEIGHT and depth.max() == pytest.approx(4e-3)
 
     def test_no_vertex_is_inside_the_drawn_tool(self, theatre, palpated):
         shape = find_scene("palpate").tool.shape

@@ -9,11 +9,11 @@ import trimesh
 from theatres import PUSHING, on_template, player, short, small
 
 from ar.optics.camera import project_cv2
-from ar.overlay.composite import WARNING
-from ar.overlay.hud import FINE, NARROW, WHITE, wrap_line
+from ar.overlay.composite import WARNING_COLOUR
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, WHITE, wrap_line
 from ar.overlay.outlines import compute_ink, has_text
 from scenes.play.frame_text import shorten_source
-from scenes.play.player import CARRIED, IN_BONE, STAGES
+from scenes.play.player import BONE_WARNING, CARRIED_DEPTH, STAGES
 from scenes.play.stage import CORTEX, TOOL
 from scenes.script.scene import Viewpoint
 from scenes.script.tool_paths import Touch
@@ -33,7 +33,9 @@ def heights(play, frame, points):
 
 def says(picture, text, ink=WHITE):
     """Whether a picture (H, W, 3) says a sentence, folded as it has to be."""
-    return all(has_text(picture, line, FINE, ink) for line in wrap_line(text, NARROW * picture.shape[1]))
+    return all(
+        has_text(picture, line, TEXT_SCALE, ink) for line in wrap_line(text, MAX_BOTTOM_WIDTH * picture.shape[1])
+    )
 
 
 def test_the_pressing_tip_rests_on_the_deformed_surface(play):
@@ -54,7 +56,7 @@ def test_a_place_under_the_bone_is_refused_said_and_shown(play, way):
     frame = play.draw(0, 0.0, Touch(way * 0.1, way * 0.1, force=0.1))
     assert frame.remark.startswith("the bone's edge stops the tool ") and frame.remark.endswith(" mm short")
     assert says(frame.shown, frame.remark)
-    assert play.site.compute_axis_distance(frame.tip[None])[0] <= play.site.compute_reach(radius) + CARRIED
+    assert play.site.compute_axis_distance(frame.tip[None])[0] <= play.site.compute_reach(radius) + CARRIED_DEPTH
     inside = play.draw(0, 0.0, Touch(force=0.1))
     assert inside.remark == "" and not says(inside.shown, frame.remark)
 
@@ -64,7 +66,9 @@ def test_tissue_pressed_into_bone_is_not_reliable(theatre):
     play = player(theatre, replace(small(), viewpoint=Viewpoint()), "fem")
     reach = play.site.compute_reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
-    assert frame.doubt == IN_BONE and all(says(frame.shown, part, compute_ink(WARNING)) for part in IN_BONE.split(": "))
+    assert frame.doubt == BONE_WARNING and all(
+        says(frame.shown, part, compute_ink(WARNING_COLOUR)) for part in BONE_WARNING.split(": ")
+    )
     assert play.site.compute_axis_distance(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
 
 

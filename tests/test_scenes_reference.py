@@ -11,7 +11,7 @@ from conftest import make_box
 from studies import nothing
 from theatres import small
 
-from scenes.builtin.retract import RELAXING
+from scenes.builtin.retract import RELAXING_BRAIN
 from scenes.play.deformers import PatientSetup
 from scenes.play.reference import solve_reference_frames
 from scenes.report.reference import ReferenceSolutions, get_reference, get_solutions_beyond, solve_reference
@@ -83,7 +83,7 @@ def test_the_truth_of_a_frame_knows_what_went_before() -> None:
     """Tissue that relaxes: pressed, held and all but let go, it is not where it was never pressed."""
     anatomy = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
     theatre = PatientSetup(anatomy, None, {}, "cpu")
-    scene = replace(small(), effects=(Elasticity(RELAXING), Held(), Slide(), ToolForce()), element="p1")
+    scene = replace(small(), effects=(Elasticity(RELAXING_BRAIN), Held(), Slide(), ToolForce()), element="p1")
     moments = ((1.5, 0.5), (1.5, 2.0), (0.5, 2.2))
     loads = [scene.build_loads(theatre.site, scene.path(moment), time) for moment, time in moments]
     found, fem, last = solve_reference_frames(theatre, scene, loads).displacement, theatre.build_fem(scene, TRAIN), None

@@ -11,7 +11,7 @@ from studies import SPECS, TISSUE
 
 from ar.screen import read_png
 from scenes.cli import main
-from scenes.report.finite_elements import HALVED, OWN, FemVariant, describe_difference
+from scenes.report.finite_elements import HALVED_MESH, OWN_MESH, FemVariant, describe_difference
 from scenes.report.page import Section, write_report
 from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow
 from sim.accuracy import REFERENCE, TRAIN
@@ -93,9 +93,9 @@ def test_reference_elements_differ_by_tolerance_only(study, fine):
     said = {
         (element, mesh): describe_difference(here, FemVariant("it", element=element, mesh=mesh))
         for element in ("p1", "p2")
-        for mesh in (OWN, HALVED)
+        for mesh in (OWN_MESH, HALVED_MESH)
     }
-    alone = ("p2", HALVED if fine else OWN)
+    alone = ("p2", HALVED_MESH if fine else OWN_MESH)
     assert said.pop(alone) == TOLERANCE_ALONE and set(said.values()) == {ERROR}
     assert describe_difference(here, FemVariant("it", "linear", *alone)) == DIFFERENCE
 

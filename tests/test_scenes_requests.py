@@ -8,7 +8,7 @@ import pytest
 from theatres import Silent
 from visitor import Visitor, report, wait_for
 
-from scenes.page.demo import READING
+from scenes.page.demo import MESSAGE_TIME
 from scenes.page.referee import FemWorker
 from scenes.page.requests import HAND, SCRIPT, Requests, describe_holder
 from scenes.play.deformers import PatientSetup
@@ -121,7 +121,7 @@ def test_rejected_load_is_shown_on_the_page(running, monkeypatch):
 def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd):
     refuse(monkeypatch, lambda number, touch: number == 5, IndexError("none such"))
     demo.wish.set(plays=True, number=4)
-    assert demo.run(READING + 1.5) > 1
+    assert demo.run(MESSAGE_TIME + 1.5) > 1
     assert demo.wish.number > 5
     said = capfd.readouterr().err
     assert said.count("\n") == 1 and "sulcus demo: a defect: IndexError, none such (line" in said

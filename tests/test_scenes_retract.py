@@ -7,7 +7,7 @@ import pytest
 from test_scenes_palpate import small
 from theatres import player
 
-from scenes.script.tool_paths import AIR, Touch
+from scenes.script.tool_paths import IDLE_HEIGHT, Touch
 from sim.deformation import Outcome
 from sim.loads import Retracted
 from sim.tools import compute_distances
@@ -24,14 +24,16 @@ class TestRetract:
         outcomes = [frame.deformation.outcome[0] for frame in frames]  # so small a body is strained beyond 50 %
         assert reads[0] == 0.0 and all(one.good or one is Outcome.OVERSTRAINED for one in outcomes)
 
-    @pytest.mark.parametrize("touch", [Touch(depth=-AIR), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)])
+    @pytest.mark.parametrize(
+        "touch", [Touch(depth=-IDLE_HEIGHT), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)]
+    )
     def test_blade_is_laid_clear_of_tissue_then_moved(self, theatre, touch):
         scene, site = small("retract"), theatre.site
         cause = scene.build_loads(site, touch, 0.0).get(Retracted)
         apart = compute_distances(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)
         upright = site.compute_direction(touch) @ site.axis
-        assert apart.min() == pytest.approx(AIR * upright, abs=0.3e-3)
+        assert apart.min() == pytest.approx(IDLE_HEIGHT * upright, abs=0.3e-3)
         moved = cause.pose[0].copy()
         moved[:3, 3] += cause.displacement[0]
         np.testing.assert_allclose(moved, scene.compute_pose(site, touch), atol=1e-15)
-        assert cause.displacement[0] == pytest.approx((AIR + touch.depth) * site.compute_direction(touch))
+        assert cause.displacement[0] == pytest.approx((IDLE_HEIGHT + touch.depth) * site.compute_direction(touch))

@@ -10,7 +10,7 @@ from conftest import make_box
 from studies import read_back
 
 from scenes.cli import main
-from scenes.commands.report import QUICK
+from scenes.commands.report import QUICK_COUNTS
 from scenes.report.page import Section, find_front, plot_error_against_time, write_report
 from scenes.report.row import ReportRow, compute_distance_figures, summarise_times
 from sim.bodies.meshfile import write_anatomy
@@ -116,7 +116,7 @@ def test_a_command_without_data_makes_its_own(tmp_path, monkeypatch, capsys):
     words = ["report", "--quick", "--anatomy", str(tmp_path / "box.vtu"), "--out", str(tmp_path), "--device"]
     assert main([*words, "cpu,cpu", "--loads", "1", "--json"]) == 0
     (section,) = json.loads(capsys.readouterr().out)["sections"]
-    assert f"{QUICK[0] - 1} palpation loads" in section["about"][0]  # one inverts tetrahedra
+    assert f"{QUICK_COUNTS[0] - 1} palpation loads" in section["about"][0]  # one inverts tetrahedra
     data = read_dataset(tmp_path / "palpation.h5")
-    assert data.estimate_seconds("load", QUICK[0]) > 0.0
+    assert data.estimate_seconds("load", QUICK_COUNTS[0]) > 0.0
     assert data.provenance["element"] == "smoothed" and "neo-hookean" in data.provenance["tissue"]

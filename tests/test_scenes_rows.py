@@ -9,7 +9,7 @@ from poison import poisoned
 from studies import SPECS, TISSUE, read_back
 
 from scenes.analysis.measurement import measure_peak_memory
-from scenes.report.finite_elements import OWN, FemVariant
+from scenes.report.finite_elements import OWN_MESH, FemVariant
 from scenes.report.learner import LearnerSpec, list_counts, measure_learner
 from scenes.report.rows import (
     list_all_combinations,
@@ -25,8 +25,8 @@ from sim.runtime.threads import limit_to_one_thread
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import compute_tool_features, reduce, split_forces
 from surrogate.data.splits import leave_sectors_out
-from surrogate.training.expansion import COARSE, EXPANDED
-from surrogate.training.learners import SVR, Tuned
+from surrogate.training.expansion import COARSE_BASIS, SERIES_MODELS
+from surrogate.training.learners import SVR_CANDIDATES, Tuned
 from surrogate.training.train import train
 
 
@@ -41,8 +41,8 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box,
         row, field = measure_learner(replace(study, data=path), LearnerSpec("svr"))
     lesson = Pushed(pushed.point[training], pushed.force[training], pushed.footprint[training])
     size, (every, direction) = split_forces(lesson)[0], split_forces(pushed)
-    basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE)
-    machine = Tuned(SVR).fit(
+    basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE_BASIS)
+    machine = Tuned(SVR_CANDIDATES).fit(
         compute_tool_features(study.patch, lesson), basis.encode(truth[training] / size[:, None, None])
     )
     within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
@@ -104,7 +104,7 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     assert (
         row.own_fem["discs"].mm.mean < 0.5 * measure_row(study, SPECS[2], tmp_path / "l.png").own_fem["discs"].mm.mean
     )
-    assert {spec.name for spec in list_learner_specs()} > set(EXPANDED)
+    assert {spec.name for spec in list_learner_specs()} > set(SERIES_MODELS)
 
 
 def test_only_what_lacks_is_measured_again(study, study_rows, tmp_path):
@@ -145,7 +145,7 @@ def test_plans(study):
         list_one_factor_variants(study)[0].accuracy == TRAIN and list_one_factor_variants(study)[-1].law != TISSUE.law
     )
     assert (
-        not any(spec.mesh != OWN for spec in list_one_factor_variants(study, remesh=False))
+        not any(spec.mesh != OWN_MESH for spec in list_one_factor_variants(study, remesh=False))
         and len(list_one_factor_variants(study, remesh=False)) == 11
     )
     product = list_all_combinations(study)

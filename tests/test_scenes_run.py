@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.overlay.hud import FINE
+from ar.overlay.hud import TEXT_SCALE
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text
 from ar.screen import write_film
 from ar.tracking.pictures import Named, read_video
@@ -51,7 +51,7 @@ def test_white_areas_stay_clear_and_share_is_reported(parts):
     np.testing.assert_array_equal(amber[0][covered == 0], amber[1][covered == 0])
     share = np.count_nonzero(mask & (covered > 0)) / np.count_nonzero(mask)
     assert 0.2 < share < 0.8
-    assert has_text(hidden.colour, f"{share:.0%} of the tumour is behind what lies in front", FINE)
+    assert has_text(hidden.colour, f"{share:.0%} of the tumour is behind what lies in front", TEXT_SCALE)
     assert hidden.known.band == whole.known.band and not hidden.known.relied
 
 

@@ -9,7 +9,15 @@ from gym_examples import SIZE, made, played
 from programs import main
 from theatres import put, theatre_of
 
-from scenes.gym.episode import ENDED, FAR, OVER_LIMIT, SHARE, STEP, EpisodeScore, compute_reward
+from scenes.gym.episode import (
+    ABORT_REWARD,
+    LIMIT_PENALTY,
+    MAX_POTENTIAL_DISTANCE,
+    SHARE_REWARD,
+    STEP_PENALTY,
+    EpisodeScore,
+    compute_reward,
+)
 from scenes.gym.model_answers import PressedModel
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
@@ -25,14 +33,19 @@ STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
 
 def test_a_reward_is_a_difference_of_potentials_and_its_limits():
     near, far = EpisodeScore(0.002, 0.1, 0, 0.5), EpisodeScore(0.012, 0.6, 0, 0.5)
-    assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - STEP)
-    assert compute_reward(near, near, False, False) == pytest.approx(-STEP)
-    assert compute_reward(near, replace(near, load=1.1), False, False) == pytest.approx(-STEP - OVER_LIMIT)
-    assert compute_reward(near, near, False, True) == pytest.approx(ENDED - STEP)
-    assert compute_reward(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * SHARE - STEP)
-    lost, farther = EpisodeScore(FAR, 1.0, 0, 0.5), EpisodeScore(2.0 * FAR, 5.0, 0, 0.5)  # beyond, all count alike
+    assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - STEP_PENALTY)
+    assert compute_reward(near, near, False, False) == pytest.approx(-STEP_PENALTY)
+    assert compute_reward(near, replace(near, load=1.1), False, False) == pytest.approx(-STEP_PENALTY - LIMIT_PENALTY)
+    assert compute_reward(near, near, False, True) == pytest.approx(ABORT_REWARD - STEP_PENALTY)
+    assert compute_reward(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * SHARE_REWARD - STEP_PENALTY)
+    lost, farther = (
+        EpisodeScore(MAX_POTENTIAL_DISTANCE, 1.0, 0, 0.5),
+        EpisodeScore(2.0 * MAX_POTENTIAL_DISTANCE, 5.0, 0, 0.5),
+    )  # beyond, all count alike
     assert (
-        compute_reward(farther, lost, False, False) == pytest.approx(-STEP) != compute_reward(lost, near, False, False)
+        compute_reward(farther, lost, False, False)
+        == pytest.approx(-STEP_PENALTY)
+        != compute_reward(lost, near, False, False)
     )
 
 

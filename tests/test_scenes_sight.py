@@ -8,14 +8,14 @@ import pytest
 from locators import locator_of
 from theatres import SIGHTED, short, small
 
-from ar.overlay.hud import FINE, NARROW, bound_words, format_millimetres, wrap_line
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, bound_words, format_millimetres, wrap_line
 from ar.overlay.outlines import compute_ink, find_ink, has_text
 from scenes.cli import main
 from scenes.page.text import describe_estimate, format_page_legend, report
 from scenes.play.checks import is_within_surface, list_objections, measure
 from scenes.play.deformers import PatientSetup, open_theatre
 from scenes.play.observer import ELLIPSOID_COLOUR
-from scenes.play.player import REFUSED
+from scenes.play.player import REJECTED_WARNING
 from scenes.play.reference import solve_reference_frames
 from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
@@ -167,7 +167,7 @@ def _estimated(observer, seen, positions):
 def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     play, frame = refused
     found, said = frame.estimate, []
-    assert frame.doubt == REFUSED and found.build_ellipsoid() is None and not found.held and frame.remark == ""
+    assert frame.doubt == REJECTED_WARNING and found.build_ellipsoid() is None and not found.held and frame.remark == ""
     nodes = play.site.anatomy.tumour_nodes
     assert np.array_equal(play.estimate_positions(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
     assert not find_ink(frame.shown, compute_ink(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
@@ -210,7 +210,9 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     assert said[-1].startswith("lines: ") and not any("tumour moved" in line for line in said[2:])
     foot = f"estimate moved {format_millimetres(found.moved, found.location.p95)}"
     assert f"truth moved {truth:.1f} mm; estimate" in frame.remark
-    assert all(has_text(frame.shown, line, FINE) for line in wrap_line(foot, NARROW * frame.shown.shape[1]))
+    assert all(
+        has_text(frame.shown, line, TEXT_SCALE) for line in wrap_line(foot, MAX_BOTTOM_WIDTH * frame.shown.shape[1])
+    )
     said.clear()
     add_cost_label(replace(frame, named=True), "fem")
     assert not any(line.startswith("lines: ") for line in said)

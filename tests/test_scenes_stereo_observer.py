@@ -10,7 +10,7 @@ from theatres import template_theatre
 from ar.overlay.outlines import compute_silhouette
 from benchmarks.studies.stereo_study import row
 from scenes.play.deformers import AtRest
-from scenes.play.player import REFUSED, Player
+from scenes.play.player import REJECTED_WARNING, Player
 from scenes.play.stereo_observer import StereoObserver
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import get_template_path
@@ -189,7 +189,9 @@ def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):
     player = Player(stage, still)
     answer = replace(still.deform(player.build_loads(0)), outcome=(Outcome.CONVERGED,))
     frame = player.draw_frame(0, player.get_touch(0), player.build_loads(0), answer, 0.0)
-    assert frame.doubt == REFUSED and frame.estimate.location is None and not len(frame.estimate.observation.now)
+    assert (
+        frame.doubt == REJECTED_WARNING and frame.estimate.location is None and not len(frame.estimate.observation.now)
+    )
     assert "sees nothing" in frame.estimate.refusal and frame.moved == 0.0
 
 

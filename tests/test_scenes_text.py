@@ -8,7 +8,7 @@ from test_scenes_page import answer
 from theatres import short, sinking, small
 
 from scenes.page.text import (
-    RESEARCH,
+    RESEARCH_ONLY,
     describe_fem,
     describe_scene,
     describe_side_of_brain,
@@ -76,7 +76,7 @@ class TestTrust:
 class TestWords:
     def test_it_says_what_is_seen_and_that_it_is_research(self, theatre):
         said = format_caption(theatre, short(), "the <default> brain")
-        assert RESEARCH in said and "&lt;default&gt;" in said and "<default>" not in said
+        assert RESEARCH_ONLY in said and "&lt;default&gt;" in said and "<default>" not in said
         assert "tumour now" in said and "tumour in the scan" in said and "tip to tumour" in said
         assert "tip to tumour" not in format_caption(theatre, sinking(), "brain")
 

@@ -7,7 +7,7 @@ from theatres import template_theatre
 
 import scenes.gym  # noqa: F401
 from scenes.gym.tasks import PALPATE
-from scenes.gym.tool_motion import HIGHEST, lay_tool, move_tool
+from scenes.gym.tool_motion import MAX_HEIGHT, lay_tool, move_tool
 from scenes.script.site import build_craniotomy_frame
 
 
@@ -17,7 +17,7 @@ def test_tool_leans_and_sinks_no_farther_than_it_may(box):
     for angle, turned in ((0.29, True), (0.31, False)):
         found = move_tool(hand, site, tool, np.array([0.0, 0.0, 0.0, 0.0, angle, 0.0]), 0.3, 5e-3)
         assert (np.abs(found.turned - hand.turned).max() > 0.1) == turned
-    for way, depth in ((-1.0, 5e-3), (1.0, -HIGHEST)):
+    for way, depth in ((-1.0, 5e-3), (1.0, -MAX_HEIGHT)):
         found = move_tool(hand, site, tool, np.array([0.0, 0.0, way, 0.0, 0.0, 0.0]), 0.3, 5e-3)
         assert (found.place - site.origin) @ site.axis == pytest.approx(depth - tool.radius)
 

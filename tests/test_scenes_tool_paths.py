@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_scenes import sampled
 
-from scenes.script.tool_paths import AIR, Touch, draw, lay, palpate, press, slide, smooth
+from scenes.script.tool_paths import IDLE_HEIGHT, Touch, draw, lay, palpate, press, slide, smooth
 
 START, END = (-0.01, -0.004), (0.008, 0.006)
 PATHS = {
@@ -59,13 +59,15 @@ class TestPaths:
 
     def test_laid_tool_tilts_towards_x_and_stays(self):
         path = lay(3e-3, tilt=0.4, rise=1.0, at=(0.002, -0.001))
-        assert path(-1.0).depth == path(0.0).depth == -AIR and path(0.5).depth == pytest.approx(0.5 * (3e-3 - AIR))
+        assert path(-1.0).depth == path(0.0).depth == -IDLE_HEIGHT and path(0.5).depth == pytest.approx(
+            0.5 * (3e-3 - IDLE_HEIGHT)
+        )
         for time in (1.0, 5.0):
             assert path(time) == Touch(0.002, -0.001, 0.0, (0.4, 0.0), pytest.approx(3e-3))
 
     def test_palpation_comes_down_slides_and_lifts_off(self):
         path = palpate(2e-3, START, END, seconds=2.0, rise=0.5)
-        assert path(0.0).depth == -AIR and path(3.0).depth == pytest.approx(-AIR)
+        assert path(0.0).depth == -IDLE_HEIGHT and path(3.0).depth == pytest.approx(-IDLE_HEIGHT)
         for time, place in ((0.5, START), (1.5, np.mean([START, END], axis=0)), (2.5, END)):
             touch = path(time)
             assert (touch.x, touch.y, touch.depth) == pytest.approx((*place, 2e-3)) and touch.force == 0.0

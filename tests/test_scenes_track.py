@@ -10,14 +10,14 @@ import pytest
 from test_ar_pose import CAMERA, CUBE, PLATE, flat, looking, taken
 
 from ar.optics.calibration import Calibration
-from ar.tracking.targets import TIP
+from ar.tracking.targets import TIP_DISTANCE
 from scenes.cli import main
 from scenes.tracked.calibration_file import read_calibration, write_calibration
 from scenes.tracked.elsewhere import follow_body
 from scenes.tracked.pose_file import COVARIANCE, read_poses
 
 PLATE_AT = flat((20.0, 15.0, 5.0), (-0.08, 0.0, 0.28))
-TIP_AT = np.array([0.0, 0.0, -TIP, 1.0])
+TIP_AT = np.array([0.0, 0.0, -TIP_DISTANCE, 1.0])
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from theatres import put, short, small
 
-from ar.overlay.hud import FINE, NARROW, format_millimetres, wrap_line
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, format_millimetres, wrap_line
 from ar.overlay.outlines import has_text
 from scenes.analysis.uncertainty import (
     SolvedMotions,
@@ -289,15 +289,17 @@ class TestSaid:
         marks = drawn_with[0][5]
         assert marks.margin == marks.gauge.error == frame.tumour_error.prior
         assert list(frame.head) == format_errors(frame.model_error, frame.tumour_error, True)
-        assert all(has_text(frame.shown, line, FINE) for line in frame.head)
+        assert all(has_text(frame.shown, line, TEXT_SCALE) for line in frame.head)
         # The panel of figures begins under them.
-        assert all(has_text(add_cost_label(frame, "linear"), line, FINE) for line in frame.head)
+        assert all(has_text(add_cost_label(frame, "linear"), line, TEXT_SCALE) for line in frame.head)
         narrow = knowing.build_player("linear", scene).draw(3, 0.1, scene.path(0.1))
         assert narrow.shown.shape == (240, 320, 3)
         assert list(narrow.head) == format_errors(narrow.model_error, narrow.tumour_error, True, brief=True)
-        moved = wrap_line(f"moved {format_millimetres(narrow.moved, narrow.tumour_error.moved)}", NARROW * 320)
+        moved = wrap_line(
+            f"moved {format_millimetres(narrow.moved, narrow.tumour_error.moved)}", MAX_BOTTOM_WIDTH * 320
+        )
         for line in (*narrow.head, *moved, "frame 3"):
-            assert has_text(narrow.shown, line, FINE)
+            assert has_text(narrow.shown, line, TEXT_SCALE)
 
     def test_in_a_hand_and_of_a_doubtful_answer_it_is_not_known(self, theatre):
         scene = short()

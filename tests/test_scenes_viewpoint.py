@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 from theatres import REAL
 
-from scenes.script.viewpoint import USUAL, Viewpoint
+from scenes.script.viewpoint import USUAL_VIEWPOINT, Viewpoint
 from sim.errors import InputError
 
 
 def test_eyes_of_a_microscope_meet_at_the_site(site):
-    left, right = (replace(USUAL, eye=eye).build_camera(site) for eye in ("left", "right"))
+    left, right = (replace(USUAL_VIEWPOINT, eye=eye).build_camera(site) for eye in ("left", "right"))
     for one in (left, right):
-        assert one.project(USUAL.find_target(site))[0] == pytest.approx([319.5, 239.5])
+        assert one.project(USUAL_VIEWPOINT.find_target(site))[0] == pytest.approx([319.5, 239.5])
     assert left.to_camera_frame(right.centre)[0] > 0.023
     with pytest.raises(InputError, match="choose left or right"):
         Viewpoint(eye="third")  # type: ignore[arg-type]

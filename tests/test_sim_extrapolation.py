@@ -15,7 +15,7 @@ from sim.deformation import guess
 from sim.effects import Elasticity, Held, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, push
-from sim.strategy.extrapolation import BEFORE, PUSHES, as_pushes, compute_shares, extrapolate_start
+from sim.strategy.extrapolation import BEFORE_KEY, PUSHES_KEY, as_pushes, compute_shares, extrapolate_start
 
 EFFECTS = (Elasticity(), Held(), ToolForce())
 POINT, DOWN = np.array([2e-3, -1e-3, 0.0]), np.array([0.0, 0.0, -0.2])
@@ -31,7 +31,7 @@ def pushed(x: float, force: float = 1.0, y: float = 0.0) -> Loads:
 
 
 def forgetting(warm: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in warm.items() if name != BEFORE}
+    return {name: value for name, value in warm.items() if name != BEFORE_KEY}
 
 
 def build_row(load: Loads) -> np.ndarray:
@@ -67,12 +67,12 @@ def test_a_tool_that_stood_still_or_was_lifted_tells_no_way():
 def test_extrapolation_follows_line_per_load():
     last, before = np.random.default_rng(0).normal(size=(2, 12, 2))
     pushes = np.stack([np.concatenate([build_row(pushed(x)) for x in (1e-3, 0.0)]).reshape(2, 7)] * 2)
-    warm = {PUSHES: pushes, BEFORE: before.T}
+    warm = {PUSHES_KEY: pushes, BEFORE_KEY: before.T}
     loads = push(np.array([POINT + [2e-3, 0.0, 0.0], POINT + [1e-3, 0.0, 0.0]]), np.array([DOWN, DOWN]), 8e-3)
     start = extrapolate_start(loads, last, warm)
     np.testing.assert_allclose(start, np.column_stack([2.0 * last[:, 0] - before[:, 0], last[:, 1]]), atol=1e-12)
     assert extrapolate_start(loads, last, {}) is last
-    assert extrapolate_start(loads, last, warm | {BEFORE: before.T[:, :9]}) is last  # another element's
+    assert extrapolate_start(loads, last, warm | {BEFORE_KEY: before.T[:, :9]}) is last  # another element's
 
 
 def test_moving_tool_frames_converge_in_fewer_steps(body):
@@ -93,21 +93,21 @@ def test_a_start_that_would_turn_inside_out_is_not_moved_on(body):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     first = fem.deform(pushed(0.0))
     last = fem.deform(pushed(1e-3), first)
-    torn = last.warm[BEFORE] + np.random.default_rng(1).normal(0.0, 0.1, last.warm[BEFORE].shape)
-    answer = fem.deform(pushed(2e-3), replace(last, warm={**last.warm, BEFORE: torn}))
+    torn = last.warm[BEFORE_KEY] + np.random.default_rng(1).normal(0.0, 0.1, last.warm[BEFORE_KEY].shape)
+    answer = fem.deform(pushed(2e-3), replace(last, warm={**last.warm, BEFORE_KEY: torn}))
     assert answer.outcome[0].name == "CONVERGED" and answer.inverted[0] == 0
 
 
 def test_a_foreign_start_tells_no_way(body):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     first = fem.deform(pushed(0.0))
-    assert BEFORE not in first.warm
+    assert BEFORE_KEY not in first.warm
     second = fem.deform(pushed(1e-3), guess(first.displacement))
-    assert BEFORE not in second.warm
-    np.testing.assert_allclose(fem.deform(pushed(2e-3), second).warm[BEFORE][0], second.displacement.ravel())
+    assert BEFORE_KEY not in second.warm
+    np.testing.assert_allclose(fem.deform(pushed(2e-3), second).warm[BEFORE_KEY][0], second.displacement.ravel())
 
 
-@pytest.mark.parametrize("spoilt", [PUSHES, "s", "known", "head"])
+@pytest.mark.parametrize("spoilt", [PUSHES_KEY, "s", "known", "head"])
 def test_a_history_that_does_not_fit_is_none(body, spoilt):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     last = fem.deform(pushed(1e-3), fem.deform(pushed(0.0)))

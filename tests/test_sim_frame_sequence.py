@@ -15,9 +15,9 @@ from sim.effects import Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, push, stack
-from sim.minimisers.lbfgs import LEARNT
+from sim.minimisers.lbfgs import HISTORY_KEYS
 from sim.strategy import frame_sequence
-from sim.strategy.captured_frame import FRAME_EVALUATIONS, CapturedFrame
+from sim.strategy.captured_frame import MAX_FRAME_EVALUATIONS, CapturedFrame
 from sim.strategy.frame_sequence import Kept
 from sim.strategy.plan import can_follow
 
@@ -95,8 +95,8 @@ def test_only_what_is_kept_leaves_the_device(fem, monkeypatch):
     kept = last
     for number in range(3):
         last = fem.deform(pushed(5e-3 + 5e-4 * number), last)
-    assert len(read) == len(LEARNT) and kept.warm["s"].any()
-    assert len(read) == len(LEARNT)
+    assert len(read) == len(HISTORY_KEYS) and kept.warm["s"].any()
+    assert len(read) == len(HISTORY_KEYS)
 
 
 def test_a_batch_between_frames_changes_nothing(fem):
@@ -147,7 +147,7 @@ def test_vertices_are_picked_from_the_same_answer(fem):
 
 def test_frame_sequence_requires_linear_elements_and_budget():
     linear, quadratic = (discretise(BODY.mesh, element) for element in ("p1", "p2"))
-    assert can_follow(linear, LIVE) and FRAME_EVALUATIONS > 20
+    assert can_follow(linear, LIVE) and MAX_FRAME_EVALUATIONS > 20
     assert not can_follow(linear, replace(LIVE, outer=5)) and not can_follow(quadratic, LIVE)
 
 

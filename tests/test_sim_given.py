@@ -14,7 +14,7 @@ from sim.accuracy import LIVE, Accuracy
 from sim.deformation import Deformation, guess
 from sim.effects import Elasticity, Held, Inertia, Resection, ToolForce
 from sim.errors import InputError
-from sim.fem import MIDDLES, Fem
+from sim.fem import MID_EDGE_KEY, Fem
 from sim.loads import (
     Displaced,
     Loads,
@@ -28,7 +28,7 @@ from sim.loads import (
     build_posture,
     push,
 )
-from sim.minimisers.lbfgs import LEARNT
+from sim.minimisers.lbfgs import HISTORY_KEYS
 from sim.resected_fem import build_fem
 
 BODY = base_held(box((3, 3, 3), 0.1))
@@ -247,7 +247,7 @@ def test_what_was_learnt_and_is_not_finite_is_forgotten(fem: Fem, value: float) 
     first = fem.deform(PUSH)
     start = fem.deform(PUSH.scale(1.1), first)
     assert start.warm["known"][0] > 0
-    for name, rest in (("s", {"pushes", "before"}), ("before", {*LEARNT, "pushes"})):
+    for name, rest in (("s", {"pushes", "before"}), ("before", {*HISTORY_KEYS, "pushes"})):
         found = fem.deform(PUSH.scale(1.2), warmed(start, **{name: np.full_like(start.warm[name], value)}))
         left = {key: array for key, array in start.warm.items() if key in rest}
         other = fem.deform(PUSH.scale(1.2), replace(start, warm=left))
@@ -257,8 +257,8 @@ def test_what_was_learnt_and_is_not_finite_is_forgotten(fem: Fem, value: float) 
 def test_mid_edge_nodes_of_another_body() -> None:
     body = Fem(BODY, EFFECTS, LIVE, "cpu", element="p2")
     answer = body.deform(PUSH)
-    wrong = spoilt(answer, **{MIDDLES: answer.memory[MIDDLES][:, :, :2]})
-    with pytest.raises(InputError, match=f"the start's memory of {MIDDLES} has shape"):
+    wrong = spoilt(answer, **{MID_EDGE_KEY: answer.memory[MID_EDGE_KEY][:, :, :2]})
+    with pytest.raises(InputError, match=f"the start's memory of {MID_EDGE_KEY} has shape"):
         body.deform(PUSH, wrong)
 
 

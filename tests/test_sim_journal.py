@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from sim.errors import InputError
-from sim.runtime.journal import HEAD, DamageWarning, open_journal, run_of
+from sim.runtime.journal import RECORD_HEADER, DamageWarning, open_journal, run_of
 
 
 def test_damaged_journal_header_discards_records(tmp_path):
@@ -14,7 +14,7 @@ def test_damaged_journal_header_discards_records(tmp_path):
     with open_journal(path, {"seed": "0"}) as journal:
         journal.add(batch, b"what was solved")
     damaged = bytearray(path.read_bytes())
-    damaged[HEAD.size + 2] ^= 1
+    damaged[RECORD_HEADER.size + 2] ^= 1
     path.write_bytes(damaged)
     with (
         pytest.raises(InputError, match="is not an unfinished run, or its beginning is damaged"),

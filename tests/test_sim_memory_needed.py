@@ -13,10 +13,10 @@ from sim.discretisation.space import discretise
 from sim.errors import InputError
 from sim.runtime.device import Device
 from sim.runtime.memory import estimate_column_bytes
-from sim.strategy.memory_needed import FIXED, PER_NODE, compute_needed, estimate_needed
+from sim.strategy.memory_needed import BYTES_PER_NODE, FIXED_BYTES, compute_needed, estimate_needed
 
 SPACE = discretise(box((6, 6, 6)), "smoothed")
-TABLES = FIXED + PER_NODE["smoothed"] * SPACE.count
+TABLES = FIXED_BYTES + BYTES_PER_NODE["smoothed"] * SPACE.count
 
 
 def test_gpu_memory_is_tables_inverse_and_loads() -> None:
@@ -33,11 +33,11 @@ def test_gpu_memory_is_tables_inverse_and_loads() -> None:
     assert inverted.kept - TABLES == 2 * 50_000**2
     assert 4 * 50_000**2 < inverted.set_up - inverted.kept < 7 * 50_000**2 and inverted.peak == inverted.set_up
     wide = compute_needed(SPACE, Device("cuda:0", "float64"), 0, 1, 1, free)
-    assert wide.column == 2 * one.column and wide.kept - FIXED == 2 * (one.kept - FIXED)
+    assert wide.column == 2 * one.column and wide.kept - FIXED_BYTES == 2 * (one.kept - FIXED_BYTES)
 
 
 def test_gpu_overflow_is_rejected_with_fitting_batch() -> None:
-    free = 2 * FIXED
+    free = 2 * FIXED_BYTES
     fits = compute_needed(SPACE, CARD, 0, None, 10**6, free).check_fits()
     assert fits.peak <= 0.9 * free and fits.batch > 100
     assert f"{fits.batch} loads together: about" in str(fits) and "of cuda:0, 2 GiB free" in str(fits)

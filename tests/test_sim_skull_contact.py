@@ -19,7 +19,7 @@ from sim.loads import Loads, Nodal
 from sim.material import Material
 from sim.runtime.device import find_device
 from sim.terms.contact.skull_contact import Skull
-from sim.terms.contact.skull_surface import BONE, Bone, bend_of
+from sim.terms.contact.skull_surface import BONE_SETTINGS, Bone, bend_of
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 MESH = box((4, 4, 4), 0.05)
@@ -65,7 +65,7 @@ def test_pressure_and_gap_complement_each_other(element: str, force: float) -> N
     assert pressure.sum() > 0.5 * force
     corner = np.unique(space.surface[:, :3]) if element == "p2" else None
     area = 0.05**2 / wall.sum() if corner is None else 0.05**2
-    assert (pressure * d).max() <= 1.25 * TISSUE.lame[0] * BONE.felt * (4.0 * area if corner is None else area)
+    assert (pressure * d).max() <= 1.25 * TISSUE.lame[0] * BONE_SETTINGS.felt * (4.0 * area if corner is None else area)
 
 
 @pytest.mark.parametrize("element", ["p1", "p2"])

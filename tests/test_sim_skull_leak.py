@@ -12,7 +12,7 @@ from sim.diagnostics.skull_leak import Leak, integrate_surface_normals
 from sim.discretisation.element import build_quadratic_elements
 from sim.discretisation.space import discretise
 from sim.effects import build_push_effects
-from sim.fem import MIDDLES, Fem
+from sim.fem import MID_EDGE_KEY, Fem
 from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 from sim.geometry.tetmesh import TetMesh, orient_tetrahedra
 from sim.loads import push
@@ -92,7 +92,7 @@ def test_leak_shrinks_with_the_size_it_is_averaged_over(egg, element):
     answer, space = pressed(egg, element), discretise(egg.mesh, element)
     u = space.interpolate_field(answer.displacement[0])
     if element == "p2":
-        u[len(egg.mesh.nodes) :] += answer.memory[MIDDLES][0]
+        u[len(egg.mesh.nodes) :] += answer.memory[MID_EDGE_KEY][0]
     else:
         swept = np.einsum("ni,ni->n", integrate_surface_normals(egg.mesh.nodes, egg.mesh.surface), u)
         assert swept[egg.slide_normal.any(axis=1)].max() < 1e-5 * np.abs(swept[egg.craniotomy]).sum()
@@ -107,7 +107,7 @@ def test_mid_edge_nodes_count(egg):
     answer = pressed(egg, "p2")
     space = discretise(egg.mesh, "p2")
     u = space.interpolate_field(answer.displacement[0])
-    u[len(egg.mesh.nodes) :] += answer.memory[MIDDLES][0]
+    u[len(egg.mesh.nodes) :] += answer.memory[MID_EDGE_KEY][0]
     device = find_device("cpu", "float64")
     assert Leak(egg, space, device).share(device.upload(u.reshape(-1, 1)))[0] == pytest.approx(
         answer.leaked[0], rel=1e-3

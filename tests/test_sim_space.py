@@ -15,7 +15,7 @@ from sim.diagnostics.skull_leak import integrate_surface_normals
 from sim.discretisation.space import Discretisation, discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.errors import InputError
-from sim.fem import MIDDLES, Fem
+from sim.fem import MID_EDGE_KEY, Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import push
 from sim.runtime.device import find_device
@@ -156,8 +156,8 @@ def test_a_deformation_speaks_of_the_meshs_own_vertices(fem: Fem) -> None:
     found = fem.deform(push([0.05, 0.05, 0.1 / 3.0], [[0.0, 0.0, -0.3], [0.0, 0.1, 0.0]], 0.02))
     assert found.displacement.shape == (2, len(THIN.nodes), 3)
     np.testing.assert_array_equal(found.nodes, np.arange(len(THIN.nodes)))
-    assert found.memory[MIDDLES].shape == (2, len(fem.space.edges), 3)
-    assert np.abs(found.memory[MIDDLES]).max() > 1e-5
+    assert found.memory[MID_EDGE_KEY].shape == (2, len(fem.space.edges), 3)
+    assert np.abs(found.memory[MID_EDGE_KEY]).max() > 1e-5
     assert fem.deform(
         push([0.05, 0.05, 0.1 / 3.0], [0.0, 0.0, -0.3], 0.02), at=np.array([7, 3])
     ).displacement.shape == (1, 2, 3)

@@ -20,8 +20,8 @@ from sim.fem import Fem
 from sim.linalg.multifrontal import Factor
 from sim.linalg.preconditioner import build_rest_solver
 from sim.local_solvers.strained_descent import (
-    LEARNT,
-    SINGLE,
+    SINGLE_LIMITS,
+    UPDATE_KEYS,
     Renewal,
     StiffenedPreconditioner,
     StiffnessUpdate,
@@ -46,7 +46,7 @@ def factor_of(problem: Problem) -> Factor:
 
 
 def descent_on(
-    problem: Problem, space: Discretisation, strains: StrainLimits = SINGLE, renewal: Renewal = RENEWAL
+    problem: Problem, space: Discretisation, strains: StrainLimits = SINGLE_LIMITS, renewal: Renewal = RENEWAL
 ) -> StrainedDescent:
     factor = factor_of(problem)
     return StrainedDescent(problem, factor, build_strained_part(problem, factor, space, strains), renewal)
@@ -114,7 +114,9 @@ def test_the_next_frame_begins_with_what_served() -> None:
     there = descent.descend(rest, np.full(1, 1e-6), 400, {})
     assert there.steps[0] > RENEWAL.served and there.learnt == {}
     first = descent.descend(there.u, np.full(1, 1e-8), 400, {})
-    assert first.status[0] == DONE and first.steps[0] <= RENEWAL.served and set(first.learnt) == set(LEARNT.values())
+    assert (
+        first.status[0] == DONE and first.steps[0] <= RENEWAL.served and set(first.learnt) == set(UPDATE_KEYS.values())
+    )
     again = descent.descend(there.u, np.full(1, 1e-8), 400, first.learnt)
     np.testing.assert_array_equal(again.u.numpy(), first.u.numpy())
     for name, array in first.learnt.items():
@@ -122,7 +124,7 @@ def test_the_next_frame_begins_with_what_served() -> None:
     assert descent.descend(there.u, np.full(1, 1e-8), 400).learnt == {}
 
 
-@pytest.mark.parametrize("name", LEARNT.values())
+@pytest.mark.parametrize("name", UPDATE_KEYS.values())
 @pytest.mark.parametrize("fault", ["missing", "short", "negative", "large", "kind"])
 def test_what_does_not_fit_is_forgotten(name: str, fault: str) -> None:
     problem, space, rest = hard()
@@ -202,16 +204,16 @@ def test_live_frames_go_the_short_way_to_the_same_place() -> None:
     for mine, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(mine.displacement, other.displacement, atol=1e-3 * size)
     assert sum(int(answer.iterations[0]) for answer in found) <= 0.6 * sum(int(each.iterations[0]) for each in expected)
-    served = [set(LEARNT.values()) <= set(answer.warm) for answer in found]
+    served = [set(UPDATE_KEYS.values()) <= set(answer.warm) for answer in found]
     assert any(served)
     np.testing.assert_array_equal(frames(live())[-1].displacement, found[-1].displacement)
 
 
 def test_models_have_the_nodes_nearest_to_the_opening() -> None:
     problem, space, rest = hard()
-    strains, kept = replace(SINGLE, near=200, nodes=30), Renewal(served=400)
+    strains, kept = replace(SINGLE_LIMITS, near=200, nodes=30), Renewal(served=400)
     descent = descent_on(problem, space, strains, kept)
-    rows = descent.descend(rest, np.full(1, 1e-6), 400, {}).learnt[LEARNT["rows"]][0]
+    rows = descent.descend(rest, np.full(1, 1e-6), 400, {}).learnt[UPDATE_KEYS["rows"]][0]
     assert len(np.unique(rows)) == len(rows) == 90
     distance = np.linalg.norm(space.nodes[:, None] - space.nodes[OPENING], axis=2).min(axis=1)
     assert distance[rows // 3].max() <= np.sort(distance)[199]

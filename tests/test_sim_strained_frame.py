@@ -17,14 +17,14 @@ from sim.fem import Fem
 from sim.linalg.multifrontal import Factor
 from sim.loads import Loads, push
 from sim.local_solvers.strained_descent import (
-    SINGLE,
+    SINGLE_LIMITS,
     Renewal,
     StiffenedPreconditioner,
     StrainedDescent,
     build_strained_part,
 )
-from sim.local_solvers.strained_frame import MATRIX, NODES, UpdatedPreconditioner, update_model_at
-from sim.strategy.captured_frame import SERVED
+from sim.local_solvers.strained_frame import MATRIX_KEY, NODES_KEY, UpdatedPreconditioner, update_model_at
+from sim.strategy.captured_frame import MAX_SERVED_STEPS
 from sim.strategy.frame_sequence import Kept
 
 BODY = make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3)
@@ -61,7 +61,7 @@ def test_they_take_fewer_steps_to_the_same_place(fem: Fem) -> None:
         size = np.abs(other.displacement).max()
         np.testing.assert_allclose(one.displacement, other.displacement, atol=5e-3 * size)
     # The first that follows comes from a solver that left no model.
-    assert own[1].iterations[0] == plain[1].iterations[0] > SERVED
+    assert own[1].iterations[0] == plain[1].iterations[0] > MAX_SERVED_STEPS
     assert sum(int(one.iterations[0]) for one in own[2:]) <= 0.6 * sum(int(one.iterations[0]) for one in plain[2:])
 
 
@@ -70,7 +70,7 @@ def test_what_served_stays_and_what_did_not_is_made_anew(fem: Fem) -> None:
     models = [answer.warm.bent for answer in answers if isinstance(answer.warm, Kept)]
     assert models[0] is not None
     anew = [after is not before for before, after in pairwise(models)]
-    assert anew == [int(answer.iterations[0]) > SERVED for answer in answers[1:]]
+    assert anew == [int(answer.iterations[0]) > MAX_SERVED_STEPS for answer in answers[1:]]
     assert not all(anew)
 
 
@@ -78,7 +78,7 @@ def test_a_start_is_the_same_on_the_device_and_on_the_host(fem: Fem) -> None:
     last = ride(fem)[-1]
     here = fem.deform(pressed(7), last)
     brought = fem.deform(pressed(7), replace(last, warm={**last.warm}))
-    assert {NODES, MATRIX} <= set(here.warm) and same(here, brought)
+    assert {NODES_KEY, MATRIX_KEY} <= set(here.warm) and same(here, brought)
 
 
 def test_an_older_frame_leads_where_it_led_before(fem: Fem) -> None:
@@ -91,21 +91,21 @@ def test_an_older_frame_leads_where_it_led_before(fem: Fem) -> None:
 def test_a_model_that_does_not_fit_is_forgotten(fem: Fem, fault: str) -> None:
     last = ride(fem)[-1]
     warm = dict(last.warm)
-    plain = {name: warm[name] for name in warm if name not in (NODES, MATRIX)}
+    plain = {name: warm[name] for name in warm if name not in (NODES_KEY, MATRIX_KEY)}
     none = fem.deform(pressed(7), replace(last, warm=plain))
     match fault:
         case "missing":
-            del warm[MATRIX]
+            del warm[MATRIX_KEY]
         case "short":
-            warm[NODES] = warm[NODES][:, 1:]
+            warm[NODES_KEY] = warm[NODES_KEY][:, 1:]
         case "far":
-            warm[NODES] = warm[NODES] + fem.problem.rows // 3
+            warm[NODES_KEY] = warm[NODES_KEY] + fem.problem.rows // 3
         case "negative":
-            warm[NODES] = warm[NODES] - fem.problem.rows // 3
+            warm[NODES_KEY] = warm[NODES_KEY] - fem.problem.rows // 3
         case "nan":
-            warm[MATRIX] = np.full_like(warm[MATRIX], np.nan)
+            warm[MATRIX_KEY] = np.full_like(warm[MATRIX_KEY], np.nan)
         case _:
-            warm[NODES] = warm[NODES].astype(float)
+            warm[NODES_KEY] = warm[NODES_KEY].astype(float)
     assert same(fem.deform(pressed(7), replace(last, warm=warm)), none)
 
 
@@ -115,7 +115,7 @@ def test_the_matrix_does_what_the_factors_do(fem: Fem) -> None:
     assert isinstance(factor, Factor)
     last = ride(fem)[-1]
     u = problem.device.upload(fem.guess(pressed(6), last))
-    part = build_strained_part(problem, factor, fem.space, SINGLE)
+    part = build_strained_part(problem, factor, fem.space, SINGLE_LIMITS)
     part.prepare()
     bent = update_model_at(part, problem.device, u)
     problem.begin(Cases(pressed(6.5), np.zeros(1)))

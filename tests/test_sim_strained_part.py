@@ -17,7 +17,7 @@ from sim.effects import Elasticity, Held, ToolContact
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import ContactDescent
-from sim.local_solvers.strained_part import STRAINS, StrainedModel, StrainedPart, StrainLimits
+from sim.local_solvers.strained_part import STRAIN_LIMITS, StrainedModel, StrainedPart, StrainLimits
 from sim.material import Material
 from sim.terms.elasticity import ElasticTerm as ElasticityTerm
 from sim.tools import Ball
@@ -41,7 +41,7 @@ def down(*depths: float) -> Loads:
 
 @cache
 def solver(
-    element: str = "p1", tissue: str = "plain", strains: StrainLimits = STRAINS, tolerance: float = 1e-8
+    element: str = "p1", tissue: str = "plain", strains: StrainLimits = STRAIN_LIMITS, tolerance: float = 1e-8
 ) -> tuple[Fem, ContactDescent]:
     """Finite elements under a ball, in double precision, whose descent has these settings."""
     effects = [Elasticity(TISSUES[tissue]), Held(), ToolContact((Ball(RADIUS),))]
@@ -192,7 +192,7 @@ def test_model_is_absent_where_valid_only_in_patches() -> None:
 def test_deep_poses_take_fewer_steps_to_the_same_end() -> None:
     """Than as stiff as at rest: a ball goes down step by step, each from where the last one ended."""
     ends, steps = [], []
-    for strains in (STRAINS, StrainLimits(least=np.inf)):
+    for strains in (STRAIN_LIMITS, StrainLimits(least=np.inf)):
         fem, _ = solver("smoothed", "plain", strains, 1e-3)
         answers = [fem.deform(down(1e-3))]
         for depth in np.arange(2, 9) * 1e-3:

@@ -14,7 +14,7 @@ from sim.discretisation.term import Term
 from sim.geometry.tetmesh import compute_signed_volumes
 from sim.runtime.device import Device
 from sim.terms.contact.tool_contact import ToolContactTerm
-from sim.terms.element_kernels import VOLUME_KEPT
+from sim.terms.element_kernels import MIN_VOLUME_RATIO
 
 EXAMPLES = OTHERS | CONTACTS
 
@@ -235,7 +235,7 @@ def test_log_law_steps_keep_a_tenth_of_volume(law: str, device: Device, size: fl
         moved = (example.u + fraction * longest * du).T.reshape(3, -1, 3) + MESH.nodes
         return np.stack([compute_signed_volumes(nodes, MESH.tets) for nodes in moved])
 
-    floor = VOLUME_KEPT * volumes(0.0)
+    floor = MIN_VOLUME_RATIO * volumes(0.0)
     fractions = np.linspace(0.0, 1.0, 101)
     assert all((volumes(fraction) >= floor - 1e-16).all() for fraction in fractions)
     doubled = np.array([(volumes(2.0 * fraction) >= floor).all(axis=1) for fraction in fractions]).all(axis=0)

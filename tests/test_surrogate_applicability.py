@@ -7,7 +7,7 @@ import pytest
 from test_scenes_effects import EFFECTS
 from theatres import short, sinking
 
-from scenes.builtin.retract import RELAXING
+from scenes.builtin.retract import RELAXING_BRAIN
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
 from sim.accuracy import LIVE
@@ -92,6 +92,6 @@ class TestLearnt:
     def test_another_tissue_goes_on_relaxing(self):
         scene = find_scene("retract").replace_tissue(Material("neo-hookean", 9000.0, 0.3), "p2")
         (effect,) = (each for each in scene.effects if isinstance(each, Elasticity))
-        assert scene.element == "p2" and effect.default == Material("neo-hookean", 9000.0, 0.3, RELAXING.prony)
+        assert scene.element == "p2" and effect.default == Material("neo-hookean", 9000.0, 0.3, RELAXING_BRAIN.prony)
         with pytest.raises(InputError, match="cannot relax"):
             find_scene("retract").replace_tissue(Material("linear", 9000.0, 0.3), None)

@@ -10,9 +10,9 @@ from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.indentation import get_only_pushes
 from surrogate.data.simulate import simulate
-from surrogate.data.splits import APART
+from surrogate.data.splits import CALIBRATION_STRIDE
 from surrogate.data.tool_loads import draw
-from surrogate.training.bounds import ENOUGH, TUMOUR, bound_by, collect_missed
+from surrogate.training.bounds import MIN_SCALE_LOADS, TUMOUR_FIT, bound_by, collect_missed
 from surrogate.training.train import train
 
 
@@ -27,7 +27,7 @@ class Proportional:
         return replace(answer, displacement=1e3 * answer.displacement)
 
 
-@pytest.mark.parametrize("count", [600, APART * ENOUGH])
+@pytest.mark.parametrize("count", [600, CALIBRATION_STRIDE * MIN_SCALE_LOADS])
 def test_where_many_loads_calibrate_one_in_three_tells_the_scale(pretender, tmp_path, count):
     """Of few loads the errors on the discs tell it."""
     simulate(tmp_path / "data.h5", pretender, draw("palpation", pretender.anatomy, count, 0), {"preset": "palpation"})
@@ -40,9 +40,9 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(pretender, tmp_
     answer = model.deform(good.select(apart), at=data.anatomy.tumour_nodes).displacement
     error = np.linalg.norm(answer - truth[apart], axis=2).max(axis=1)
     near = collect_missed(model, open_patch(data.anatomy), get_only_pushes(good.select(apart)), error)
-    bounds = bound_by(near, TUMOUR, float(model.bounds.growth))
+    bounds = bound_by(near, TUMOUR_FIT, float(model.bounds.growth))
     pairs = ((model.bounds.weights, bounds.weights), (model.bounds.quantile, bounds.quantile))
-    assert [np.allclose(*pair) for pair in pairs] == 2 * [trained.calibrated >= ENOUGH] == 2 * [count > 600]
+    assert [np.allclose(*pair) for pair in pairs] == 2 * [trained.calibrated >= MIN_SCALE_LOADS] == 2 * [count > 600]
 
 
 def test_a_correction_that_does_not_help_is_left_out(box, pretender, tmp_path):

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from sim.errors import InputError
 from surrogate.locating import calibration
 from surrogate.locating.calibration import (
-    NEAREST,
+    NEAREST_TRIALS,
     assign_held_out,
     compute_covering_factor,
     compute_likeness,
@@ -74,7 +74,7 @@ def test_patch_trials_give_covariance_growth(evidence):
     small = replace(evidence, at=0.5 * evidence.at)
     tried = np.concatenate(
         [
-            np.tile(np.append(compute_likeness(of), square), (NEAREST, 1))
+            np.tile(np.append(compute_likeness(of), square), (NEAREST_TRIALS, 1))
             for of, square in ((evidence, 1.0), (small, 9.0))
         ]
     )
@@ -87,7 +87,8 @@ def test_a_cloud_is_like_no_named_points(evidence):
     assert np.array_equal(compute_likeness(cloud)[1:3], compute_likeness(evidence)[1:3])
     assert compute_likeness(cloud)[3] > 100.0 + compute_likeness(evidence)[3]
     named, unnamed = (
-        np.tile(np.append(compute_likeness(of), square), (NEAREST, 1)) for of, square in ((evidence, 1.0), (cloud, 9.0))
+        np.tile(np.append(compute_likeness(of), square), (NEAREST_TRIALS, 1))
+        for of, square in ((evidence, 1.0), (cloud, 9.0))
     )
     tried = np.concatenate([named, unnamed])
     assert compute_covering_factor(tried, cloud) == pytest.approx(9.0 * compute_covering_factor(tried, evidence))
@@ -139,8 +140,8 @@ def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
 def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
     """Squares that are chi-square of three degrees, times a number, need just that number: by 115 of 120."""
     random = np.random.default_rng(1)
-    squares = times * chi2.ppf((np.arange(NEAREST) + 0.5) / NEAREST, 3)
-    spread = 0.01 * random.standard_normal((NEAREST, 4)) * [1.0, 1.0, 1.0, 0.0]
+    squares = times * chi2.ppf((np.arange(NEAREST_TRIALS) + 0.5) / NEAREST_TRIALS, 3)
+    spread = 0.01 * random.standard_normal((NEAREST_TRIALS, 4)) * [1.0, 1.0, 1.0, 0.0]
     tried = np.column_stack([compute_likeness(evidence) + spread, squares])
     rank = chi2.ppf(114.5 / 120.0, 3) / chi2.ppf(0.95, 3)
     assert compute_covering_factor(tried, evidence) == pytest.approx(times * rank) and abs(rank - 1.0) < 0.12

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_surrogate_locator import FEW
 
-from surrogate.locating.causes import LETS_GO, build_drainages, build_groups, build_pushes
+from surrogate.locating.causes import SEPARATING_SKULL, build_drainages, build_groups, build_pushes
 
 
 def test_draws_depend_on_the_seed_and_the_group_alone(body):
@@ -22,7 +22,7 @@ def test_draws_depend_on_the_seed_and_the_group_alone(body):
 
 def test_separating_skull_rejects_swollen_fluid_tissue(body):
     made = {(group.skull, group.poisson) for group in build_groups(body, 0, FEW)}
-    assert (LETS_GO, 0.45) in made and (LETS_GO, 0.485) not in made and ("slide", 0.485) in made
+    assert (SEPARATING_SKULL, 0.45) in made and (SEPARATING_SKULL, 0.485) not in made and ("slide", 0.485) in made
 
 
 def test_each_skull_has_soft_and_stiff_tumours(body):

@@ -7,7 +7,7 @@ import pytest
 
 from surrogate.model.conformal import (
     LEVELS,
-    MOST_GROWTH,
+    MAX_GROWTH,
     USUAL_GROWTH,
     compute_conformal_quantile,
     fit_bound,
@@ -75,7 +75,7 @@ def test_growth_is_that_by_which_errors_grow_with_the_distance(growth):
 def test_too_few_far_loads_give_no_growth():
     near, far = far_and_near(300.0, 0)
     assert fit_growth(near, (far[0][:18], far[1][:18])) == USUAL_GROWTH
-    assert fit_growth(near, (1e9 * far[0], far[1])) == MOST_GROWTH
+    assert fit_growth(near, (1e9 * far[0], far[1])) == MAX_GROWTH
 
 
 def test_bounds_that_grow_with_the_distance_hold_near_and_far():

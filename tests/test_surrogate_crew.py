@@ -22,7 +22,7 @@ from sim.errors import InputError
 from sim.material import BRAIN
 from sim.runtime.processes import process_pool
 from surrogate.data.crew import LazyFem, choose_even_batch, open_solvers
-from surrogate.data.dataset import SEAL, read_dataset
+from surrogate.data.dataset import SEAL_ATTRIBUTE, read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.tasks import SolverPool
 from surrogate.data.tool_loads import draw
@@ -46,7 +46,7 @@ def box_file(tmp_path_factory, body):
 def undated(path):
     """The bytes of a data set, but for its date, the seconds that solves took, and the hash of these."""
     with h5py.File(path) as file:
-        names = ("date", SEAL, "seconds a load", "seconds a unit response")
+        names = ("date", SEAL_ATTRIBUTE, "seconds a load", "seconds a unit response")
         texts = {file.attrs[name].encode() for name in names}
     raw = path.read_bytes()
     for text in texts:

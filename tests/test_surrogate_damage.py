@@ -25,7 +25,7 @@ from sim.loads import push
 from sim.material import read_tissue_json
 from sim.runtime.journal import DamageWarning
 from surrogate.data.answer_rows import compute_row_checksums, get_row_type
-from surrogate.data.dataset import FORMAT, SEAL, UNCHECKED, read_dataset, read_stored
+from surrogate.data.dataset import FORMAT, OLD_FORMAT, SEAL_ATTRIBUTE, read_dataset, read_stored
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.training.train import train
@@ -188,8 +188,8 @@ class TestFinished:
     def test_finished_files_of_previous_version_are_read(self, tmp_path, pretender, loads, whole):
         path = Path(shutil.copy(whole, tmp_path))
         with h5py.File(path, "r+") as file:
-            del file.attrs[SEAL]
-            file.attrs["format"] = UNCHECKED
+            del file.attrs[SEAL_ATTRIBUTE]
+            file.attrs["format"] = OLD_FORMAT
             for group in ("unit", "answers"):
                 del file[f"{group}/checksum"]
                 file[f"{group}/done"] = np.ones(len(file[f"{group}/residual"]), bool)

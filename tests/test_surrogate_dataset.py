@@ -13,7 +13,7 @@ from boxes import box as cube
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, build_posture, push
-from surrogate.data.dataset import SEAL, read_dataset, read_embedded, read_loads, write_embedded, write_loads
+from surrogate.data.dataset import SEAL_ATTRIBUTE, read_dataset, read_embedded, read_loads, write_embedded, write_loads
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 
@@ -133,7 +133,7 @@ simulate(path, tools["Pretender"](box), draw("palpation", box, 20, 0), {"preset"
 def undated(path):
     """The bytes of a data set, but for its date, the seconds that solves took, and the hash of these."""
     with h5py.File(path) as file:
-        dates = [file.attrs[name].encode() for name in ("date", SEAL)]
+        dates = [file.attrs[name].encode() for name in ("date", SEAL_ATTRIBUTE)]
         times = [file.attrs[f"seconds a {each}"].encode() for each in ("load", "unit response")]
     raw = path.read_bytes()
     assert all(raw.count(date) == 1 for date in dates) and all(len(time) == 9 for time in times)

@@ -21,9 +21,9 @@ from surrogate.data.encode import ENCODERS, compute_tool_features, split_forces
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import DiscSplit
 from surrogate.model.store import load, save
-from surrogate.regressors.force_series import ORDERS, SPANS, Series
+from surrogate.regressors.force_series import MAX_ORDER, ORDER_COLUMNS, Series
 from surrogate.training.examples import Examples
-from surrogate.training.expansion import ADDED, COARSE, EXPANDED, Expansion
+from surrogate.training.expansion import ADDED_BASIS, COARSE_BASIS, SERIES_MODELS, Expansion
 from surrogate.training.fem_tables import add_edge_midpoints, tabulate
 from surrogate.training.train import list_learners, train
 
@@ -52,7 +52,7 @@ def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
     nodes = box.tumour_nodes
     loads = pushes(patch, 30, 3, (7e-3, 7e-3))
     reading = every_motion(fem, nodes)
-    exact = fem.compute_series(Loads((loads,)), ORDERS, reading)
+    exact = fem.compute_series(Loads((loads,)), MAX_ORDER, reading)
     (triangles, places), radii = add_edge_midpoints(patch), np.array([7e-3])
     heard = []
     table = tabulate(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
@@ -102,7 +102,7 @@ def expansion(data):
 
 @pytest.fixture(scope="module")
 def trained(data, expansion):
-    return train(data, ["linear", *EXPANDED], expansion=expansion)
+    return train(data, ["linear", *SERIES_MODELS], expansion=expansion)
 
 
 def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, patch):
@@ -110,15 +110,17 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, p
     some = np.flatnonzero(data.good)[:90]
     loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
     nodes = (expansion.tumour, expansion.cortex)
-    bases = expansion.build_bases(Examples(loads, *(data.read_displacement(at)[some] for at in nodes)), ADDED, COARSE)
+    bases = expansion.build_bases(
+        Examples(loads, *(data.read_displacement(at)[some] for at in nodes)), ADDED_BASIS, COARSE_BASIS
+    )
     fem = Fem(box, build_push_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     places = np.array([0, 17, 60, 120, 198])
     point = np.repeat(add_edge_midpoints(patch)[1][places], 3, axis=0)
     units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
     predicted = expansion.build_series(bases, np.zeros(len(expansion.places), bool))
     for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact, strict=True):
-        wanted = fem.compute_series(units, ORDERS, every_motion(fem, at), 3) @ basis.modes.T
-        for terms in SPANS[len(exact) :]:
+        wanted = fem.compute_series(units, MAX_ORDER, every_motion(fem, at), 3) @ basis.modes.T
+        for terms in ORDER_COLUMNS[len(exact) :]:
             table = found.table.values.reshape(len(expansion.places), *wanted.shape[1:])
             miss = np.linalg.norm((table[places] - wanted)[:, terms])
             assert miss < 0.06 * np.linalg.norm(wanted[:, terms])  # rounded to 1 in 500 of the largest
@@ -186,7 +188,7 @@ def test_gp_halves_series_error_on_known_cortex(tmp_path):
     data = simulated(tmp_path / "data.h5", small, 300)
     fourth = np.where(np.arange(data.good.sum()) % 4 == 3, 0, -1)
     nowhere = DiscSplit(np.full((1, 3), 1.0), 1e-3, fourth, 1.0)
-    series, learnt = train(data, EXPANDED, split=nowhere, expansion=Expansion(data, "cpu")).scores
+    series, learnt = train(data, SERIES_MODELS, split=nowhere, expansion=Expansion(data, "cpu")).scores
     assert learnt.mean_percent < 0.5 * series.mean_percent and learnt.mean_mm < 0.5 * series.mean_mm
 
 
@@ -199,8 +201,8 @@ def test_held_out_discs_are_unknown_to_series(trained, data, expansion, tmp_path
     inside = split.is_covered(again.places)
     assert 0 < inside.sum() < len(inside)
     again.tabulated.table[inside] = np.random.default_rng(0).normal(size=again.tabulated.table[inside].shape)
-    before, after = (train(each.data, EXPANDED, split=split, expansion=each) for each in (expansion, again))
-    for name in EXPANDED:
+    before, after = (train(each.data, SERIES_MODELS, split=split, expansion=each) for each in (expansion, again))
+    for name in SERIES_MODELS:
         for one, other in zip(before.models[name].parts, after.models[name].parts, strict=True):
             assert np.array_equal(one.basis.modes, other.basis.modes)
             states = one.regressor.state(), other.regressor.state()
@@ -240,13 +242,13 @@ def test_the_cortex_moves_as_the_finite_elements_say(trained, data, box, patch):
 def test_stored_series_answer_alike(trained, data, box, tmp_path):
     save(tmp_path / "model.npz", trained.models)
     again = load(tmp_path / "model.npz", box)
-    for name in EXPANDED:
+    for name in SERIES_MODELS:
         before, after = trained.models[name].deform(data.loads), again[name].deform(data.loads)
         assert np.array_equal(before.displacement, after.displacement) and np.array_equal(before.bound, after.bound)
 
 
 def test_series_need_a_tissue(data):
     untold = replace(data, provenance={})
-    assert not set(EXPANDED) & set(list_learners(untold)) and set(EXPANDED) < set(list_learners(data))
+    assert not set(SERIES_MODELS) & set(list_learners(untold)) and set(SERIES_MODELS) < set(list_learners(data))
     with pytest.raises(InputError, match="does not state its tissue"):
         train(untold, ["series"])

@@ -30,7 +30,7 @@ from surrogate.model.store import load, save
 from surrogate.onnx_export.export import build_onnx_model
 from surrogate.regressors.baselines import Ann
 from surrogate.regressors.force_series import Series
-from surrogate.training.expansion import EXPANDED, Expansion
+from surrogate.training.expansion import SERIES_MODELS, Expansion
 from surrogate.training.train import LEARNERS, train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
@@ -116,7 +116,7 @@ def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
     assert answer["extrapolated"].sum() >= 6 and not answer["extrapolated"].all()
     assert not answer["displacement"][8].any() and not answer["bound"][8].any()  # no force
     # The cortex, and the tumour by most learners, stand on tables of forces at nodes.
-    tables = cortex or name in ("linear", "pcr", "residual", *EXPANDED)
+    tables = cortex or name in ("linear", "pcr", "residual", *SERIES_MODELS)
     assert {"point", "force", "footprint", *(["weight"] if tables else [])} == {p.name for p in session.get_inputs()}
     assert ("pressed" in answer) == tables and (not tables or np.array_equal(answer["pressed"], patch.nodes))
     for row in (0, 12):

@@ -25,8 +25,8 @@ from surrogate.data.tool_poses import choose_ball, compute_poses, draw_poses
 from surrogate.evaluation.score import compare_forces, compute_point_errors
 from surrogate.model.store import load, save
 from surrogate.model.tool_contact import compute_wrench
-from surrogate.regressors.rigid_contact import THICKER, RigidContact
-from surrogate.training.expansion import TOUCHED
+from surrogate.regressors.rigid_contact import MEAN_GAP, RigidContact
+from surrogate.training.expansion import CONTACT_MODELS
 from surrogate.training.fem_tables import compute_unit_responses, condense_contact
 from surrogate.training.train import list_learners, train
 
@@ -68,8 +68,8 @@ def test_the_ball_enters_no_facet_and_pulls_nothing(box, pressed):
     arm, force = moved - middle[:, None], force.reshape(moved.shape)
     facets = np.einsum("qc,bsci->bsqi", build_barycentric_lattice(12), arm[:, contact.triangles])
     nearest = np.linalg.norm(facets, axis=3).min(axis=(1, 2))
-    assert (nearest > BALL.radius + THICKER - 2e-6).all()
-    assert (nearest < BALL.radius + THICKER + 1e-4).all()
+    assert (nearest > BALL.radius + MEAN_GAP - 2e-6).all()
+    assert (nearest < BALL.radius + MEAN_GAP + 1e-4).all()
     assert (np.einsum("bi,bi->b", force.sum(axis=1), X[:, 3:6]) > 0.0).all()
     moment = np.linalg.norm(np.cross(arm, force).sum(axis=1), axis=1)
     size = np.linalg.norm(force.sum(axis=1), axis=1) * BALL.radius
@@ -180,12 +180,12 @@ def data(tmp_path_factory, elements):
 
 @pytest.fixture(scope="module")
 def trained(data):
-    return train(data, TOUCHED)
+    return train(data, CONTACT_MODELS)
 
 
 def test_contact_learns_how_forces_grow_and_a_process_the_rest(trained, elements, box):
     """On discs left out and on fresh poses; and bounds hold about as often as they say."""
-    contact, both = (trained.models[name] for name in TOUCHED)
+    contact, both = (trained.models[name] for name in CONTACT_MODELS)
     regressor = contact.parts[0].regressor
     assert isinstance(regressor, RigidContact)
     np.testing.assert_allclose(regressor.line[:, 0], LINE, atol=0.1)
@@ -206,7 +206,7 @@ def test_contact_learns_how_forces_grow_and_a_process_the_rest(trained, elements
 
 
 def test_the_tool_s_force_is_answered_with_a_bound_of_its_own(data, trained, elements, box):
-    contact, both = (trained.models[name] for name in TOUCHED)
+    contact, both = (trained.models[name] for name in CONTACT_MODELS)
     regressor = contact.parts[0].regressor
     assert isinstance(regressor, RigidContact)
     np.testing.assert_allclose(regressor.grip, GRIP, atol=0.1)
@@ -255,7 +255,7 @@ def test_without_reactions_the_force_is_not_answered(tmp_path, data, box):
 def test_it_is_stored_and_answers_alone_as_in_company(tmp_path, trained, box):
     save(tmp_path / "model.npz", trained.models)
     again, fresh = load(tmp_path / "model.npz", box), draw_poses("palpation", box, 6, 1)
-    for name in TOUCHED:
+    for name in CONTACT_MODELS:
         together = trained.models[name].deform(fresh).displacement
         np.testing.assert_array_equal(again[name].deform(fresh).displacement, together)
         for what in ("reaction", "reaction_bound"):
@@ -267,9 +267,9 @@ def test_it_is_stored_and_answers_alone_as_in_company(tmp_path, trained, box):
 
 
 def test_what_contact_needs_is_said(data):
-    assert set(TOUCHED) < set(list_learners(data))
+    assert set(CONTACT_MODELS) < set(list_learners(data))
     untold = replace(data, provenance={"ball": repr(BALL.radius)})
-    assert not set(TOUCHED) & set(list_learners(untold))
+    assert not set(CONTACT_MODELS) & set(list_learners(untold))
     with pytest.raises(InputError, match="does not state its tissue, so series and contact are not available"):
         train(untold, ["contact"])
     pushes = replace(data, provenance={name: said for name, said in data.provenance.items() if name != "shape"})

@@ -9,14 +9,14 @@ import pytest
 from theatres import player, small
 
 from scenes.options.theatre_options import add_theatre, build_requested_theatre
-from scenes.page.cast import ALL, SceneSolvers
+from scenes.page.cast import ALL_ACTIVE, SceneSolvers
 from scenes.play.deformers import GUARDED, AtRest
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
 from sim.errors import InputError
 from surrogate.data.tool_loads import draw
 from surrogate.model.guarded import describe_error, find_first_model
-from surrogate.model.left_out import LIMIT, LeftOut, measure_held_out
+from surrogate.model.left_out import MAX_VERTEX_ERROR, LeftOut, measure_held_out
 from surrogate.model.store import load, save
 
 
@@ -113,7 +113,7 @@ def test_a_frame_says_who_answered(theatre, limit):
 def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
     cast = SceneSolvers(theatre, small(), GUARDED, threading.Lock())
     play = cast.get_player(GUARDED)
-    cast.players[GUARDED, ALL] = replace(play, deformer=replace(play.deformer, limit=0.0))
+    cast.players[GUARDED, ALL_ACTIVE] = replace(play, deformer=replace(play.deformer, limit=0.0))
     question = (0, Touch(force=0.1))
     first, again = (cast.predict(GUARDED, question).deformation for _ in range(2))
     assert first.iterations[0] > again.iterations[0] == 0
@@ -124,7 +124,7 @@ def test_the_limit_is_the_user_s(theatre):
     strict = replace(theatre, limit=5e-5)
     assert (
         strict.build_deformer(GUARDED, small()).limit == 5e-5
-        and theatre.build_deformer(GUARDED, small()).limit == LIMIT
+        and theatre.build_deformer(GUARDED, small()).limit == MAX_VERTEX_ERROR
     )
     assert "where its error may exceed 0.05 mm" in strict.describe_deformer(GUARDED, small())
     parser = argparse.ArgumentParser()
@@ -161,7 +161,7 @@ def test_fem_share_matches_held_out_errors(theatre):
     bound, inside = 1e-3 * np.array([0.15, 0.08, 0.03, 0.005]), np.zeros(4, bool)
     distance = 1e-3 * np.array([[0.30], [0.06], [0.02], [0.004]])
     wide, middle, none = (measure_held_out(distance, np.full(4, size), bound, inside) for size in (1e-2, 1e-3, 5e-5))
-    assert (wide.limit, wide.solved) == (LIMIT, 0.0) and wide.guarded == pytest.approx(wide.mean)
+    assert (wide.limit, wide.solved) == (MAX_VERTEX_ERROR, 0.0) and wide.guarded == pytest.approx(wide.mean)
     assert (middle.limit, middle.solved) == (0.05e-3, 0.5) and middle.guarded == pytest.approx(0.024 / 4)
     assert (none.limit, none.solved, none.guarded) == (0.0, 1.0, 0.0) and "above 0 mm) 0.00 %" in str(none)
     many = measure_held_out(

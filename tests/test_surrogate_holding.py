@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 from test_surrogate_relaxation import BALL, EFFECTS, SERIES, played, pressed
 
-from scenes.builtin.retract import RELAXING
+from scenes.builtin.retract import RELAXING_BRAIN
 from scenes.cli import main
 from sim.bodies.meshfile import write_anatomy
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.tools import Capsule
 from surrogate.data.dataset import read_dataset
-from surrogate.data.holding import BROUGHT, compute_unfaded, read_series, sample_times, solve_histories
+from surrogate.data.holding import APPROACH_TIME, compute_unfaded, read_series, sample_times, solve_histories
 from surrogate.data.tool_poses import draw_poses
 from surrogate.model.relaxation import follow_relaxation
 
 
 def test_a_history_is_what_two_steps_make_of_it():
-    for time in (0.0, 0.2, BROUGHT, 3.0, 80.0):
+    for time in (0.0, 0.2, APPROACH_TIME, 3.0, 80.0):
         alone = follow_relaxation(SERIES, pressed(2e-3), np.array([time]), None, 1e-4)
-        steps = [t for t in (min(time, BROUGHT), time) if t > 0.0]
+        steps = [t for t in (min(time, APPROACH_TIME), time) if t > 0.0]
         np.testing.assert_allclose(alone.share, played([2e-3] * len(steps), steps)[-1].share if steps else 0.0)
         assert alone.share[0] == pytest.approx(0.7 - compute_unfaded(SERIES, np.array([time])).sum())
 
@@ -30,7 +30,7 @@ def test_finite_elements_depend_on_the_share_alone(box):
     causes = draw_poses("palpation", box, 1, 5, BALL).causes
     slow = solve_histories(fem, Loads(causes, np.array([2.0])))
     gone = compute_unfaded(SERIES, np.array([2.0])).sum()
-    low, high = BROUGHT, 60.0
+    low, high = APPROACH_TIME, 60.0
     for _ in range(60):  # one step of so long
         middle = 0.5 * (low + high)
         left = sum(g * np.exp(-middle / (2.0 * tau)) for g, tau in SERIES)
@@ -50,7 +50,7 @@ def test_the_command_draws_times_where_tissue_relaxes(tmp_path, box, capsys):
     wanted += ["--preset", "dissector", "--capsule", "2", "26"]
     assert main([*wanted, "--element", "p1", "--prony", "0.45,0.5;0.365,50"]) == 0
     found = read_dataset(out)
-    assert read_series(found.provenance) == RELAXING.prony
+    assert read_series(found.provenance) == RELAXING_BRAIN.prony
     np.testing.assert_array_equal(found.loads.times, sample_times(2, 0))
     assert found.good.all() and found.tool == Capsule(2e-3, 0.026)
     assert main([*wanted, "--prony", "0.45;50", "--force"]) == 2

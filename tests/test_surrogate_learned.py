@@ -17,15 +17,15 @@ from sim.loads import Displaced, Loads, Nodal, Posture, Pushed, push, stack
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
-from surrogate.data.splits import APART
+from surrogate.data.splits import CALIBRATION_STRIDE
 from surrogate.data.tool_loads import draw
 from surrogate.evaluation.coverage import compute_coverage, measure_covered, measure_held
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
-from surrogate.training.bounds import TUMOUR, bound_by, collect_missed, compute_growth
-from surrogate.training.expansion import EXPANDED
+from surrogate.training.bounds import TUMOUR_FIT, bound_by, collect_missed, compute_growth
+from surrogate.training.expansion import SERIES_MODELS
 from surrogate.training.train import LEARNERS, train
 
 
@@ -44,7 +44,7 @@ def trained(data, short_fits):
     return train(data)
 
 
-@pytest.fixture(params=[name for name in LEARNERS if name not in EXPANDED])
+@pytest.fixture(params=[name for name in LEARNERS if name not in SERIES_MODELS])
 def model(request, trained):
     return trained.models[request.param]
 
@@ -136,7 +136,7 @@ def test_what_is_used_was_trained_on_the_discs_too(trained, scored, data):
         both = (trained.models[name], scored.models[name])
         used, judged = (compute_point_errors(model, held_out, truth, data.anatomy.tumour_nodes) for model in both)
         assert used.mean() < 0.9 * judged.mean()
-    assert trained.calibrated == data.good.sum() // APART and scored.calibrated == 0
+    assert trained.calibrated == data.good.sum() // CALIBRATION_STRIDE and scored.calibrated == 0
     assert [row.mean_mm for row in trained.scores] == [row.mean_mm for row in scored.scores]
 
 
@@ -175,7 +175,7 @@ def test_held_out_coverage_is_reported(trained, scored, data):
         near, held, alone, stated = seen(beside), [], [], trained.models[name].left_out
         for disc in range(len(split.centres)):
             here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
-            bounds = bound_by(near, TUMOUR, compute_growth(near, seen(others), TUMOUR))
+            bounds = bound_by(near, TUMOUR_FIT, compute_growth(near, seen(others), TUMOUR_FIT))
             bounded, asked = replace(model, bounds=bounds), good.select(here)
             answer = bounded.deform(asked, at=data.anatomy.tumour_nodes)
             held.append(seen(here).error <= answer.bound)

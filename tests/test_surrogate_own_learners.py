@@ -21,9 +21,9 @@ from sim.runtime.user_script import run_script
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model.own_learners import OWN, PLAYERS, RESERVED, find_own, register_learner
+from surrogate.model.own_learners import OWN_LEARNERS, PLAYER_NAMES, RESERVED_NAMES, find_own, register_learner
 from surrogate.model.store import FITTED, load, save
-from surrogate.training.train import LEARNERS, OF_POSES, train
+from surrogate.training.train import LEARNERS, POSE_LEARNERS, train
 
 NEAREST = Path(__file__).parents[1] / "examples/nearest.py"
 
@@ -31,11 +31,11 @@ NEAREST = Path(__file__).parents[1] / "examples/nearest.py"
 @pytest.fixture
 def clean():
     """Nobody has registered anything, and nobody will have."""
-    before, modules = dict(OWN), set(sys.modules)
-    OWN.clear()
+    before, modules = dict(OWN_LEARNERS), set(sys.modules)
+    OWN_LEARNERS.clear()
     yield
-    OWN.clear()
-    OWN.update(before)
+    OWN_LEARNERS.clear()
+    OWN_LEARNERS.update(before)
     for name in set(sys.modules) - modules:
         if name.startswith("own_"):
             del sys.modules[name]
@@ -54,7 +54,7 @@ def folder(tmp_path_factory, box):
 
 def forget(name: str) -> None:
     """As in a new process."""
-    OWN.clear()
+    OWN_LEARNERS.clear()
     for module in [module for module in sys.modules if module.startswith("own_")]:
         del sys.modules[module]
     assert find_own(name) is None
@@ -132,8 +132,8 @@ def test_ones_own_features(box, clean):
 
 
 def test_all_names_of_what_comes_with_sulcus_are_reserved():
-    assert {*LEARNERS, *OF_POSES, *FITTED} == RESERVED
-    assert {"auto", "fem", GUARDED} == PLAYERS
+    assert {*LEARNERS, *POSE_LEARNERS, *FITTED} == RESERVED_NAMES
+    assert {"auto", "fem", GUARDED} == PLAYER_NAMES
 
 
 @pytest.mark.parametrize(

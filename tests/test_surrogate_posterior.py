@@ -9,17 +9,17 @@ from scipy.stats import multivariate_normal
 
 from sim.geometry.locate import Located
 from surrogate.locating.causes import SWELLING, TOOL
-from surrogate.locating.evidence import SHIFT, SIGMA, SLIPPED, TURN, build_motion_evidence
+from surrogate.locating.evidence import SHIFT_ERROR, SIGMA, SLIPPED_ERROR, TURN_PER_SHIFT, build_motion_evidence
 from surrogate.locating.observation import Observation, place_again
 from surrogate.locating.posterior import (
-    COARSENED,
-    MIXED,
+    EVIDENCE_DIVISOR,
+    MAX_HYPOTHESES,
     ObservedPrior,
     Posterior,
     build_observed_prior,
     condition_prior,
 )
-from surrogate.locating.prior import BESIDE, NOWHERE, RIGIDS, SETS, WITH_PLACE, MotionPrior
+from surrogate.locating.prior import CAUSE_SETS, NO_PLACE, OTHER_CAUSES, PLACE_SETS, RIGID_RATIOS, MotionPrior
 from surrogate.locating.whitened import whiten
 
 POINTS = 30
@@ -29,8 +29,8 @@ POINTS = 30
 def prior():
     """Smooth random motions of a box as shapes of every cause in three skulls, and of tools on two places."""
     random, box = np.random.default_rng(0), make_box()
-    labels = [(kind, skull, NOWHERE) for kind in BESIDE for skull in range(3)]
-    labels += [(TOOL, skull, place) for skull in range(2) for place in (NOWHERE, 0, 1)]
+    labels = [(kind, skull, NO_PLACE) for kind in OTHER_CAUSES for skull in range(3)]
+    labels += [(TOOL, skull, place) for skull in range(2) for place in (NO_PLACE, 0, 1)]
     kind, skull, place = np.repeat(np.array(labels), 3, axis=0).T
     wave = random.normal(scale=60.0, size=(len(kind), 3))
     shape = np.sin(box.mesh.nodes @ wave.T + random.uniform(0, 6, len(kind))).T[:, :, None]
@@ -47,7 +47,7 @@ def seen(prior, motion, count=POINTS):
 
 
 # Of a rigid error, as it is unless something else is known.
-RIGID = np.repeat([SHIFT, TURN * SHIFT], 3)
+RIGID = np.repeat([SHIFT_ERROR, TURN_PER_SHIFT * SHIFT_ERROR], 3)
 
 
 def drawn(prior, random, number=0):
@@ -91,17 +91,17 @@ def test_cloud_is_compared_without_its_rigid_error(prior):
 
 
 def test_hypotheses_cover_causes_skulls_and_tool(prior):
-    assert len(prior.hypotheses) == 3 * len(SETS) * len(RIGIDS)
+    assert len(prior.hypotheses) == 3 * len(CAUSE_SETS) * len(RIGID_RATIOS)
     taking = set()
     for number, hypothesis in enumerate(prior.hypotheses):
-        kinds, skull = prior.kind[hypothesis.rows], number // (len(RIGIDS) * len(SETS))
+        kinds, skull = prior.kind[hypothesis.rows], number // (len(RIGID_RATIOS) * len(CAUSE_SETS))
         taking.add((skull, tuple(sorted(set(kinds.tolist())))))
         assert set(prior.skull[hypothesis.rows[kinds != TOOL]]) <= {skull}
         pressed = set(prior.skull[hypothesis.rows[kinds == TOOL]]) | set(prior.skull[hypothesis.places.ravel()])
         assert pressed == {min(skull, 1)}, "a skull that lets go is pressed as one in which the brain slides"
         causes = tuple(sorted(set(kinds.tolist()) - {TOOL}))
-        assert len(hypothesis.places) == (2 if causes in WITH_PLACE else 0)
-    assert taking == {(skull, tuple(sorted((*some, TOOL)))) for skull in range(3) for some in SETS}
+        assert len(hypothesis.places) == (2 if causes in PLACE_SETS else 0)
+    assert taking == {(skull, tuple(sorted((*some, TOOL)))) for skull in range(3) for some in CAUSE_SETS}
     assert {hypothesis.rigid for hypothesis in prior.hypotheses} == {0.1, 1.0, np.inf}
 
 
@@ -121,7 +121,7 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
     unknown = seen_unknowns(prior, evidence).T
     logs, density = [], []
     for hypothesis, found in zip(prior.hypotheses, sight.logs, strict=True):
-        pressed, rigid = len(hypothesis.places), min(hypothesis.rigid, SLIPPED / SHIFT)
+        pressed, rigid = len(hypothesis.places), min(hypothesis.rigid, SLIPPED_ERROR / SHIFT_ERROR)
         assert np.isfinite(found[: 1 + pressed]).all() and (found[1 + pressed :] == -np.inf).all()
         for number, log in enumerate(found[: 1 + pressed]):
             place = hypothesis.places[number - 1] if number else np.zeros(0, int)
@@ -134,7 +134,7 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
             assert answer.mean == pytest.approx(mean, rel=1e-4, abs=1e-6)
             logs.append(log)
             density.append(multivariate_normal(cov=noise + (some.T * size**2) @ some).logpdf(evidence.value))
-    assert COARSENED * np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
+    assert EVIDENCE_DIVISOR * np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
 
 
 def test_axes_that_are_alike_are_whitened_as_all_rows_together(prior):
@@ -193,7 +193,7 @@ def test_a_mixture_lies_between_its_hypotheses(prior):
     found = condition_prior(prior, evidence)
     assert not len(found.outliers) and 0.2 < found.surprise < 1.6
     answers = build_observed_prior(prior, evidence).compute_posteriors()
-    assert len(answers) == MIXED and sum(answer.share for answer in answers) == pytest.approx(1.0)
+    assert len(answers) == MAX_HYPOTHESES and sum(answer.share for answer in answers) == pytest.approx(1.0)
     means = np.zeros((len(answers), len(prior.kind) + 6))
     spreads = np.zeros((len(answers), *2 * means.shape[1:]))
     for mean, spread, answer in zip(means, spreads, answers, strict=True):

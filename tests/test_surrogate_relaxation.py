@@ -20,14 +20,14 @@ from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import compute_tool_features
-from surrogate.data.holding import BROUGHT, HISTORY, read_series, sample_times
+from surrogate.data.holding import APPROACH_TIME, HISTORY, read_series, sample_times
 from surrogate.data.indentation import Relaxing, add_relaxation, get_poses, get_relaxation, to_indentation
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.applicability import find_rejection
 from surrogate.model.guarded import Guarded, describe_error
-from surrogate.model.relaxation import MEMORY, Relaxed, follow_relaxation
+from surrogate.model.relaxation import MEMORY_KEY, Relaxed, follow_relaxation
 from surrogate.model.store import load, save
 from surrogate.model.tool_contact import compute_wrench
 from surrogate.onnx_export.export import build_onnx_model
@@ -52,7 +52,7 @@ def pressed(depth: float, x: float = 0.0) -> Pushed:
 
 
 def start_of(past: Relaxed, time: float) -> Deformation:
-    return replace(guess(np.zeros((1, 1, 3))), memory={MEMORY: past.memory}, time=np.array([time]))
+    return replace(guess(np.zeros((1, 1, 3))), memory={MEMORY_KEY: past.memory}, time=np.array([time]))
 
 
 def played(depths: list[float], times: list[float], x: list[float] | None = None) -> list[Relaxed]:
@@ -153,7 +153,7 @@ def test_answers_follow_from_the_ones_before(model, box):
     touching = loads.get(Touching)
     assert touching is not None
     answer, forces = None, []
-    for time in (BROUGHT, 1.5, 3.0, 9.0):
+    for time in (APPROACH_TIME, 1.5, 3.0, 9.0):
         answer = model.deform(Loads(loads.causes, np.full(3, time)), answer)
         forces.append(np.linalg.norm(answer.reaction[:, 0, :3], axis=1))
     assert answer is not None and (np.diff(forces, axis=0) < 0.0).all()
@@ -215,7 +215,7 @@ def test_it_plays_alone_frame_by_frame(model, box):
     last = None
     for number in range(0, 40, 4):
         last = player.compute_deformation(player.build_loads(number), last)
-    assert last is not None and last.memory[MEMORY].shape == (1, 4 + len(SERIES))
+    assert last is not None and last.memory[MEMORY_KEY].shape == (1, 4 + len(SERIES))
     held_there = player.build_loads(40)
-    going_on, alone = (player.compute_deformation(held_there, start).memory[MEMORY] for start in (last, None))
+    going_on, alone = (player.compute_deformation(held_there, start).memory[MEMORY_KEY] for start in (last, None))
     assert np.abs(going_on[0, 4:]).min() > 0.0 and not np.allclose(going_on, alone, atol=1e-5)

@@ -41,7 +41,7 @@ def test_settled_round_starts_from_the_last_result(prior, monkeypatch, named, lo
     monkeypatch.setattr(rounds, "condition_prior", condition)
     monkeypatch.setattr(rounds, "place_again", place)
     found, near = rounds.match_and_update(prior, seen, free=True)
-    assert found is results[-1] and 2 <= len(results) <= rounds.ROUNDS + 1
+    assert found is results[-1] and 2 <= len(results) <= rounds.MAX_ITERATIONS + 1
     np.testing.assert_array_equal(near, np.arange(count))  # without the one that is off the cortex
     every = prior.restrict_shapes(np.arange(len(body.mesh.nodes)))
     for result, (points, motion, bias) in zip(results, starts, strict=False):

@@ -10,7 +10,7 @@ import pytest
 from scenes.cli import main
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
-from surrogate.data.tool_loads import BEYOND_TISSUE
+from surrogate.data.tool_loads import OVERLOAD_PRESETS
 from surrogate.model.store import load, read_reported_errors
 from surrogate.training.train import LEARNERS
 
@@ -57,7 +57,7 @@ def test_simulate_keeps_strained_answers_of_brutal_loads(folder, tmp_path):
         "cpu",
         "--json",
     ]
-    assert main([*words, "--out", str(out)]) == 0 and BEYOND_TISSUE == ("seed", "brutal")
+    assert main([*words, "--out", str(out)]) == 0 and OVERLOAD_PRESETS == ("seed", "brutal")
     assert "limit_strain=False" in read_dataset(out).provenance["accuracy"]
 
 

@@ -28,7 +28,7 @@ from surrogate.evaluation.coverage import measure_distance_coverage
 from surrogate.model.store import load, save
 from surrogate.model.tip_distance import TipModel
 from surrogate.training.bounds import (
-    TIP,
+    TIP_FIT,
     KnownDistances,
     bound_by,
     collect_missed,
@@ -144,7 +144,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
         )
 
     kept, later = known(1500, 21), known(1000, 22)
-    bounded = replace(model, tip=replace(model.tip, bound=bound_by(seen(kept), TIP, 0.0)))
+    bounded = replace(model, tip=replace(model.tip, bound=bound_by(seen(kept), TIP_FIT, 0.0)))
     found = measure_distance_coverage(bounded, later.loads, later.distance)
     assert 0.93 <= found.held[0] <= 0.97 and min(found.tenths) > 0.85 and found.held[1] > 0.975
 
@@ -165,7 +165,7 @@ def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
     near, held = seen(beside), []
     for disc in range(len(split.centres)):
         here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
-        bound = bound_by(near, TIP, compute_growth(near, seen(others), TIP))
+        bound = bound_by(near, TIP_FIT, compute_growth(near, seen(others), TIP_FIT))
         bounded = replace(scored, tip=replace(scored.tip, bound=bound))
         held.append(seen(here).error <= bounded.predict_distance(good.select(here)).bound)
     found = trained.distance_left_out["linear"]

@@ -22,7 +22,7 @@ from surrogate.data.indentation import to_indentation
 from surrogate.model.guarded import compute_tool_pressure, has_tool_pressure
 from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.store import load
-from surrogate.model.tool_contact import HELD, ForceModel
+from surrogate.model.tool_contact import CONTACT_KEY, ForceModel
 from surrogate.model.training_range import compute_training_range
 from surrogate.training.fem_tables import condense_contact, join_bases
 
@@ -80,10 +80,10 @@ def test_it_comes_straight_in_where_that_is_nearer(model, box):
     assert found.displacement[2].tobytes() != straight.displacement[2].tobytes()
     lifted = model.deform(over(box, (0.0, -1.0)), starts[2])
     assert not lifted.displacement.any() and not lifted.reaction[:, 0, :3].any()
-    strange = replace(starts[2], warm={HELD: np.ones((1, 5))})
+    strange = replace(starts[2], warm={CONTACT_KEY: np.ones((1, 5))})
     alone = there.select(np.array([2]))
     assert model.deform(alone, strange).displacement.tobytes() == model.deform(alone).displacement.tobytes()
-    spoiled = replace(starts[2], warm={HELD: np.nan * starts[2].warm[HELD]})
+    spoiled = replace(starts[2], warm={CONTACT_KEY: np.nan * starts[2].warm[CONTACT_KEY]})
     assert model.deform(alone, spoiled).displacement.tobytes() == model.deform(alone).displacement.tobytes()
 
 

@@ -7,7 +7,7 @@ from sim.errors import InputError
 from sim.loads import Pushed
 from surrogate.data.cortex_patch import Patch
 from surrogate.data.tool_loads import (
-    HARDEST,
+    MAX_PRESSURE,
     PLANE_MODULUS,
     PUBLISHED_FOOTPRINT,
     TOOLS,
@@ -30,7 +30,7 @@ def test_tools_stay_in_their_ranges(box, patch, name):
     cosine = -loads.force[:, 2] / force  # the open top faces +z
     assert (loads.footprint >= tool.footprint[0]).all() and (loads.footprint <= tool.footprint[1]).all()
     assert (force >= tool.force[0] * (1 - 1e-12)).all() and (force <= tool.force[1] * (1 + 1e-12)).all()
-    assert pressure.max() <= HARDEST and pressure.min() >= tool.pressure[0]
+    assert pressure.max() <= MAX_PRESSURE and pressure.min() >= tool.pressure[0]
     assert (3 * force / (4 * PLANE_MODULUS * loads.footprint)).max() <= tool.depth
     assert cosine.min() >= np.cos(tool.cone) - 1e-12
     assert (patch.compute_edge_distance(loads.point) >= loads.footprint).all()

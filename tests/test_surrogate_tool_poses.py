@@ -20,13 +20,13 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.indentation import to_indentation
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import TOOLS, draw
-from surrogate.data.tool_poses import DEEP, SHALLOW, choose_ball, compute_poses, draw_poses
+from surrogate.data.tool_poses import MAX_BALL_DEPTH, MIN_DEPTH_RATIO, choose_ball, compute_poses, draw_poses
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.applicability import find_rejection
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
 from surrogate.model.training_range import compute_training_range
-from surrogate.training.learners import POSED
+from surrogate.training.learners import POSE_MODELS
 from surrogate.training.train import list_learners, train
 
 BALL = choose_ball("palpation")
@@ -44,8 +44,8 @@ def test_draws_are_each_of_their_own_number(box):
     assert other is not None
     assert not np.array_equal(some.pose, other.pose)
     depth = np.linalg.norm(to_indentation(many, BALL, open_patch(box)).force, axis=1) / BALL.radius
-    assert depth.min() >= SHALLOW * np.cos(TOOLS["palpation"].cone) - 1e-9
-    assert depth.max() <= DEEP + 1e-9
+    assert depth.min() >= MIN_DEPTH_RATIO * np.cos(TOOLS["palpation"].cone) - 1e-9
+    assert depth.max() <= MAX_BALL_DEPTH + 1e-9
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def trained(data):
 
 def test_poses_train_where_there_is_no_force(data, trained, pretender, box):
     """Fresh poses, as drawn: learnt to a few per cent, and bounds hold about as often as they say."""
-    assert list_learners(data) == POSED
+    assert list_learners(data) == POSE_MODELS
     model, fresh = trained.models["gp"], draw_poses("palpation", box, 100, 77)
     nodes = box.tumour_nodes
     truth = PosedPretender(pretender).deform(fresh).restrict(nodes).displacement

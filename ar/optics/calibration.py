@@ -15,11 +15,11 @@ import numpy as np
 from .camera import Camera
 from .lens import Lens
 
-LARGEST_SIDE = 16384  # Largest image side [pixel].
-READOUT = "readout_time"
+MAX_IMAGE_SIDE = 16384  # Largest image side [pixel].
+READOUT_KEY = "readout_time"
 """Key of a rolling shutter's readout time [s]: neither OpenCV nor ROS has one, and both ignore it."""
-LONGEST = 256  # Maximum length of a camera's name [characters].
-LONGEST_READOUT = 1.0  # Largest readout time, from the first row of an image to the last [s].
+MAX_NAME_LENGTH = 256  # Maximum length of a camera's name [characters].
+MAX_READOUT = 1.0  # Largest readout time, from the first row of an image to the last [s].
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class Calibration:
 
     def __post_init__(self) -> None:
         for what, pixels in (("width", self.width), ("height", self.height)):
-            if not 1 <= pixels <= LARGEST_SIDE:
-                raise ValueError(f"an image_{what} of 1 to {LARGEST_SIDE}, not {pixels}: calibrate again.")
-        if not 0.0 <= self.readout <= LONGEST_READOUT:
+            if not 1 <= pixels <= MAX_IMAGE_SIDE:
+                raise ValueError(f"an image_{what} of 1 to {MAX_IMAGE_SIDE}, not {pixels}: calibrate again.")
+        if not 0.0 <= self.readout <= MAX_READOUT:
             raise ValueError(
-                f"an image's rows are read in 0 to {LONGEST_READOUT:g} s, not in {self.readout:g}: give another "
-                f"{READOUT} [s]."
+                f"an image's rows are read in 0 to {MAX_READOUT:g} s, not in {self.readout:g}: give another "
+                f"{READOUT_KEY} [s]."
             )
         if not all(0.0 < each < np.inf for each in self.focal):
             raise ValueError(f"focal lengths are numbers of pixels above 0, not {self.focal}: calibrate again.")
@@ -71,8 +71,10 @@ class Calibration:
                     f"the principal point {self.principal} is far outside an image of {self.width} x {self.height}: "
                     "give the size that the camera was calibrated with."
                 )
-        if len(self.name) > LONGEST or not (self.name + "x").isprintable():
-            raise ValueError(f"a camera's name has at most {LONGEST} characters that can be printed: shorten it.")
+        if len(self.name) > MAX_NAME_LENGTH or not (self.name + "x").isprintable():
+            raise ValueError(
+                f"a camera's name has at most {MAX_NAME_LENGTH} characters that can be printed: shorten it."
+            )
 
     @property
     def K(self) -> np.ndarray:
@@ -113,7 +115,7 @@ def to_opencv_text(calibration: Calibration) -> str:
     storage.write("camera_matrix", calibration.K)
     storage.write("distortion_coefficients", to_opencv_coefficients(calibration.lens)[:, None])
     if calibration.readout > 0.0:
-        storage.write(READOUT, calibration.readout)
+        storage.write(READOUT_KEY, calibration.readout)
     return storage.releaseAndGetString()
 
 
@@ -128,12 +130,12 @@ def to_ros_text(calibration: Calibration) -> str:
         f"image_height: {calibration.height}",
         f"camera_name: {json.dumps(calibration.name, ensure_ascii=False)}",
     ]
-    lines += _matrix("camera_matrix", calibration.K)
+    lines += _format_matrix("camera_matrix", calibration.K)
     lines += [f"distortion_model: {'plumb_bob' if len(coefficients) == 5 else 'rational_polynomial'}"]
-    lines += _matrix("distortion_coefficients", coefficients[None])
-    lines += _matrix("rectification_matrix", np.eye(3))
-    lines += _matrix("projection_matrix", np.hstack([calibration.K, np.zeros((3, 1))]))
-    lines += [f"{READOUT}: {calibration.readout!r}"] if calibration.readout > 0.0 else []
+    lines += _format_matrix("distortion_coefficients", coefficients[None])
+    lines += _format_matrix("rectification_matrix", np.eye(3))
+    lines += _format_matrix("projection_matrix", np.hstack([calibration.K, np.zeros((3, 1))]))
+    lines += [f"{READOUT_KEY}: {calibration.readout!r}"] if calibration.readout > 0.0 else []
     return "\n".join(lines) + "\n"
 
 
@@ -142,21 +144,21 @@ def to_opencv_coefficients(lens: Lens) -> np.ndarray:
     return lens.coefficients if lens.coefficients[5:].any() else lens.coefficients[:5]
 
 
-def _matrix(name: str, values: np.ndarray) -> list[str]:
+def _format_matrix(name: str, values: np.ndarray) -> list[str]:
     rows, columns = values.shape
     numbers = ", ".join(repr(value) for value in values.ravel().tolist())
     return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{numbers}]"]
 
 
-LONGEST_TEXT = 64 * 1024  # Maximum length of a calibration file [characters]: a calibration has about a thousand.
-DEEPEST = 4  # Maximum nesting depth of brackets: OpenCV's parser is recursive, and a calibration needs two.
+MAX_TEXT_LENGTH = 64 * 1024  # Maximum length of a calibration file [characters]: a calibration has about a thousand.
+MAX_NESTING = 4  # Maximum nesting depth of brackets: OpenCV's parser is recursive, and a calibration needs two.
 # Minimum number of coefficients of the distortion models named by ROS.
-MODELS = {"plumb_bob": 5, "rational_polynomial": 8}
+MIN_COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8}
 # Allowed numbers of distortion coefficients in OpenCV; those after the eighth are of thin prisms and tilted sensors.
-COUNTS = (4, 5, 8, 12, 14)
+COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
 KEYS = (
     "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model", "distortion_coefficients",
-    "rectification_matrix", "projection_matrix", "fisheye_model", READOUT,
+    "rectification_matrix", "projection_matrix", "fisheye_model", READOUT_KEY,
 )  # fmt: skip
 """Keys of a calibration that are read."""
 # Pattern of a YAML list of numbers, one on each line.
@@ -167,7 +169,7 @@ ITEM = re.compile(r"^ *- *([-+.\w]+)", re.MULTILINE)
 NAME_LINE = re.compile(r"^(camera_name:[ \t]+)([^\s\"'\[{][^\n\"#]*?)[ \t]*$", re.MULTILINE)
 OTHER_LINE = re.compile(rf"^(?!(?:{'|'.join(KEYS)})\b)\w+:[ \t]+[^\s\[{{|>&!][^\n]*\n", re.MULTILINE)
 """Pattern of a one-line entry whose key is not read."""
-WANTED = (  # Required content of the file, in error messages.
+REMEDY = (  # Required content of the file, in error messages.
     "Give YAML with image_width, image_height, camera_matrix and distortion_coefficients, as OpenCV or ROS writes it."
 )
 
@@ -183,7 +185,7 @@ def parse_calibration(text: str) -> Calibration:
         A text that is too long or not such YAML. A part that is missing, is given twice, has another shape or is not
         finite. An unsupported lens or distortion model. Errors of `Calibration`.
     """
-    storage = _opened(text)
+    storage = _open_text(text)
     root = storage.root()
     keys = [] if root.empty() or not root.isMap() else list(root.keys())
     twice = sorted({key for key in keys if keys.count(key) > 1})
@@ -191,8 +193,8 @@ def parse_calibration(text: str) -> Calibration:
         raise ValueError(f"{twice[0][:40]} is given twice: leave one out.")
     missing = [key for key in ("image_width", "image_height", "camera_matrix") if key not in keys]
     if missing:
-        raise ValueError(f"{missing[0]} is missing. {WANTED}")
-    if "fisheye_model" in keys and not (root.getNode("fisheye_model").isInt() and not _int(root, "fisheye_model")):
+        raise ValueError(f"{missing[0]} is missing. {REMEDY}")
+    if "fisheye_model" in keys and not (root.getNode("fisheye_model").isInt() and not _read_int(root, "fisheye_model")):
         raise ValueError("the camera was calibrated as a fisheye: calibrate it without CALIB_FISHEYE.")
     K = _read_matrix(root, "camera_matrix", (3, 3))
     if not K.any():
@@ -203,40 +205,40 @@ def parse_calibration(text: str) -> Calibration:
         if key in keys:
             _read_matrix(root, key, shape)  # for rectified images, which are not used here
     (fx, _, cx), (_, fy, cy) = K[:2].tolist()
-    width, height = (_int(root, key) for key in ("image_width", "image_height"))
-    lens, name = _lens(root, keys), _name(root, keys)
-    return Calibration((fx, fy), (cx, cy), width, height, lens, name, _readout(root, keys))
+    width, height = (_read_int(root, key) for key in ("image_width", "image_height"))
+    lens, name = _read_lens(root, keys), _name(root, keys)
+    return Calibration((fx, fy), (cx, cy), width, height, lens, name, _read_readout(root, keys))
 
 
-def _opened(text: str) -> cv2.FileStorage:
+def _open_text(text: str) -> cv2.FileStorage:
     """Open the text with OpenCV."""
-    if len(text) > LONGEST_TEXT:
-        raise ValueError(f"it has more than {LONGEST_TEXT} characters, and a calibration some thousand. {WANTED}")
+    if len(text) > MAX_TEXT_LENGTH:
+        raise ValueError(f"it has more than {MAX_TEXT_LENGTH} characters, and a calibration some thousand. {REMEDY}")
     text = text.removeprefix("\ufeff").replace("\r\n", "\n")
     if not text.replace("\n", "").replace("\t", "").isprintable() or text.lstrip().startswith("<"):
-        raise ValueError(f"it is no YAML. {WANTED}")
+        raise ValueError(f"it is no YAML. {REMEDY}")
     deep = np.cumsum([(sign in "[{") - (sign in "]}") for sign in text])
-    if deep.max(initial=0) > DEEPEST or re.search(r"^[ \t]*(?:[^\n]*:)?(?:[ \t]*-[ \t]){2}", text, re.MULTILINE):
-        raise ValueError(f"its lists are nested too deeply. {WANTED}")
-    text = _needed(text)
+    if deep.max(initial=0) > MAX_NESTING or re.search(r"^[ \t]*(?:[^\n]*:)?(?:[ \t]*-[ \t]){2}", text, re.MULTILINE):
+        raise ValueError(f"its lists are nested too deeply. {REMEDY}")
+    text = _convert_text(text)
     if not text.startswith("%YAML"):
         text = "%YAML:1.0\n---\n" + re.sub(r"\A\s*---[ \t]*\n", "", text)
     try:
         return cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (cv2.error, SystemError) as error:  # a failing constructor raises SystemError
-        raise ValueError(f"it is no YAML that OpenCV reads: set lists in brackets, or indent them. {WANTED}") from error
+        raise ValueError(f"it is no YAML that OpenCV reads: set lists in brackets, or indent them. {REMEDY}") from error
 
 
-def _needed(text: str) -> str:
+def _convert_text(text: str) -> str:
     """Convert the text for OpenCV's parser: lists in brackets, names in quotes, and only keys that are read."""
     text = BLOCK_LIST.sub(lambda found: f"{found[1]}[{', '.join(ITEM.findall(found[3]))}]\n", text)
     return OTHER_LINE.sub("", NAME_LINE.sub(r'\1"\2"', text))
 
 
-def _int(root: cv2.FileNode, key: str) -> int:
+def _read_int(root: cv2.FileNode, key: str) -> int:
     node = root.getNode(key)
     if not node.isInt():
-        raise ValueError(f"{key} must be a whole number. {WANTED}")
+        raise ValueError(f"{key} must be a whole number. {REMEDY}")
     return int(node.real())
 
 
@@ -244,48 +246,52 @@ def _read_matrix(root: cv2.FileNode, key: str, shape: tuple[int, int] | None = N
     """Read a matrix of finite numbers; its declared size allocates no memory."""
     node = root.getNode(key)
     if not node.isMap() or not {"rows", "cols", "data"} <= set(node.keys()):
-        raise ValueError(f"{key} must have rows, cols and data. {WANTED}")
-    rows, columns, data = _int(node, "rows"), _int(node, "cols"), node.getNode("data")
+        raise ValueError(f"{key} must have rows, cols and data. {REMEDY}")
+    rows, columns, data = _read_int(node, "rows"), _read_int(node, "cols"), node.getNode("data")
     found = [data.at(index) for index in range(data.size())] if data.isSeq() else []
     wanted = "" if shape is None else f", which must be {shape[0]} x {shape[1]}"
     if rows * columns != len(found) or rows < 0 or (shape is not None and (rows, columns) != shape):
-        raise ValueError(f"{key} says {rows} x {columns}{wanted}, and has {len(found)} numbers. {WANTED}")
+        raise ValueError(f"{key} says {rows} x {columns}{wanted}, and has {len(found)} numbers. {REMEDY}")
     if not all(each.isReal() or each.isInt() for each in found):
-        raise ValueError(f"{key} holds what is no number. {WANTED}")
+        raise ValueError(f"{key} holds what is no number. {REMEDY}")
     values = np.array([each.real() for each in found], np.float64).reshape(rows, columns)
     if not np.isfinite(values).all():
         raise ValueError(f"{key} holds a number that is not finite: calibrate again.")
     return values
 
 
-def _lens(root: cv2.FileNode, keys: list[str]) -> Lens:
+def _read_lens(root: cv2.FileNode, keys: list[str]) -> Lens:
     """Read the lens distortion."""
     if "distortion_coefficients" not in keys:
-        raise ValueError(f"distortion_coefficients is missing; five times 0 for no distortion. {WANTED}")
+        raise ValueError(f"distortion_coefficients is missing; five times 0 for no distortion. {REMEDY}")
     values = _read_matrix(root, "distortion_coefficients")
     count = values.size
-    if min(values.shape) != 1 or count not in COUNTS:
+    if min(values.shape) != 1 or count not in COEFFICIENT_COUNTS:
         raise ValueError(f"distortion_coefficients has {count} numbers in {values.shape}: give a row of 4, 5 or 8.")
     if "distortion_model" in keys:
         node = root.getNode("distortion_model")
         model = node.string() if node.isString() else ""
-        if model not in MODELS:
-            raise ValueError(f"the distortion_model {model[:40]!r} is not known: choose one of {', '.join(MODELS)}.")
-        if count < MODELS[model] or (model == "plumb_bob" and count != 5):
-            raise ValueError(f"the distortion_model {model} has {MODELS[model]} coefficients, not {count}: give those.")
+        if model not in MIN_COEFFICIENTS:
+            raise ValueError(
+                f"the distortion_model {model[:40]!r} is not known: choose one of {', '.join(MIN_COEFFICIENTS)}."
+            )
+        if count < MIN_COEFFICIENTS[model] or (model == "plumb_bob" and count != 5):
+            raise ValueError(
+                f"the distortion_model {model} has {MIN_COEFFICIENTS[model]} coefficients, not {count}: give those."
+            )
     numbers = values.ravel().tolist()
     if any(numbers[8:]):
         raise ValueError("a thin prism or a tilted sensor is not drawn: calibrate with at most 8 coefficients.")
     return Lens(*numbers[:8])
 
 
-def _readout(root: cv2.FileNode, keys: list[str]) -> float:
+def _read_readout(root: cv2.FileNode, keys: list[str]) -> float:
     """Read the readout time of a rolling shutter [s]; 0 if the text has none."""
-    if READOUT not in keys:
+    if READOUT_KEY not in keys:
         return 0.0
-    node = root.getNode(READOUT)
+    node = root.getNode(READOUT_KEY)
     if not (node.isReal() or node.isInt()):
-        raise ValueError(f"{READOUT} must be a number of seconds, such as 0.02.")
+        raise ValueError(f"{READOUT_KEY} must be a number of seconds, such as 0.02.")
     return float(node.real())
 
 

@@ -261,10 +261,12 @@ def build_stereo_pair(
     return camera.move(-half).perturb(-inwards), camera.move(half).perturb(inwards)
 
 
-STEP = 0.4  # Largest motion of points during a band of rows [pixel]: the error of a row is then at most half of it.
-MOMENTS = 33  # Number of times at which motion during the readout is sampled.
-FEWEST = 4  # Minimum height of a band [rows].
-STEPS = 6  # Number of fixed-point iterations for the row in which a point is seen.
+MAX_BAND_MOTION = (
+    0.4  # Largest motion of points during a band of rows [pixel]: the error of a row is then at most half of it.
+)
+MOTION_SAMPLES = 33  # Number of times at which motion during the readout is sampled.
+MIN_BAND_ROWS = 4  # Minimum height of a band [rows].
+ROW_ITERATIONS = 6  # Number of fixed-point iterations for the row in which a point is seen.
 
 
 def compute_row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:
@@ -280,10 +282,10 @@ def split_row_bands(
     There are as many as needed for points (n, 3) [m] to move by at most `STEP` pixels in each.
     """
     middle = camera_at(0.0)
-    moments = readout * np.linspace(-0.5, 0.5, MOMENTS)
+    moments = readout * np.linspace(-0.5, 0.5, MOTION_SAMPLES)
     pixels = np.stack([camera_at(float(moment)).project(points)[0] for moment in moments])
-    fastest = float(np.nan_to_num(np.linalg.norm(np.diff(pixels, axis=0), axis=2)).max()) * (MOMENTS - 1)
-    count = int(np.clip(np.ceil(fastest / STEP), 1, max(middle.height // FEWEST, 1)))
+    fastest = float(np.nan_to_num(np.linalg.norm(np.diff(pixels, axis=0), axis=2)).max()) * (MOTION_SAMPLES - 1)
+    count = int(np.clip(np.ceil(fastest / MAX_BAND_MOTION), 1, max(middle.height // MIN_BAND_ROWS, 1)))
     edges = np.linspace(0, middle.height, count + 1).round().astype(int).tolist()
     bands = []
     for top, low in pairwise(edges):
@@ -295,7 +297,7 @@ def split_row_bands(
 def find_row_time(camera_at: Callable[[float], Camera], readout: float, point: np.ndarray) -> float:
     """Compute the time [s] of the row in which a point (3,) [m] is seen; 0 if it has no pixel."""
     time = 0.0
-    for _ in range(STEPS):
+    for _ in range(ROW_ITERATIONS):
         camera = camera_at(time)
         (pixel,), _ = camera.project(point[None])
         if not np.isfinite(pixel).all():

@@ -10,13 +10,13 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-WIDEST = np.radians(88.0)  # Largest angle from the optical axis that is tried [rad].
-STEPS = 4096  # Number of radii, from the axis outwards, at which the mapping is sampled.
-ROUND = 32  # Number of directions round the axis at which the mapping is sampled.
-NEWTON = 20  # Maximum number of Newton iterations of the inverse mapping.
+MAX_ANGLE = np.radians(88.0)  # Largest angle from the optical axis that is tried [rad].
+RADIUS_COUNT = 4096  # Number of radii, from the axis outwards, at which the mapping is sampled.
+DIRECTION_COUNT = 32  # Number of directions round the axis at which the mapping is sampled.
+MAX_NEWTON_ITERATIONS = 20  # Maximum number of Newton iterations of the inverse mapping.
 # Residual that ends the Newton iterations, in normalised coordinates: 1e-9 pixel at a focal length of 1000 pixels.
-EXACT = 1e-12
-TOGETHER = 8192  # Chunk size [points]: its arrays fit in the CPU cache. All at once take half as long again.
+NEWTON_TOLERANCE = 1e-12
+CHUNK_POINTS = 8192  # Chunk size [points]: its arrays fit in the CPU cache. All at once take half as long again.
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class Lens:
         Polynomials fold back. In a disc where the Jacobian's symmetric part is positive definite, no two points have
         the same image.
         """
-        radii = np.tan(np.linspace(0.0, WIDEST, STEPS))
-        angles = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
+        radii = np.tan(np.linspace(0.0, MAX_ANGLE, RADIUS_COUNT))
+        angles = np.linspace(0.0, 2.0 * np.pi, DIRECTION_COUNT, endpoint=False)
         x, y = np.multiply.outer(radii, [np.cos(angles), np.sin(angles)]).transpose(1, 0, 2)
         with np.errstate(all="ignore"):
-            a, b, c = self._slopes(x, y)
+            a, b, c = self._compute_slopes(x, y)
             r2 = radii**2
             good = (
                 (a + c > 0.0) & (a * c > b * b) & (1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6)) > 0.0)[:, None]
@@ -80,7 +80,7 @@ class Lens:
         with np.errstate(invalid="ignore"):
             seen = np.hypot(x, y) <= self.reach
         x, y = np.where(seen, x, np.nan), np.where(seen, y, np.nan)
-        return np.stack(self._moved(x, y), axis=-1)
+        return np.stack(self._apply_distortion(x, y), axis=-1)
 
     def undistort(self, places: np.ndarray) -> np.ndarray:
         """Undistort positions (..., 2), the inverse of `bent`, by Newton's method; NaN without solution in `reach`."""
@@ -91,39 +91,39 @@ class Lens:
         far = moved[-1] + 3.0 * (abs(self.p1) + abs(self.p2)) * self.reach**2
         near = np.flatnonzero(np.hypot(*wanted) <= far)
         out = np.full(wanted.shape, np.nan)
-        for part in np.split(near, range(TOGETHER, len(near), TOGETHER)):
-            out[:, part] = self._solved(wanted[:, part])
+        for part in np.split(near, range(CHUNK_POINTS, len(near), CHUNK_POINTS)):
+            out[:, part] = self._undistort_points(wanted[:, part])
         return out.T.reshape(places.shape)
 
-    def _solved(self, wanted: np.ndarray) -> np.ndarray:
+    def _undistort_points(self, wanted: np.ndarray) -> np.ndarray:
         """Undistort positions (2, n)."""
         far = np.hypot(*wanted)
         # Start: without its tangential part the lens moves positions along rays.
         radii, moved = self._along
         x, y = np.interp(far, moved, radii) / np.where(far > 0.0, far, 1.0) * wanted
-        for _ in range(NEWTON):
-            at = self._moved(x, y)
+        for _ in range(MAX_NEWTON_ITERATIONS):
+            at = self._apply_distortion(x, y)
             off_x, off_y = at[0] - wanted[0], at[1] - wanted[1]
-            if max(np.abs(off_x).max(initial=0.0), np.abs(off_y).max(initial=0.0)) <= EXACT:
+            if max(np.abs(off_x).max(initial=0.0), np.abs(off_y).max(initial=0.0)) <= NEWTON_TOLERANCE:
                 break
-            a, b, c = self._slopes(x, y)
+            a, b, c = self._compute_slopes(x, y)
             inverse = 1.0 / (a * c - b * b)
             x, y = x - inverse * (c * off_x - b * off_y), y - inverse * (a * off_y - b * off_x)
             # Beyond the reach the derivatives are meaningless: a step that leads there ends at its edge.
             back = np.minimum(1.0, self.reach / np.maximum(np.hypot(x, y), self.reach))
             x, y = back * x, back * y
-        at = self._moved(x, y)
-        found = np.hypot(at[0] - wanted[0], at[1] - wanted[1]) < 1e3 * EXACT
+        at = self._apply_distortion(x, y)
+        found = np.hypot(at[0] - wanted[0], at[1] - wanted[1]) < 1e3 * NEWTON_TOLERANCE
         return np.where(found, (x, y), np.nan)
 
     @cached_property
     def _along(self) -> tuple[np.ndarray, np.ndarray]:
         """Distances from the axis, undistorted and distorted without the tangential part, both ascending."""
-        radii = np.linspace(0.0, self.reach, STEPS)
-        moved = radii * self._radial(radii**2)[0]
+        radii = np.linspace(0.0, self.reach, RADIUS_COUNT)
+        moved = radii * self._compute_radial(radii**2)[0]
         return radii, np.maximum.accumulate(moved)
 
-    def _radial(self, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _compute_radial(self, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute q, and its derivative by r^2."""
         over = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         under = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
@@ -132,18 +132,18 @@ class Lens:
         q = over / under
         return q, (steep - q * lower) / under
 
-    def _moved(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _apply_distortion(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distort (x, y) without the limit of the reach."""
         r2, xy = x * x + y * y, 2.0 * x * y
-        q, _ = self._radial(r2)
+        q, _ = self._compute_radial(r2)
         return (
             x * q + self.p1 * xy + self.p2 * (r2 + 2.0 * x * x),
             y * q + self.p1 * (r2 + 2.0 * y * y) + self.p2 * xy,
         )
 
-    def _slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _compute_slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute the entries (xx, xy, yy) of the Jacobian, which is symmetric."""
-        q, steep = self._radial(x * x + y * y)
+        q, steep = self._compute_radial(x * x + y * y)
         across = 2.0 * steep * x * y + 2.0 * self.p1 * x + 2.0 * self.p2 * y
         return (
             q + 2.0 * steep * x * x + 2.0 * self.p1 * y + 6.0 * self.p2 * x,

@@ -17,9 +17,20 @@ from ..rendering.renderer import Picture
 from . import distances, window
 from .distances import separate_rings
 from .gauge import draw_line, write_gauge
-from .hud import FINE, FONT, HEAD, NARROW, ROW, Below, format_millimetres, lay, wrap_line
+from .hud import FONT, HEAD_ROW, LINE_SPACING, MAX_BOTTOM_WIDTH, TEXT_SCALE, Below, format_millimetres, lay, wrap_line
 from .legend import Entry, draw_legend, place_sheet
-from .marks import BEFORE, DOTTED, NO_COVER, NO_MARKS, NO_WORDS, Cover, Marks, Words, draw_before, draw_trace
+from .marks import (
+    BEFORE_COLOUR,
+    BEFORE_STROKES,
+    NO_COVER,
+    NO_MARKS,
+    NO_WORDS,
+    Cover,
+    Marks,
+    Words,
+    draw_before,
+    draw_trace,
+)
 from .measured import Measure
 from .outlines import (
     allocate_sheet,
@@ -31,25 +42,31 @@ from .outlines import (
     join_boxes,
     to_key,
 )
-from .places import CLEAR, PAD
+from .places import BORDER_DISTANCE, TEXT_DISTANCE
 from .styles import STYLES, Opening, Style
-from .window import DARK, FRONT, SHUT, Lines, Roles, draw_overlay
+from .window import BORDER_COLOUR, CLOSED_GROUND, FRONT, Lines, Roles, draw_overlay
 
-DOUBTFUL = (0.92, 0.50, 0.05)  # Outline colour (RGB, 0 to 1) of an unreliable overlay; its outline is broken as well.
+DOUBTFUL_COLOUR = (
+    0.92,
+    0.50,
+    0.05,
+)  # Outline colour (RGB, 0 to 1) of an unreliable overlay; its outline is broken as well.
 # Text colour of an unreliable overlay: pixels of the outline's colour belong to the outline alone.
-WARNING = (1.0, 0.84, 0.5)
-SEEN = (255.0, 245.0, 190.0)
+WARNING_COLOUR = (1.0, 0.84, 0.5)
+POINT_COLOUR = (255.0, 245.0, 190.0)
 """Colour of observed points."""
-FAINT = 0.75  # Brightness of the margin line relative to the outline, as the margin is not the surface itself.
-BROKEN = (9, 6)  # Stroke and gap lengths of an unreliable outline [pixel].
-DASHED = (12, 7)  # Stroke and gap lengths of a margin [pixel].
-HIDDEN = (9, 6)  # Stroke and gap lengths of an outline under closed ground [pixel].
-BOLD = 2  # Line width of an outline under closed ground [pixel].
-SHORT = 96  # Width of text lines within the silhouette [pixel].
-LOWER = 2  # Number of text rows by which text at the top may be lower, to leave a line visible.
+MARGIN_BRIGHTNESS = (
+    0.75  # Brightness of the margin line relative to the outline, as the margin is not the surface itself.
+)
+BROKEN_STROKES = (9, 6)  # Stroke and gap lengths of an unreliable outline [pixel].
+MARGIN_STROKES = (12, 7)  # Stroke and gap lengths of a margin [pixel].
+HIDDEN_STROKES = (9, 6)  # Stroke and gap lengths of an outline under closed ground [pixel].
+HIDDEN_LINE_WIDTH = 2  # Line width of an outline under closed ground [pixel].
+SILHOUETTE_TEXT_WIDTH = 96  # Width of text lines within the silhouette [pixel].
+MAX_LOWER_ROWS = 2  # Number of text rows by which text at the top may be lower, to leave a line visible.
 # Widths of text at the top as shares of the image width; the first that covers no tool is used.
 HEAD_WIDTHS = 0.62, 0.5, 0.4, 0.32, 0.25
-APART = 2 * ROW  # Distance of a style's text from the number next to the tip [pixel].
+STYLE_TEXT_DISTANCE = 2 * LINE_SPACING  # Distance of a style's text from the number next to the tip [pixel].
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +165,7 @@ def composite(
         return plain
     if words.doubt:
         gauge = None if marks.gauge is None else replace(marks.gauge, error=None)
-        hidden, words = replace(hidden, colour=DOUBTFUL), replace(words, error=None)
+        hidden, words = replace(hidden, colour=DOUBTFUL_COLOUR), replace(words, error=None)
         marks = replace(marks, margin=0.0, gauge=gauge)
     grown = None
     if np.any(np.asarray(marks.margin) > 0.0):
@@ -159,15 +176,15 @@ def composite(
     surfaces = [layer.vertices for layer in (hidden, grown, marks.before) if layer is not None]
     surfaces += [trace.layer.vertices for trace in marks.traces]
     box = find_pixel_box(camera, np.concatenate([*surfaces, measure.reached]))
-    sketch = _sketched(measure, grown, marks, cover.opening, bool(words.doubt), box)
-    motion = "" if box is None or marks.before is None else _motion(hidden, marks.before, words)
-    drawn = _written(sketch, camera, words, motion)
+    sketch = _draw_sketch(measure, grown, marks, cover.opening, bool(words.doubt), box)
+    motion = "" if box is None or marks.before is None else _describe_motion(hidden, marks.before, words)
+    drawn = _write_lines(sketch, camera, words, motion)
     if marks.gauge is None and cover.opening is None and style not in ("depth", "rings", "cut"):
         return drawn
-    return _explained(drawn, sketch, measure, list_legend_entries(hidden, grown, marks, words))
+    return _write_labels(drawn, sketch, measure, list_legend_entries(hidden, grown, marks, words))
 
 
-def _sketched(
+def _draw_sketch(
     measure: Measure, grown: Layer | None, marks: Marks, opening: Opening | None, doubtful: bool,
     box: tuple[slice, slice] | None,
 ) -> Sketch:  # fmt: skip
@@ -186,7 +203,7 @@ def _sketched(
     if grown is not None:
         bare = under[..., 3] == 0
         wider = rasterise_surface(part, grown.vertices, grown.triangles, device=device).mask
-        draw_dashes(under, find_outlines(wider), get_margin_ink(hidden), DASHED, 1)
+        draw_dashes(under, find_outlines(wider), get_margin_ink(hidden), MARGIN_STROKES, 1)
         faint[around] = bare & (under[..., 3] > 0)
     if opening is not None:
         role = measure.roles.read_roles(picture.segmentation, around)
@@ -207,7 +224,7 @@ def _sketched(
     return Sketch(out, taken, faint, thin, around, ground)
 
 
-def _motion(hidden: Layer, before: Layer, words: Words) -> str:
+def _describe_motion(hidden: Layer, before: Layer, words: Words) -> str:
     """Describe the surface's mean motion, or the given motion."""
     mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
     return (
@@ -215,7 +232,7 @@ def _motion(hidden: Layer, before: Layer, words: Words) -> str:
     )
 
 
-def _written(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overlaid:
+def _write_lines(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overlaid:
     """Write the lines at the top, the motion and the warning.
 
     Top and corner come first, so that their text seldom moves; then by importance, for some is left out without space.
@@ -224,13 +241,13 @@ def _written(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overl
     write_head(drawn, words.head)
     if motion:
         firm = drawn.taken * ~sketch.faint  # it keeps its place, although it is on the margin's line
-        lay(drawn.colour, firm, wrap_line(motion, NARROW * camera.width), (0, camera.height))
+        lay(drawn.colour, firm, wrap_line(motion, MAX_BOTTOM_WIDTH * camera.width), (0, camera.height))
         np.bitwise_or(drawn.taken, firm, out=drawn.taken)
     write_doubt(drawn, words.doubt)
     return drawn
 
 
-def _explained(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Sequence[Entry]) -> Overlaid:
+def _write_labels(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Sequence[Entry]) -> Overlaid:
     """Write the number next to the tip, the label of closed ground, the text of the style, and the legend."""
     out, taken = drawn.colour, drawn.taken
     whole = measure.roles.read_roles(measure.picture.segmentation)
@@ -240,13 +257,15 @@ def _explained(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Sequence
         before_it = taken.copy()
         write_gauge(out, taken, measure.camera, measure.gauge, front, sketch.taken, sketch.thin)
         # The text of the style is not about the number.
-        apart = cv2.dilate(((taken > 0) & (before_it == 0)).view(np.uint8), np.ones((2 * APART + 1,) * 2, np.uint8))
+        apart = cv2.dilate(
+            ((taken > 0) & (before_it == 0)).view(np.uint8), np.ones((2 * STYLE_TEXT_DISTANCE + 1,) * 2, np.uint8)
+        )
     ground, around = sketch.ground, sketch.around
     if ground is None or around is None:
         measure.lay(out, taken, front, front)
         return drawn
     write_ground(drawn, around, ground, front, sketch.taken)
-    sights = (whole != SHUT).view(np.uint8)
+    sights = (whole != CLOSED_GROUND).view(np.uint8)
     needed = front.copy()
     for each in (sights, needed):
         each[around] |= ground.mask
@@ -271,7 +290,7 @@ def find_ground(segmentation: np.ndarray, role: np.ndarray, found: RasterisedSur
     mask = found.mask
     counts = np.bincount(segmentation[mask & (role != FRONT)], minlength=256)
     layers = np.flatnonzero(counts).tolist()
-    return Ground(mask, role == SHUT, opening.describe({layer: int(counts[layer]) for layer in layers}))
+    return Ground(mask, role == CLOSED_GROUND, opening.describe({layer: int(counts[layer]) for layer in layers}))
 
 
 def draw_broken(
@@ -279,14 +298,16 @@ def draw_broken(
 ) -> None:
     """Draw the broken parts of an outline, in place: all of an unreliable one, and those under closed ground."""
     if doubtful:
-        draw_dashes(sheet, find_outlines(found.mask), ink, BROKEN)
+        draw_dashes(sheet, find_outlines(found.mask), ink, BROKEN_STROKES)
     elif ground is not None and ground.shut.any():
-        draw_dashes(sheet, cut_outlines(find_outlines(ground.mask), ground.shut), ink, HIDDEN, BOLD)
+        draw_dashes(
+            sheet, cut_outlines(find_outlines(ground.mask), ground.shut), ink, HIDDEN_STROKES, HIDDEN_LINE_WIDTH
+        )
 
 
 def get_margin_ink(hidden: Layer) -> tuple[float, ...]:
     """Compute the colour of the margin line round a surface."""
-    return tuple(FAINT * share for share in compute_ink(hidden.colour))
+    return tuple(MARGIN_BRIGHTNESS * share for share in compute_ink(hidden.colour))
 
 
 def list_legend_entries(hidden: Layer, grown: Layer | None, marks: Marks, words: Words) -> tuple[Entry, ...]:
@@ -294,10 +315,12 @@ def list_legend_entries(hidden: Layer, grown: Layer | None, marks: Marks, words:
     names = words.names
     named = zip(marks.traces, names.traces, strict=False)
     entries = [
-        Entry(names.now, to_key(compute_ink(hidden.colour)), BROKEN if words.doubt else None, BOLD),
-        *([] if grown is None else [Entry(names.margin, get_margin_ink(hidden), DASHED, 1)]),
+        Entry(
+            names.now, to_key(compute_ink(hidden.colour)), BROKEN_STROKES if words.doubt else None, HIDDEN_LINE_WIDTH
+        ),
+        *([] if grown is None else [Entry(names.margin, get_margin_ink(hidden), MARGIN_STROKES, 1)]),
         *(Entry(name, to_key(compute_ink(trace.layer.colour)), trace.pattern) for trace, name in named),
-        *([] if marks.before is None else [Entry(names.before, compute_ink(BEFORE), DOTTED)]),
+        *([] if marks.before is None else [Entry(names.before, compute_ink(BEFORE_COLOUR), BEFORE_STROKES)]),
     ]
     return tuple(entry for entry in entries if entry.name)
 
@@ -309,8 +332,8 @@ def draw_points(drawn: Overlaid, camera: Camera, points: np.ndarray, where: np.n
     here = here[((here >= 0) & (here < (camera.width, camera.height))).all(axis=1)]
     near = cv2.dilate(drawn.taken, np.ones((7, 7), np.uint8))  # keeps letters of text intact
     for column, row in here[where[here[:, 1], here[:, 0]] & (near[here[:, 1], here[:, 0]] == 0)].tolist():
-        cv2.circle(drawn.colour, (column, row), 2, DARK, -1)
-        cv2.circle(drawn.colour, (column, row), 1, SEEN, -1)
+        cv2.circle(drawn.colour, (column, row), 2, BORDER_COLOUR, -1)
+        cv2.circle(drawn.colour, (column, row), 1, POINT_COLOUR, -1)
 
 
 def write_ground(
@@ -321,15 +344,15 @@ def write_ground(
         return
     there = cv2.moments((ground.mask & ground.shut).view(np.uint8), binaryImage=True)
     lines = format_ground(ground.words)
-    wide = max(cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines)
+    wide = max(cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines)
     column, row = there["m10"] / there["m00"] + box[1].start, there["m01"] / there["m00"] + box[0].start
-    wish = round(column - wide / 2), round(row - ROW * len(lines) / 2)
-    lay(drawn.colour, drawn.taken, lines, wish, FINE, needed=True, below=Below(front, lines_there))
+    wish = round(column - wide / 2), round(row - LINE_SPACING * len(lines) / 2)
+    lay(drawn.colour, drawn.taken, lines, wish, TEXT_SCALE, needed=True, below=Below(front, lines_there))
 
 
 def format_ground(words: str) -> list[str]:
     """Break the ground's label into short lines, which fit into a silhouette."""
-    return wrap_line(words, SHORT)
+    return wrap_line(words, SILHOUETTE_TEXT_WIDTH)
 
 
 def format_head_lines(texts: Sequence[str], tool: np.ndarray) -> list[str]:
@@ -337,28 +360,43 @@ def format_head_lines(texts: Sequence[str], tool: np.ndarray) -> list[str]:
     width = tool.shape[1]
     tried = [[part for text in texts for part in wrap_line(text, share * width)] for share in HEAD_WIDTHS]
     for lines in tried:
-        long = max((cv2.getTextSize(line, FONT, FINE, 1)[0][0] for line in lines), default=0)
-        if not tool[HEAD - CLEAR : HEAD + ROW * len(lines) + CLEAR, : PAD + long + CLEAR].any():
+        long = max((cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines), default=0)
+        if not tool[
+            HEAD_ROW - TEXT_DISTANCE : HEAD_ROW + LINE_SPACING * len(lines) + TEXT_DISTANCE,
+            : BORDER_DISTANCE + long + TEXT_DISTANCE,
+        ].any():
             return lines
     return tried[0]
 
 
 def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
     """Draw text lines in the top-left corner, below the orientation letter, in place; may cover other lines."""
-    free, middle, below = drawn.taken.copy(), len(drawn.taken) // 2, HEAD + ROW * (len(lines) + LOWER)
-    free[:HEAD] = free[middle - HEAD // 2 : middle + HEAD // 2] = 1  # for the orientation letters
+    free, middle, below = (
+        drawn.taken.copy(),
+        len(drawn.taken) // 2,
+        HEAD_ROW + LINE_SPACING * (len(lines) + MAX_LOWER_ROWS),
+    )
+    free[:HEAD_ROW] = free[middle - HEAD_ROW // 2 : middle + HEAD_ROW // 2] = 1  # for the orientation letters
     free[below:] = 1  # rather over a line than in the centre of the image
     before = free.copy()
-    lay(drawn.colour, free, lines, (0, HEAD), needed=True, below=Below(lines=drawn.taken))
+    lay(drawn.colour, free, lines, (0, HEAD_ROW), needed=True, below=Below(lines=drawn.taken))
     drawn.taken[free > before] = 1
 
 
 def write_doubt(drawn: Overlaid, doubt: str) -> None:
     """Write the reason why a result is unreliable in the bottom-left corner, in place; may cover other text."""
     height, width = drawn.taken.shape
-    lay(drawn.colour, drawn.taken, format_warning(doubt, width), (0, height), FINE, compute_ink(WARNING), needed=True)
+    lay(
+        drawn.colour,
+        drawn.taken,
+        format_warning(doubt, width),
+        (0, height),
+        TEXT_SCALE,
+        compute_ink(WARNING_COLOUR),
+        needed=True,
+    )
 
 
 def format_warning(doubt: str, width: int) -> list[str]:
     """Break a warning into lines for an image of this width [pixel]: its reason, and its consequence."""
-    return [line for part in doubt.split(": ") for line in wrap_line(part, NARROW * width)]
+    return [line for part in doubt.split(": ") for line in wrap_line(part, MAX_BOTTOM_WIDTH * width)]

@@ -16,28 +16,28 @@ from ..rendering.layer import Layer
 from .distances import build_tree, compute_signed_distance
 from .hud import WHITE, write_haloed
 from .outlines import draw_dashes, find_outlines
-from .window import FRONT, SHUT
+from .window import CLOSED_GROUND, FRONT
 
 # Smallest distance of a tip from the line of sight that gives a direction [m]; below, the image's right is used.
-ASTRAY = 1e-3
-ROUND = 12e-3  # Margin of the inset round the hidden surface [m].
-OVER = 4e-3  # Margin of the inset above the visible surface, and round the tip [m].
-FAR = 60e-3  # Largest measured distance to the hidden surface [m].
-BAND = 5e-3  # Width of a tone [m]: tissue is toned by its distance to the surface.
+MIN_TIP_DISTANCE = 1e-3
+SURFACE_MARGIN = 12e-3  # Margin of the inset round the hidden surface [m].
+TOP_MARGIN = 4e-3  # Margin of the inset above the visible surface, and round the tip [m].
+MAX_DISTANCE = 60e-3  # Largest measured distance to the hidden surface [m].
+TONE_WIDTH = 5e-3  # Width of a tone [m]: tissue is toned by its distance to the surface.
 # Colours of the tones (RGB), the closest to the surface first.
 TONES = np.array([(222, 206, 192), (184, 168, 156), (146, 132, 124), (112, 100, 94), (82, 74, 70)], np.float64)
-EMPTY = (20.0, 24.0, 27.0)
+EMPTY_COLOUR = (20.0, 24.0, 27.0)
 """Colour of the inset above the visible surface."""
-CLOSED = (120.0, 165.0, 180.0)
+CLOSED_COLOUR = (120.0, 165.0, 180.0)
 """Colour of the visible surface where the hidden one does not shine through."""
-SMALL = 0.38  # Font scale of the inset's text.
-LEADING = 14  # Line spacing of the inset's text [pixel].
-STROKES = (5, 4)  # Stroke and gap lengths of the margin [pixel].
-SCALE = 10e-3
+INSET_TEXT_SCALE = 0.38  # Font scale of the inset's text.
+INSET_LINE_SPACING = 14  # Line spacing of the inset's text [pixel].
+INSET_STROKES = (5, 4)  # Stroke and gap lengths of the margin [pixel].
+SCALE_BAR_LENGTH = 10e-3
 """Length of the scale bar [m]."""
-ENDS = ("a", "b")
+END_LETTERS = ("a", "b")
 """Letters at the ends of the cutting line in the image, and at the inset's sides."""
-WIDE = 10  # Half the width of a number [pixel].
+HALF_NUMBER_WIDTH = 10  # Half the width of a number [pixel].
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def build_plane(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> C
     level = camera.T_camera_world[0, :3]
     towards = level if tip is None else tip - middle
     across = towards - (towards @ along) * along
-    if np.linalg.norm(across) < ASTRAY:
+    if np.linalg.norm(across) < MIN_TIP_DISTANCE:
         across = level - (level @ along) * along
     across /= np.linalg.norm(across)
     return CutPlane(middle, across if across @ level >= 0.0 else -across, along)
@@ -115,55 +115,55 @@ def draw_section(
         Error bound of the surface [m]: drawn as a dashed line at this distance outside.
     """
     wide, tall = size
-    low, scale = _frame(plane, hidden, seen[0], tip, size)
+    low, scale = _compute_frame(plane, hidden, seen[0], tip, size)
     columns, rows = np.meshgrid(np.arange(wide), np.arange(tall))
     places = low + np.stack([columns, rows], axis=2) / scale
     distance = compute_signed_distance(
-        build_tree(hidden.vertices, hidden.triangles), plane.to_world(places).reshape(-1, 3), FAR
+        build_tree(hidden.vertices, hidden.triangles), plane.to_world(places).reshape(-1, 3), MAX_DISTANCE
     ).reshape(tall, wide)
-    tone = np.nan_to_num(distance / BAND, nan=len(TONES)).clip(0, len(TONES) - 1).astype(int)
+    tone = np.nan_to_num(distance / TONE_WIDTH, nan=len(TONES)).clip(0, len(TONES) - 1).astype(int)
     out = TONES[tone]
     out[distance < 0.0] = ink
     if len(seen[0]):
-        out[places[..., 1] < np.interp(places[..., 0], seen[0][:, 0], seen[0][:, 1])] = EMPTY
+        out[places[..., 1] < np.interp(places[..., 0], seen[0][:, 0], seen[0][:, 1])] = EMPTY_COLOUR
     out = out.astype(np.uint8)
     if error is not None:
-        draw_dashes(out, find_outlines(distance < error), ink, STROKES, 2)
+        draw_dashes(out, find_outlines(distance < error), ink, INSET_STROKES, 2)
     at = np.rint((seen[0] - low) * scale).astype(np.int32)
     for (column, row), role in zip(at.tolist(), seen[1].tolist(), strict=True):
-        cv2.circle(out, (column, row), 1, (*(CLOSED if role == SHUT else WHITE), 255), -1)
+        cv2.circle(out, (column, row), 1, (*(CLOSED_COLOUR if role == CLOSED_GROUND else WHITE), 255), -1)
     if tip is not None:
         column, row = np.rint((plane.to_plane(tip) - low) * scale).astype(int).tolist()
         cv2.circle(out, (column, row), 5, (10, 12, 12, 255), -1, cv2.LINE_AA)
         cv2.circle(out, (column, row), 3, (*WHITE, 255), -1, cv2.LINE_AA)
     _write_bands(out, distance, places, seen[0])
-    for letter, column in zip(ENDS, (4, wide - 12), strict=True):
-        write_haloed(out, letter, (column, 12), SMALL)
-    bar = round(SCALE * scale)
+    for letter, column in zip(END_LETTERS, (4, wide - 12), strict=True):
+        write_haloed(out, letter, (column, 12), INSET_TEXT_SCALE)
+    bar = round(SCALE_BAR_LENGTH * scale)
     cv2.line(out, (6, tall - 6), (6 + bar, tall - 6), (*WHITE, 255), 2)
-    write_haloed(out, f"{1e3 * SCALE:.0f} mm", (6, tall - 11), SMALL)
+    write_haloed(out, f"{1e3 * SCALE_BAR_LENGTH:.0f} mm", (6, tall - 11), INSET_TEXT_SCALE)
     return out
 
 
 def add_caption(inset: np.ndarray, lines: list[str]) -> np.ndarray:
     """Add lines of text below an inset (h, w, 3) uint8, and a thin frame."""
-    foot = np.full((LEADING * len(lines) + 4, inset.shape[1], 3), np.array(EMPTY), np.uint8)
+    foot = np.full((INSET_LINE_SPACING * len(lines) + 4, inset.shape[1], 3), np.array(EMPTY_COLOUR), np.uint8)
     for number, line in enumerate(lines):
-        write_haloed(foot, line, (5, LEADING * (number + 1) - 2), SMALL)
+        write_haloed(foot, line, (5, INSET_LINE_SPACING * (number + 1) - 2), INSET_TEXT_SCALE)
     out = np.concatenate([inset, foot])
     cv2.rectangle(out, (0, 0), (out.shape[1] - 1, out.shape[0] - 1), (150, 154, 158, 255), 1)
     return out
 
 
-def _frame(
+def _compute_frame(
     plane: CutPlane, hidden: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
 ) -> tuple[np.ndarray, float]:
     """Compute the position (2,) [m] of the inset's upper left corner, and pixels per metre."""
     places = plane.to_plane(hidden.vertices)
-    held = [places.min(axis=0) - ROUND, places.max(axis=0) + ROUND]
+    held = [places.min(axis=0) - SURFACE_MARGIN, places.max(axis=0) + SURFACE_MARGIN]
     near = surface[(surface[:, 0] > held[0][0]) & (surface[:, 0] < held[1][0])]
-    held += [near.min(axis=0) - OVER] if len(near) else []
-    held += [] if tip is None else [plane.to_plane(tip) - OVER, plane.to_plane(tip) + OVER]
+    held += [near.min(axis=0) - TOP_MARGIN] if len(near) else []
+    held += [] if tip is None else [plane.to_plane(tip) - TOP_MARGIN, plane.to_plane(tip) + TOP_MARGIN]
     low, high = np.min(held, axis=0), np.max(held, axis=0)
     scale = float((np.array(size) / (high - low)).min())
     return 0.5 * (low + high) - 0.5 * np.array(size) / scale, scale
@@ -173,12 +173,17 @@ def _write_bands(out: np.ndarray, distance: np.ndarray, places: np.ndarray, surf
     """Write the distances [mm] where tones change, near the centre row, on the side of more tissue; in place."""
     middle, wide = int(np.abs(places[:, 0, 1]).argmin()), out.shape[1]
     for step in (1, 2, 3):
-        row = min(max(middle + (step - 2) * LEADING, 0), len(out) - 1)
+        row = min(max(middle + (step - 2) * INSET_LINE_SPACING, 0), len(out) - 1)
         tissue = np.ones(wide, bool)
         if len(surface):
             tissue = places[row, :, 1] > np.interp(places[row, :, 0], surface[:, 0], surface[:, 1])
         left = tissue[: wide // 2].sum() >= tissue[wide // 2 :].sum()
-        columns = np.flatnonzero((distance[row] < step * BAND) & tissue)
+        columns = np.flatnonzero((distance[row] < step * TONE_WIDTH) & tissue)
         column = int(columns[0 if left else -1]) if len(columns) else 0
-        if WIDE < column < wide - WIDE and tissue[column - WIDE : column + WIDE].all():
-            write_haloed(out, f"{1e3 * step * BAND:.0f}", (column - WIDE // 2, row + 4), SMALL)
+        if (
+            HALF_NUMBER_WIDTH < column < wide - HALF_NUMBER_WIDTH
+            and tissue[column - HALF_NUMBER_WIDTH : column + HALF_NUMBER_WIDTH].all()
+        ):
+            write_haloed(
+                out, f"{1e3 * step * TONE_WIDTH:.0f}", (column - HALF_NUMBER_WIDTH // 2, row + 4), INSET_TEXT_SCALE
+            )

@@ -10,11 +10,11 @@ import warp as wp
 
 from ..optics.camera import Camera
 from ..rendering.parallel import forward_kernel, launch_in_bands, load
-from .hud import FINE, FONT
+from .hud import FONT, TEXT_SCALE
 from .outlines import OPAQUE, clip_to_sheet, cut_outlines, find_outlines
-from .window import DARK
+from .window import BORDER_COLOUR
 
-RAYS = wp.constant(3)  # Number of rays of the inside test: odd, so that there is always a majority.
+RAY_COUNT = wp.constant(3)  # Number of rays of the inside test: odd, so that there is always a majority.
 
 
 def build_tree(vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> wp.Mesh:
@@ -76,7 +76,7 @@ def measure_points(
     """Measure a run of points."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
-        found = wp.mesh_query_point_sign_parity(tree, points[index], reach, RAYS)
+        found = wp.mesh_query_point_sign_parity(tree, points[index], reach, RAY_COUNT)
         distance[index] = wp.nan
         if found.result:
             nearest = wp.mesh_eval_position(tree, found.face, found.u, found.v)
@@ -114,18 +114,25 @@ def measure_seen(
                 distance[row, column] = wp.length(point - nearest)
 
 
-RINGS = (1e-3, 5e-3, 10e-3, 15e-3)  # Distances of the rings from the surface [m]; the first stands for contact.
-RING = (232.0, 228.0, 204.0)
+RING_DISTANCES = (
+    1e-3,
+    5e-3,
+    10e-3,
+    15e-3,
+)  # Distances of the rings from the surface [m]; the first stands for contact.
+RING_COLOUR = (232.0, 228.0, 204.0)
 """Colour of rings."""
-SHORTEST = 24  # Smallest length of a drawn ring [pixel].
-OFF = 3  # Distance of rings from the edge of the ground [pixel].
-ROOM = 3  # Gap on all sides of a ring's number [pixel].
+MIN_RING_LENGTH = 24  # Smallest length of a drawn ring [pixel].
+EDGE_DISTANCE = 3  # Distance of rings from the edge of the ground [pixel].
+NUMBER_GAP = 3  # Gap on all sides of a ring's number [pixel].
 # Side of the square opening that separates numbers from lines [pixel]: thicker than lines, thinner than numbers.
-THICK = 9
-LONG = 80  # Smallest length of a piece of a ring with a number of its own [pixel].
+OPENING_SIDE = 9
+MIN_NUMBERED_LENGTH = 80  # Smallest length of a piece of a ring with a number of its own [pixel].
 
 
-def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels: Sequence[float] = RINGS) -> list[str]:
+def draw_rings(
+    sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels: Sequence[float] = RING_DISTANCES
+) -> list[str]:
     """Draw rings with their numbers in millimetres, in place; return the numbers of the rings that are drawn.
 
     Each piece that is long enough has its number, and each ring at least one, even over other lines.
@@ -140,20 +147,20 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
         (h, w) bool: free places for a number; false at other lines.
     """
     ground = np.isfinite(distance).astype(np.uint8)
-    within = cv2.erode(ground, np.ones((2 * OFF + 1,) * 2, np.uint8), borderValue=0) > 0
+    within = cv2.erode(ground, np.ones((2 * EDGE_DISTANCE + 1,) * 2, np.uint8), borderValue=0) > 0
     rings: dict[str, list[np.ndarray]] = {}
     for level in levels:
         near = np.nan_to_num(distance, nan=np.inf) < level
-        lines = [line for line in cut_outlines(find_outlines(near), within) if len(line) >= SHORTEST]
+        lines = [line for line in cut_outlines(find_outlines(near), within) if len(line) >= MIN_RING_LENGTH]
         lines = [line for piece in lines for line in clip_to_sheet(piece, sheet.shape[1], sheet.shape[0])]
         if lines:
             rings[f"{1e3 * level:.0f}"] = sorted(lines, key=len, reverse=True)
     for lines in rings.values():
-        for ink, width in ((DARK, 3), (RING, 1)):
+        for ink, width in ((BORDER_COLOUR, 3), (RING_COLOUR, 1)):
             cv2.polylines(sheet, lines, False, (*ink, OPAQUE), width, cv2.LINE_AA)
     taken, written = ~free, np.zeros(free.shape, bool)
     for number, lines in rings.items():
-        found = [_write_on(sheet, line, number, taken, written) for line in lines if len(line) >= LONG]
+        found = [_write_on(sheet, line, number, taken, written) for line in lines if len(line) >= MIN_NUMBERED_LENGTH]
         if not any(found):
             # Without free space: first over lines, and then over another number.
             any(
@@ -166,7 +173,7 @@ def draw_rings(sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels
 
 def separate_rings(drawn: np.ndarray) -> np.ndarray:
     """Separate rings (h, w) bool from their numbers, given the mask `drawn` (h, w) of both."""
-    numbers = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_OPEN, np.ones((THICK,) * 2, np.uint8))
+    numbers = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OPENING_SIDE,) * 2, np.uint8))
     return drawn & (numbers == 0)
 
 
@@ -175,19 +182,24 @@ def _write_on(sheet: np.ndarray, line: np.ndarray, text: str, shut: np.ndarray, 
 
     Its place is marked in both (h, w) bool.
     """
-    (width, height), _ = cv2.getTextSize(text, FONT, FINE, 1)
+    (width, height), _ = cv2.getTextSize(text, FONT, TEXT_SCALE, 1)
     middle = len(line) // 2
     for at in sorted(range(0, len(line), 4), key=lambda at: abs(at - middle)):
         column, row = line[at, 0].tolist()
         left, top = column - width // 2, row - height // 2
-        box = slice(max(top - ROOM, 0), top + height + ROOM), slice(max(left - ROOM, 0), left + width + ROOM)
-        if left >= ROOM and top >= ROOM and not shut[box].any() and _fits(sheet, box):
-            cv2.rectangle(sheet, (left - 2, top - 2), (left + width + 1, top + height + 1), (*DARK, OPAQUE), -1)
-            cv2.putText(sheet, text, (left, top + height), FONT, FINE, (*RING, OPAQUE), 1, cv2.LINE_AA)
+        box = (
+            slice(max(top - NUMBER_GAP, 0), top + height + NUMBER_GAP),
+            slice(max(left - NUMBER_GAP, 0), left + width + NUMBER_GAP),
+        )
+        if left >= NUMBER_GAP and top >= NUMBER_GAP and not shut[box].any() and _is_within(sheet, box):
+            cv2.rectangle(
+                sheet, (left - 2, top - 2), (left + width + 1, top + height + 1), (*BORDER_COLOUR, OPAQUE), -1
+            )
+            cv2.putText(sheet, text, (left, top + height), FONT, TEXT_SCALE, (*RING_COLOUR, OPAQUE), 1, cv2.LINE_AA)
             shut[box] = written[box] = True
             return True
     return False
 
 
-def _fits(sheet: np.ndarray, box: tuple[slice, slice]) -> bool:
+def _is_within(sheet: np.ndarray, box: tuple[slice, slice]) -> bool:
     return box[0].stop <= sheet.shape[0] and box[1].stop <= sheet.shape[1]

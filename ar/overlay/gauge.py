@@ -11,9 +11,9 @@ from ..optics.camera import Camera
 from .hud import Below, format_millimetres, lay
 from .outlines import OPAQUE
 
-GAUGE = 0.6  # Font scale of the number at the tip.
-BESIDE = 10  # Horizontal and vertical distance of the number from the tip [pixel].
-BENDS = 33  # Number of points of a straight line, to draw it under lens distortion.
+NUMBER_SCALE = 0.6  # Font scale of the number at the tip.
+NUMBER_DISTANCE = 10  # Horizontal and vertical distance of the number from the tip [pixel].
+LINE_POINTS = 33  # Number of points of a straight line, to draw it under lens distortion.
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ def format_gauge(distance: float, error: float | None, inside: bool) -> str:
 def draw_line(sheet: np.ndarray, camera: Camera, gauge: Gauge) -> None:
     """Draw the gauge's line, in place; nothing if a part of it is behind the camera or beyond its lens."""
     # Lens distortion bends it.
-    shares = np.linspace(0.0, 1.0, 2 if camera.lens is None else BENDS)[:, None]
+    shares = np.linspace(0.0, 1.0, 2 if camera.lens is None else LINE_POINTS)[:, None]
     line, _ = camera.project((1.0 - shares) * gauge.tip + shares * gauge.nearest)
     if not np.isfinite(line).all():
         return
@@ -93,5 +93,5 @@ def write_gauge(
     seen = ends[np.isfinite(ends).all(axis=1)]
     if len(seen):
         column, row = np.clip(seen[0], -1e4, 1e4).round().astype(int).tolist()
-        wish = column + BESIDE, row + BESIDE
-        lay(colour, taken, [str(gauge)], wish, GAUGE, needed=True, below=Below(covered, lines, thin))
+        wish = column + NUMBER_DISTANCE, row + NUMBER_DISTANCE
+        lay(colour, taken, [str(gauge)], wish, NUMBER_SCALE, needed=True, below=Below(covered, lines, thin))

@@ -12,24 +12,24 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from .places import PAD, find_free_place
+from .places import BORDER_DISTANCE, find_free_place
 
 Corner = Literal["top left", "top right", "bottom left", "bottom right"]
 FONT = cv2.FONT_HERSHEY_SIMPLEX  # OpenCV font of all text in images.
 WHITE = (244, 244, 240)  # Default text colour (RGB).
-FINE = 0.45  # Default font scale of text in images.
-ROW = 18  # Line spacing of text [pixel].
-NARROW = 0.25  # Largest width of text at the bottom, as a share of the image width.
-NEAR = 48  # Distance from the desired place beyond which text covers thin lines instead [pixel].
+TEXT_SCALE = 0.45  # Default font scale of text in images.
+LINE_SPACING = 18  # Line spacing of text [pixel].
+MAX_BOTTOM_WIDTH = 0.25  # Largest width of text at the bottom, as a share of the image width.
+MAX_TEXT_SHIFT = 48  # Distance from the desired place beyond which text covers thin lines instead [pixel].
 # Widths of a panel's lines as shares of the image width; the first that fits is used.
 PANEL_WIDTHS = (0.9, 0.5, 0.36, 0.27, 0.2)
-SMALLER = 0.85  # Factor on the font scale of a panel in the second try.
-HEAD = 34  # Top row of the text at the top, below the orientation letter [pixel].
-SIGN = 0.6  # Font scale of the orientation letters.
+RETRY_SCALE = 0.85  # Factor on the font scale of a panel in the second try.
+HEAD_ROW = 34  # Top row of the text at the top, below the orientation letter [pixel].
+LETTER_SCALE = 0.6  # Font scale of the orientation letters.
 SIDES = ("RL", "AP", "SI")  # Orientation letters of the positive and negative direction of each RAS axis.
-OBLIQUE = 0.38  # Smallest component of a unit direction for which a second letter is shown.
+MIN_OBLIQUE = 0.38  # Smallest component of a unit direction for which a second letter is shown.
 # Allowed line breaks: not after a colon, nor between a name, its number, that number's error and their unit.
-BREAK = re.compile(
+BREAK_PATTERN = re.compile(
     r"\s+(?!(?:moved |reads )?[-+]?\d|\(\d\.|\+- )(?<![:-] )(?<!\d (?=%))(?<!\d (?=(?:mm|s|ms|N|kPa|ml|points)\b))"
 )
 
@@ -84,7 +84,7 @@ class Below:
     thin: np.ndarray | None = None
 
 
-NOTHING = Below()  # Default: text may cover no part of the image.
+COVER_NOTHING = Below()  # Default: text may cover no part of the image.
 
 
 def lay(
@@ -92,10 +92,10 @@ def lay(
     taken: np.ndarray,
     lines: Sequence[str],
     wish: tuple[int, int],
-    scale: float = FINE,
+    scale: float = TEXT_SCALE,
     ink: Sequence[float] = WHITE,
     needed: bool = False,
-    below: Below = NOTHING,
+    below: Below = COVER_NOTHING,
 ) -> None:
     """Write lines of ASCII text at the free place closest to a wish, and mark that place; both arrays change in place.
 
@@ -114,44 +114,44 @@ def lay(
         return
     sizes = [cv2.getTextSize(line, FONT, scale, 1) for line in lines]
     above, under = sizes[0][0][1], sizes[0][1]
-    size = max(width for (width, _), _ in sizes), above + under + ROW * (len(lines) - 1)
+    size = max(width for (width, _), _ in sizes), above + under + LINE_SPACING * (len(lines) - 1)
     sights, thin = below.sights, below.thin
     place = None if sights is None else find_free_place(taken | sights, size, wish)
     place = place or find_free_place(taken, size, wish)
-    if thin is not None and (place is None or np.hypot(place[0] - wish[0], place[1] - wish[1]) > NEAR):
+    if thin is not None and (place is None or np.hypot(place[0] - wish[0], place[1] - wish[1]) > MAX_TEXT_SHIFT):
         shut = taken * ~thin
         place = find_free_place(shut if sights is None else shut | sights, size, wish) or place
     if place is None and needed and below.lines is not None:
         place = find_free_place(taken & (1 - below.lines), size, wish)
     if place is None and needed:
-        place = find_free_place(np.zeros_like(taken), size, wish) or (PAD, PAD)
+        place = find_free_place(np.zeros_like(taken), size, wish) or (BORDER_DISTANCE, BORDER_DISTANCE)
     if place is None:
         return
     column, row = place
     for number, line in enumerate(lines):
-        write(colour, line, (column, row + above + number * ROW), scale, ink)
+        write(colour, line, (column, row + above + number * LINE_SPACING), scale, ink)
     taken[row : row + size[1], column : column + size[0]] = 1
 
 
-def wrap_line(text: str, room: float, scale: float = FINE) -> list[str]:
+def wrap_line(text: str, room: float, scale: float = TEXT_SCALE) -> list[str]:
     """Break a line of text into as few lines as fit into `room` [pixel], at allowed breaks, of about equal width.
 
     A number stays next to its name, its error and its unit, even if that takes more space.
     """
     if cv2.getTextSize(text, FONT, scale, 1)[0][0] <= room:
         return [text] if text else []
-    lines = _broken(text, room, scale)
-    for narrower in range(int(room), 0, -PAD):
-        tried = _broken(text, narrower, scale)
+    lines = _break_lines(text, room, scale)
+    for narrower in range(int(room), 0, -BORDER_DISTANCE):
+        tried = _break_lines(text, narrower, scale)
         if len(tried) > len(lines):
             break
         lines = tried
     return lines
 
 
-def _broken(text: str, room: float, scale: float) -> list[str]:
+def _break_lines(text: str, room: float, scale: float) -> list[str]:
     lines: list[str] = []
-    for word in BREAK.split(text.strip()):
+    for word in BREAK_PATTERN.split(text.strip()):
         longer = f"{lines[-1]} {word}" if lines else word
         if lines and cv2.getTextSize(longer, FONT, scale, 1)[0][0] <= room:
             lines[-1] = longer
@@ -210,31 +210,31 @@ def draw_text_panel(
     rooms = [share * width for share in PANEL_WIDTHS]
     shapes = [
         (letters, [wrap_line(line, room, letters) for line in lines])
-        for letters, room in itertools.product((scale, SMALLER * scale), rooms)
+        for letters, room in itertools.product((scale, RETRY_SCALE * scale), rooms)
     ]
-    wish = 0 if "left" in corner else width, PAD + below if "top" in corner else height
+    wish = 0 if "left" in corner else width, BORDER_DISTANCE + below if "top" in corner else height
     for sight, kept, (letters, parts) in itertools.product(sights, range(len(lines), 0, -1), shapes):
         broken = [part for line in parts[:kept] for part in line]
-        size, step = _size(broken, letters)
+        size, step = _compute_size(broken, letters)
         place = find_free_place(sight, size, wish)
         if place is not None:
-            return _lettered(out, broken, place, size, step, letters)
-    broken = [part for line in lines for part in wrap_line(line, width - 4 * PAD, scale)]
-    broken = broken[: max((height - below - 3 * PAD) // _size(broken, scale)[1], 1)]
-    size, step = _size(broken, scale)
-    top = PAD + below if "top" in corner else max(height - size[1] - PAD, 0)
-    left = PAD if "left" in corner else max(width - size[0] - PAD, 0)
-    return _lettered(out, broken, (left, top), size, step, scale)
+            return _write_panel(out, broken, place, size, step, letters)
+    broken = [part for line in lines for part in wrap_line(line, width - 4 * BORDER_DISTANCE, scale)]
+    broken = broken[: max((height - below - 3 * BORDER_DISTANCE) // _compute_size(broken, scale)[1], 1)]
+    size, step = _compute_size(broken, scale)
+    top = BORDER_DISTANCE + below if "top" in corner else max(height - size[1] - BORDER_DISTANCE, 0)
+    left = BORDER_DISTANCE if "left" in corner else max(width - size[0] - BORDER_DISTANCE, 0)
+    return _write_panel(out, broken, (left, top), size, step, scale)
 
 
-def _size(lines: Sequence[str], scale: float) -> tuple[tuple[int, int], int]:
+def _compute_size(lines: Sequence[str], scale: float) -> tuple[tuple[int, int], int]:
     """Compute the width and height of a panel of lines, and its line spacing [pixel]."""
     sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
-    step = max(height for _, height in sizes) + PAD
-    return (max(width for width, _ in sizes) + 2 * PAD, step * len(lines) + PAD), step
+    step = max(height for _, height in sizes) + BORDER_DISTANCE
+    return (max(width for width, _ in sizes) + 2 * BORDER_DISTANCE, step * len(lines) + BORDER_DISTANCE), step
 
 
-def _lettered(
+def _write_panel(
     out: np.ndarray, lines: Sequence[str], at: tuple[int, int], size: tuple[int, int], step: int, scale: float
 ) -> np.ndarray:
     """Draw lines on a dark ground, with the upper left corner at a column and row, into an image (H, W, 3) uint8."""
@@ -242,7 +242,7 @@ def _lettered(
     ground = out[top : top + size[1], left : left + size[0]]
     ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])
     for number, line in enumerate(lines, start=1):
-        write(out, line, (left + PAD, top + number * step), scale)
+        write(out, line, (left + BORDER_DISTANCE, top + number * step), scale)
     return out
 
 
@@ -252,7 +252,7 @@ def name_direction(direction: np.ndarray) -> str:
     L left, R right, A anterior, P posterior, S superior, I inferior; of the patient.
     """
     part = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    axes = [axis for axis in np.argsort(-np.abs(part), kind="stable")[:2] if abs(part[axis]) > OBLIQUE]
+    axes = [axis for axis in np.argsort(-np.abs(part), kind="stable")[:2] if abs(part[axis]) > MIN_OBLIQUE]
     return "".join(SIDES[axis][int(part[axis] < 0.0)] for axis in axes)
 
 
@@ -275,16 +275,16 @@ def draw_orientation_labels(colour: np.ndarray, rotation: np.ndarray, taken: np.
     out, taken = colour.copy(), taken.copy()
     height, width = taken.shape
     for edge, letters in name_bearings(rotation).items():
-        (long, tall), below = cv2.getTextSize(letters, FONT, SIGN, 1)
+        (long, tall), below = cv2.getTextSize(letters, FONT, LETTER_SCALE, 1)
         # Not at the centre of the top and bottom edges: tools enter there, and a tumour may extend to the bottom.
         strip, wish = {
-            "left": (np.s_[:, : long + 2 * PAD], (0, (height - tall) // 2)),
-            "right": (np.s_[:, -long - 2 * PAD :], (width, (height - tall) // 2)),
-            "top": (np.s_[: tall + below + 2 * PAD], (width // 4 - long // 2, 0)),
-            "bottom": (np.s_[-tall - below - 2 * PAD :], (3 * width // 4 - long // 2, height)),
+            "left": (np.s_[:, : long + 2 * BORDER_DISTANCE], (0, (height - tall) // 2)),
+            "right": (np.s_[:, -long - 2 * BORDER_DISTANCE :], (width, (height - tall) // 2)),
+            "top": (np.s_[: tall + below + 2 * BORDER_DISTANCE], (width // 4 - long // 2, 0)),
+            "bottom": (np.s_[-tall - below - 2 * BORDER_DISTANCE :], (3 * width // 4 - long // 2, height)),
         }[edge]
         elsewhere = np.ones_like(taken)
         elsewhere[strip] = taken[strip]
-        lay(out, elsewhere, [letters], wish, SIGN)
+        lay(out, elsewhere, [letters], wish, LETTER_SCALE)
         taken[strip] = elsewhere[strip]
     return out

@@ -8,19 +8,19 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from .hud import FONT, HEAD, WHITE, write_haloed
+from .hud import FONT, HEAD_ROW, WHITE, write_haloed
 from .outlines import OPAQUE
-from .places import CLEAR, PAD
-from .window import DARK, FAINTEST, STEP, STEPS, STRONGEST
+from .places import BORDER_DISTANCE, TEXT_DISTANCE
+from .window import BORDER_COLOUR, DEPTH_STEP, DEPTH_STEP_COUNT, MAX_TINT_OPACITY, MIN_TINT_OPACITY
 
-SMALL = 0.4  # Font scale of a legend.
-SAMPLE = 26  # Length of a line's sample [pixel].
-AFTER = 6  # Gap after a line's sample [pixel].
-LEADING = 16  # Height of a line of text [pixel].
-TALL = 12  # Height of a step of the tint's scale [pixel].
-LEAST = 480  # Smallest image width with a legend [pixel].
-GROUND = (200.0, 150.0, 135.0)  # Ground colour under the tint's scale (RGB).
-SHEET = 255
+LEGEND_TEXT_SCALE = 0.4  # Font scale of a legend.
+SAMPLE_LENGTH = 26  # Length of a line's sample [pixel].
+SAMPLE_GAP = 6  # Gap after a line's sample [pixel].
+LEGEND_LINE_HEIGHT = 16  # Height of a line of text [pixel].
+TINT_STEP_HEIGHT = 12  # Height of a step of the tint's scale [pixel].
+MIN_IMAGE_WIDTH = 480  # Smallest image width with a legend [pixel].
+GROUND_COLOUR = (200.0, 150.0, 135.0)  # Ground colour under the tint's scale (RGB).
+SHEET_VALUE = 255
 """Value of `taken` at a legend, a scale or an inset: no panel goes there."""
 
 
@@ -58,17 +58,17 @@ class Entry:
 @lru_cache(maxsize=16)
 def draw_legend(entries: tuple[Entry, ...]) -> np.ndarray:
     """Draw a sheet (h, w, 4) uint8, colour times coverage and coverage: a sample of each line, and its name."""
-    wide = max(cv2.getTextSize(entry.name, FONT, SMALL, 1)[0][0] for entry in entries)
-    sheet = np.zeros((LEADING * len(entries), SAMPLE + AFTER + wide + 4, 4), np.uint8)
+    wide = max(cv2.getTextSize(entry.name, FONT, LEGEND_TEXT_SCALE, 1)[0][0] for entry in entries)
+    sheet = np.zeros((LEGEND_LINE_HEIGHT * len(entries), SAMPLE_LENGTH + SAMPLE_GAP + wide + 4, 4), np.uint8)
     for number, entry in enumerate(entries):
-        row = LEADING * number + LEADING // 2
-        stroke, gap = entry.pattern or (SAMPLE, 0)
-        strokes = [(left, min(left + stroke, SAMPLE) - 1) for left in range(2, SAMPLE - 2, stroke + gap)]
-        rim = [(DARK, entry.width + 2)] if entry.width > 1 else []  # border as in `dash`
+        row = LEGEND_LINE_HEIGHT * number + LEGEND_LINE_HEIGHT // 2
+        stroke, gap = entry.pattern or (SAMPLE_LENGTH, 0)
+        strokes = [(left, min(left + stroke, SAMPLE_LENGTH) - 1) for left in range(2, SAMPLE_LENGTH - 2, stroke + gap)]
+        rim = [(BORDER_COLOUR, entry.width + 2)] if entry.width > 1 else []  # border as in `dash`
         for ink, width in (*rim, (entry.ink, entry.width)):
             for left, right in strokes:
                 cv2.line(sheet, (left, row), (right, row), (*ink, OPAQUE), width, cv2.LINE_AA)
-        write_haloed(sheet, entry.name, (SAMPLE + AFTER, row + 4), SMALL)
+        write_haloed(sheet, entry.name, (SAMPLE_LENGTH + SAMPLE_GAP, row + 4), LEGEND_TEXT_SCALE)
     return sheet
 
 
@@ -76,19 +76,21 @@ def draw_legend(entries: tuple[Entry, ...]) -> np.ndarray:
 def draw_depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
     """Draw a sheet (h, w, 4) uint8: the tint of the depth style by depth, with millimetres and a caption."""
     lines = caption.split("\n")
-    wide = max(cv2.getTextSize(line, FONT, SMALL, 1)[0][0] for line in lines)
-    sheet = np.zeros((LEADING * len(lines) + STEPS * TALL + 10, wide + 4, 4), np.uint8)
+    wide = max(cv2.getTextSize(line, FONT, LEGEND_TEXT_SCALE, 1)[0][0] for line in lines)
+    sheet = np.zeros(
+        (LEGEND_LINE_HEIGHT * len(lines) + DEPTH_STEP_COUNT * TINT_STEP_HEIGHT + 10, wide + 4, 4), np.uint8
+    )
     for number, line in enumerate(lines):
-        write_haloed(sheet, line, (0, LEADING * number + 12), SMALL)
-    top = LEADING * len(lines) + 4
-    for step in range(STEPS):
-        tint = STRONGEST - (STRONGEST - FAINTEST) * step / (STEPS - 1)
-        row = top + step * TALL
-        sheet[row : row + TALL, 2:16, :3] = (1.0 - tint) * np.array(GROUND) + tint * np.array(ink)
-        sheet[row : row + TALL, 2:16, 3] = OPAQUE
+        write_haloed(sheet, line, (0, LEGEND_LINE_HEIGHT * number + 12), LEGEND_TEXT_SCALE)
+    top = LEGEND_LINE_HEIGHT * len(lines) + 4
+    for step in range(DEPTH_STEP_COUNT):
+        tint = MAX_TINT_OPACITY - (MAX_TINT_OPACITY - MIN_TINT_OPACITY) * step / (DEPTH_STEP_COUNT - 1)
+        row = top + step * TINT_STEP_HEIGHT
+        sheet[row : row + TINT_STEP_HEIGHT, 2:16, :3] = (1.0 - tint) * np.array(GROUND_COLOUR) + tint * np.array(ink)
+        sheet[row : row + TINT_STEP_HEIGHT, 2:16, 3] = OPAQUE
         if step % 2 == 0:
             cv2.line(sheet, (16, row), (20, row), (*WHITE, OPAQUE), 1)
-            write_haloed(sheet, f"{1e3 * STEP * step:.0f}", (24, row + 4), SMALL)
+            write_haloed(sheet, f"{1e3 * DEPTH_STEP * step:.0f}", (24, row + 4), LEGEND_TEXT_SCALE)
     return sheet
 
 
@@ -105,14 +107,19 @@ def place_sheet(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, sights
         (H, W) uint8: above 0 on what should stay visible, as tools.
     """
     (height, width), (tall, wide) = taken.shape, sheet.shape[:2]
-    if width < LEAST:
+    if width < MIN_IMAGE_WIDTH:
         return False
-    upper, lower = height // 2 - HEAD // 2, height // 2 + HEAD // 2  # orientation letters are between, and at both ends
-    rows = [row for row in (HEAD, upper - tall) if HEAD <= row <= upper - tall]
-    rows += [row for row in (lower, height - HEAD - tall) if lower <= row <= height - HEAD - tall]
-    for column in (width - PAD - wide, PAD):
+    upper, lower = (
+        height // 2 - HEAD_ROW // 2,
+        height // 2 + HEAD_ROW // 2,
+    )  # orientation letters are between, and at both ends
+    rows = [row for row in (HEAD_ROW, upper - tall) if HEAD_ROW <= row <= upper - tall]
+    rows += [row for row in (lower, height - HEAD_ROW - tall) if lower <= row <= height - HEAD_ROW - tall]
+    for column in (width - BORDER_DISTANCE - wide, BORDER_DISTANCE):
         for row in rows:
-            around = np.s_[row - CLEAR : row + tall + CLEAR, column - CLEAR : column + wide + CLEAR]
+            around = np.s_[
+                row - TEXT_DISTANCE : row + tall + TEXT_DISTANCE, column - TEXT_DISTANCE : column + wide + TEXT_DISTANCE
+            ]
             if not taken[around].any() and not sights[around].any():
                 paste(colour, taken, sheet, (column, row))
                 return True
@@ -125,4 +132,4 @@ def paste(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, at: tuple[in
     box = np.s_[row : row + sheet.shape[0], column : column + sheet.shape[1]]
     left = 1.0 - sheet[..., 3:] / np.float32(OPAQUE)
     colour[box] = np.minimum(colour[box] * left + sheet[..., :3], 255.0)
-    taken[box] = SHEET
+    taken[box] = SHEET_VALUE

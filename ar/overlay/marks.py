@@ -23,12 +23,12 @@ from .outlines import (
     find_pixel_box,
 )
 from .styles import Opening
-from .window import DARK
+from .window import BORDER_COLOUR
 
-BEFORE = (0.86, 0.88, 0.90)  # Colour of the previous position (RGB, 0 to 1): grey.
-DOTTED = (2, 5)  # Stroke and gap lengths of the outline at the previous position [pixel].
-LEAST_ARROW = 4.0  # Smallest motion with an arrow [pixel].
-UNNAMED = LegendNames()  # Default legend names.
+BEFORE_COLOUR = (0.86, 0.88, 0.90)  # Colour of the previous position (RGB, 0 to 1): grey.
+BEFORE_STROKES = (2, 5)  # Stroke and gap lengths of the outline at the previous position [pixel].
+MIN_ARROW = 4.0  # Smallest motion with an arrow [pixel].
+DEFAULT_NAMES = LegendNames()  # Default legend names.
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +55,10 @@ def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], bef
     middles = np.stack([before.vertices.mean(axis=0), hidden.vertices.mean(axis=0)])
     ends, _ = camera.crop_to(*box).project(middles)
     length = float(np.linalg.norm(ends[1] - ends[0]))
-    if not length >= LEAST_ARROW:  # nor where one has no pixel
+    if not length >= MIN_ARROW:  # nor where one has no pixel
         return
     start, end = (tuple(each) for each in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
-    for ink, width in ((DARK, 4), (compute_ink(BEFORE), 2)):
+    for ink, width in ((BORDER_COLOUR, 4), (compute_ink(BEFORE_COLOUR), 2)):
         cv2.arrowedLine(sheet, start, end, (*ink, OPAQUE), width, cv2.LINE_AA, tipLength=min(0.5, 6.0 / length))
 
 
@@ -70,7 +70,10 @@ def draw_dotted(camera: Camera, layer: Layer) -> np.ndarray:
     part = camera.crop_to(*box)
     sheet = allocate_sheet(part)
     draw_dashes(
-        sheet, find_outlines(compute_silhouette(part, layer.vertices, layer.triangles)), compute_ink(BEFORE), DOTTED
+        sheet,
+        find_outlines(compute_silhouette(part, layer.vertices, layer.triangles)),
+        compute_ink(BEFORE_COLOUR),
+        BEFORE_STROKES,
     )
     return sheet
 
@@ -89,7 +92,7 @@ def draw_trace(sheet: np.ndarray, camera: Camera, trace: Trace) -> None:
     )
     column, row = np.clip(at, -1e4, 1e4).round().astype(int).tolist()
     pale = [0.5 * (share + 255.0) for share in ink]  # so that pixels of this colour are the outline's alone
-    for colour, radius in ((DARK, 4), (pale, 3)):
+    for colour, radius in ((BORDER_COLOUR, 4), (pale, 3)):
         cv2.circle(sheet, (column, row), radius, (*colour, OPAQUE), -1, cv2.LINE_AA)
 
 
@@ -158,7 +161,7 @@ class Words:
 
     doubt: str = ""
     head: Sequence[str] = ()
-    names: LegendNames = UNNAMED
+    names: LegendNames = DEFAULT_NAMES
     moved: tuple[float, float] | None = None
     error: float | None = None
 

@@ -11,26 +11,26 @@ import numpy as np
 from ..optics.camera import Camera
 from ..rendering.layer import Layer
 from ..rendering.renderer import Picture
-from .cut import ENDS, CutPlane, add_caption, build_plane, compute_profile, draw_section
-from .distances import RING, RINGS, build_tree, compute_seen_distance, draw_rings
+from .cut import END_LETTERS, CutPlane, add_caption, build_plane, compute_profile, draw_section
+from .distances import RING_COLOUR, RING_DISTANCES, build_tree, compute_seen_distance, draw_rings
 from .gauge import Gauge
-from .hud import FINE, HEAD, Below, bound_words, lay, wrap_line, write_haloed
-from .legend import SMALL, draw_depth_scale, paste, place_sheet
+from .hud import HEAD_ROW, TEXT_SCALE, Below, bound_words, lay, wrap_line, write_haloed
+from .legend import LEGEND_TEXT_SCALE, draw_depth_scale, paste, place_sheet
 from .outlines import OPAQUE, compute_ink, draw_dashes, to_key
-from .places import PAD, find_free_place
+from .places import BORDER_DISTANCE, find_free_place
 from .styles import Style
 from .window import FRONT, Roles
 
-BEYOND = 3e-3  # Search margin beyond the last ring [m].
-WIDTHS = (0.34, 0.27, 0.21)  # Widths of a cut's inset as shares of the image width; the first that fits is used.
-ASPECT = 0.75  # Height of the inset over its width.
+SEARCH_MARGIN = 3e-3  # Search margin beyond the last ring [m].
+INSET_WIDTHS = (0.34, 0.27, 0.21)  # Widths of a cut's inset as shares of the image width; the first that fits is used.
+INSET_ASPECT = 0.75  # Height of the inset over its width.
 CUT_STROKES = (3, 5)  # Stroke and gap lengths of the cutting line in the image [pixel].
 # Half-width of the search for the visible surface over a cut [half-widths of the hidden surface in the cut].
-ACROSS = 4.0
-EDGE = 12  # Distance of the cut's letters from the image border and from tools [pixel].
-ASIDE = 10  # Distance of a letter from the cutting line [pixel].
-HALF = 6  # Half the size of a letter [pixel].
-NO_ROOM = "no room for the cut"  # Text in the image where no place for the inset is free.
+SEARCH_HALF_WIDTH = 4.0
+LETTER_EDGE_DISTANCE = 12  # Distance of the cut's letters from the image border and from tools [pixel].
+LETTER_LINE_DISTANCE = 10  # Distance of a letter from the cutting line [pixel].
+HALF_LETTER_SIZE = 6  # Half the size of a letter [pixel].
+NO_ROOM_TEXT = "no room for the cut"  # Text in the image where no place for the inset is free.
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Measure:
         low, high = self.hidden.vertices.min(axis=0), self.hidden.vertices.max(axis=0)
         if self.style != "rings":
             return np.stack([low, high])[:0]
-        beyond = RINGS[-1] + BEYOND
+        beyond = RING_DISTANCES[-1] + SEARCH_MARGIN
         return np.stack(np.meshgrid(*np.stack([low - beyond, high + beyond], axis=1)), axis=-1).reshape(-1, 3)
 
     @property
@@ -82,7 +82,7 @@ class Measure:
         if self.style == "rings":
             free = self.roles.read_roles(self.picture.segmentation, box) == 0
             tree = build_tree(self.hidden.vertices, self.hidden.triangles, str(self.picture.drawn.depth.device))
-            reach = RINGS[-1] + BEYOND
+            reach = RING_DISTANCES[-1] + SEARCH_MARGIN
             draw_rings(
                 sheet,
                 compute_seen_distance(tree, self.camera, box, self.picture.drawn.depth[0], free, reach),
@@ -96,21 +96,35 @@ class Measure:
             line = pixels[np.isfinite(pixels).all(axis=1)].round().astype(np.int32)
             line = line[np.diff(line, axis=0, append=-1).any(axis=1)]
             lines = np.ascontiguousarray(sheet[..., 3] > 0).astype(np.uint8)
-            draw_dashes(sheet, [line[:, None]], RING, CUT_STROKES, 1)
-            line = line[((line >= EDGE) & (line < (part.width - EDGE, part.height - EDGE))).all(axis=1)]
+            draw_dashes(sheet, [line[:, None]], RING_COLOUR, CUT_STROKES, 1)
+            line = line[
+                (
+                    (line >= LETTER_EDGE_DISTANCE)
+                    & (line < (part.width - LETTER_EDGE_DISTANCE, part.height - LETTER_EDGE_DISTANCE))
+                ).all(axis=1)
+            ]
             # Letters are outside of tools, where the line is visible.
             front = (self.roles.read_roles(self.picture.segmentation, box) == FRONT).astype(np.uint8)
-            line = line[cv2.dilate(front, np.ones((2 * EDGE + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] == 0]
+            line = line[
+                cv2.dilate(front, np.ones((2 * LETTER_EDGE_DISTANCE + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] == 0
+            ]
             if len(line):
                 # Next to the line: there may be another on it, from the tip.
                 along = (line[-1] - line[0]) / max(float(np.linalg.norm(line[-1] - line[0])), 1.0)
-                beside = np.rint(ASIDE * np.array([along[1], -along[0]])).astype(int)
-                places = np.clip(line + beside, EDGE, (part.width - EDGE, part.height - EDGE))
+                beside = np.rint(LETTER_LINE_DISTANCE * np.array([along[1], -along[0]])).astype(int)
+                places = np.clip(
+                    line + beside,
+                    LETTER_EDGE_DISTANCE,
+                    (part.width - LETTER_EDGE_DISTANCE, part.height - LETTER_EDGE_DISTANCE),
+                )
                 # Prefer places that hide no other line.
-                clear = cv2.dilate(lines, np.ones((2 * HALF + 1,) * 2, np.uint8))[places[:, 1], places[:, 0]] == 0
+                clear = (
+                    cv2.dilate(lines, np.ones((2 * HALF_LETTER_SIZE + 1,) * 2, np.uint8))[places[:, 1], places[:, 0]]
+                    == 0
+                )
                 places = places[clear] if clear.any() else places
-                for letter, (column, row) in zip(ENDS, places[[0, -1]].tolist(), strict=True):
-                    write_haloed(above, letter, (column - 4, row + 4), FINE, RING)
+                for letter, (column, row) in zip(END_LETTERS, places[[0, -1]].tolist(), strict=True):
+                    write_haloed(above, letter, (column - 4, row + 4), TEXT_SCALE, RING_COLOUR)
 
     def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
         """Add the explanation of the lines to a composite image, with arguments of `place_sheet`; in place.
@@ -123,7 +137,7 @@ class Measure:
             scale = draw_depth_scale(to_key(compute_ink(self.hidden.colour)), caption)
             if not place_sheet(colour, taken, scale, sights):
                 # A tint needs its scale: rather over cortex than not at all.
-                wish = colour.shape[1], HEAD
+                wish = colour.shape[1], HEAD_ROW
                 places = (
                     find_free_place(shut, scale.shape[1::-1], wish) for shut in (taken | sights, taken | needed, taken)
                 )
@@ -132,32 +146,32 @@ class Measure:
                     paste(colour, taken, scale, place)
         if self.style == "rings":
             said = f"rings: mm to the {self.name or 'surface'}; {self.off}"
-            lay(colour, taken, wrap_line(said, 0.3 * width), (width, HEAD), below=Below(sights))
+            lay(colour, taken, wrap_line(said, 0.3 * width), (width, HEAD_ROW), below=Below(sights))
         if self.style == "cut":
             self._lay_cut(colour, taken, sights, needed)
 
     def _lay_cut(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
         roles = self.roles.read_roles(self.picture.segmentation)
         plane = self.plane
-        reach = ACROSS * float(np.abs(plane.to_plane(self.hidden.vertices)[:, 0]).max())
+        reach = SEARCH_HALF_WIDTH * float(np.abs(plane.to_plane(self.hidden.vertices)[:, 0]).max())
         seen = compute_profile(self.camera, plane, self.picture.depth, roles, reach)
         tip = None if self.gauge is None else self.gauge.tip
         ink = to_key(compute_ink(self.hidden.colour))
-        for shut, share in itertools.product((taken | sights, taken | needed), WIDTHS):
+        for shut, share in itertools.product((taken | sights, taken | needed), INSET_WIDTHS):
             wide = round(share * taken.shape[1])
             lines = [
                 line
                 for text in (f"cut: mm to the {self.name or 'surface'}", self.off)
-                for line in wrap_line(text, wide - PAD, SMALL)
+                for line in wrap_line(text, wide - BORDER_DISTANCE, LEGEND_TEXT_SCALE)
             ]
-            inset = add_caption(np.zeros((round(ASPECT * wide), wide, 3), np.uint8), lines)
-            shut[-HEAD:] = 1  # for the text at the bottom
-            place = find_free_place(shut, inset.shape[1::-1], (taken.shape[1], HEAD))
+            inset = add_caption(np.zeros((round(INSET_ASPECT * wide), wide, 3), np.uint8), lines)
+            shut[-HEAD_ROW:] = 1  # for the text at the bottom
+            place = find_free_place(shut, inset.shape[1::-1], (taken.shape[1], HEAD_ROW))
             if place is not None:
                 drawn = draw_section(
-                    self.camera, self.hidden, plane, seen, (wide, round(ASPECT * wide)), ink, tip, self.error
+                    self.camera, self.hidden, plane, seen, (wide, round(INSET_ASPECT * wide)), ink, tip, self.error
                 )
                 whole = add_caption(drawn, lines)
                 paste(colour, taken, np.dstack([whole, np.full(whole.shape[:2], OPAQUE, np.uint8)]), place)
                 return
-        lay(colour, taken, [NO_ROOM], (taken.shape[1], HEAD))
+        lay(colour, taken, [NO_ROOM_TEXT], (taken.shape[1], HEAD_ROW))

@@ -11,10 +11,10 @@ import numpy as np
 from ..optics.camera import Camera
 from ..rendering.rasteriser import rasterise_surface
 from .hud import FONT, WHITE
-from .window import DARK, NEAR_EDGE, SURROUND
+from .window import BORDER_COLOUR, MAX_EDGE_DISTANCE, SOFT_EDGE_WIDTH
 
 OPAQUE = 255  # Value of a sheet's fourth channel that covers what is under it.
-COARSE = 16  # Grid spacing of the coarse search under lens distortion [pixel].
+COARSE_SPACING = 16  # Grid spacing of the coarse search under lens distortion [pixel].
 
 
 def compute_ink(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
@@ -45,8 +45,12 @@ def find_pixel_box(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | 
         pixels = find_pixel_corners(camera, points)
         if not len(pixels):
             return None
-    low = np.maximum(np.floor(pixels.min(axis=0)) - SURROUND, 0.0).astype(int).tolist()
-    high = np.minimum(np.ceil(pixels.max(axis=0)) + SURROUND + 1.0, (camera.width, camera.height)).astype(int).tolist()
+    low = np.maximum(np.floor(pixels.min(axis=0)) - SOFT_EDGE_WIDTH, 0.0).astype(int).tolist()
+    high = (
+        np.minimum(np.ceil(pixels.max(axis=0)) + SOFT_EDGE_WIDTH + 1.0, (camera.width, camera.height))
+        .astype(int)
+        .tolist()
+    )
     box = slice(low[1], high[1]), slice(low[0], high[0])
     return box if all(side.start < side.stop for side in box) else None
 
@@ -58,22 +62,22 @@ def find_pixel_corners(camera: Camera, points: np.ndarray) -> np.ndarray:
     """
     ends, _ = replace(camera, lens=None).project(points)
     # Coarse grid first, with a margin of the largest step of the undistorted coordinates.
-    step = COARSE if min(camera.width, camera.height) > 2 * COARSE else 1
+    step = COARSE_SPACING if min(camera.width, camera.height) > 2 * COARSE_SPACING else 1
     few = camera.straight[::step, ::step]
     steps = [np.abs(np.diff(few, axis=axis)).reshape(-1, 2) for axis in (0, 1)]
     room = 1.0 + np.nan_to_num(np.concatenate(steps)).max(axis=0, initial=0.0)
-    rows, columns = (step * where for where in _inside(few, ends.min(axis=0) - room, ends.max(axis=0) + room))
+    rows, columns = (step * where for where in _find_inside(few, ends.min(axis=0) - room, ends.max(axis=0) + room))
     corners = np.zeros((0, 2))
     if len(rows):
         top, left = max(rows[0] - step, 0), max(columns[0] - step, 0)
         part = camera.straight[top : rows[-1] + step + 1, left : columns[-1] + step + 1]
-        rows, columns = _inside(part, ends.min(axis=0), ends.max(axis=0))
+        rows, columns = _find_inside(part, ends.min(axis=0), ends.max(axis=0))
         corners = np.array([(left + columns[end], top + rows[end]) for end in (0, -1) if len(rows)]).reshape(-1, 2)
     near, _ = camera.project(points)
     return np.concatenate([corners, near[np.isfinite(near).all(axis=1)]])
 
 
-def _inside(straight: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_inside(straight: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find rows and columns with positions (h, w, 2) between two corners (2,)."""
     inside = np.all((straight >= low) & (straight <= high), axis=2)
     return np.flatnonzero(np.any(inside, axis=1)), np.flatnonzero(np.any(inside, axis=0))
@@ -109,13 +113,13 @@ def draw_dashes(
     lines = [piece for line in lines for piece in clip_to_sheet(line, out.shape[1], out.shape[0])]
     strokes = [line[start : start + stroke] for line in lines for start in range(0, len(line), stroke + gap)]
     if width > 1:
-        cv2.polylines(out, strokes, False, (*DARK, OPAQUE), width + 2, cv2.LINE_AA)
+        cv2.polylines(out, strokes, False, (*BORDER_COLOUR, OPAQUE), width + 2, cv2.LINE_AA)
     cv2.polylines(out, strokes, False, (*ink, OPAQUE), width, cv2.LINE_AA)
 
 
 def clip_to_sheet(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:
     """Return the pieces of an outline (n, 1, 2) inside a sheet, away from its edge."""
-    inside = (line >= NEAR_EDGE) & (line < (width - NEAR_EDGE, height - NEAR_EDGE))
+    inside = (line >= MAX_EDGE_DISTANCE) & (line < (width - MAX_EDGE_DISTANCE, height - MAX_EDGE_DISTANCE))
     return split_runs(line, inside.all(axis=(1, 2)))
 
 
@@ -137,13 +141,13 @@ def to_key(ink: Sequence[float]) -> tuple[float, ...]:
     return tuple(share + 8.0 if share < 128.0 else share - 8.0 for share in ink)
 
 
-SAME = 2  # Colour tolerance in each channel: centres of lines have the exact colour, within rounding.
+COLOUR_TOLERANCE = 2  # Colour tolerance in each channel: centres of lines have the exact colour, within rounding.
 # Percentile of the outline pixels' distances that is reported [%]: corners and crossings of lines are excluded.
-SHARE = 95.0
-CUT = 5  # Distance from occluders or the image border within which an outline may be cut [pixel].
-BESIDE = 6  # Distance from a mask's edge within which lines may be drawn [pixel].
-FEW = 60  # Minimum number of pixels for a share.
-APART = 8  # Margin round a line of text without its colour: else "1.5" would be found in "11.5" [pixel].
+DISTANCE_PERCENTILE = 95.0
+CUT_DISTANCE = 5  # Distance from occluders or the image border within which an outline may be cut [pixel].
+LINE_DISTANCE = 6  # Distance from a mask's edge within which lines may be drawn [pixel].
+MIN_PIXELS = 60  # Minimum number of pixels for a share.
+TEXT_MARGIN = 8  # Margin round a line of text without its colour: else "1.5" would be found in "11.5" [pixel].
 
 
 def measure_outline_gap(
@@ -172,7 +176,9 @@ def measure_outline_gap(
     true = np.zeros(mask.shape, np.uint8)
     for outline in find_outlines(mask):
         cv2.polylines(true, [outline], True, (1,))
-    shut = cv2.dilate(np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT + 1,) * 2, np.uint8))
+    shut = cv2.dilate(
+        np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT_DISTANCE + 1,) * 2, np.uint8)
+    )
     seen = shut[1:-1, 1:-1] == 0
     wanted = (true > 0) & seen
     if max(np.count_nonzero(wanted), np.count_nonzero(found & seen)) < least:
@@ -180,17 +186,17 @@ def measure_outline_gap(
     there = (true > 0, found) if least > 1 else (wanted, found & seen)
     if not all(each.any() for each in there):
         return np.inf
-    apart = _distance(true > 0)[found & seen], np.maximum(_distance(found)[wanted] - 0.5 * gap, 0.0)
-    return float(max(np.percentile(each, SHARE) for each in apart if len(each)))
+    apart = _compute_distance(true > 0)[found & seen], np.maximum(_compute_distance(found)[wanted] - 0.5 * gap, 0.0)
+    return float(max(np.percentile(each, DISTANCE_PERCENTILE) for each in apart if len(each)))
 
 
-def find_ink(colour: np.ndarray, ink: Sequence[float], off: int = SAME) -> np.ndarray:
+def find_ink(colour: np.ndarray, ink: Sequence[float], off: int = COLOUR_TOLERANCE) -> np.ndarray:
     """Return the mask (H, W) bool of pixels of an image (H, W, 3) uint8 within `off` of a colour (3,) in 0 .. 255."""
     low, high = (tuple(np.clip(np.rint(ink) + by, 0, 255).tolist()) for by in (-off, off))
     return cv2.inRange(np.ascontiguousarray(colour), low, high) > 0
 
 
-def _distance(mask: np.ndarray) -> np.ndarray:
+def _compute_distance(mask: np.ndarray) -> np.ndarray:
     """Compute the distance (H, W) of each pixel from the nearest pixel of a mask (H, W) [pixel]."""
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
@@ -205,10 +211,10 @@ def find_text(
 ) -> tuple[int, int, int, int] | None:
     """Locate a line of text written by `hud.write`: left, top, right and bottom [pixel]; None if not found."""
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
-    blank = np.zeros((above + below + 2, width + 2 * APART, 3), np.uint8)
-    cv2.putText(blank, text, (APART, above + 1), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
+    blank = np.zeros((above + below + 2, width + 2 * TEXT_MARGIN, 3), np.uint8)
+    cv2.putText(blank, text, (TEXT_MARGIN, above + 1), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
     shape = (blank == ink).all(axis=2).astype(np.float32)
-    here = np.pad(find_ink(colour, ink, 0), APART).astype(np.float32)
+    here = np.pad(find_ink(colour, ink, 0), TEXT_MARGIN).astype(np.float32)
     if shape.shape[0] > here.shape[0] or shape.shape[1] > here.shape[1]:
         return None
     right = cv2.matchTemplate(here, shape, cv2.TM_CCORR)
@@ -218,7 +224,7 @@ def find_text(
     places = np.argwhere((right > count - 0.5) & (every < count + 0.5))
     if not len(places):
         return None
-    left, foot = int(places[0, 1]), int(places[0, 0]) + above + 1 - APART + below
+    left, foot = int(places[0, 1]), int(places[0, 0]) + above + 1 - TEXT_MARGIN + below
     return left, foot - below - above, left + width, foot
 
 
@@ -229,7 +235,9 @@ def compute_inked_share(colour: np.ndarray, ink: Sequence[float], mask: np.ndarr
     """
     outline = np.zeros(mask.shape, np.uint8)
     cv2.drawContours(outline, find_outlines(mask), -1, (1,))
-    shut = cv2.dilate(np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT + 1,) * 2, np.uint8))
+    shut = cv2.dilate(
+        np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT_DISTANCE + 1,) * 2, np.uint8)
+    )
     return _share(find_ink(colour, ink), (outline > 0) & (shut[1:-1, 1:-1] == 0))
 
 
@@ -238,9 +246,9 @@ def compute_changed_share(before: np.ndarray, after: np.ndarray, where: np.ndarr
 
     NaN for fewer than `FEW` pixels.
     """
-    inner = cv2.erode(where.astype(np.uint8), np.ones((2 * BESIDE + 1,) * 2, np.uint8), borderValue=0) > 0
+    inner = cv2.erode(where.astype(np.uint8), np.ones((2 * LINE_DISTANCE + 1,) * 2, np.uint8), borderValue=0) > 0
     return _share(~find_ink(cv2.absdiff(before, after), (0, 0, 0)), inner)
 
 
 def _share(found: np.ndarray, where: np.ndarray) -> float:
-    return float(found[where].mean()) if np.count_nonzero(where) >= FEW else np.nan
+    return float(found[where].mean()) if np.count_nonzero(where) >= MIN_PIXELS else np.nan

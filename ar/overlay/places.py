@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-PAD = 8  # Distance of text from the image border [pixel].
-CLEAR = 6  # Distance of text from lines and other text [pixel].
-STEP = 4  # Grid spacing of candidate places [pixel].
-REACHES = 64, 256  # Search radii around the desired place [pixel], tried in order before the whole image.
-ASIDE = 2  # Weight of a sideways distance relative to a vertical one: lines of text go below each other.
+BORDER_DISTANCE = 8  # Distance of text from the image border [pixel].
+TEXT_DISTANCE = 6  # Distance of text from lines and other text [pixel].
+GRID_SPACING = 4  # Grid spacing of candidate places [pixel].
+SEARCH_RADII = 64, 256  # Search radii around the desired place [pixel], tried in order before the whole image.
+SIDEWAYS_WEIGHT = 2  # Weight of a sideways distance relative to a vertical one: lines of text go below each other.
 
 
 def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) -> tuple[int, int] | None:
@@ -24,25 +24,27 @@ def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, i
         [pixel].
     """
     (height, width), (wide, tall) = taken.shape, size
-    right, low = width - PAD - wide, height - PAD - tall
-    if right < PAD or low < PAD:
+    right, low = width - BORDER_DISTANCE - wide, height - BORDER_DISTANCE - tall
+    if right < BORDER_DISTANCE or low < BORDER_DISTANCE:
         return None
-    column, row = min(max(wish[0], PAD), right), min(max(wish[1], PAD), low)
-    near = taken[row - CLEAR : row + tall + CLEAR, column - CLEAR : column + wide + CLEAR]
+    column, row = min(max(wish[0], BORDER_DISTANCE), right), min(max(wish[1], BORDER_DISTANCE), low)
+    near = taken[
+        row - TEXT_DISTANCE : row + tall + TEXT_DISTANCE, column - TEXT_DISTANCE : column + wide + TEXT_DISTANCE
+    ]
     if not near.any():
         return column, row
-    whole = ASIDE * width + height
-    for reach in (*REACHES, whole):
+    whole = SIDEWAYS_WEIGHT * width + height
+    for reach in (*SEARCH_RADII, whole):
         # All places within this radius, and the taken pixels round them.
-        columns, rows = list_places_within(column, reach // ASIDE, right), list_places_within(row, reach, low)
-        top, left = rows[0] - CLEAR, columns[0] - CLEAR
-        there = taken[top : rows[-1] + tall + CLEAR, left : columns[-1] + wide + CLEAR]
+        columns, rows = list_places_within(column, reach // SIDEWAYS_WEIGHT, right), list_places_within(row, reach, low)
+        top, left = rows[0] - TEXT_DISTANCE, columns[0] - TEXT_DISTANCE
+        there = taken[top : rows[-1] + tall + TEXT_DISTANCE, left : columns[-1] + wide + TEXT_DISTANCE]
         # Integral image: the number of taken pixels in a box is a sum of four values.
         sums = cv2.integral((there > 0).astype(np.uint8))
-        up, aside = rows[:, None] - CLEAR - top, columns - CLEAR - left
-        down, across = up + tall + 2 * CLEAR, aside + wide + 2 * CLEAR
+        up, aside = rows[:, None] - TEXT_DISTANCE - top, columns - TEXT_DISTANCE - left
+        down, across = up + tall + 2 * TEXT_DISTANCE, aside + wide + 2 * TEXT_DISTANCE
         inside = sums[down, across] - sums[up, across] - sums[down, aside] + sums[up, aside]
-        far = (ASIDE * (columns - column)) ** 2 + ((rows - row) ** 2)[:, None]
+        far = (SIDEWAYS_WEIGHT * (columns - column)) ** 2 + ((rows - row) ** 2)[:, None]
         best = np.where(inside == 0, far, np.inf)
         at = np.unravel_index(best.argmin(), best.shape)
         if best[at] <= reach**2:
@@ -52,5 +54,5 @@ def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, i
 
 def list_places_within(middle: int, reach: int, last: int) -> np.ndarray:
     """List the candidate places PAD, PAD + STEP, ... up to `last` that are at most `reach` from a centre."""
-    places = np.arange(PAD, last + 1, STEP)
+    places = np.arange(BORDER_DISTANCE, last + 1, GRID_SPACING)
     return places[np.abs(places - middle) <= reach]

@@ -20,8 +20,8 @@ STYLES: Mapping[Style, str] = MappingProxyType(
     }
 )
 """Display names of the styles."""
-NOTICED = 0.1  # Share of the visible silhouette from which the closed ground over it is reported.
-WHOLE = 0.9  # Share of the visible silhouette from which closed ground is reported without "partly".
+MIN_REPORTED_SHARE = 0.1  # Share of the visible silhouette from which the closed ground over it is reported.
+WHOLE_SHARE = 0.9  # Share of the visible silhouette from which closed ground is reported without "partly".
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Opening:
                 words = dict(self.under).get(layer, self.otherwise)
                 under[words] = under.get(words, 0) + count
         total, shut = sum(counts.values()), sum(under.values())
-        if not total or shut < NOTICED * total:
+        if not total or shut < MIN_REPORTED_SHARE * total:
             return ""
         most = max(under, key=lambda words: under[words])
-        return most if shut >= WHOLE * total else f"partly {most}"
+        return most if shut >= WHOLE_SHARE * total else f"partly {most}"

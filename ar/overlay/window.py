@@ -13,30 +13,32 @@ from ..optics.camera import Camera
 from ..rendering.layer import Layer, compute_vertex_normals
 from ..rendering.lens_rasteriser import pixel_at
 from ..rendering.parallel import forward_kernel, launch_in_bands, load
-from ..rendering.rasteriser import NOTHING, RasterisedSurface, depth_of, face_of
+from ..rendering.rasteriser import EMPTY_PIXEL, RasterisedSurface, depth_of, face_of
 from ..rendering.renderer import Pictures
 from ..rendering.triangle import weights_of
 
-FADE = wp.constant(0.03)  # Depth under the surface over which light falls to 1 / e [m].
-SURROUND = wp.constant(24)  # Width of the window's soft edge round the silhouette [pixel].
-STRAIGHT = wp.constant(0.955)  # Length of a straight chamfer step, as in OpenCV [pixel].
-SLANTED = wp.constant(1.3693)  # Length of a diagonal chamfer step, as in OpenCV [pixel].
-REACH = wp.constant(26)  # Search radius of the chamfer distance [pixel]: covers the soft edge.
-LINE = wp.constant(1.7)  # Half the width of the outline [pixel].
-RIM = wp.constant(2.7)  # Half the width of the outline with its dark border [pixel].
-NEAR_EDGE = wp.constant(5.0)  # Distance from the silhouette's edge within which outline and border are drawn [pixel].
-STEP = wp.constant(0.005)  # Width of a depth step of the style `depth` [m].
-STEPS = wp.constant(6)  # Number of depth steps of the style `depth`.
-STRONGEST = wp.constant(0.85)  # Opacity of the tint at the surface.
-FAINTEST = wp.constant(0.1)  # Opacity of the tint at the last depth step.
+FADE_DEPTH = wp.constant(0.03)  # Depth under the surface over which light falls to 1 / e [m].
+SOFT_EDGE_WIDTH = wp.constant(24)  # Width of the window's soft edge round the silhouette [pixel].
+STRAIGHT_STEP = wp.constant(0.955)  # Length of a straight chamfer step, as in OpenCV [pixel].
+DIAGONAL_STEP = wp.constant(1.3693)  # Length of a diagonal chamfer step, as in OpenCV [pixel].
+CHAMFER_RADIUS = wp.constant(26)  # Search radius of the chamfer distance [pixel]: covers the soft edge.
+HALF_LINE_WIDTH = wp.constant(1.7)  # Half the width of the outline [pixel].
+HALF_BORDER_WIDTH = wp.constant(2.7)  # Half the width of the outline with its dark border [pixel].
+MAX_EDGE_DISTANCE = wp.constant(
+    5.0
+)  # Distance from the silhouette's edge within which outline and border are drawn [pixel].
+DEPTH_STEP = wp.constant(0.005)  # Width of a depth step of the style `depth` [m].
+DEPTH_STEP_COUNT = wp.constant(6)  # Number of depth steps of the style `depth`.
+MAX_TINT_OPACITY = wp.constant(0.85)  # Opacity of the tint at the surface.
+MIN_TINT_OPACITY = wp.constant(0.1)  # Opacity of the tint at the last depth step.
 # Roles of a layer: in front of the overlay; ground that nothing shines through.
-FRONT, SHUT = wp.constant(1), wp.constant(2)
+FRONT, CLOSED_GROUND = wp.constant(1), wp.constant(2)
 # Shading of the ground inside the silhouette.
-SHINES, TINTED, DEEPENED = wp.constant(1), wp.constant(2), wp.constant(3)
-SHADES = {"window": SHINES, "fill": TINTED, "depth": DEEPENED}
+WINDOW_SHADING, TINT_SHADING, DEPTH_SHADING = wp.constant(1), wp.constant(2), wp.constant(3)
+SHADES = {"window": WINDOW_SHADING, "fill": TINT_SHADING, "depth": DEPTH_SHADING}
 """Shading by style; none in other styles."""
-DARK = (10.0, 12.0, 12.0)  # Colour of the dark border of lines (RGB).
-DARK_INK = wp.constant(wp.vec3f(*DARK))  # Colour of the dark border for kernels.
+BORDER_COLOUR = (10.0, 12.0, 12.0)  # Colour of the dark border of lines (RGB).
+BORDER_INK = wp.constant(wp.vec3f(*BORDER_COLOUR))  # Colour of the dark border for kernels.
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +138,7 @@ def build_role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) ->
     """Return the table (256,) uint8 of roles by the id of a layer: `FRONT`, `SHUT` or 0."""
     ids = np.arange(256)
     shut = np.zeros(256, bool) if open_to is None else ~np.isin(ids, open_to)
-    return np.where(np.isin(ids, front), FRONT, np.where(shut, SHUT, 0)).astype(np.uint8)
+    return np.where(np.isin(ids, front), FRONT, np.where(shut, CLOSED_GROUND, 0)).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)
@@ -190,11 +192,11 @@ def find_edge(
         row = index / nearest.shape[1]
         column = index - row * nearest.shape[1]
         within = wp.uint8(1)
-        if nearest[row, column] != NOTHING:
-            up = nearest[wp.max(row - 1, 0), column] == NOTHING
-            down = nearest[wp.min(row + 1, nearest.shape[0] - 1), column] == NOTHING
-            left = nearest[row, wp.max(column - 1, 0)] == NOTHING
-            right = nearest[row, wp.min(column + 1, nearest.shape[1] - 1)] == NOTHING
+        if nearest[row, column] != EMPTY_PIXEL:
+            up = nearest[wp.max(row - 1, 0), column] == EMPTY_PIXEL
+            down = nearest[wp.min(row + 1, nearest.shape[0] - 1), column] == EMPTY_PIXEL
+            left = nearest[row, wp.max(column - 1, 0)] == EMPTY_PIXEL
+            right = nearest[row, wp.min(column + 1, nearest.shape[1] - 1)] == EMPTY_PIXEL
             if up or down or left or right:
                 within = wp.uint8(0)
         beside[row, column] = within
@@ -214,8 +216,8 @@ def find_aside(
     for index in range(start, wp.min(start + run, end)):
         row = index / beside.shape[1]
         column = index - row * beside.shape[1]
-        least = wp.int32(REACH)
-        for other in range(wp.max(column - REACH, 0), wp.min(column + REACH + 1, beside.shape[1])):
+        least = wp.int32(CHAMFER_RADIUS)
+        for other in range(wp.max(column - CHAMFER_RADIUS, 0), wp.min(column + CHAMFER_RADIUS + 1, beside.shape[1])):
             if beside[row, other] == wp.uint8(0):
                 least = wp.min(least, wp.abs(other - column))
         aside[row, column] = least
@@ -235,12 +237,12 @@ def find_distance(
     for index in range(start, wp.min(start + run, end)):
         row = index / aside.shape[1]
         column = index - row * aside.shape[1]
-        least = wp.float32(2 * REACH)
-        for other in range(wp.max(row - REACH, 0), wp.min(row + REACH + 1, aside.shape[0])):
+        least = wp.float32(2 * CHAMFER_RADIUS)
+        for other in range(wp.max(row - CHAMFER_RADIUS, 0), wp.min(row + CHAMFER_RADIUS + 1, aside.shape[0])):
             away = wp.abs(other - row)
             slanted = wp.min(away, aside[other, column])
             straight = wp.max(away, aside[other, column]) - slanted
-            least = wp.min(least, STRAIGHT * wp.float32(straight) + SLANTED * wp.float32(slanted))
+            least = wp.min(least, STRAIGHT_STEP * wp.float32(straight) + DIAGONAL_STEP * wp.float32(slanted))
         distance[row, column] = least
 
 
@@ -254,7 +256,7 @@ def smooth_distance(
         for j in range(-1, 2):
             y = wp.clamp(row + i, 0, away.shape[0] - 1)
             x = wp.clamp(column + j, 0, away.shape[1] - 1)
-            total += wp.where(nearest[y, x] == NOTHING, away[y, x], -away[y, x])
+            total += wp.where(nearest[y, x] == EMPTY_PIXEL, away[y, x], -away[y, x])
     return total / 9.0
 
 
@@ -284,14 +286,14 @@ def shining(
     under = wp.float32(0.0)
     if surface > 0.0:
         under = wp.max(depth_of(key) - surface, 0.0)
-    return 1.1 * (0.25 + 0.75 * wp.abs(look[0])) * wp.exp(-under / FADE) * wp.vec3f(look[1], look[2], look[3])
+    return 1.1 * (0.25 + 0.75 * wp.abs(look[0])) * wp.exp(-under / FADE_DEPTH) * wp.vec3f(look[1], look[2], look[3])
 
 
 @wp.func
 def strength(under: wp.float32) -> wp.float32:
     """Strength of the depth style's tint, at a depth under the ground [m]."""
-    share = wp.clamp(wp.floor(under / STEP) / wp.float32(STEPS - 1), 0.0, 1.0)
-    return STRONGEST - (STRONGEST - FAINTEST) * share
+    share = wp.clamp(wp.floor(under / DEPTH_STEP) / wp.float32(DEPTH_STEP_COUNT - 1), 0.0, 1.0)
+    return MAX_TINT_OPACITY - (MAX_TINT_OPACITY - MIN_TINT_OPACITY) * share
 
 
 @forward_kernel
@@ -335,19 +337,21 @@ def lay_over(
         free = role != FRONT
         if front.shape[0] > 0 and front[y, x] != wp.uint8(0):
             free = False
-        through = role != SHUT
+        through = role != CLOSED_GROUND
         key = nearest[row, column]
-        inside = through and key != NOTHING
+        inside = through and key != EMPTY_PIXEL
         window = wp.float32(0.0)
-        if shade == SHINES and through:
-            window = wp.where(inside, 1.0, wp.clamp(1.25 - 1.25 * away[row, column] / wp.float32(SURROUND), 0.0, 1.0))
+        if shade == WINDOW_SHADING and through:
+            window = wp.where(
+                inside, 1.0, wp.clamp(1.25 - 1.25 * away[row, column] / wp.float32(SOFT_EDGE_WIDTH), 0.0, 1.0)
+            )
         # Coverage by the outline's dark rim, and by its ink.
         rim = wp.float32(0.0)
         line = wp.float32(0.0)
-        if outlined and through and away[row, column] < NEAR_EDGE:
+        if outlined and through and away[row, column] < MAX_EDGE_DISTANCE:
             far = wp.abs(smooth_distance(row, column, away, nearest))
-            rim = wp.clamp(RIM + 0.5 - far, 0.0, 1.0)
-            line = wp.clamp(LINE + 0.5 - far, 0.0, 1.0)
+            rim = wp.clamp(HALF_BORDER_WIDTH + 0.5 - far, 0.0, 1.0)
+            line = wp.clamp(HALF_LINE_WIDTH + 0.5 - far, 0.0, 1.0)
         low = wp.vec4ub(wp.uint8(0))
         high = wp.vec4ub(wp.uint8(0))
         if under.shape[0] > 0:
@@ -356,21 +360,21 @@ def lay_over(
             high = above[index]
         lined = rim > 0.0 or low[3] > wp.uint8(0) or high[3] > wp.uint8(0)
         taken[row, column] = wp.uint8(wp.where(lined and free, 1, 0))
-        if free and (lined or window > 0.0 or (shade > SHINES and inside)):
+        if free and (lined or window > 0.0 or (shade > WINDOW_SHADING and inside)):
             was = ground[y, x]
             light = wp.vec3f(wp.float32(was[0]), wp.float32(was[1]), wp.float32(was[2]))
-            if shade == SHINES:
+            if shade == WINDOW_SHADING:
                 light *= 1.0 - 0.62 * window * window * (3.0 - 2.0 * window)
                 if inside:
                     p = pixel_at(0, column, row, pixels)
                     light += shining(p, key, q, triangles, looks, depth[y, x])
             light = wp.min(light, wp.vec3f(255.0))
-            if inside and shade == TINTED:
+            if inside and shade == TINT_SHADING:
                 light = 0.55 * light + 0.45 * ink
-            if inside and shade == DEEPENED:
+            if inside and shade == DEPTH_SHADING:
                 light += strength(depth_of(key) - depth[y, x]) * (ink - light)
             light = over(low, light)
-            light = (1.0 - rim) * light + rim * DARK_INK
+            light = (1.0 - rim) * light + rim * BORDER_INK
             light = (1.0 - line) * light + line * ink
             light = over(high, light)
             ground[y, x] = wp.vec3ub(wp.uint8(light[0]), wp.uint8(light[1]), wp.uint8(light[2]))

@@ -18,27 +18,27 @@ import viser
 from .control_lock import Clients, Inputs, format_note
 from .elements import (
     ASIDE_SPOT,
-    BACK,
+    BACK_KEY,
     KEYS,
     LIVE_KEYS,
-    ON,
+    ON_KEY,
     PICTURE,
-    RECORD,
+    PLAY_KEY,
+    RECORD_KEY,
     SAID,
-    SPACE,
     build_image_element,
     build_tabs,
     keep_together,
     to_data_url,
 )
-from .guard import LIMITS, ConnectionLimits, check_address, open_server, to_bracketed
+from .guard import DEFAULT_LIMITS, ConnectionLimits, check_address, open_server, to_bracketed
 from .parts import Control, Fold, LastChange, Note, Playback, SceneSurface, SceneViewpoint, Sign
 from .recording import Recorder
 from .scene import add_body, set_up_scene
 from .style import PAGE, STATUS, build_style
 
-LAST = 1e9  # Sort order of the element after all that are added later.
-EVERYWHERE = ("127.0.0.1", "0.0.0.0", "::1", "::")  # Addresses that this machine reaches by the name localhost.
+LAST_ORDER = 1e9  # Sort order of the element after all that are added later.
+LOCAL_ADDRESSES = ("127.0.0.1", "0.0.0.0", "::1", "::")  # Addresses that this machine reaches by the name localhost.
 
 
 Shown = tuple[int, np.ndarray, str, int]
@@ -64,7 +64,7 @@ class Browser:
         port: int = 8080,
         size: tuple[int, int] = (640, 480),
         signs: Sequence[Sign] = (),
-        limits: ConnectionLimits = LIMITS,
+        limits: ConnectionLimits = DEFAULT_LIMITS,
         origins: tuple[str, ...] = (),
     ) -> None:
         """Start the server; if `port` is taken, the next free one is used, see `address`.
@@ -90,7 +90,7 @@ class Browser:
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
         gui.add_html(build_element(PICTURE, ""))
         # Last: if a low window has no space for them under the image, the controls come before them.
-        self.words = gui.add_html(build_element(PAGE, keep_together(words)), order=LAST)
+        self.words = gui.add_html(build_element(PAGE, keep_together(words)), order=LAST_ORDER)
         self.line = gui.add_html("")
         self.text = gui.add_html(build_element(SAID, ""))
         # Shown and requested state: frame, image and words. Last encoded image, and number of images sent.
@@ -162,7 +162,7 @@ class Browser:
     def address(self) -> str:
         """Address of the page as seen from this machine, with the token that other machines need."""
         host = self.server.get_host()
-        name = "localhost" if host in EVERYWHERE else to_bracketed(host)
+        name = "localhost" if host in LOCAL_ADDRESSES else to_bracketed(host)
         return f"http://{name}:{self.server.get_port()}" + (f"/?token={self.token}" if self.token else "")
 
     @property
@@ -341,10 +341,10 @@ class Browser:
         self.controls.press(self.button, toggle)
         # A slider needs a length, so that of a single frame has two positions.
         self.controls.receive_input(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
-        self.controls.bind_key(SPACE, toggle)
+        self.controls.bind_key(PLAY_KEY, toggle)
         if seekable:
-            self.controls.bind_key(BACK, lambda _: step(-1))
-            self.controls.bind_key(ON, lambda _: step(1))
+            self.controls.bind_key(BACK_KEY, lambda _: step(-1))
+            self.controls.bind_key(ON_KEY, lambda _: step(1))
 
     def add_savers(self) -> None:
         """Add buttons that download the shown image (every client) and a video (client with control)."""
@@ -362,7 +362,7 @@ class Browser:
             self.recorder.toggle(client, self.coded)
 
         self.controls.press(self.recorder.add_button(name), record)
-        self.controls.bind_key(RECORD, record)
+        self.controls.bind_key(RECORD_KEY, record)
 
     status, plays = show_status, show_playback  # Former names, for one release.
 

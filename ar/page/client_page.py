@@ -17,7 +17,7 @@ ICON = (  # Icon of the page (SVG).
     "<circle cx='16' cy='16' r='9' fill='#1f6f3a' stroke='#37e36b' stroke-width='3'/>"
     "<path d='M4 10 Q16 3 28 10' fill='none' stroke='#eee' stroke-width='2' stroke-dasharray='2 2'/></svg>"
 )
-WITHOUT = "sulcus-without-webgl"
+NO_WEBGL_CLASS = "sulcus-without-webgl"
 """Class of the document's element in a browser without WebGL."""
 # Each WebGL constant equals its own name here, so that results are looked up by name.
 SCRIPT = """
@@ -59,7 +59,7 @@ def build_document(document: bytes, is_zipped: bool) -> bytes:
     """Insert this page's title, icon and script into viser's document."""
     text = (gzip.decompress(document) if is_zipped else document).decode()
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'
-    script = f"<script>{SCRIPT.replace('WITHOUT', WITHOUT)}</script>"
+    script = f"<script>{SCRIPT.replace('WITHOUT', NO_WEBGL_CLASS)}</script>"
     for pattern, own in (
         (r"<title>[^<]*</title>", f"<title>{TITLE}</title>"),
         (r'<link\s+rel="icon"[^>]*>', icon),

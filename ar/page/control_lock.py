@@ -11,9 +11,9 @@ from typing import Any
 import viser
 
 from .parts import Control, Dropdown, Fold, Key, LastChange, Note, Slider, Toggle
-from .style import LOOKS_ON, NOTE
+from .style import NOTE, VIEW_ONLY_STYLE
 
-IDLE = 60.0
+MAX_IDLE_TIME = 60.0
 """Idle time of the client with control [s], after which a request for control is granted at once."""
 
 
@@ -29,7 +29,7 @@ class ControlLock:
         """Update the clients present: if the one with control has left, the first in the queue or the oldest has it."""
         self.asking = tuple(visitor for visitor in self.asking if visitor in here)
         if self.leader not in here:
-            self._pass((*self.asking, *sorted(here), None)[0], now)
+            self._give_control((*self.asking, *sorted(here), None)[0], now)
 
     def act(self, visitor: int, now: float) -> bool:
         """Record that a client sets something; return True if it has control."""
@@ -42,15 +42,15 @@ class ControlLock:
         if visitor == self.leader or visitor in self.asking:
             return
         self.asking += (visitor,)
-        if now - self.acted >= IDLE:
+        if now - self.acted >= MAX_IDLE_TIME:
             self.give(now)
 
     def give(self, now: float) -> None:
         """Hand over control to the first client in the queue."""
         if self.asking:
-            self._pass(self.asking[0], now)
+            self._give_control(self.asking[0], now)
 
-    def _pass(self, visitor: int | None, now: float) -> None:
+    def _give_control(self, visitor: int | None, now: float) -> None:
         self.leader, self.acted = visitor, now
         self.asking = tuple(other for other in self.asking if other != visitor)
 
@@ -110,7 +110,7 @@ class Clients:
             _set(row.line, "content", words)
             _set(row.ask, "visible", not leads and visitor not in self.lead.asking)
             _set(row.give, "visible", leads and bool(self.lead.asking))
-            _set(row.dim, "content", "" if leads else LOOKS_ON)
+            _set(row.dim, "content", "" if leads else VIEW_ONLY_STYLE)
 
     def add_row(self, client: viser.ClientHandle) -> ClientRow:
         """Add the elements that only this client sees to its page."""

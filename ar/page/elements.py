@@ -17,10 +17,10 @@ from html import escape
 import cv2
 import numpy as np
 
-from ..overlay.hud import BREAK
+from ..overlay.hud import BREAK_PATTERN
 from .parts import Key
 
-QUALITY = 88  # JPEG quality of images on the page, 0 to 100.
+JPEG_QUALITY = 88  # JPEG quality of images on the page, 0 to 100.
 PICTURE, SAID, NEXT = "sulcus-picture", "sulcus-said", "sulcus-next"
 """Ids of the elements that hold the image, the words next to it, and the hidden next ones."""
 SLICES, HISTORY = "sulcus-slices", "sulcus-history"
@@ -57,14 +57,14 @@ def keep_together(words: str) -> str:
     """Keep numbers on one line with their name, error and unit: replace spaces in words (HTML) by no-break spaces."""
     return re.sub(
         r"<[^>]*>|\s+",
-        lambda part: part[0] if part[0][0] == "<" or BREAK.match(words, part.start()) else "&nbsp;",
+        lambda part: part[0] if part[0][0] == "<" or BREAK_PATTERN.match(words, part.start()) else "&nbsp;",
         words,
     )
 
 
 def to_data_url(colour: np.ndarray) -> str:
     """Encode an image (H, W, 3) uint8 as a data URL."""
-    written = cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    written = cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(written.tobytes()).decode()}"
 
 
@@ -88,15 +88,15 @@ CAPTION = (  # Text under the slices.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 
 
-SPACE = Key(" ", "space", "space", "play or pause")  # Key that plays or pauses.
-BACK, ON = (  # Keys that move one frame back and one frame on.
+PLAY_KEY = Key(" ", "space", "space", "play or pause")  # Key that plays or pauses.
+BACK_KEY, ON_KEY = (  # Keys that move one frame back and one frame on.
     Key("ArrowLeft", "arrowleft", "\N{LEFTWARDS ARROW}", "one frame back"),
     Key("ArrowRight", "arrowright", "\N{RIGHTWARDS ARROW}", "one frame on"),
 )
-STYLE = Key("s", "S", "s", "next overlay")  # Key that selects the next overlay.
-RECORD = Key("r", "R", "r", "start or stop recording")  # Key that starts or stops a recording.
-LIVE_KEYS = (SPACE, STYLE, RECORD)  # Keys of a page without frames to seek.
-KEYS = (SPACE, BACK, ON, STYLE, RECORD)
+STYLE_KEY = Key("s", "S", "s", "next overlay")  # Key that selects the next overlay.
+RECORD_KEY = Key("r", "R", "r", "start or stop recording")  # Key that starts or stops a recording.
+LIVE_KEYS = (PLAY_KEY, STYLE_KEY, RECORD_KEY)  # Keys of a page without frames to seek.
+KEYS = (PLAY_KEY, BACK_KEY, ON_KEY, STYLE_KEY, RECORD_KEY)
 """Keys that the server receives: of a page with frames to seek (`LIVE_KEYS`: of one without)."""
 # In the 3-D view arrows and letters move the camera: our keys go to viser's own commands alone, which listen on the
 # document's element. Text fields, and sliders that arrows move, keep their keys.

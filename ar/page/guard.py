@@ -29,11 +29,11 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from .client_page import build_document
-from .messages import LARGEST, MessageError, check_message
+from .messages import MAX_MESSAGE_BYTES, MessageError, check_message
 
-KNOWN = "1.1."  # Supported viser release line: the guard relies on internals of it.
-PORTS = {"http": 80, "https": 443}  # Default ports by scheme.
-NAME = re.compile(r"[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?")  # Pattern of a valid host name.
+VISER_VERSION = "1.1."  # Supported viser release line: the guard relies on internals of it.
+DEFAULT_PORTS = {"http": 80, "https": 443}  # Default ports by scheme.
+HOST_PATTERN = re.compile(r"[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?")  # Pattern of a valid host name.
 # HTTP headers so that another page can neither frame this one (clickjacking) nor learn its address.
 HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "Referrer-Policy": "no-referrer"}
 
@@ -62,7 +62,7 @@ class ConnectionLimits:
     asides: float = 2.0
 
 
-LIMITS = ConnectionLimits()  # Default limits of connections.
+DEFAULT_LIMITS = ConnectionLimits()  # Default limits of connections.
 
 
 class UnguardedError(RuntimeError):
@@ -215,7 +215,7 @@ class Controls:
 
 
 def open_server(
-    host: str, port: int, title: str, limits: ConnectionLimits = LIMITS, origins: tuple[str, ...] = ()
+    host: str, port: int, title: str, limits: ConnectionLimits = DEFAULT_LIMITS, origins: tuple[str, ...] = ()
 ) -> tuple[viser.ViserServer, str | None]:
     """Serve a page; return viser's server and the token that the page's address must carry, if any.
 
@@ -224,8 +224,8 @@ def open_server(
     UnguardedError
         An unsupported viser release: nothing is served.
     """
-    if not viser.__version__.startswith(KNOWN):
-        raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}*.")
+    if not viser.__version__.startswith(VISER_VERSION):
+        raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {VISER_VERSION}*.")
     door, controls = AccessPolicy.create(host, origins), Controls()
     with guard_server(door, controls, limits) as opened:
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
@@ -237,11 +237,11 @@ def open_server(
             server._websock_server.unregister_handler(message)
     except (AttributeError, AssertionError, KeyError) as error:
         server.stop()
-        raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {KNOWN}1.") from error
+        raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {VISER_VERSION}1.") from error
     return server, door.token
 
 
-PATCHING = threading.Lock()  # Lock while websockets' `serve` is replaced.
+PATCH_LOCK = threading.Lock()  # Lock while websockets' `serve` is replaced.
 
 
 @contextmanager
@@ -255,10 +255,10 @@ def guard_server(door: AccessPolicy, controls: Controls, limits: ConnectionLimit
     def guarded(*args: Any, process_request: Callable, **settings: Any) -> Any:
         opened.append(True)
         visit = partial(Connection, controls=controls, limits=limits)
-        settings |= {"max_size": LARGEST, "logger": log, "create_connection": visit}
+        settings |= {"max_size": MAX_MESSAGE_BYTES, "logger": log, "create_connection": visit}
         return serve(*args, process_request=partial(handle_request, door, limits, process_request), **settings)
 
-    with PATCHING:
+    with PATCH_LOCK:
         websockets.asyncio.server.serve = guarded
         try:
             yield opened
@@ -311,16 +311,21 @@ def format_origin(address: str) -> str:
             ipaddress.IPv6Address(name)
     except ValueError:
         scheme, name, port, rebuilt = "", "", None, ""
-    plain_name = ":" in name or bool(NAME.fullmatch(name))
-    if scheme not in PORTS or not plain_name or port == 0 or address.lower().rstrip("/") != f"{scheme}://{rebuilt}":
+    plain_name = ":" in name or bool(HOST_PATTERN.fullmatch(name))
+    if (
+        scheme not in DEFAULT_PORTS
+        or not plain_name
+        or port == 0
+        or address.lower().rstrip("/") != f"{scheme}://{rebuilt}"
+    ):
         raise ValueError(f"{address!r}: must be https://NAME or https://NAME:PORT, without a path.")
-    return f"{scheme}://{to_bracketed(name)}" + ("" if port in (None, PORTS[scheme]) else f":{port}")
+    return f"{scheme}://{to_bracketed(name)}" + ("" if port in (None, DEFAULT_PORTS[scheme]) else f":{port}")
 
 
 def list_hosts(origin: str) -> set[str]:
     """Return the host names of requests to an address, with and without the port that the scheme implies."""
     scheme, _, place = origin.partition("://")
-    return {place} if place.rpartition(":")[2].isdecimal() else {place, f"{place}:{PORTS[scheme]}"}
+    return {place} if place.rpartition(":")[2].isdecimal() else {place, f"{place}:{DEFAULT_PORTS[scheme]}"}
 
 
 def to_bracketed(host: str) -> str:

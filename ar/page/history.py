@@ -8,17 +8,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 
-SPAN = 20.0
+TIME_SPAN = 20.0
 """Time span of a chart [s]."""
-WIDE = 600.0  # Width of the charts [SVG units].
-HIGH = 105.0  # Height of one chart [SVG units].
-LEFT = 44.0  # Left margin of a chart [SVG units].
-ABOVE = 20.0  # Margin above the curve of a chart [SVG units].
-BELOW = 16.0  # Margin below the curve of a chart [SVG units].
-MOST = 1200  # Maximum number of samples that are kept.
-DRAWN = 240  # Maximum number of samples that are drawn: a pixel or two apart.
-PAUSE = 2.0  # Time gap beyond which samples are not joined [s].
-DOT = 0.06  # Half the width of an isolated sample [s].
+CHART_WIDTH = 600.0  # Width of the charts [SVG units].
+CHART_HEIGHT = 105.0  # Height of one chart [SVG units].
+LEFT_MARGIN = 44.0  # Left margin of a chart [SVG units].
+TOP_MARGIN = 20.0  # Margin above the curve of a chart [SVG units].
+BOTTOM_MARGIN = 16.0  # Margin below the curve of a chart [SVG units].
+MAX_SAMPLES = 1200  # Maximum number of samples that are kept.
+MAX_DRAWN_SAMPLES = 240  # Maximum number of samples that are drawn: a pixel or two apart.
+MAX_TIME_GAP = 2.0  # Time gap beyond which samples are not joined [s].
+HALF_DOT_WIDTH = 0.06  # Half the width of an isolated sample [s].
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ class History:
     """Recent samples of some lines. Samples more than `SPAN` older than the newest are dropped."""
 
     lines: tuple[Line, ...]
-    samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MOST))
+    samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
 
     def add(self, sample: Sample) -> None:
         """Append a sample, and drop those older than `SPAN`."""
         self.samples.append(sample)
-        while self.samples[0].time < sample.time - SPAN:
+        while self.samples[0].time < sample.time - TIME_SPAN:
             self.samples.popleft()
 
     def break_off(self, time: float) -> None:
@@ -61,19 +61,19 @@ class History:
     def draw_chart(self) -> str:
         """Draw all lines, one below the other, as an SVG element."""
         kept = list(self.samples)
-        step = max(1, math.ceil(len(kept) / DRAWN))
+        step = max(1, math.ceil(len(kept) / MAX_DRAWN_SAMPLES))
         gaps = [None in each.values for each in kept]
         kept = [each for place, each in enumerate(kept[:-1]) if place % step == 0 or gaps[place]] + kept[-1:]
         parts = [_plot(line, number, kept) for number, line in enumerate(self.lines)]
-        words = "; ".join(f"{line.name}: {_newest(kept, number)}" for number, line in enumerate(self.lines))
-        size = f"0 0 {WIDE:g} {HIGH * len(self.lines):g}"
+        words = "; ".join(f"{line.name}: {_format_newest(kept, number)}" for number, line in enumerate(self.lines))
+        size = f"0 0 {CHART_WIDTH:g} {CHART_HEIGHT * len(self.lines):g}"
         return (
-            f'<svg viewBox="{size}" role="img" aria-label="{escape(f"The last {SPAN:g} seconds. {words}")}">'
+            f'<svg viewBox="{size}" role="img" aria-label="{escape(f"The last {TIME_SPAN:g} seconds. {words}")}">'
             f"{''.join(parts)}</svg>"
         )
 
 
-def _newest(samples: Sequence[Sample], number: int) -> str:
+def _format_newest(samples: Sequence[Sample], number: int) -> str:
     value = samples[-1].values[number] if samples else None
     return "not known" if value is None else f"{value:.2f}"
 
@@ -81,19 +81,23 @@ def _newest(samples: Sequence[Sample], number: int) -> str:
 def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
     """Draw one line with its scale; dotted where its error is not available, interrupted where its value is not."""
     known = [each for each in samples if each.values[number] is not None]
-    top, end = HIGH * number + ABOVE, samples[-1].time if samples else 0.0
-    room = HIGH - ABOVE - BELOW
+    top, end = CHART_HEIGHT * number + TOP_MARGIN, samples[-1].time if samples else 0.0
+    room = CHART_HEIGHT - TOP_MARGIN - BOTTOM_MARGIN
     ends = [(each.values[number] or 0.0, each.errors[number] or 0.0) for each in known]
     high = round_up_scale(max((value + error for value, error in ends), default=0.0))
 
     def at(time: float, value: float) -> str:
-        across = LEFT + (WIDE - LEFT - 6.0) * (1.0 - (end - time) / SPAN)
+        across = LEFT_MARGIN + (CHART_WIDTH - LEFT_MARGIN - 6.0) * (1.0 - (end - time) / TIME_SPAN)
         return f"{across:.1f},{top + room * (1.0 - min(max(value / high, 0.0), 1.0)):.1f}"
 
     drawn = []
     for piece in split_line(samples, number):
         # An isolated sample is as wide as its dot.
-        moments = [(each.time + aside, each) for each in piece for aside in ((0.0,) if len(piece) > 1 else (-DOT, DOT))]
+        moments = [
+            (each.time + aside, each)
+            for each in piece
+            for aside in ((0.0,) if len(piece) > 1 else (-HALF_DOT_WIDTH, HALF_DOT_WIDTH))
+        ]
         if piece[-1].errors[number] is not None:
             above = [at(time, (each.values[number] or 0.0) + (each.errors[number] or 0.0)) for time, each in moments]
             below = [at(time, (each.values[number] or 0.0) - (each.errors[number] or 0.0)) for time, each in moments]
@@ -103,20 +107,24 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
         corners = " ".join(at(time, each.values[number] or 0.0) for time, each in moments)
         drawn.append(f'<polyline points="{corners}" fill="none" stroke="{line.colour}" stroke-width="1.6"{dotted}/>')
     if not known:
-        middle = f'x="{0.5 * (LEFT + WIDE):g}" y="{top + 0.5 * room + 4:g}"'
+        middle = f'x="{0.5 * (LEFT_MARGIN + CHART_WIDTH):g}" y="{top + 0.5 * room + 4:g}"'
         what = "not known" if samples else "nothing yet"
         drawn.append(f'<text {middle} text-anchor="middle" opacity="0.7">{what}</text>')
     said = f"{line.name} [{line.unit}]" + (f", {line.whose}" if line.whose else "")
     scale = "".join(
-        f'<text x="{LEFT - 5:g}" y="{top + room * (1 - share) + 4:g}" text-anchor="end">{share * high:g}</text>'
-        f'<path d="M{LEFT:g} {top + room * (1 - share):g}H{WIDE - 6:g}" stroke="#666" stroke-width="0.6"/>'
+        f'<text x="{LEFT_MARGIN - 5:g}" y="{top + room * (1 - share) + 4:g}" text-anchor="end">{share * high:g}</text>'
+        f'<path d="M{LEFT_MARGIN:g} {top + room * (1 - share):g}H{CHART_WIDTH - 6:g}" stroke="#666" stroke-width="0.6"/>'
         for share in (0.0, 1.0)
     )
     times = "".join(
-        f'<text x="{LEFT + (WIDE - LEFT - 6) * share:g}" y="{top + room + 14:g}" text-anchor="{anchor}">{words}</text>'
-        for share, anchor, words in ((0.0, "start", f"{SPAN:g} s ago"), (0.5, "middle", "10 s"), (1.0, "end", "now"))
+        f'<text x="{LEFT_MARGIN + (CHART_WIDTH - LEFT_MARGIN - 6) * share:g}" y="{top + room + 14:g}" text-anchor="{anchor}">{words}</text>'
+        for share, anchor, words in (
+            (0.0, "start", f"{TIME_SPAN:g} s ago"),
+            (0.5, "middle", "10 s"),
+            (1.0, "end", "now"),
+        )
     )
-    return f'<text x="{LEFT:g}" y="{top - 6:g}">{escape(said)}</text>{scale}{times}{"".join(drawn)}'
+    return f'<text x="{LEFT_MARGIN:g}" y="{top - 6:g}">{escape(said)}</text>{scale}{times}{"".join(drawn)}'
 
 
 def split_line(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
@@ -130,7 +138,7 @@ def split_line(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
         before, last = last, each if each.values[number] is not None else None
         if last is None:
             continue
-        if before is not None and each.time - before.time < PAUSE:
+        if before is not None and each.time - before.time < MAX_TIME_GAP:
             if (before.errors[number] is None) == (each.errors[number] is None):
                 found[-1].append(each)
                 continue

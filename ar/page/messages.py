@@ -12,8 +12,8 @@ from typing import Annotated
 import msgspec
 import viser
 
-LARGEST = 65536  # Maximum size of a client's message [bytes]: camera and value take some 300.
-ROUNDING = 1e-6  # Tolerance for a browser's rounding, as a share of a slider's range.
+MAX_MESSAGE_BYTES = 65536  # Maximum size of a client's message [bytes]: camera and value take some 300.
+RANGE_TOLERANCE = 1e-6  # Tolerance for a browser's rounding, as a share of a slider's range.
 
 Pixels = Annotated[float, msgspec.Meta(ge=0.0, le=65536.0)]
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
@@ -106,7 +106,7 @@ def clamp_value(control: object, value: bool | int | float | str) -> bool | int 
         return value
     if isinstance(control, viser.GuiSliderHandle) and isinstance(value, int | float) and not isinstance(value, bool):
         low, high = control.min, control.max
-        slack = ROUNDING * (high - low)
+        slack = RANGE_TOLERANCE * (high - low)
         whole = isinstance(control.value, int)
         # A comparison with NaN is false, so NaN is rejected below.
         if low - slack <= value <= high + slack and (not whole or value == int(value)):

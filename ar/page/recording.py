@@ -16,11 +16,11 @@ import viser
 
 from ..screen import write_film
 
-LONGEST = 60.0  # Maximum duration of a recording [s]; it then ends automatically.
-LARGEST = 64_000_000  # Maximum size of a recording [characters of coded images]; it then ends automatically.
-RATE = 15.0
+MAX_DURATION = 60.0  # Maximum duration of a recording [s]; it then ends automatically.
+MAX_RECORDING_SIZE = 64_000_000  # Maximum size of a recording [characters of coded images]; it then ends automatically.
+FRAME_RATE = 15.0
 """Frame rate of a video [1/s]."""
-RECORDS, STOPS, MAKES = "Record", "Stop recording", "Encoding the video ..."
+RECORD_LABEL, STOP_LABEL, ENCODE_LABEL = "Record", "Stop recording", "Encoding the video ..."
 """Labels of the button: start, stop, encoding in progress."""
 
 
@@ -40,7 +40,7 @@ class PageRecording:
 
     def is_full(self, now: float) -> bool:
         """Return True if the recording is full."""
-        return now - self.began >= LONGEST or self.size >= LARGEST
+        return now - self.began >= MAX_DURATION or self.size >= MAX_RECORDING_SIZE
 
     def encode_video(self, ended: float) -> bytes:
         """Return an MP4 video of the recording up to `ended` [s], in real time; all frames have the size of the first.
@@ -54,7 +54,7 @@ class PageRecording:
         """
         with tempfile.TemporaryDirectory(prefix="sulcus-") as folder:
             path = Path(folder) / "page.mp4"
-            write_film(path, replay_images(self.taken, min(ended, self.began + LONGEST), RATE), RATE)
+            write_film(path, replay_images(self.taken, min(ended, self.began + MAX_DURATION), FRAME_RATE), FRAME_RATE)
             return path.read_bytes()
 
 
@@ -97,9 +97,9 @@ class Recorder:
 
     def add_button(self, name: str) -> viser.GuiButtonHandle:
         """Add the button to the page; `name` is the file name without suffix."""
-        hint = f"what the page shows, as a video (.mp4), {LONGEST:.0f} seconds at most"
+        hint = f"what the page shows, as a video (.mp4), {MAX_DURATION:.0f} seconds at most"
         self.button, self.name = (
-            self.server.gui.add_button(RECORDS, hint=hint, icon=viser.Icon.PLAYER_RECORD, color="gray"),
+            self.server.gui.add_button(RECORD_LABEL, hint=hint, icon=viser.Icon.PLAYER_RECORD, color="gray"),
             name,
         )
         self.update_label()
@@ -157,7 +157,7 @@ class Recorder:
 
     def update_label(self) -> None:
         """Set the button's label to its next action."""
-        words = MAKES if self.making else RECORDS if self.recording is None else STOPS
+        words = ENCODE_LABEL if self.making else RECORD_LABEL if self.recording is None else STOP_LABEL
         button = self.button
         if button is not None and button.label != words:
-            button.label, button.color = words, "red" if words == STOPS else "gray"
+            button.label, button.color = words, "red" if words == STOP_LABEL else "gray"

@@ -9,7 +9,7 @@ import viser
 
 from .parts import SceneSurface, SceneViewpoint, Sign
 
-PANEL = 676.0  # Width of the docked panel in browsers that do not support the page's rules [CSS pixel].
+PANEL_WIDTH = 676.0  # Width of the docked panel in browsers that do not support the page's rules [CSS pixel].
 
 
 def set_up_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Sequence[Sign]) -> None:
@@ -17,7 +17,7 @@ def set_up_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Se
     gui, scene = server.gui, server.scene
     gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
     gui.main_panel.dock_left()
-    gui.main_panel.set_width(PANEL)
+    gui.main_panel.set_width(PANEL_WIDTH)
     # Two soft lights from the first viewpoint's sides: the page's own four wash the colours out.
     scene.configure_default_lights(enabled=False)
     scene.add_light_ambient("/light/ambient", intensity=2.0)

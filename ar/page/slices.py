@@ -11,24 +11,24 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
-from ..overlay.composite import BROKEN, DASHED, DOUBTFUL
-from ..overlay.hud import FINE, WHITE, bound_words, name_direction, write
-from ..overlay.marks import BEFORE, DOTTED
+from ..overlay.composite import BROKEN_STROKES, DOUBTFUL_COLOUR, MARGIN_STROKES
+from ..overlay.hud import TEXT_SCALE, WHITE, bound_words, name_direction, write
+from ..overlay.marks import BEFORE_COLOUR, BEFORE_STROKES
 from ..overlay.outlines import compute_ink, draw_dashes
 from ..rendering.layer import Layer, Solid
 
-REACH = 40e-3  # Half the side of a view [m].
-SIDE = 280  # Side of a view [pixel].
-GRAIN = 0.8e-3  # Sampling distance of the scan [m]: finer adds nothing.
-NOWHERE = 26  # Grey level outside the scan.
-BRIGHT = 190.0  # Maximum grey level of the scan, so that lines stand out.
-TINT = 0.22  # Opacity of the error band.
-EDGE = 90  # Grey level of the line between two views.
-COARSE = 7  # Grid spacing of the distances for the band [pixel]; linear interpolation between.
-BAR = 20e-3  # Length of the scale bar [m].
-BESIDE = 1e-3  # Maximum distance of a tip that counts as in the plane [m].
-PAD = 8  # Distance of letters, names and the bar from the edge [pixel].
-DIGITS = 4  # Number of binary digits of subpixel positions of outlines.
+HALF_VIEW = 40e-3  # Half the side of a view [m].
+VIEW_SIDE = 280  # Side of a view [pixel].
+SAMPLING_DISTANCE = 0.8e-3  # Sampling distance of the scan [m]: finer adds nothing.
+OUTSIDE_GREY = 26  # Grey level outside the scan.
+MAX_GREY = 190.0  # Maximum grey level of the scan, so that lines stand out.
+BAND_OPACITY = 0.22  # Opacity of the error band.
+EDGE_GREY = 90  # Grey level of the line between two views.
+COARSE_SPACING = 7  # Grid spacing of the distances for the band [pixel]; linear interpolation between.
+BAR_LENGTH = 20e-3  # Length of the scale bar [m].
+PLANE_TOLERANCE = 1e-3  # Maximum distance of a tip that counts as in the plane [m].
+EDGE_DISTANCE = 8  # Distance of letters, names and the bar from the edge [pixel].
+SUBPIXEL_BITS = 4  # Number of binary digits of subpixel positions of outlines.
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class SliceView:
 
     def compute_points(self, middle: np.ndarray, count: int) -> np.ndarray:
         """Compute positions (count, count, 3) [m] of a square pixel grid round a centre (3,) [m], row by row."""
-        steps = REACH * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
+        steps = HALF_VIEW * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
         return middle + steps[:, None, None] * np.asarray(self.down) + steps[None, :, None] * np.asarray(self.right)
 
     def project_points(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
         """Project positions (n, 3) [m] to columns and rows (n, 2) of a view; whole numbers are pixel centres."""
         off = (np.asarray(points) - middle) @ np.stack([self.right, self.down], axis=1)
-        return (off / REACH + 1.0) * (0.5 * SIDE) - 0.5
+        return (off / HALF_VIEW + 1.0) * (0.5 * VIEW_SIDE) - 0.5
 
 
 PLANES = (
@@ -99,29 +99,34 @@ def draw_slices(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
 
 def view(plane: SliceView, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
     """Draw one view (SIDE, SIDE, 3) uint8."""
-    grey = np.full((SIDE, SIDE), NOWHERE, np.uint8) if scan is None else resample_view(plane, scan, middle)
+    grey = (
+        np.full((VIEW_SIDE, VIEW_SIDE), OUTSIDE_GREY, np.uint8) if scan is None else resample_view(plane, scan, middle)
+    )
     colour = np.repeat(grey[..., None], 3, axis=2)
-    ink = compute_ink(DOUBTFUL if cut.doubtful else cut.now.colour if len(cut.now.vertices) else BEFORE)
+    ink = compute_ink(DOUBTFUL_COLOUR if cut.doubtful else cut.now.colour if len(cut.now.vertices) else BEFORE_COLOUR)
     if cut.error is not None and not cut.doubtful:
         inside = find_pixels_within(plane, middle, cut.now, cut.error)
-        colour[inside] = (1.0 - TINT) * colour[inside] + TINT * np.array(ink)
+        colour[inside] = (1.0 - BAND_OPACITY) * colour[inside] + BAND_OPACITY * np.array(ink)
         edges = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-        draw_dashes(colour, list(edges), ink, DASHED, 1)
+        draw_dashes(colour, list(edges), ink, MARGIN_STROKES, 1)
     for layer in cut.others:
         draw_strokes(colour, cut_by_plane(plane, layer, middle), compute_ink(layer.colour))
     draw_dashes(
-        colour, [to_pixel_line(line) for line in cut_by_plane(plane, cut.before, middle)], compute_ink(BEFORE), DOTTED
+        colour,
+        [to_pixel_line(line) for line in cut_by_plane(plane, cut.before, middle)],
+        compute_ink(BEFORE_COLOUR),
+        BEFORE_STROKES,
     )
     now = cut_by_plane(plane, cut.now, middle)
     if cut.doubtful:
-        draw_dashes(colour, [to_pixel_line(line) for line in now], ink, BROKEN)
+        draw_dashes(colour, [to_pixel_line(line) for line in now], ink, BROKEN_STROKES)
     else:
         draw_strokes(colour, now, ink, 2)
     if cut.tip is not None:
         mark(colour, plane, np.asarray(cut.tip), middle)
     label(colour, plane, middle)
-    write(colour, describe_band(cut), (PAD, 4 * PAD + 6), FINE)
-    colour[:, -1] = EDGE
+    write(colour, describe_band(cut), (EDGE_DISTANCE, 4 * EDGE_DISTANCE + 6), TEXT_SCALE)
+    colour[:, -1] = EDGE_GREY
     return colour
 
 
@@ -134,29 +139,29 @@ def describe_band(cut: Cut) -> str:
 
 def resample_view(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarray:
     """Resample the scan in a view, (SIDE, SIDE) uint8; `NOWHERE` outside it."""
-    count = round(2.0 * REACH / GRAIN)
+    count = round(2.0 * HALF_VIEW / SAMPLING_DISTANCE)
     matrix = scan.T_index_world
     index = plane.compute_points(middle, count) @ matrix[:3, :3].T + matrix[:3, 3]
     held = ((index >= -0.5) & (index <= np.array(scan.values.shape) - 0.5)).all(axis=-1)
     read = np.zeros((count, count), np.float32)
     map_coordinates(scan.values, np.moveaxis(index, -1, 0), order=1, mode="nearest", output=read)
-    large = cv2.resize(BRIGHT * read, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
-    inside = cv2.resize(np.asarray(held, np.uint8), (SIDE, SIDE), interpolation=cv2.INTER_NEAREST) > 0
-    return np.where(inside, np.clip(large, 0.0, 255.0), NOWHERE).astype(np.uint8)
+    large = cv2.resize(MAX_GREY * read, (VIEW_SIDE, VIEW_SIDE), interpolation=cv2.INTER_CUBIC)
+    inside = cv2.resize(np.asarray(held, np.uint8), (VIEW_SIDE, VIEW_SIDE), interpolation=cv2.INTER_NEAREST) > 0
+    return np.where(inside, np.clip(large, 0.0, 255.0), OUTSIDE_GREY).astype(np.uint8)
 
 
 def find_pixels_within(plane: SliceView, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
     """Compute the mask (SIDE, SIDE) bool of pixels within a distance (error [m]) of a surface, in 3-D."""
-    count = SIDE // COARSE
+    count = VIEW_SIDE // COARSE_SPACING
     if not len(layer.triangles):
-        return np.zeros((SIDE, SIDE), bool)
+        return np.zeros((VIEW_SIDE, VIEW_SIDE), bool)
     corners = layer.vertices[layer.triangles]
     halves = 0.5 * (corners + np.roll(corners, 1, axis=1))
     samples = np.concatenate([layer.vertices, halves.reshape(-1, 3), corners.mean(axis=1)])
-    far = error + 4.0 * REACH / count
+    far = error + 4.0 * HALF_VIEW / count
     away = KDTree(samples).query(plane.compute_points(middle, count).reshape(-1, 3), distance_upper_bound=far)[0]
     grid = np.minimum(away, far).reshape(count, count)
-    return cv2.resize(grid, (SIDE, SIDE), interpolation=cv2.INTER_LINEAR) <= error
+    return cv2.resize(grid, (VIEW_SIDE, VIEW_SIDE), interpolation=cv2.INTER_LINEAR) <= error
 
 
 def cut_surface(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
@@ -206,8 +211,8 @@ def cut_by_plane(plane: SliceView, layer: Layer, middle: np.ndarray) -> list[np.
 
 def draw_strokes(colour: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], width: int = 1) -> None:
     """Draw lines, each (n, 2), with subpixel accuracy into an image (H, W, 3), in place."""
-    fine = [np.rint(line * 2**DIGITS).astype(np.int32)[:, None] for line in lines]
-    cv2.polylines(colour, fine, False, tuple(ink), width, cv2.LINE_AA, DIGITS)
+    fine = [np.rint(line * 2**SUBPIXEL_BITS).astype(np.int32)[:, None] for line in lines]
+    cv2.polylines(colour, fine, False, tuple(ink), width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def to_pixel_line(line: np.ndarray) -> np.ndarray:
@@ -221,7 +226,7 @@ def to_pixel_line(line: np.ndarray) -> np.ndarray:
 def mark(colour: np.ndarray, plane: SliceView, tip: np.ndarray, middle: np.ndarray) -> None:
     """Mark a tip (3,) [m], in place: a dot if it is in the plane, else a ring."""
     ((column, row),) = np.clip(plane.project_points(tip[None], middle), -1e4, 1e4).round().astype(int).tolist()
-    beside = abs(float((tip - middle) @ plane.normal)) > BESIDE
+    beside = abs(float((tip - middle) @ plane.normal)) > PLANE_TOLERANCE
     cv2.circle(colour, (column, row), 5, (12, 14, 16), 1 if beside else -1, cv2.LINE_AA)
     cv2.circle(colour, (column, row), 4, WHITE, 1 if beside else -1, cv2.LINE_AA)
 
@@ -230,17 +235,22 @@ def label(colour: np.ndarray, plane: SliceView, middle: np.ndarray) -> None:
     """Draw a view's name and position, the orientation labels and a scale bar, in place."""
     right, down = np.asarray(plane.right), np.asarray(plane.down)
     axis = int(np.argmax(np.abs(plane.normal)))
-    write(colour, f"{plane.name}  {'xyz'[axis]} {1e3 * middle[axis]:.0f} mm", (PAD, 2 * PAD + 4), FINE)
-    half = SIDE // 2
+    write(
+        colour,
+        f"{plane.name}  {'xyz'[axis]} {1e3 * middle[axis]:.0f} mm",
+        (EDGE_DISTANCE, 2 * EDGE_DISTANCE + 4),
+        TEXT_SCALE,
+    )
+    half = VIEW_SIDE // 2
     places = (
-        (-right, (PAD, half)),
-        (right, (SIDE - 3 * PAD, half)),
-        (-down, (half + 4 * PAD, 2 * PAD + 4)),
-        (down, (half, SIDE - PAD)),
+        (-right, (EDGE_DISTANCE, half)),
+        (right, (VIEW_SIDE - 3 * EDGE_DISTANCE, half)),
+        (-down, (half + 4 * EDGE_DISTANCE, 2 * EDGE_DISTANCE + 4)),
+        (down, (half, VIEW_SIDE - EDGE_DISTANCE)),
     )
     for way, at in places:
         write(colour, name_direction(way), at)
-    length, row = round(0.5 * SIDE * BAR / REACH), SIDE - PAD
+    length, row = round(0.5 * VIEW_SIDE * BAR_LENGTH / HALF_VIEW), VIEW_SIDE - EDGE_DISTANCE
     for ink, width in (((12, 14, 16), 4), (WHITE, 2)):
-        cv2.line(colour, (PAD, row), (PAD + length, row), ink, width)
-    write(colour, f"{1e3 * BAR:.0f} mm", (PAD, row - PAD), FINE)
+        cv2.line(colour, (EDGE_DISTANCE, row), (EDGE_DISTANCE + length, row), ink, width)
+    write(colour, f"{1e3 * BAR_LENGTH:.0f} mm", (EDGE_DISTANCE, row - EDGE_DISTANCE), TEXT_SCALE)

@@ -7,7 +7,7 @@ rules and shows image and controls in one docked panel.
 
 from __future__ import annotations
 
-from .client_page import WITHOUT
+from .client_page import NO_WEBGL_CLASS
 from .elements import ASIDE, HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 
 PAGE, STATUS = "sulcus", "sulcus-status"
@@ -23,7 +23,7 @@ DIMMED = (  # Selectors of controls that are dimmed and receive no pointer event
     ".mantine-Slider-root, .mantine-InputWrapper-root, .mantine-NumberInput-root, .mantine-Checkbox-root, "
     "div:has(> button):has(+ div .mantine-Slider-root) > button, div:has(> button) + div:has(> button) > button"
 )
-LOOKS_ON = f"<style>{PARTS} :is({DIMMED}) {{ opacity: 0.45; pointer-events: none }}</style>"
+VIEW_ONLY_STYLE = f"<style>{PARTS} :is({DIMMED}) {{ opacity: 0.45; pointer-events: none }}</style>"
 """Rules for a client without control."""
 
 # Style sheet of the page; names in capitals are replaced by selectors.
@@ -133,7 +133,7 @@ def build_style(aspect: float) -> str:
     """Build the style element for an image with width / height `aspect`."""
     rules = RULES
     for name, value in (
-        ("WITHOUT", WITHOUT),
+        ("WITHOUT", NO_WEBGL_CLASS),
         ("#PICTURE", f"#{PICTURE}"),
         ("PANEL", PANEL),
         ("VIEW", VIEW),

@@ -12,7 +12,7 @@ from ..optics.camera import Camera
 from .parallel import forward_kernel, load, run_length
 from .triangle import box_of, edge, first_row
 
-CELL = 64  # Average number of pixels in a cell of the lookup table.
+CELL_PIXELS = 64  # Average number of pixels in a cell of the lookup table.
 
 
 @wp.struct
@@ -50,7 +50,7 @@ def get_undistortion(cameras: tuple[Camera, ...], device: str) -> Unbent:
     """Compute `build_undistortion`, cached: a fixed camera is used in every image, and a part of it by each surface."""
     straight = np.stack([camera.straight for camera in cameras])
     count, height, width = straight.shape[:3]
-    side = max(int(np.sqrt(height * width / CELL)), 1)
+    side = max(int(np.sqrt(height * width / CELL_PIXELS)), 1)
     with np.errstate(invalid="ignore"):
         low = np.fmin.reduce(straight.reshape(count, -1, 2), axis=1)
         high = np.fmax.reduce(straight.reshape(count, -1, 2), axis=1)

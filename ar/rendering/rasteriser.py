@@ -23,11 +23,11 @@ from .lens_rasteriser import Unbent, build_undistortion, keep_nearest_through_le
 from .parallel import forward_kernel, launch_in_bands, load, run_in_bands, run_length
 from .triangle import box_of, edge, first_row, weights_of
 
-NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
+EMPTY_PIXEL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Value of an empty z-buffer entry."""
-NEAR = 1e-3
+NEAR_PLANE = 1e-3
 """Near plane [m]: nothing closer to a camera is drawn."""
-PARTS = 8  # Number of threads that share the rows of a triangle on a GPU.
+ROW_THREADS = 8  # Number of threads that share the rows of a triangle on a GPU.
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Fragments:
 
 
 def rasterise(
-    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu"
+    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR_PLANE, device: str = "cpu"
 ) -> Fragments:
     """Find the nearest triangle at every pixel centre.
 
@@ -112,7 +112,7 @@ class RasterisedSurface:
 
 
 def rasterise_surface(
-    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR, device: str = "cpu"
+    camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR_PLANE, device: str = "cpu"
 ) -> RasterisedSurface:
     """Draw one surface into a z-buffer. Arguments and errors as in `rasterise`."""
     vertices, triangles = check_mesh(vertices, triangles)
@@ -132,7 +132,7 @@ def rasterise_surface(
 
 def allocate_z_buffer(count: int, height: int, width: int, device: str) -> wp.array:
     """Create empty z-buffers (count, height, width) of (depth, face)."""
-    return wp.full((count, height, width), value=NOTHING, dtype=wp.uint64, device=device)
+    return wp.full((count, height, width), value=EMPTY_PIXEL, dtype=wp.uint64, device=device)
 
 
 def draw(
@@ -142,7 +142,7 @@ def draw(
     rows: slice,
     nearest: wp.array,
     device: str,
-    near: float = NEAR,
+    near: float = NEAR_PLANE,
     through: Unbent | None = None,
 ) -> None:
     """Draw the triangles from number `since` on into z-buffers (B, H, W), in some rows.
@@ -155,7 +155,7 @@ def draw(
     load(device, kernel.module)
     count, run = triangles.shape[0] - since, run_length(device)
     # On a GPU the rows of a triangle are shared by several threads.
-    parts = 1 if device == "cpu" else PARTS
+    parts = 1 if device == "cpu" else ROW_THREADS
     size = nearest.shape[0], -(-count // run), parts
 
     def scan(begin: int, end: int) -> None:
@@ -305,7 +305,7 @@ def mark_covered(
     """Set each pixel: 1 if a surface is visible."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
-        mask[index] = wp.uint8(wp.where(nearest[index] != NOTHING, 1, 0))
+        mask[index] = wp.uint8(wp.where(nearest[index] != EMPTY_PIXEL, 1, 0))
 
 
 @forward_kernel
@@ -329,7 +329,7 @@ def read_nearest(
         row = index / nearest.shape[1]
         column = index - row * nearest.shape[1]
         key = nearest[row, column]
-        if key != NOTHING:
+        if key != EMPTY_PIXEL:
             winner = face_of(key)
             t = triangles[winner]
             face[row, column] = winner

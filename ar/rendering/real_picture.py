@@ -13,7 +13,7 @@ from .parallel import forward_kernel, launch_in_bands, load
 from .rasteriser import rasterise
 from .renderer import Picture, Pictures
 
-SOFT = wp.constant(0.12)  # Width of the field's soft edge as a share of its radius.
+SOFT_EDGE_SHARE = wp.constant(0.12)  # Width of the field's soft edge as a share of its radius.
 
 
 def add_vignette(picture: Picture, field: float) -> Picture:
@@ -56,7 +56,7 @@ def darken(
         column = index % width
         x = wp.float32(column) - 0.5 * wp.float32(width - 1)
         y = wp.float32(row) - 0.5 * wp.float32(height - 1)
-        inside = (1.0 - wp.sqrt(x * x + y * y) / radius) / SOFT
+        inside = (1.0 - wp.sqrt(x * x + y * y) / radius) / SOFT_EDGE_SHARE
         if inside < 1.0:
             share = wp.max(inside, 0.0)
             share = share * share * (3.0 - 2.0 * share)

@@ -13,11 +13,11 @@ from ..optics.camera import Camera, look_at
 from .layer import Layer
 from .lens_rasteriser import Unbent, build_undistortion
 from .parallel import launch_in_bands, load
-from .rasteriser import NEAR, allocate_z_buffer, draw, find_rows_reached
-from .shade import BRIGHTEST, SOFT, TILE, bound, remember, shade
+from .rasteriser import NEAR_PLANE, allocate_z_buffer, draw, find_rows_reached
+from .shade import HALF_SOFT_WIDTH, TILE_SIDE, WHITE_LEVEL, bound, remember, shade
 from .surfaces import Light, PlacedSurface, Shadow, Stack, place
 
-DRAPE = (0.13, 0.30, 0.36)  # Colour of the drape (RGB, scene-linear).
+DRAPE_COLOUR = (0.13, 0.30, 0.36)  # Colour of the drape (RGB, scene-linear).
 SHADOW_PIXELS = 384  # Side of the shadow map [pixel].
 
 
@@ -145,8 +145,8 @@ class Renderer:
         """
         moved = self.stack.copy_vertices(np.concatenate([np.zeros((0, 3)), *vertices])[None])
         stays, self.seen_by = camera is self.seen_by, camera
-        backdrop = self._backdrop(camera, moved) if stays and self.stack.still_faces else None
-        return Picture(self._drawn([camera], moved, backdrop))
+        backdrop = self._get_backdrop(camera, moved) if stays and self.stack.still_faces else None
+        return Picture(self._draw_images([camera], moved, backdrop))
 
     def render_batch(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
         """Render images of cameras of one size; nothing leaves the device.
@@ -170,9 +170,9 @@ class Renderer:
             raise ValueError(f"{len(cameras)} cameras for {count} images: give one for each, or one for all.")
         if len({(camera.width, camera.height) for camera in cameras}) > 1:
             raise ValueError("the cameras have several sizes: draw those of each size together.")
-        return self._drawn([*cameras] * (count // len(cameras)), moved, None)
+        return self._draw_images([*cameras] * (count // len(cameras)), moved, None)
 
-    def _drawn(self, cameras: Sequence[Camera], moved: wp.array, backdrop: Backdrop | None) -> Pictures:
+    def _draw_images(self, cameras: Sequence[Camera], moved: wp.array, backdrop: Backdrop | None) -> Pictures:
         """Draw every image, upon the backdrop if there is one."""
         count, height, width = len(cameras), cameras[0].height, cameras[0].width
         if count * max(height * width, SHADOW_PIXELS**2) >= 2**31:
@@ -187,7 +187,7 @@ class Renderer:
             pictures = Pictures(*(wp.clone(array) for array in backdrop.pictures.arrays))
         self._place(cameras, moved, placed, vertex)
         through = build_undistortion(cameras, self.device)
-        rows = slice(0, height) if through.pixels.size else self._rows(placed.seen, vertex, height)
+        rows = slice(0, height) if through.pixels.size else self._find_rows(placed.seen, vertex, height)
         draw(placed.seen, stack.surfaces.triangles, face, rows, nearest, self.device, through=through)
         self._shade(cameras, placed, nearest, stack.casting, face, lit_at, through, pictures)
         return pictures
@@ -205,9 +205,9 @@ class Renderer:
     ) -> None:
         """Light the contents of the z-buffers, in the shadow of some triangles, into images that hold all else."""
         count, height, width = nearest.shape
-        shadow = self._shadow(placed, casting)
+        shadow = self._draw_shadow(placed, casting)
         inputs = [
-            width, height * width, nearest.flatten(), self.stack.surfaces, placed, self._eyes(cameras), self.light,
+            width, height * width, nearest.flatten(), self.stack.surfaces, placed, self._get_centres(cameras), self.light,
             shadow, self.curve, still, lit_at, through.pixels,
         ]  # fmt: skip
         outputs = [array.flatten() for array in pictures.arrays]
@@ -224,15 +224,15 @@ class Renderer:
         ]  # fmt: skip
         launch_in_bands(place, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)
 
-    def _rows(self, seen: wp.array, since: int, height: int) -> slice:
+    def _find_rows(self, seen: wp.array, since: int, height: int) -> slice:
         """Return the rows that vertices from number `since` on can cover: on a GPU all, as a test would take longer."""
         if self.device != "cpu":
             return slice(0, height)
-        return slice(*find_rows_reached(seen.numpy()[:, since:].reshape(-1, 3), NEAR, height))
+        return slice(*find_rows_reached(seen.numpy()[:, since:].reshape(-1, 3), NEAR_PLANE, height))
 
-    def _shadow(self, placed: PlacedSurface, casting: wp.array) -> Shadow:
+    def _draw_shadow(self, placed: PlacedSurface, casting: wp.array) -> Shadow:
         """Draw the shadow map of each image."""
-        count, tiles = placed.lit.shape[0], SHADOW_PIXELS // int(TILE)
+        count, tiles = placed.lit.shape[0], SHADOW_PIXELS // int(TILE_SIDE)
         shadow = Shadow()
         shadow.size = SHADOW_PIXELS
         shadow.depth = wp.empty(count * SHADOW_PIXELS**2, dtype=wp.float32, device=self.device)
@@ -242,10 +242,10 @@ class Renderer:
         launch_in_bands(bound, [nearest], [shadow], count * tiles**2, self.device)
         return shadow
 
-    def _eyes(self, cameras: Sequence[Camera]) -> wp.array:
+    def _get_centres(self, cameras: Sequence[Camera]) -> wp.array:
         return wp.array([camera.centre for camera in cameras], dtype=wp.vec3f, device=self.device)
 
-    def _backdrop(self, camera: Camera, moved: wp.array) -> Backdrop:
+    def _get_backdrop(self, camera: Camera, moved: wp.array) -> Backdrop:
         """Return the image of the fixed layers for a camera; that of the last camera is cached."""
         if self.backdrop is not None and self.backdrop.camera is camera:
             return self.backdrop
@@ -258,7 +258,15 @@ class Renderer:
         draw(placed.seen, there, 0, slice(0, height), nearest, self.device, through=through)
         self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, through, pictures)
         lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
-        inputs = [width, nearest.flatten(), stack.surfaces, placed, self._eyes([camera]), self.light, through.pixels]
+        inputs = [
+            width,
+            nearest.flatten(),
+            stack.surfaces,
+            placed,
+            self._get_centres([camera]),
+            self.light,
+            through.pixels,
+        ]
         launch_in_bands(remember, inputs, [lit_at], height * width, self.device)
         self.backdrop = Backdrop(camera, nearest, placed, pictures, lit_at)
         return self.backdrop
@@ -301,7 +309,7 @@ def as_light(lamp: Lamp) -> Light:
     light.outer, light.steepness = float(np.cos(angle)), float(1.0 / (np.cos(0.55 * angle) - np.cos(angle)))
     light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(compute_projection(camera))
     # The offset equals the filter width: then the surface itself is never under the filter, at any slant to the lamp.
-    light.offset = float(1.05 * (SOFT + 0.5) * np.linalg.norm(axis) / camera.K[0, 0])
+    light.offset = float(1.05 * (HALF_SOFT_WIDTH + 0.5) * np.linalg.norm(axis) / camera.K[0, 0])
     return light
 
 
@@ -310,12 +318,12 @@ def draw_background(width: int, height: int, device: str) -> wp.array:
     """Draw the background (H, W, 3) uint8 on a device: a drape, brighter in the centre."""
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
     fall = 1.0 - 0.45 * np.clip(np.hypot(x, y) / np.sqrt(2.0), 0.0, 1.0)
-    return wp.array((255.0 * fall[..., None] * DRAPE).astype(np.uint8), dtype=wp.vec3ub, device=device)
+    return wp.array((255.0 * fall[..., None] * DRAPE_COLOUR).astype(np.uint8), dtype=wp.vec3ub, device=device)
 
 
 @lru_cache(maxsize=1)
 def build_tone_curve() -> np.ndarray:
     """Compute the table (4096,) uint8 from scene-linear light to display: filmic (Narkowicz 2016), then gamma 2."""
-    x = np.linspace(0.0, float(BRIGHTEST), 4096)
+    x = np.linspace(0.0, float(WHITE_LEVEL), 4096)
     filmic = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
     return (255.0 * np.sqrt(filmic) + 0.5).astype(np.uint8)

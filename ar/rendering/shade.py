@@ -6,17 +6,17 @@ import warp as wp
 
 from .lens_rasteriser import pixel_at
 from .parallel import forward_kernel
-from .rasteriser import NOTHING, depth_of, face_of
+from .rasteriser import EMPTY_PIXEL, depth_of, face_of
 from .surfaces import FaceCorners, LayerShading, Light, PlacedSurface, Point, Shadow, Surfaces
 from .triangle import weights_at
 
-BIAS = wp.constant(0.0002)  # Minimum depth of an occluder in front of a point that it shades [m].
-SOFT = wp.constant(3)  # Half the width of the shadow's soft edge [shadow-map pixel].
-TAPS = wp.constant(7)  # Width of the shadow filter [shadow-map pixel]: 2 SOFT + 1.
+DEPTH_BIAS = wp.constant(0.0002)  # Minimum depth of an occluder in front of a point that it shades [m].
+HALF_SOFT_WIDTH = wp.constant(3)  # Half the width of the shadow's soft edge [shadow-map pixel].
+FILTER_WIDTH = wp.constant(7)  # Width of the shadow filter [shadow-map pixel]: 2 SOFT + 1.
 Taps = wp.types.vector(length=7, dtype=wp.float32)
 # Side of the tiles of the shadow map's depth bounds [shadow-map pixel]: the filter overlaps at most four.
-TILE = wp.constant(8)
-BRIGHTEST = wp.constant(4.0)  # Scene-linear light displayed as white.
+TILE_SIDE = wp.constant(8)
+WHITE_LEVEL = wp.constant(4.0)  # Scene-linear light displayed as white.
 
 
 @wp.func
@@ -125,14 +125,20 @@ def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
     column = wp.int32(at[0] + 0.5)
     row = wp.int32(at[1] + 0.5)
     size = shadow.size
-    if at[2] <= 0.0 or row < SOFT or column < SOFT or row >= size - SOFT or column >= size - SOFT:
+    if (
+        at[2] <= 0.0
+        or row < HALF_SOFT_WIDTH
+        or column < HALF_SOFT_WIDTH
+        or row >= size - HALF_SOFT_WIDTH
+        or column >= size - HALF_SOFT_WIDTH
+    ):
         return 1.0
-    z = at[2] - BIAS
-    tiles = size / TILE
-    top = (picture * tiles + (row - SOFT) / TILE) * tiles
-    low = (picture * tiles + (row + SOFT) / TILE) * tiles
-    left = (column - SOFT) / TILE
-    right = (column + SOFT) / TILE
+    z = at[2] - DEPTH_BIAS
+    tiles = size / TILE_SIDE
+    top = (picture * tiles + (row - HALF_SOFT_WIDTH) / TILE_SIDE) * tiles
+    low = (picture * tiles + (row + HALF_SOFT_WIDTH) / TILE_SIDE) * tiles
+    left = (column - HALF_SOFT_WIDTH) / TILE_SIDE
+    right = (column + HALF_SOFT_WIDTH) / TILE_SIDE
     first = shadow.bounds[top + left]
     second = shadow.bounds[top + right]
     third = shadow.bounds[low + left]
@@ -143,24 +149,24 @@ def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
         return 0.0
     # A box 2 SOFT wide about (u, v): taps at its border are weighted by their part inside, so that no steps are
     # visible.
-    reach = wp.float32(SOFT) + 0.5
+    reach = wp.float32(HALF_SOFT_WIDTH) + 0.5
     across = Taps()
-    for j in range(TAPS):
-        across[j] = wp.min(reach - wp.abs(wp.float32(column - SOFT + j) - at[0]), 1.0)
+    for j in range(FILTER_WIDTH):
+        across[j] = wp.min(reach - wp.abs(wp.float32(column - HALF_SOFT_WIDTH + j) - at[0]), 1.0)
     hidden = wp.float32(0.0)
-    for i in range(TAPS):
-        begin = (picture * size + row - SOFT + i) * size + column - SOFT
+    for i in range(FILTER_WIDTH):
+        begin = (picture * size + row - HALF_SOFT_WIDTH + i) * size + column - HALF_SOFT_WIDTH
         along = wp.float32(0.0)
-        for j in range(TAPS):
+        for j in range(FILTER_WIDTH):
             along += wp.where(z > shadow.depth[begin + j], across[j], 0.0)
-        hidden += along * wp.min(reach - wp.abs(wp.float32(row - SOFT + i) - at[1]), 1.0)
-    return 1.0 - hidden / wp.float32(4 * SOFT * SOFT)
+        hidden += along * wp.min(reach - wp.abs(wp.float32(row - HALF_SOFT_WIDTH + i) - at[1]), 1.0)
+    return 1.0 - hidden / wp.float32(4 * HALF_SOFT_WIDTH * HALF_SOFT_WIDTH)
 
 
 @wp.func
 def tone(x: wp.float32, curve: wp.array(dtype=wp.uint8)) -> wp.uint8:
     """Map scene-linear light to an 8-bit value by the table `curve`, which spans 0 .. BRIGHTEST."""
-    return curve[wp.int32(wp.min(x * (1.0 / BRIGHTEST), 1.0) * wp.float32(curve.shape[0] - 1))]
+    return curve[wp.int32(wp.min(x * (1.0 / WHITE_LEVEL), 1.0) * wp.float32(curve.shape[0] - 1))]
 
 
 @wp.func
@@ -197,18 +203,18 @@ def bound(
 ):
     """Compute the shadow maps' depths, and their minimum and maximum in a run of the tiles begin .. end - 1."""
     start = begin + wp.tid() * run
-    tiles = shadow.size / TILE
+    tiles = shadow.size / TILE_SIDE
     for index in range(start, wp.min(start + run, end)):
         picture = index / (tiles * tiles)
         row = (index / tiles) % tiles
         column = index % tiles
         least = wp.float32(wp.inf)
         greatest = wp.float32(0.0)
-        for i in range(row * TILE, (row + 1) * TILE):
-            for j in range(column * TILE, (column + 1) * TILE):
+        for i in range(row * TILE_SIDE, (row + 1) * TILE_SIDE):
+            for j in range(column * TILE_SIDE, (column + 1) * TILE_SIDE):
                 key = nearest[picture, i, j]
                 depth = wp.float32(wp.inf)
-                if key != NOTHING:
+                if key != EMPTY_PIXEL:
                     depth = depth_of(key)
                 shadow.depth[(picture * shadow.size + i) * shadow.size + j] = depth
                 least = wp.min(least, depth)
@@ -237,7 +243,7 @@ def remember(
         row = index / width
         column = index - row * width
         key = nearest[index]
-        if key != NOTHING:
+        if key != EMPTY_PIXEL:
             winner = face_of(key)
             look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
             corners = corners_of(0, winner, surfaces, placed)
@@ -288,9 +294,9 @@ def shade(
         key = nearest[index]
         winner = face_of(key)
         share = wp.float32(1.0)
-        if key != NOTHING and winner < still:
+        if key != EMPTY_PIXEL and winner < still:
             share = lit(picture, lit_at[pixel], shadow)
-        if key != NOTHING and (winner >= still or share < 1.0):
+        if key != EMPTY_PIXEL and (winner >= still or share < 1.0):
             row = pixel / width
             column = pixel - row * width
             if winner != last or column == 0:

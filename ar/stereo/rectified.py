@@ -11,7 +11,7 @@ import numpy as np
 from ..optics.camera import Camera
 
 # Smallest share of the baseline along the left eye's rows: the right eye is to the right of the left one.
-ALONG_ROWS = 0.9
+MIN_BASELINE_SHARE = 0.9
 Maps = tuple[np.ndarray, np.ndarray]
 
 
@@ -86,7 +86,7 @@ def rectify(
     """
     between = right.centre - left.centre
     baseline = float(np.linalg.norm(between))
-    if not left.T_camera_world[0, :3] @ between > ALONG_ROWS * baseline or not baseline > 0.0:
+    if not left.T_camera_world[0, :3] @ between > MIN_BASELINE_SHARE * baseline or not baseline > 0.0:
         raise ValueError("the right eye is not to the right of the left one: check which is which.")
     x = between / baseline
     y = np.cross(left.T_camera_world[2, :3] + right.T_camera_world[2, :3], x)
@@ -100,11 +100,13 @@ def rectify(
     middle = 0.5 * (size - 1)
     principal = middle - focal * at[:2] / at[2]
     shift = np.array([focal * baseline / at[2], 0.0])
-    maps = tuple(_maps(eye, R, focal, place, size) for eye, place in ((left, principal), (right, principal + shift)))
+    maps = tuple(
+        _build_maps(eye, R, focal, place, size) for eye, place in ((left, principal), (right, principal + shift))
+    )
     return Rectified(T, focal, principal, baseline, float(at[2]), size, (maps[0], maps[1]))
 
 
-def _maps(eye: Camera, R: np.ndarray, focal: float, principal: np.ndarray, size: int) -> Maps:
+def _build_maps(eye: Camera, R: np.ndarray, focal: float, principal: np.ndarray, size: int) -> Maps:
     K = np.array([[focal, 0.0, principal[0]], [0.0, focal, principal[1]], [0.0, 0.0, 1.0]])
     turn = R @ eye.T_camera_world[:3, :3].T
     return cv2.initUndistortRectifyMap(eye.K, eye.distortion, turn, K, (size, size), cv2.CV_16SC2)

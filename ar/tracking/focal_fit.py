@@ -9,15 +9,15 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize_scalar
 
 from ..optics.camera import Camera
-from .pose import LEAST, fit_least_squares
+from .pose import MIN_DEVIATION, fit_least_squares
 from .targets import DetectedCorners, Target
 
-FEWEST = 12  # Minimum number of corners in a view.
-BOUNDS = (0.5, 2.0)  # Search range of the factor on the focal length.
-EXACT = 1e-3  # Tolerance of the factor.
-STEP = 0.02  # Step of the factor in the finite difference for the curvature of the sum of squares.
-TOLERATED = 0.05  # Relative error above which a focal length differs.
-SURE = 6.0  # Error above which a focal length differs [standard deviations], if it exceeds TOLERATED as well.
+MIN_CORNERS = 12  # Minimum number of corners in a view.
+FACTOR_BOUNDS = (0.5, 2.0)  # Search range of the factor on the focal length.
+FACTOR_TOLERANCE = 1e-3  # Tolerance of the factor.
+FACTOR_STEP = 0.02  # Step of the factor in the finite difference for the curvature of the sum of squares.
+MAX_RELATIVE_ERROR = 0.05  # Relative error above which a focal length differs.
+MAX_DEVIATIONS = 6.0  # Error above which a focal length differs [standard deviations], if it exceeds TOLERATED as well.
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class FocalFit:
     @property
     def differs(self) -> bool:
         """True if the focal length differs significantly."""
-        return abs(self.factor - 1.0) > max(TOLERATED, SURE * self.deviation)
+        return abs(self.factor - 1.0) > max(MAX_RELATIVE_ERROR, MAX_DEVIATIONS * self.deviation)
 
 
 def fit_focal_length(camera: Camera, seen: Sequence[tuple[Target, DetectedCorners]]) -> FocalFit | None:
@@ -40,7 +40,7 @@ def fit_focal_length(camera: Camera, seen: Sequence[tuple[Target, DetectedCorner
     minimum and the residual variance of corners. Source: Triggs et al. 2000, "Bundle adjustment: a modern synthesis",
     section 6.1.
     """
-    enough = [(target, corners) for target, corners in seen if len(corners.points) >= FEWEST]
+    enough = [(target, corners) for target, corners in seen if len(corners.points) >= MIN_CORNERS]
     freedom = sum(2 * len(corners.points) - 6 for _, corners in enough) - 1
     if freedom <= 0:
         return None
@@ -50,11 +50,11 @@ def fit_focal_length(camera: Camera, seen: Sequence[tuple[Target, DetectedCorner
         K[[0, 1], [0, 1]] *= factor
         return sum(fit_least_squares(replace(camera, K=K), target, corners) for target, corners in enough)
 
-    found = minimize_scalar(squares, bounds=BOUNDS, method="bounded", options={"xatol": EXACT})
+    found = minimize_scalar(squares, bounds=FACTOR_BOUNDS, method="bounded", options={"xatol": FACTOR_TOLERANCE})
     assert isinstance(found, OptimizeResult)
-    around = squares(found.x - STEP), squares(found.x + STEP)
+    around = squares(found.x - FACTOR_STEP), squares(found.x + FACTOR_STEP)
     if not np.isfinite([found.fun, *around]).all() or sum(around) <= 2.0 * found.fun:
         return None
-    bend = (sum(around) - 2.0 * found.fun) / STEP**2
-    variance = max(found.fun / freedom, LEAST**2)
+    bend = (sum(around) - 2.0 * found.fun) / FACTOR_STEP**2
+    variance = max(found.fun / freedom, MIN_DEVIATION**2)
     return FocalFit(float(found.x), float(np.sqrt(2.0 * variance / bend)))

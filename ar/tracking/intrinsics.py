@@ -14,9 +14,9 @@ from ..optics.camera import Camera
 from ..optics.lens import Lens
 from .targets import Detector, Face
 
-FEWEST_CORNERS = 8  # Minimum number of corners in a view.
-FEWEST_LINES = 3  # Minimum number of the board's rows and of its columns with corners in a view.
-BLURRED = 0.6  # Sharpness below which a view is left out, as a share of the median.
+MIN_CORNERS = 8  # Minimum number of corners in a view.
+MIN_LINES = 3  # Minimum number of the board's rows and of its columns with corners in a view.
+MIN_SHARPNESS = 0.6  # Sharpness below which a view is left out, as a share of the median.
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,16 +59,16 @@ def find_board(detector: Detector, name: str, grey: np.ndarray) -> BoardView | N
     """
     (board,) = detector.targets
     seen = detector.detect(grey).get(board.name)
-    if seen is None or len(seen.points) < FEWEST_CORNERS:
+    if seen is None or len(seen.points) < MIN_CORNERS:
         return None
     lines = np.rint(seen.points[:, :2] / board.faces[0].square)
-    if min(len(np.unique(lines[:, axis])) for axis in (0, 1)) < FEWEST_LINES:
+    if min(len(np.unique(lines[:, axis])) for axis in (0, 1)) < MIN_LINES:
         return None
-    view = BoardView(name, seen.points, seen.pixels, _sharpness(grey, seen.pixels))
+    view = BoardView(name, seen.points, seen.pixels, _compute_sharpness(grey, seen.pixels))
     return view if np.isfinite(view.homography).all() and np.linalg.matrix_rank(view.homography) == 3 else None
 
 
-def _sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
+def _compute_sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
     """Compute the sharpness of the image part that holds the pixels (n, 2): the smaller of columns and rows."""
     low, high = np.floor(pixels.min(axis=0)).astype(int), np.ceil(pixels.max(axis=0)).astype(int) + 1
     part = grey[max(low[1], 0) : high[1], max(low[0], 0) : high[0]].astype(np.float32)
@@ -84,7 +84,7 @@ def choose_views(views: Sequence[BoardView], face: Face, most: int) -> list[Boar
     maximum intercluster distance": the farthest view from all chosen ones comes next.
     """
     median = np.median([view.sharpness for view in views]) if views else 0.0
-    sharp = [view for view in views if view.sharpness >= BLURRED * median]
+    sharp = [view for view in views if view.sharpness >= MIN_SHARPNESS * median]
     if len(sharp) <= most:
         return sharp
     outline = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * face.size
@@ -120,17 +120,17 @@ def measure_covered_share(views: Sequence[BoardView], width: int, height: int) -
     return float(mask.mean())
 
 
-POSE = slice(0, 6)  # Columns of OpenCV's derivatives: rotation and translation of a pose.
+POSE_COLUMNS = slice(0, 6)  # Columns of OpenCV's derivatives: rotation and translation of a pose.
 # Columns of OpenCV's derivatives: focal lengths, principal point and five coefficients of the lens.
-INTRINSIC = slice(6, 15)
+INTRINSIC_COLUMNS = slice(6, 15)
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Parameters in the order of the covariance; focal lengths and principal point [pixel]."""
-FEWEST_VIEWS = 8  # Minimum number of views for a calibration.
-OUTLIER = 3.0  # Ratio of a view's error to the median error above which it is left out.
-SMALLEST_ANGLE = np.radians(12.0)  # Smallest angle between the planes of the board [rad].
-UNSURE = 0.02  # Largest relative standard deviation of the focal length.
+MIN_VIEWS = 8  # Minimum number of views for a calibration.
+OUTLIER_RATIO = 3.0  # Ratio of a view's error to the median error above which it is left out.
+MIN_ANGLE = np.radians(12.0)  # Smallest angle between the planes of the board [rad].
+MAX_FOCAL_DEVIATION = 0.02  # Largest relative standard deviation of the focal length.
 # Remedy in error messages.
-TILT = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the image's corners."
+REMEDY = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the image's corners."
 
 
 def compute_calibration_error(
@@ -159,8 +159,8 @@ def compute_calibration_error(
         for points in (corners, place[None])
     ]
     seen, there = slopes
-    taken_up = np.linalg.lstsq(seen[:, POSE], seen[:, INTRINSIC], rcond=None)[0]
-    left = there[:, INTRINSIC] - there[:, POSE] @ taken_up
+    taken_up = np.linalg.lstsq(seen[:, POSE_COLUMNS], seen[:, INTRINSIC_COLUMNS], rcond=None)[0]
+    left = there[:, INTRINSIC_COLUMNS] - there[:, POSE_COLUMNS] @ taken_up
     across = np.linalg.pinv(there[:, 3:6]) @ left
     return across @ covariance @ across.T
 
@@ -219,9 +219,9 @@ def calibrate_intrinsics(views: Sequence[BoardView], width: int, height: int, na
     """
     kept, left_out = list(views), []
     while True:
-        _demand_views(kept, len(left_out), width, height)
-        K, coefficients, poses, errors = _solved(kept, width, height)
-        bad = errors > OUTLIER * np.median(errors)
+        _check_views(kept, len(left_out), width, height)
+        K, coefficients, poses, errors = _solve_views(kept, width, height)
+        bad = errors > OUTLIER_RATIO * np.median(errors)
         if not bad.any():
             break
         left_out += [view.name for view, worse in zip(kept, bad, strict=True) if worse]
@@ -230,7 +230,7 @@ def calibrate_intrinsics(views: Sequence[BoardView], width: int, height: int, na
     try:
         covariance, rms = compute_intrinsics_covariance(calibration, kept, poses)
     except np.linalg.LinAlgError as error:
-        raise ValueError(f"the views determine no camera. {TILT}") from error
+        raise ValueError(f"the views determine no camera. {REMEDY}") from error
     found = Intrinsics(
         calibration,
         covariance,
@@ -240,28 +240,28 @@ def calibrate_intrinsics(views: Sequence[BoardView], width: int, height: int, na
         measure_covered_share(kept, width, height),
     )
     unsure = found.deviations[:2] / calibration.focal
-    if not unsure.max() <= UNSURE:
-        raise ValueError(f"the views leave the focal length unknown to {100.0 * unsure.max():.0f} %. {TILT}")
+    if not unsure.max() <= MAX_FOCAL_DEVIATION:
+        raise ValueError(f"the views leave the focal length unknown to {100.0 * unsure.max():.0f} %. {REMEDY}")
     return found
 
 
-def _demand_views(views: Sequence[BoardView], left_out: int, width: int, height: int) -> None:
+def _check_views(views: Sequence[BoardView], left_out: int, width: int, height: int) -> None:
     """Raise ValueError for views that do not determine a camera."""
-    if len(views) < FEWEST_VIEWS:
+    if len(views) < MIN_VIEWS:
         without = f", and {left_out} more fit badly" if left_out else ""
         raise ValueError(
-            f"{len(views)} sharp views show the board{without}, but {FEWEST_VIEWS} are needed: take 20 images or "
+            f"{len(views)} sharp views show the board{without}, but {MIN_VIEWS} are needed: take 20 images or "
             "more, in good light and without motion."
         )
     angle = measure_tilt_range(views, width, height)
-    if angle < SMALLEST_ANGLE:
+    if angle < MIN_ANGLE:
         raise ValueError(
             f"the board is seen from one direction in all {len(views)} views, to {np.degrees(angle):.0f} degrees. "
-            f"{TILT}"
+            f"{REMEDY}"
         )
 
 
-def _solved(
+def _solve_views(
     views: Sequence[BoardView], width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
     """Solve for K (3, 3), five coefficients, and each view's rotation vector, translation (3,), rms error [pixel]."""
@@ -273,10 +273,10 @@ def _solved(
             points, pixels, (width, height), guess, np.zeros(5), flags=cv2.CALIB_USE_INTRINSIC_GUESS
         )
     except cv2.error as error:
-        raise ValueError(f"the views determine no camera. {TILT}") from error
+        raise ValueError(f"the views determine no camera. {REMEDY}") from error
     poses = [(np.ravel(turn), np.ravel(shift)) for turn, shift in zip(turns, shifts, strict=True)]
     if not (np.isfinite(K).all() and np.isfinite(coefficients).all() and np.isfinite(errors).all()):
-        raise ValueError(f"the views determine no camera. {TILT}")
+        raise ValueError(f"the views determine no camera. {REMEDY}")
     return np.asarray(K), np.ravel(coefficients)[:5], poses, np.ravel(errors)
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from .pictures import Named, to_named_image
 
-FAILURES = 10  # Number of consecutive failed images before the camera is opened again.
-PAUSE = 0.05  # Pause between two tries [s].
+MAX_FAILURES = 10  # Number of consecutive failed images before the camera is opened again.
+RETRY_PAUSE = 0.05  # Pause between two tries [s].
 
 
 class FrameSource(Protocol):
@@ -58,8 +58,8 @@ def read_camera_images(
                 continue
             yield None
             failed += 1
-            clock.sleep(PAUSE)
-            if failed % FAILURES == 0:
+            clock.sleep(RETRY_PAUSE)
+            if failed % MAX_FAILURES == 0:
                 source.release()
                 source = again()
     finally:

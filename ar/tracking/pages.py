@@ -11,23 +11,32 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
-from .targets import BORDER, MARKER, MARKERS, TIP, Face, Target, build_tool_cube, list_targets
+from .targets import (
+    BORDER_WIDTH,
+    MARKER_DICTIONARY,
+    MARKER_RATIO,
+    TIP_DISTANCE,
+    Face,
+    Target,
+    build_tool_cube,
+    list_targets,
+)
 
 PER_MM = 20  # Resolution of a page [pixel/mm]: each module of each marker takes a whole number of pixels.
 DPI = 25.4 * PER_MM  # Resolution of a page [pixel/inch].
 A4 = (210.0, 297.0)  # Width and height of the page [mm].
-RULER = 100.0  # Length of the printed rulers [mm].
-MAKER = "sulcus markers"
+RULER_LENGTH = 100.0  # Length of the printed rulers [mm].
+PROGRAM_NAME = "sulcus markers"
 """Program name in the metadata of PDF and PNG."""
-THIN = 0.2  # Line width [mm].
-SMALL = 3.4  # Height of the text [mm].
-LARGE = 6.0  # Height of titles [mm].
-TINY = 2.6  # Height of the names of faces [mm].
-LINE = 4.8
+LINE_WIDTH = 0.2  # Line width [mm].
+TEXT_HEIGHT = 3.4  # Height of the text [mm].
+TITLE_HEIGHT = 6.0  # Height of titles [mm].
+NAME_HEIGHT = 2.6  # Height of the names of faces [mm].
+LINE_SPACING = 4.8
 """Line spacing of text [mm]."""
-PRINTING = (  # Instructions on each page.
+PRINT_INSTRUCTIONS = (  # Instructions on each page.
     "Print at 100 % on A4 ('actual size', not 'fit to page'), then measure both rulers.",
-    f"If a ruler is not {RULER:.0f} mm long to 0.2 mm, do not use this page: correct the scale, and print it again.",
+    f"If a ruler is not {RULER_LENGTH:.0f} mm long to 0.2 mm, do not use this page: correct the scale, and print it again.",
 )
 
 
@@ -73,7 +82,7 @@ class Page:
 def build_printed_pages() -> tuple[Page, ...]:
     """Draw the pages of the tool's cube, the patient's reference and the calibration board."""
     cube, plate, board = list_targets()
-    return _cube_page(cube), _plate_page(plate), _board_page(board)
+    return _draw_cube_page(cube), _draw_plate_page(plate), _draw_board_page(board)
 
 
 def to_face_name(face: Face) -> str:
@@ -86,19 +95,19 @@ def to_face_name(face: Face) -> str:
 def to_png(page: Page) -> bytes:
     """Encode a page as a PNG of one bit a pixel, with its resolution."""
     said = PngInfo()
-    said.add_text("Source", MAKER)
-    return _saved([page], "PNG", dpi=(DPI, DPI), pnginfo=said)
+    said.add_text("Source", PROGRAM_NAME)
+    return _encode_pages([page], "PNG", dpi=(DPI, DPI), pnginfo=said)
 
 
 def to_pdf(pages: Sequence[Page]) -> bytes:
     """Encode pages as one PDF, each as large as its paper."""
-    return _saved(pages, "PDF", resolution=DPI, creator=MAKER, title="Targets of sulcus")
+    return _encode_pages(pages, "PDF", resolution=DPI, creator=PROGRAM_NAME, title="Targets of sulcus")
 
 
 def get_dictionary_name() -> str:
     """Return OpenCV's name of the markers' dictionary."""
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
-    return next(name for name in names if getattr(cv2.aruco, name) == MARKERS)
+    return next(name for name in names if getattr(cv2.aruco, name) == MARKER_DICTIONARY)
 
 
 def describe_targets() -> dict:
@@ -112,102 +121,102 @@ def describe_targets() -> dict:
         "unit": "mm",
         "dictionary": get_dictionary_name(),
         "targets": [
-            {"name": target.name, "faces": [_listed(face) for face in target.faces]} for target in list_targets()
+            {"name": target.name, "faces": [_describe_face(face) for face in target.faces]} for target in list_targets()
         ],
-        "nominal_tip_mm": {build_tool_cube().name: [0.0, 0.0, _mm(-TIP)]},
+        "nominal_tip_mm": {build_tool_cube().name: [0.0, 0.0, _to_millimetres(-TIP_DISTANCE)]},
     }
 
 
-def _listed(face: Face) -> dict:
+def _describe_face(face: Face) -> dict:
     return {
         "name": to_face_name(face),
         "columns": face.columns,
         "rows": face.rows,
-        "square_mm": _mm(face.square),
-        "marker_mm": _mm(MARKER * face.square),
+        "square_mm": _to_millimetres(face.square),
+        "marker_mm": _to_millimetres(MARKER_RATIO * face.square),
         "ids": face.ids.tolist(),
-        "outline_mm": _mm(face.outline),
-        "corners_mm": _mm(face.corners),
+        "outline_mm": _to_millimetres(face.outline),
+        "corners_mm": _to_millimetres(face.corners),
     }
 
 
-def _mm(metres: float | np.ndarray):
+def _to_millimetres(metres: float | np.ndarray):
     """Convert to millimetres, rounded to the nanometre: a float, or lists of floats."""
     return (np.round(1e3 * np.asarray(metres), 6) + 0.0).tolist()
 
 
-def _cube_page(target: Target) -> Page:
+def _draw_cube_page(target: Target) -> Page:
     """Draw the three faces so that they fold into a corner of the cube: +z above +x, and +y to the right of it."""
     along_x, along_y, along_z = target.faces
-    wide, border = _mm(along_x.size[0] + 2.0 * BORDER), _mm(BORDER)
+    wide, border = _to_millimetres(along_x.size[0] + 2.0 * BORDER_WIDTH), _to_millimetres(BORDER_WIDTH)
     left, top = 57.0, 118.0
     cells = ((along_z, left, top, 1), (along_x, left, top + wide, 0), (along_y, left + wide, top + wide, 0))
-    page, ink = _blank(A4)
+    page, ink = _create_page(A4)
     placed = tuple(PlacedFace(face, x + border, y + border, turns) for face, x, y, turns in cells)
     for each, (face, x, y, _) in zip(placed, cells, strict=True):
         _print(page, each)
-        _write(ink, to_face_name(face), x + 0.8, y + 0.4, TINY)
+        _write(ink, to_face_name(face), x + 0.8, y + 0.4, NAME_HEIGHT)
     right, below, flap = left + wide, top + wide, 10.0
     folds = [((left, below), (right, below)), ((right, below), (right, below + wide)), ((right, top), (right, below))]
     for start, end in folds:
-        _line(ink, start, end, 1.0)
+        _draw_line(ink, start, end, 1.0)
     tab = [(right, top), (right + flap, top + flap), (right + flap, below - flap), (right, below - 1.0)]
     around = [*tab, (right, below), (right + wide, below), (right + wide, below + wide), (left, below + wide)]
     for start, end in zip([*around, (left, top)], [*around[1:], (left, top), (right, top)], strict=True):
-        _line(ink, start, end, 3.0)
-    _write(ink, "tab", right + 2.5, top + 0.5 * wide - 2.0, SMALL)
+        _draw_line(ink, start, end, 3.0)
+    _write(ink, "tab", right + 2.5, top + 0.5 * wide - 2.0, TEXT_HEIGHT)
     said = (
         f"A cube of {wide:.0f} mm with three faces along +x, +y and +z; their names stand in their borders.",
-        *_sizes(target),
-        *PRINTING,
+        *_describe_sizes(target),
+        *PRINT_INSTRUCTIONS,
         "Cut along the long dashes. Fold backwards along the short dashes: three faces meet at one corner.",
         f"Glue the paper onto a stiff cube of {wide:.0f} mm, and the tab behind the upper border of +y.",
         "Or cut the faces apart and glue each alone. Sides that touch here must touch on the cube,",
         "and so must the upper side of +y and the side with the tab.",
         "The shaft leaves the cube through the middle of the face opposite +z, at a right angle.",
-        f"The tool's tip is nominally {_mm(TIP):.0f} mm from the middle of the cube, before calibration.",
+        f"The tool's tip is nominally {_to_millimetres(TIP_DISTANCE):.0f} mm from the middle of the cube, before calibration.",
     )
-    return _finished(target, page, ink, placed, said, ((20.0, top), (55.0, top + 2.0 * wide + 20.0)))
+    return _compose_page(target, page, ink, placed, said, ((20.0, top), (55.0, top + 2.0 * wide + 20.0)))
 
 
-def _plate_page(target: Target) -> Page:
+def _draw_plate_page(target: Target) -> Page:
     """Draw one face with its border, to be cut out."""
     (face,) = target.faces
-    wide, border = _mm(face.size[0] + 2.0 * BORDER), _mm(BORDER)
+    wide, border = _to_millimetres(face.size[0] + 2.0 * BORDER_WIDTH), _to_millimetres(BORDER_WIDTH)
     left, top = 0.5 * (A4[0] - wide), 110.0
-    page, ink = _blank(A4)
+    page, ink = _create_page(A4)
     placed = PlacedFace(face, left + border, top + border)
     _print(page, placed)
     corners = [(left, top), (left + wide, top), (left + wide, top + wide), (left, top + wide)]
     for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
-        _line(ink, start, end, 3.0)
+        _draw_line(ink, start, end, 3.0)
     said = (
-        f"A plate of {_mm(face.size[0]):.0f} mm, {wide:.0f} mm with its border.",
-        *_sizes(target),
-        *PRINTING,
+        f"A plate of {_to_millimetres(face.size[0]):.0f} mm, {wide:.0f} mm with its border.",
+        *_describe_sizes(target),
+        *PRINT_INSTRUCTIONS,
         "Cut along the dashes, and glue the paper onto a stiff, flat plate.",
         "Fix the plate next to the craniotomy, so that it cannot move against the skull.",
         "Its frame has its origin in the upper left corner of the squares: x right, y down, z into the plate.",
     )
-    return _finished(target, page, ink, (placed,), said, ((20.0, top), (55.0, top + wide + 50.0)))
+    return _compose_page(target, page, ink, (placed,), said, ((20.0, top), (55.0, top + wide + 50.0)))
 
 
-def _board_page(target: Target) -> Page:
+def _draw_board_page(target: Target) -> Page:
     """Draw the board across the page; nothing is cut."""
     (face,) = target.faces
-    page, ink = _blank((A4[1], A4[0]))
-    placed = PlacedFace(face, 0.5 * (A4[1] - _mm(face.size[0])) + 20.0, 7.0)
+    page, ink = _create_page((A4[1], A4[0]))
+    placed = PlacedFace(face, 0.5 * (A4[1] - _to_millimetres(face.size[0])) + 20.0, 7.0)
     _print(page, placed)
-    said = (*_sizes(target), *PRINTING)
-    _write(ink, f"sulcus: {target.name}", 15.0, 176.0, LARGE)
-    _write(ink, "Glue it onto a stiff, flat plate: a bent board calibrates wrongly.", 60.5, 178.5, SMALL)
-    _paragraph(ink, said, 15.0, 183.0)
-    _ruler(ink, 15.0, 40.0, down=True)
-    _ruler(ink, 180.0, 192.0, down=False)
-    return Page(target.name, _pixels(page), (placed,))
+    said = (*_describe_sizes(target), *PRINT_INSTRUCTIONS)
+    _write(ink, f"sulcus: {target.name}", 15.0, 176.0, TITLE_HEIGHT)
+    _write(ink, "Glue it onto a stiff, flat plate: a bent board calibrates wrongly.", 60.5, 178.5, TEXT_HEIGHT)
+    _write_paragraph(ink, said, 15.0, 183.0)
+    _draw_ruler(ink, 15.0, 40.0, down=True)
+    _draw_ruler(ink, 180.0, 192.0, down=False)
+    return Page(target.name, _read_pixels(page), (placed,))
 
 
-def _finished(
+def _compose_page(
     target: Target,
     page: Image.Image,
     ink: ImageDraw.ImageDraw,
@@ -216,84 +225,94 @@ def _finished(
     rulers: tuple[tuple[float, float], tuple[float, float]],
 ) -> Page:
     """Finish an upright page: title, text, and rulers down and right from two places."""
-    _write(ink, f"sulcus: {target.name}", 15.0, 14.0, LARGE)
-    _paragraph(ink, said, 15.0, 25.0)
-    _ruler(ink, *rulers[0], down=True)
-    _ruler(ink, *rulers[1], down=False)
-    return Page(target.name, _pixels(page), placed)
+    _write(ink, f"sulcus: {target.name}", 15.0, 14.0, TITLE_HEIGHT)
+    _write_paragraph(ink, said, 15.0, 25.0)
+    _draw_ruler(ink, *rulers[0], down=True)
+    _draw_ruler(ink, *rulers[1], down=False)
+    return Page(target.name, _read_pixels(page), placed)
 
 
-def _sizes(target: Target) -> tuple[str, str]:
+def _describe_sizes(target: Target) -> tuple[str, str]:
     """Describe the faces: squares and markers."""
     face, ids = target.faces[0], np.concatenate([each.ids for each in target.faces])
     return (
-        f"Each face has {face.columns} x {face.rows} squares of {_mm(face.square):g} mm, "
-        f"and markers of {_mm(MARKER * face.square):g} mm.",
+        f"Each face has {face.columns} x {face.rows} squares of {_to_millimetres(face.square):g} mm, "
+        f"and markers of {_to_millimetres(MARKER_RATIO * face.square):g} mm.",
         f"The markers are numbers {ids.min()} to {ids.max()} of OpenCV's {get_dictionary_name()}.",
     )
 
 
-def _blank(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.ImageDraw]:
+def _create_page(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.ImageDraw]:
     """Create white paper of (width, height) [mm], and the object that draws on it."""
-    page = Image.new("1", (_px(size[0]), _px(size[1])), 1)
+    page = Image.new("1", (_to_pixels(size[0]), _to_pixels(size[1])), 1)
     return page, ImageDraw.Draw(page)
 
 
 def _print(page: Image.Image, placed: PlacedFace) -> None:
-    picture = np.rot90(placed.face.draw(_px(_mm(placed.face.square))), -placed.turns)
-    page.paste(Image.fromarray(np.ascontiguousarray(picture)), (_px(placed.left), _px(placed.top)))
+    picture = np.rot90(placed.face.draw(_to_pixels(_to_millimetres(placed.face.square))), -placed.turns)
+    page.paste(Image.fromarray(np.ascontiguousarray(picture)), (_to_pixels(placed.left), _to_pixels(placed.top)))
 
 
 def _write(ink: ImageDraw.ImageDraw, text: str, left: float, top: float, size: float) -> None:
-    ink.text((_px(left), _px(top)), text, fill=0, font=ImageFont.load_default(_px(size)))
+    ink.text((_to_pixels(left), _to_pixels(top)), text, fill=0, font=ImageFont.load_default(_to_pixels(size)))
 
 
-def _paragraph(ink: ImageDraw.ImageDraw, lines: Sequence[str], left: float, top: float) -> None:
+def _write_paragraph(ink: ImageDraw.ImageDraw, lines: Sequence[str], left: float, top: float) -> None:
     for number, line in enumerate(lines):
-        _write(ink, line, left, top + LINE * number, SMALL)
+        _write(ink, line, left, top + LINE_SPACING * number, TEXT_HEIGHT)
 
 
-def _line(ink: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float, float], dash: float = 0.0) -> None:
+def _draw_line(
+    ink: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float, float], dash: float = 0.0
+) -> None:
     """Draw a line between positions [mm], with dashes and gaps of a length; 0: solid."""
     start_, end_ = np.array(start), np.array(end)
     pieces = max(2 * round(np.hypot(*(end_ - start_)) / (2.0 * dash)) + 1, 1) if dash else 1
     at = start_ + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end_ - start_)
     for one, other in zip(at[:-1:2], at[1::2], strict=True):
-        ink.line([*map(_px, one), *map(_px, other)], fill=0, width=_px(THIN))
+        ink.line([*map(_to_pixels, one), *map(_to_pixels, other)], fill=0, width=_to_pixels(LINE_WIDTH))
 
 
-def _ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> None:
+def _draw_ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> None:
     """Draw a ruler with a mark every 10 mm, from a position to the right or down."""
     along, across = (
         (np.array([0.0, 1.0]), np.array([1.0, 0.0])) if down else (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     )
     origin = np.array([left, top])
-    _bar(ink, origin, origin + RULER * along)
-    for at in np.arange(0.0, RULER + 1.0, 10.0):
-        ends = at in (0.0, 0.5 * RULER, RULER)
+    _draw_bar(ink, origin, origin + RULER_LENGTH * along)
+    for at in np.arange(0.0, RULER_LENGTH + 1.0, 10.0):
+        ends = at in (0.0, 0.5 * RULER_LENGTH, RULER_LENGTH)
         mark = origin + at * along
-        _bar(ink, mark, mark + (5.0 if ends else 3.0) * across)
+        _draw_bar(ink, mark, mark + (5.0 if ends else 3.0) * across)
         if ends:
             x, y = mark + (6.0 * across - 1.8 * along if down else 5.5 * across - 1.0 * along)
-            _write(ink, f"{at:.0f}" if at < RULER else f"{at:.0f} mm", x, y, SMALL)
+            _write(ink, f"{at:.0f}" if at < RULER_LENGTH else f"{at:.0f} mm", x, y, TEXT_HEIGHT)
 
 
-def _bar(ink: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None:
+def _draw_bar(ink: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None:
     """Draw a line along a side of the page, whose centre is exact: `THIN` is a multiple of two pixels."""
-    half = _px(THIN) // 2
+    half = _to_pixels(LINE_WIDTH) // 2
     low, high = np.minimum(start, end), np.maximum(start, end)
-    ink.rectangle([_px(low[0]) - half, _px(low[1]) - half, _px(high[0]) + half - 1, _px(high[1]) + half - 1], fill=0)
+    ink.rectangle(
+        [
+            _to_pixels(low[0]) - half,
+            _to_pixels(low[1]) - half,
+            _to_pixels(high[0]) + half - 1,
+            _to_pixels(high[1]) + half - 1,
+        ],
+        fill=0,
+    )
 
 
-def _px(mm: float) -> int:
+def _to_pixels(mm: float) -> int:
     return round(mm * PER_MM)
 
 
-def _pixels(page: Image.Image) -> np.ndarray:
+def _read_pixels(page: Image.Image) -> np.ndarray:
     return np.asarray(page.convert("L"))
 
 
-def _saved(pages: Sequence[Page], form: str, **how: object) -> bytes:
+def _encode_pages(pages: Sequence[Page], form: str, **how: object) -> bytes:
     """Encode pages with Pillow as one image file, or several in one file."""
     first, *others = [Image.fromarray(page.pixels).convert("1", dither=Image.Dither.NONE) for page in pages]
     more = {"save_all": True, "append_images": others} if others else {}

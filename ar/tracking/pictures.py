@@ -15,18 +15,20 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from ..optics.calibration import LARGEST_SIDE
+from ..optics.calibration import MAX_IMAGE_SIDE
 
-MOST_PICTURES = 300  # Maximum number of images used, spread evenly over all.
-MOST_PIXELS = 64_000_000  # Maximum number of pixels of an image.
-MOST_BYTES = 256_000_000  # Maximum size of an image file [bytes].
-NUMBER = re.compile(r"([0-9]+)")  # Pattern of a number in a file name, to sort by.
+MAX_IMAGES = 300  # Maximum number of images used, spread evenly over all.
+MAX_PIXELS = 64_000_000  # Maximum number of pixels of an image.
+MAX_FILE_BYTES = 256_000_000  # Maximum size of an image file [bytes].
+NUMBER_PATTERN = re.compile(r"([0-9]+)")  # Pattern of a number in a file name, to sort by.
 SUFFIXES = (".png", ".jpg", ".jpeg")  # Endings of image files.
-STEP = 5  # Stride of the frames read from a video of unknown length.
-GIVE = "Give a video, or a folder of PNG or JPEG images."  # Remedy in error messages.
+VIDEO_STRIDE = 5  # Stride of the frames read from a video of unknown length.
+REMEDY = "Give a video, or a folder of PNG or JPEG images."  # Remedy in error messages.
 # Signatures of video files: MP4 and MOV (after four bytes), AVI, Matroska and WebM.
-BEGINNINGS = (b"ftyp", b"RIFF", b"\x1aE\xdf\xa3")
-TOO_LARGE = "has more pixels than a camera gives. Write it smaller."  # Error message of an image with too many pixels.
+VIDEO_SIGNATURES = (b"ftyp", b"RIFF", b"\x1aE\xdf\xa3")
+TOO_LARGE_ERROR = (
+    "has more pixels than a camera gives. Write it smaller."  # Error message of an image with too many pixels.
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +62,9 @@ def read_images(path: Path) -> Iterator[Named]:
         No such file, a folder without images, a file that is not a video or image, or an image that is too large.
     """
     if path.is_dir():
-        files = _files(path)
+        files = _list_files(path)
         return (Named(files[index].name, _read(files[index])) for index in _spread(len(files)))
-    return islice(_in_video(path, None), MOST_PICTURES)
+    return islice(_read_video_frames(path, None), MAX_IMAGES)
 
 
 def read_video(path: Path, rate: float, colour: bool = False, first: int = 0) -> Iterator[Named]:
@@ -79,11 +81,11 @@ def read_video(path: Path, rate: float, colour: bool = False, first: int = 0) ->
         See `read_images`.
     """
     if path.is_dir():
-        files = islice(enumerate(_files(path)), first, None)
+        files = islice(enumerate(_list_files(path)), first, None)
         if colour:
             return (to_named_image(file.name, _read(file, "RGB"), number / rate) for number, file in files)
         return (Named(file.name, _read(file), number / rate) for number, file in files)
-    return _in_video(path, 1, colour, first)
+    return _read_video_frames(path, 1, colour, first)
 
 
 def count_frames(path: Path) -> int:
@@ -95,13 +97,13 @@ def count_frames(path: Path) -> int:
         See `read_images`.
     """
     if path.is_dir():
-        return len(_files(path))
-    video = _opened(path)
+        return len(_list_files(path))
+    video = _open_video(path)
     try:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     finally:
         video.release()
-    return count if count > 0 else sum(1 for _ in _in_video(path, 1))
+    return count if count > 0 else sum(1 for _ in _read_video_frames(path, 1))
 
 
 def to_named_image(name: str, colour: np.ndarray, time: float) -> Named:
@@ -109,29 +111,29 @@ def to_named_image(name: str, colour: np.ndarray, time: float) -> Named:
     return Named(name, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), time, colour)
 
 
-def _files(folder: Path) -> list[Path]:
+def _list_files(folder: Path) -> list[Path]:
     alphabetical = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not alphabetical:
         raise ValueError(f"{folder}: holds no images. Give a folder of PNG or JPEG images.")
     # A hyphen is a minus sign if the same words also occur before a number without it.
-    plain = {before for path in alphabetical for before, _ in _numbers(path)[:-1]}
-    files = sorted(alphabetical, key=lambda path: [_signed(each, plain) for each in _numbers(path)])
+    plain = {before for path in alphabetical for before, _ in _split_name(path)[:-1]}
+    files = sorted(alphabetical, key=lambda path: [_apply_sign(each, plain) for each in _split_name(path)])
     if files != alphabetical:
         first = next(index for index, path in enumerate(files) if path != alphabetical[index])
-        _notice(
+        _warn_once(
             f"{folder}: is read in the order of the numbers in its names, not alphabetically: image {first + 1} is "
             f"{files[first].name}, not {alphabetical[first].name}"
         )
     return files
 
 
-def _numbers(path: Path) -> list[tuple[str, str]]:
+def _split_name(path: Path) -> list[tuple[str, str]]:
     """Split a file's name into numbers, each with the words before it; words at the end have the number -1."""
-    *pairs, end = NUMBER.split(f"/{path.stem.casefold()}")
+    *pairs, end = NUMBER_PATTERN.split(f"/{path.stem.casefold()}")
     return [*zip(pairs[::2], pairs[1::2], strict=True), (end, "-1")]
 
 
-def _signed(numbered: tuple[str, str], plain: set[str]) -> tuple[str, int]:
+def _apply_sign(numbered: tuple[str, str], plain: set[str]) -> tuple[str, int]:
     words, number = numbered
     if words.endswith("-") and words[:-1] in plain:
         return words[:-1], -int(number)
@@ -139,47 +141,49 @@ def _signed(numbered: tuple[str, str], plain: set[str]) -> tuple[str, int]:
 
 
 @cache
-def _notice(text: str) -> None:
+def _warn_once(text: str) -> None:
     """Warn once of each text."""
     warnings.warn(text, stacklevel=1)
 
 
 def _read(path: Path, kind: str = "L") -> np.ndarray:
     """Read an image as stored, grey or RGB; EXIF orientation is ignored, since the lens is not turned either."""
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"{path}: is larger than {MOST_BYTES / 1e6:.0f} MB. Remove it, or write it smaller.")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise ValueError(f"{path}: is larger than {MAX_FILE_BYTES / 1e6:.0f} MB. Remove it, or write it smaller.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(path, formats=("PNG", "JPEG")) as picture:
-                _demand_size(path, *picture.size)
+                _check_size(path, *picture.size)
                 if picture.mode.startswith("I"):  # 16 bits
                     grey = (np.asarray(picture) >> 8).astype(np.uint8)
                     return grey if kind == "L" else np.repeat(grey[..., None], 3, axis=2)
                 return np.asarray(picture.convert(kind))
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        raise ValueError(f"{path}: {TOO_LARGE}") from error
+        raise ValueError(f"{path}: {TOO_LARGE_ERROR}") from error
     except (OSError, SyntaxError) as error:
         raise ValueError(f"{path}: is not a readable image. Remove it, or write it again.") from error
 
 
-def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[Named]:
+def _read_video_frames(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[Named]:
     """Read one in `step` frames of a video from the `first` on; None: a step that gives `MOST_PICTURES` frames."""
     if not path.is_file():
-        raise ValueError(f"{path}: no such file. {GIVE}")
-    video = _opened(path)
+        raise ValueError(f"{path}: no such file. {REMEDY}")
+    video = _open_video(path)
     try:
         width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not video.isOpened() or min(width, height) < 1:
             raise ValueError(
-                f"{path}: is not a readable video, as {_flaw(path)}: give a video, or a folder of PNG or JPEG images."
+                f"{path}: is not a readable video, as {_describe_flaw(path)}: give a video, or a folder of PNG or JPEG images."
             )
-        _demand_size(path, width, height)
+        _check_size(path, width, height)
         if turn := int(video.get(cv2.CAP_PROP_ORIENTATION_META)):
-            _notice(f"{path}: its metadata turns it by {turn} degrees: pixels are used as stored, as by calibrations")
+            _warn_once(
+                f"{path}: its metadata turns it by {turn} degrees: pixels are used as stored, as by calibrations"
+            )
         # The length in a file's metadata may be wrong: frames are read until the end.
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        every = step or (-(-count // MOST_PICTURES) if count > 0 else STEP)
+        every = step or (-(-count // MAX_IMAGES) if count > 0 else VIDEO_STRIDE)
         number = 0
         while video.grab():
             if number >= first and (number - first) % every == 0:
@@ -194,7 +198,7 @@ def _in_video(path: Path, step: int | None, colour: bool = False, first: int = 0
         video.release()
 
 
-def _opened(path: Path) -> cv2.VideoCapture:
+def _open_video(path: Path) -> cv2.VideoCapture:
     """Open a video silently: errors are reported by an exception, not by FFmpeg and OpenCV on the console."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read at the first video of a process
     logging = cv2.utils.logging  # type: ignore[attr-defined]
@@ -207,30 +211,32 @@ def _opened(path: Path) -> cv2.VideoCapture:
         logging.setLogLevel(before)
 
 
-def _flaw(path: Path) -> str:
+def _describe_flaw(path: Path) -> str:
     """Describe why a file is not a video, by its first bytes."""
     with path.open("rb") as file:
         first = file.read(8)
     if not first:
         return "it is empty"
-    return "it is cut off or damaged" if any(each in first for each in BEGINNINGS) else "its bytes are not a video's"
+    return (
+        "it is cut off or damaged" if any(each in first for each in VIDEO_SIGNATURES) else "its bytes are not a video's"
+    )
 
 
 def _spread(count: int) -> list[int]:
     """Select at most `MOST_PICTURES` of the numbers below `count`, evenly spaced."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_PICTURES)).round().astype(int)).tolist()
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_IMAGES)).round().astype(int)).tolist()
 
 
-def _demand_size(path: Path, width: int, height: int) -> None:
-    if max(width, height) > LARGEST_SIDE or width * height > MOST_PIXELS:
-        raise ValueError(f"{path}: {TOO_LARGE}")
+def _check_size(path: Path, width: int, height: int) -> None:
+    if max(width, height) > MAX_IMAGE_SIDE or width * height > MAX_PIXELS:
+        raise ValueError(f"{path}: {TOO_LARGE_ERROR}")
 
 
 def read_frame_rate(path: Path) -> float | None:
     """Return the frame rate [1/s] in a video's metadata; None for a folder, or if not given."""
     if not path.is_file():
         return None
-    video = _opened(path)
+    video = _open_video(path)
     try:
         rate = float(video.get(cv2.CAP_PROP_FPS))
         return rate if 0.0 < rate < np.inf else None

@@ -13,14 +13,14 @@ from ..optics.camera import Camera
 from .rigid import build_cross_matrices, compute_angles
 from .targets import DetectedCorners, Detector, Target, find_window, is_seen_from_front
 
-FEWEST = 6  # Minimum number of corners of a pose.
-LEAST = 0.1  # Lower bound of the residual's standard deviation [pixel].
-MOST = 1.0  # Largest rms residual of a pose [pixel].
-CLEARLY = 30.0  # Excess of chi^2 over the best pose that excludes another pose.
-ALIKE_TURN = np.radians(2.0)  # Rotation within which two poses count as equal [rad].
-ALIKE_SHIFT = 1e-3  # Distance within which two poses count as equal [m].
+MIN_CORNERS = 6  # Minimum number of corners of a pose.
+MIN_DEVIATION = 0.1  # Lower bound of the residual's standard deviation [pixel].
+MAX_RESIDUAL = 1.0  # Largest rms residual of a pose [pixel].
+MIN_CHI2_EXCESS = 30.0  # Excess of chi^2 over the best pose that excludes another pose.
+TURN_TOLERANCE = np.radians(2.0)  # Rotation within which two poses count as equal [rad].
+SHIFT_TOLERANCE = 1e-3  # Distance within which two poses count as equal [m].
 # Largest rotation from the previous pose that selects one of two poses [rad]; the other must be twice as far.
-NEAR = np.radians(15.0)
+MAX_POSE_TURN = np.radians(15.0)
 
 
 class Verdict(Enum):
@@ -89,32 +89,36 @@ def find_pose(
     before
         Previous T_camera_target (4, 4), if it was certain.
     """
-    if corners is None or len(corners.points) < FEWEST:
+    if corners is None or len(corners.points) < MIN_CORNERS:
         return Verdict.LOST, None
-    fits = sorted(_fits(camera, target, corners), key=lambda fit: fit[1])
+    fits = sorted(_fit_candidates(camera, target, corners), key=lambda fit: fit[1])
     if not fits:
         return Verdict.POOR, None
     best, squares = fits[0]
     count = len(corners.points)
     residual = float(np.sqrt(squares / count))
-    if not residual <= MOST:
+    if not residual <= MAX_RESIDUAL:
         return Verdict.POOR, None
-    variance = max(squares / (2 * count - 6), LEAST**2)
-    rivals = [T for T, other in fits[1:] if other < squares + CLEARLY * variance and not _alike(T, best)]
+    variance = max(squares / (2 * count - 6), MIN_DEVIATION**2)
+    rivals = [T for T, other in fits[1:] if other < squares + MIN_CHI2_EXCESS * variance and not _is_same_pose(T, best)]
     if rivals:
         near = sorted([best, *rivals], key=lambda T: np.inf if before is None else _turn(T, before))
-        if before is None or _turn(near[0], before) > NEAR or _turn(near[1], before) < 2.0 * _turn(near[0], before):
+        if (
+            before is None
+            or _turn(near[0], before) > MAX_POSE_TURN
+            or _turn(near[1], before) < 2.0 * _turn(near[0], before)
+        ):
             return Verdict.AMBIGUOUS, None
         best = near[0]
-    return Verdict.GOOD, Pose(best, variance * _inverse_normal(camera, best, corners.points), residual, count)
+    return Verdict.GOOD, Pose(best, variance * _compute_covariance(camera, best, corners.points), residual, count)
 
 
 def fit_least_squares(camera: Camera, target: Target, corners: DetectedCorners) -> float:
     """Return the smallest sum of squared distances [pixel^2] of a target's corners over its poses; inf if none."""
-    return min((squares for _, squares in _fits(camera, target, corners)), default=np.inf)
+    return min((squares for _, squares in _fit_candidates(camera, target, corners)), default=np.inf)
 
 
-def _fits(camera: Camera, target: Target, corners: DetectedCorners) -> list[tuple[np.ndarray, float]]:
+def _fit_candidates(camera: Camera, target: Target, corners: DetectedCorners) -> list[tuple[np.ndarray, float]]:
     """Compute candidate poses (4, 4), and their sums of squared distances of all corners [pixel^2]."""
     out = []
     for number in np.unique(corners.face):
@@ -126,22 +130,22 @@ def _fits(camera: Camera, target: Target, corners: DetectedCorners) -> list[tupl
         flat[:, 2] = 0.0
         found = cv2.solvePnPGeneric(flat, corners.pixels[rows], camera.K, camera.distortion, flags=cv2.SOLVEPNP_IPPE)
         for turn, shift in zip(found[1], found[2], strict=True):
-            T = _rigid(turn, shift) @ np.linalg.inv(T_face)
+            T = _build_rigid(turn, shift) @ np.linalg.inv(T_face)
             if np.isfinite(T).all():
-                fit = _refined(camera, corners, T)
-                out += [fit] if _faces_camera(target, corners, fit[0]) else []
+                fit = _refine_pose(camera, corners, T)
+                out += [fit] if _is_facing_camera(target, corners, fit[0]) else []
     return out
 
 
-def _refined(camera: Camera, corners: DetectedCorners, T: np.ndarray) -> tuple[np.ndarray, float]:
+def _refine_pose(camera: Camera, corners: DetectedCorners, T: np.ndarray) -> tuple[np.ndarray, float]:
     """Refine a pose T (4, 4) to all corners; return it and the sum of squares [pixel^2]."""
     turn, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3].reshape(3, 1).copy()
     turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, camera.K, camera.distortion, turn, shift)
     pixels = cv2.projectPoints(corners.points, turn, shift, camera.K, camera.distortion)[0].reshape(-1, 2)
-    return _rigid(turn, shift), float(np.square(pixels - corners.pixels).sum())
+    return _build_rigid(turn, shift), float(np.square(pixels - corners.pixels).sum())
 
 
-def _faces_camera(target: Target, corners: DetectedCorners, T: np.ndarray) -> bool:
+def _is_facing_camera(target: Target, corners: DetectedCorners, T: np.ndarray) -> bool:
     """Return True if every face with corners is seen from its front, and is before the camera."""
     for number in np.unique(corners.face):
         T_camera_face = T @ target.faces[number].T_target_face
@@ -150,7 +154,7 @@ def _faces_camera(target: Target, corners: DetectedCorners, T: np.ndarray) -> bo
     return True
 
 
-def _inverse_normal(camera: Camera, T: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _compute_covariance(camera: Camera, T: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Compute the covariance (6, 6) for corners of unit variance."""
     arm = points @ T[:3, :3].T
     slopes = cv2.projectPoints(arm + T[:3, 3], np.zeros(3), np.zeros(3), camera.K, camera.distortion)[1][:, 3:6]
@@ -159,7 +163,7 @@ def _inverse_normal(camera: Camera, T: np.ndarray, points: np.ndarray) -> np.nda
     return np.linalg.inv(J.T @ J)
 
 
-def _rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+def _build_rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
     return T
@@ -170,14 +174,14 @@ def _turn(one: np.ndarray, other: np.ndarray) -> float:
     return float(compute_angles(one[:3, :3] @ other[:3, :3].T))
 
 
-def _alike(one: np.ndarray, other: np.ndarray) -> bool:
-    return _turn(one, other) < ALIKE_TURN and float(np.linalg.norm(one[:3, 3] - other[:3, 3])) < ALIKE_SHIFT
+def _is_same_pose(one: np.ndarray, other: np.ndarray) -> bool:
+    return _turn(one, other) < TURN_TOLERANCE and float(np.linalg.norm(one[:3, 3] - other[:3, 3])) < SHIFT_TOLERANCE
 
 
-AROUND = 0.4  # Search margin round a target's last outline, as a share of its size.
-MARGIN = 32.0  # Minimum search margin round a target's last outline [pixel].
-STALE = 5  # Age after which a pose is not used as the start [images].
-SEARCHED = 3  # Interval of searches for lost targets [images].
+SEARCH_MARGIN = 0.4  # Search margin round a target's last outline, as a share of its size.
+MIN_SEARCH_MARGIN = 32.0  # Minimum search margin round a target's last outline [pixel].
+MAX_POSE_AGE = 5  # Age after which a pose is not used as the start [images].
+SEARCH_INTERVAL = 3  # Interval of searches for lost targets [images].
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,8 +236,10 @@ class Tracker:
         """
         check_image_size(grey, self.camera.width, self.camera.height)
         number = 0 if before is None else before.number + 1
-        last = {} if before is None else {k: each for k, each in before.last.items() if number - each[1] <= STALE}
-        found = self._seen(grey, number, last)
+        last = (
+            {} if before is None else {k: each for k, each in before.last.items() if number - each[1] <= MAX_POSE_AGE}
+        )
+        found = self._detect_corners(grey, number, last)
         verdicts, poses = {}, {}
         for target in self.targets:
             expected = last[target.name][0] if target.name in last else None
@@ -243,7 +249,7 @@ class Tracker:
                 last[target.name] = pose.T_camera_target, number
         return TrackedTargets(number, verdicts, poses, last)
 
-    def _seen(
+    def _detect_corners(
         self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]
     ) -> dict[str, DetectedCorners]:
         """Detect corners near the last poses, or in the whole image if just lost, and at intervals while lost."""
@@ -251,12 +257,12 @@ class Tracker:
         for target in self.targets:
             if target.name in last:
                 T, outline = last[target.name][0], target.outline
-                window = find_window(self.camera, outline @ T[:3, :3].T + T[:3, 3], AROUND, MARGIN)
+                window = find_window(self.camera, outline @ T[:3, :3].T + T[:3, 3], SEARCH_MARGIN, MIN_SEARCH_MARGIN)
                 seen = None if window is None else self._detector.detect_in_window(target, grey, window)
-                found |= {target.name: seen} if seen is not None and len(seen.points) >= FEWEST else {}
+                found |= {target.name: seen} if seen is not None and len(seen.points) >= MIN_CORNERS else {}
         missing = [target.name for target in self.targets if target.name not in found]
         just_left = any(last.get(name, (None, -2))[1] == number - 1 for name in missing)
-        if missing and (just_left or number % SEARCHED == 0):
+        if missing and (just_left or number % SEARCH_INTERVAL == 0):
             found |= self._detector.detect(grey, missing)
         return found
 

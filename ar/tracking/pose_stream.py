@@ -10,31 +10,33 @@ from scipy.spatial.transform import Rotation
 from .pose import Pose
 from .rigid import turn_vectors
 
-LONGEST = 0.1  # Largest gap between samples with interpolation [s].
-AHEAD = 0.05  # Largest extrapolation after the last sample [s].
-ROUNDING = 1e-3  # Difference below which times count as equal [s]: files round them.
-DAY = 86_400.0
+MAX_GAP = 0.1  # Largest gap between samples with interpolation [s].
+MAX_EXTRAPOLATION = 0.05  # Largest extrapolation after the last sample [s].
+TIME_TOLERANCE = 1e-3  # Difference below which times count as equal [s]: files round them.
+DAY_SECONDS = 86_400.0
 """Period of a 24-hour clock [s]."""
-STEP = 0.01  # Step of tried time offsets [s].
-FEWEST = 8  # Minimum number of images for an estimate of the time offset.
-MOST_SECONDS = 900.0  # Largest range of tried offsets [s].
-LEAST_MOVED = 1e-3  # Smallest motion of the tool that determines the offset [m].
-ANOTHER = 0.15  # Time difference beyond which a second minimum is another offset [s].
-CLEARLY = 2.0  # Smallest ratio of the sum of squares at another offset to that of the best fit.
-NOISE = 0.1e-3  # Noise level of positions [m]: lower bound of the best fit's error in the comparison of offsets.
-ROUNDS = 20  # Maximum number of Gauss-Newton iterations of the offset.
+OFFSET_STEP = 0.01  # Step of tried time offsets [s].
+MIN_IMAGES = 8  # Minimum number of images for an estimate of the time offset.
+MAX_OFFSET_RANGE = 900.0  # Largest range of tried offsets [s].
+MIN_MOTION = 1e-3  # Smallest motion of the tool that determines the offset [m].
+MIN_OFFSET_DIFFERENCE = 0.15  # Time difference beyond which a second minimum is another offset [s].
+MIN_SQUARES_RATIO = 2.0  # Smallest ratio of the sum of squares at another offset to that of the best fit.
+POSITION_NOISE = (
+    0.1e-3  # Noise level of positions [m]: lower bound of the best fit's error in the comparison of offsets.
+)
+MAX_ITERATIONS = 20  # Maximum number of Gauss-Newton iterations of the offset.
 # Remedy in error messages.
-MOVE = "Move the tool to and fro by centimetres, quickly and unevenly, while markers and poses are both seen."
+REMEDY = "Move the tool to and fro by centimetres, quickly and unevenly, while markers and poses are both seen."
 
 
 def unwrap_times(times: np.ndarray) -> np.ndarray:
     """Unwrap times (n,) [s] of a 24-hour clock at midnight; times of other clocks are unchanged."""
-    back = np.diff(times) < -0.5 * DAY
-    return times + DAY * np.concatenate([[0], np.cumsum(back)]) if _of_a_day(times) else times
+    back = np.diff(times) < -0.5 * DAY_SECONDS
+    return times + DAY_SECONDS * np.concatenate([[0], np.cumsum(back)]) if _is_time_of_day(times) else times
 
 
-def _of_a_day(times: np.ndarray) -> bool:
-    return bool(len(times) and times.min() >= 0.0 and times.max() < DAY)
+def _is_time_of_day(times: np.ndarray) -> bool:
+    return bool(len(times) and times.min() >= 0.0 and times.max() < DAY_SECONDS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,19 +69,19 @@ class PoseStream:
         observed here.
         """
         time = self.to_stream_day(time)
-        first = int(np.searchsorted(self.times, time + ROUNDING, side="right")) - 1
+        first = int(np.searchsorted(self.times, time + TIME_TOLERANCE, side="right")) - 1
         if first < 0:
             return None
-        if first + 1 == len(self.times) or self.times[first + 1] - self.times[first] > LONGEST:
-            if abs(time - self.times[first]) <= ROUNDING:
+        if first + 1 == len(self.times) or self.times[first + 1] - self.times[first] > MAX_GAP:
+            if abs(time - self.times[first]) <= TIME_TOLERANCE:
                 return Pose(self.poses[first], self.covariances[first], 0.0, 0)
             first -= 1
-            if first < 0 or self.times[first + 1] - self.times[first] > LONGEST:
+            if first < 0 or self.times[first + 1] - self.times[first] > MAX_GAP:
                 return None
         second = first + 1
-        if time - self.times[second] > AHEAD:
+        if time - self.times[second] > MAX_EXTRAPOLATION:
             return None
-        return self._between(first, second, time)
+        return self._interpolate_pose(first, second, time)
 
     def compute_age(self, time: float) -> float:
         """Return the time [s] since the last sample before `time`; infinite before the first."""
@@ -92,9 +94,9 @@ class PoseStream:
         if not self.daily:
             return time
         middle = 0.5 * float(self.times[0] + self.times[-1])
-        return time - DAY * round((time - middle) / DAY)
+        return time - DAY_SECONDS * round((time - middle) / DAY_SECONDS)
 
-    def _between(self, first: int, second: int, time: float) -> Pose:
+    def _interpolate_pose(self, first: int, second: int, time: float) -> Pose:
         since, until = time - self.times[first], self.times[second] - time
         share = float(since / (since + until))
         a, b = self.poses[first], self.poses[second]
@@ -103,10 +105,10 @@ class PoseStream:
         T[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ a[:3, :3]
         T[:3, 3] = (1.0 - share) * a[:3, 3] + share * b[:3, 3]
         own = (1.0 - share) ** 2 * self.covariances[first] + share**2 * self.covariances[second]
-        bent = 0.5 * abs(since * until) * self._quickening(first, second)
+        bent = 0.5 * abs(since * until) * self._compute_acceleration(first, second)
         return Pose(T, own + np.diag(np.repeat(bent**2, 3)), 0.0, 0)
 
-    def _quickening(self, first: int, second: int) -> np.ndarray:
+    def _compute_acceleration(self, first: int, second: int) -> np.ndarray:
         """Compute the largest acceleration (2,) round two samples, of translations [m/s^2] and rotations [rad/s^2]."""
         low, high = max(0, first - 1), min(len(self.times), second + 2)
         times, poses = self.times[low:high], self.poses[low:high]
@@ -116,7 +118,7 @@ class PoseStream:
         shifts = np.diff(poses[:, :3, 3], axis=0) / steps[:, None]
         turns = turn_vectors(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1)) / steps[:, None]
         apart = 0.5 * (steps[1:] + steps[:-1])
-        near = apart <= LONGEST
+        near = apart <= MAX_GAP
         changes = [np.linalg.norm(np.diff(each, axis=0), axis=1) / apart for each in (shifts, turns)]
         return np.array([each[near].max(initial=0.0) for each in changes])
 
@@ -135,7 +137,7 @@ def build_pose_stream(times: np.ndarray, poses: np.ndarray, covariances: np.ndar
     back = np.flatnonzero(np.diff(going_on) <= 0.0)
     if len(back):
         raise ValueError(f"pose {back[0] + 2} is not later than the one before it: sort the rows by time_s.")
-    return PoseStream(going_on, poses, covariances, _of_a_day(times))
+    return PoseStream(going_on, poses, covariances, _is_time_of_day(times))
 
 
 @dataclass(frozen=True)
@@ -157,61 +159,67 @@ def estimate_clock_by_motion(times: np.ndarray, places: np.ndarray, samples: np.
         Too few images, motion that is too small, no offset with poses for all images, or two offsets that fit about as
         well.
     """
-    if len(times) < FEWEST:
-        raise ValueError(f"{len(times)} images show what the poses have, and {FEWEST} are needed. {MOVE}")
+    if len(times) < MIN_IMAGES:
+        raise ValueError(f"{len(times)} images show what the poses have, and {MIN_IMAGES} are needed. {REMEDY}")
     low, high = samples[0] - times[0], samples[-1] - times[-1]
     if high < low:
         raise ValueError("the poses end before the images do: record them for longer than the video.")
-    if high - low > MOST_SECONDS:
-        raise ValueError(f"the poses are {high - low:.0f} s longer than the video: cut them to {MOST_SECONDS:.0f} s.")
-    tried = np.arange(low, high + STEP, STEP).clip(low, high)
-    squares = np.array([_squares(_apart(times + offset, places, samples, others)) for offset in tried])
+    if high - low > MAX_OFFSET_RANGE:
+        raise ValueError(
+            f"the poses are {high - low:.0f} s longer than the video: cut them to {MAX_OFFSET_RANGE:.0f} s."
+        )
+    tried = np.arange(low, high + OFFSET_STEP, OFFSET_STEP).clip(low, high)
+    squares = np.array(
+        [_sum_squares(_compute_differences(times + offset, places, samples, others)) for offset in tried]
+    )
     if not np.isfinite(squares).any():
-        raise ValueError(f"the poses have gaps of more than {LONGEST:g} s wherever the images are.")
+        raise ValueError(f"the poses have gaps of more than {MAX_GAP:g} s wherever the images are.")
     best = int(np.argmin(squares))
-    clock, least = _refined(float(tried[best]), times, places, samples, others)
+    clock, least = _refine_offset(float(tried[best]), times, places, samples, others)
     walled = np.pad(squares, 1, constant_values=np.inf)
     valley = (squares <= walled[:-2]) & (squares <= walled[2:])
-    far = np.where(valley & (np.abs(tried - tried[best]) > ANOTHER), squares, np.inf)
+    far = np.where(valley & (np.abs(tried - tried[best]) > MIN_OFFSET_DIFFERENCE), squares, np.inf)
     if np.isfinite(far.min()):
-        _, rival = _refined(float(tried[int(np.argmin(far))]), times, places, samples, others)
-        if rival < CLEARLY * max(least, places.size * NOISE**2):
-            raise ValueError(f"more than one offset of the clocks fits. {MOVE}")
+        _, rival = _refine_offset(float(tried[int(np.argmin(far))]), times, places, samples, others)
+        if rival < MIN_SQUARES_RATIO * max(least, places.size * POSITION_NOISE**2):
+            raise ValueError(f"more than one offset of the clocks fits. {REMEDY}")
     return clock
 
 
-def _refined(
+def _refine_offset(
     offset: float, times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray
 ) -> tuple[Clock, float]:
     """Refine an offset by Gauss-Newton; return it and the remaining sum of squares [m^2]."""
     low, high = samples[0] - times[0], samples[-1] - times[-1]
     speed, off = np.zeros_like(places), np.zeros_like(places)
-    for _ in range(ROUNDS):
-        off = _apart(times + offset, places, samples, others)
-        ahead, behind = min(offset + STEP, high), max(offset - STEP, low)
-        speed = _apart(times + ahead, places, samples, others) - _apart(times + behind, places, samples, others)
+    for _ in range(MAX_ITERATIONS):
+        off = _compute_differences(times + offset, places, samples, others)
+        ahead, behind = min(offset + OFFSET_STEP, high), max(offset - OFFSET_STEP, low)
+        speed = _compute_differences(times + ahead, places, samples, others) - _compute_differences(
+            times + behind, places, samples, others
+        )
         speed /= max(ahead - behind, np.finfo(float).tiny)
         step = -float((speed * off).sum() / max((speed**2).sum(), np.finfo(float).tiny))
-        offset = float(np.clip(offset + np.clip(step, -STEP, STEP), low, high))
+        offset = float(np.clip(offset + np.clip(step, -OFFSET_STEP, OFFSET_STEP), low, high))
         if abs(step) < 1e-6:
             break
     moved = float(np.sqrt((speed**2).sum(axis=1).mean())) * float(times[-1] - times[0])
-    if not moved > LEAST_MOVED:
-        raise ValueError(f"the tool moves by {1e3 * moved:.1f} mm only: that says nothing of the clocks. {MOVE}")
-    left = _squares(_apart(times + offset, places, samples, others))
+    if not moved > MIN_MOTION:
+        raise ValueError(f"the tool moves by {1e3 * moved:.1f} mm only: that says nothing of the clocks. {REMEDY}")
+    left = _sum_squares(_compute_differences(times + offset, places, samples, others))
     scatter = np.sqrt(left / max(off.size - 4, 1))
     return Clock(offset, float(scatter / np.sqrt((speed**2).sum()))), left
 
 
-def _apart(at: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _compute_differences(at: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Compute differences (n, 3) of positions from those of samples at times (n,), without their mean; NaN in gaps."""
     there = np.column_stack([np.interp(at, samples, column) for column in others.T])
     after = np.searchsorted(samples, at).clip(1, len(samples) - 1)
-    there[samples[after] - samples[after - 1] > LONGEST] = np.nan
+    there[samples[after] - samples[after - 1] > MAX_GAP] = np.nan
     off = there - places
     return off - off.mean(axis=0)
 
 
-def _squares(off: np.ndarray) -> float:
+def _sum_squares(off: np.ndarray) -> float:
     total = float((off**2).sum())
     return total if np.isfinite(total) else np.inf

@@ -11,16 +11,20 @@ from scipy.stats import chi2, f
 
 from .rigid import build_cross_matrices, move_about
 
-FEWEST_PAIRS = 3  # Minimum number of pairs of points.
-FEWEST_SURFACE = 20  # Minimum number of points on the surface.
-LEAST = 0.1e-3  # Lower bound of rms residuals in ratios [m]: error of a touched point.
-MOST = 5e-3  # Largest rms residual of pairs and of surface points [m].
-FLATTEST = 0.05  # Smallest ratio of the second to the largest spread of points: below, the points are on a line.
-RESIZED = 0.1  # Largest absolute log-ratio of the sizes of two point sets.
-SMALLEST = 5e-3  # Smallest spread of points on a head [m].
-CLEARLY = 4.0  # Ratio of residuals above which one wrong pair, a swap or a mirrored coordinate system is reported.
-ROUNDS = 50  # Maximum number of Gauss-Newton iterations on a surface.
-SMALL = 1e-9  # Step below which the iterations on a surface end [m], [rad].
+MIN_PAIRS = 3  # Minimum number of pairs of points.
+MIN_SURFACE_POINTS = 20  # Minimum number of points on the surface.
+MIN_RMS = 0.1e-3  # Lower bound of rms residuals in ratios [m]: error of a touched point.
+MAX_RMS = 5e-3  # Largest rms residual of pairs and of surface points [m].
+MIN_SPREAD_RATIO = (
+    0.05  # Smallest ratio of the second to the largest spread of points: below, the points are on a line.
+)
+MAX_SIZE_LOG_RATIO = 0.1  # Largest absolute log-ratio of the sizes of two point sets.
+MIN_SPREAD = 5e-3  # Smallest spread of points on a head [m].
+MIN_RESIDUAL_RATIO = (
+    4.0  # Ratio of residuals above which one wrong pair, a swap or a mirrored coordinate system is reported.
+)
+MAX_ITERATIONS = 50  # Maximum number of Gauss-Newton iterations on a surface.
+STEP_TOLERANCE = 1e-9  # Step below which the iterations on a surface end [m], [rad].
 LEVEL = 0.95  # Confidence level of the registration's error.
 
 Nearest = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -99,13 +103,13 @@ def register_points(scan: np.ndarray, patient: np.ndarray) -> Registration:
         Fewer than three pairs, points on a line, or two sets of different size. A mirrored set, two pairs that are
         swapped, one that fits far worse than the others, or pairs that fit no rigid motion.
     """
-    _demand_shape(scan, patient)
-    T, off = _fitted(scan, patient)
-    _demand_fit(scan, patient, off)
+    _check_shape(scan, patient)
+    T, off = _fit_rigid(scan, patient)
+    _check_fit(scan, patient, off)
     centre = scan.mean(axis=0)
     freedom = 3 * len(scan) - 6
     J = compute_jacobian(T, scan, centre) / _scatter(off, freedom)
-    return Registration(T, _widened(J.T @ J, freedom), centre, _rms(off), len(scan))
+    return Registration(T, _widen_covariance(J.T @ J, freedom), centre, _compute_rms(off), len(scan))
 
 
 def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Nearest) -> Registration:
@@ -120,14 +124,14 @@ def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray,
         See `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean
         square).
     """
-    if len(seen) < FEWEST_SURFACE:
-        raise ValueError(f"{len(seen)} points of the surface are too few: trace {FEWEST_SURFACE} or more.")
+    if len(seen) < MIN_SURFACE_POINTS:
+        raise ValueError(f"{len(seen)} points of the surface are too few: trace {MIN_SURFACE_POINTS} or more.")
     start = register_points(scan, patient)
     T, centre = start.T_patient_scan, start.centre
     freedom = 3 * len(scan) - 6
     touched = _scatter(scan @ T[:3, :3].T + T[:3, 3] - patient, freedom)
     normal, off, away = np.eye(6), np.zeros((1, 3)), np.zeros(1)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         off = scan @ T[:3, :3].T + T[:3, 3] - patient
         place, outward = nearest((seen - T[:3, 3]) @ T[:3, :3])
         turned = outward @ T[:3, :3].T
@@ -138,71 +142,80 @@ def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray,
         normal = J.T @ J + K.T @ K
         step = -np.linalg.solve(normal, J.T @ off.ravel() / touched + K.T @ away / traced)
         T = move_about(T, centre, step)
-        if np.abs(step).max() < SMALL:
+        if np.abs(step).max() < STEP_TOLERANCE:
             break
-    if not max(_rms(off), _rms(away[:, None])) <= MOST:
+    if not max(_compute_rms(off), _compute_rms(away[:, None])) <= MAX_RMS:
         raise ValueError(
-            f"the points stay {1e3 * _rms(away[:, None]):.1f} mm (rms) from the surface, and the pairs "
-            f"{1e3 * _rms(off):.1f} mm: trace the surface that the scan shows, before it moves."
+            f"the points stay {1e3 * _compute_rms(away[:, None]):.1f} mm (rms) from the surface, and the pairs "
+            f"{1e3 * _compute_rms(off):.1f} mm: trace the surface that the scan shows, before it moves."
         )
-    return Registration(T, _widened(normal, freedom + len(seen)), centre, _rms(off), len(scan), len(seen))
+    return Registration(
+        T, _widen_covariance(normal, freedom + len(seen)), centre, _compute_rms(off), len(scan), len(seen)
+    )
 
 
-def _demand_shape(scan: np.ndarray, patient: np.ndarray) -> None:
+def _check_shape(scan: np.ndarray, patient: np.ndarray) -> None:
     """Raise ValueError for points that determine no rigid motion."""
-    if len(scan) < FEWEST_PAIRS:
-        raise ValueError(f"{len(scan)} pairs are too few: touch {FEWEST_PAIRS} points or more, better six.")
+    if len(scan) < MIN_PAIRS:
+        raise ValueError(f"{len(scan)} pairs are too few: touch {MIN_PAIRS} points or more, better six.")
     sizes = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (scan, patient)]
     for what, size in zip(("scan", "patient"), sizes, strict=True):
-        if not size[1] > FLATTEST * size[0]:
+        if not size[1] > MIN_SPREAD_RATIO * size[0]:
             raise ValueError(f"the points of the {what} lie on a line: choose some that lie apart from it.")
-    if not sizes[0][0] > SMALLEST:
+    if not sizes[0][0] > MIN_SPREAD:
         raise ValueError(f"the points lie within {2e3 * sizes[0][0]:.2g} mm of each other: give millimetres.")
     ratio = float(np.linalg.norm(sizes[1]) / np.linalg.norm(sizes[0]))
-    if abs(np.log(ratio)) > RESIZED:
+    if abs(np.log(ratio)) > MAX_SIZE_LOG_RATIO:
         raise ValueError(
             f"the patient's points are {ratio:.3g} times as far apart as the scan's: give both in millimetres."
         )
 
 
-def _demand_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
+def _check_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
     """Raise ValueError for a mirrored set, one wrong pair among good ones, and pairs that do not fit."""
-    rms = _rms(off)
-    mirrored = _rms(_fitted(scan * [-1.0, 1.0, 1.0], patient)[1])
-    if CLEARLY * max(mirrored, LEAST) < rms:
+    rms = _compute_rms(off)
+    mirrored = _compute_rms(_fit_rigid(scan * [-1.0, 1.0, 1.0], patient)[1])
+    if MIN_RESIDUAL_RATIO * max(mirrored, MIN_RMS) < rms:
         raise ValueError("the scan's points fit their mirror image only: one frame is left-handed. Give RAS.")
-    if len(scan) > FEWEST_PAIRS + 1:
-        others = [_rms(_fitted(*(np.delete(p, row, axis=0) for p in (scan, patient)))[1]) for row in range(len(scan))]
-        row, swaps = int(np.argmin(others)), _if_swapped(scan, patient)
+    if len(scan) > MIN_PAIRS + 1:
+        others = [
+            _compute_rms(_fit_rigid(*(np.delete(p, row, axis=0) for p in (scan, patient)))[1])
+            for row in range(len(scan))
+        ]
+        row, swaps = int(np.argmin(others)), _compute_swapped_rms(scan, patient)
         one, other = min(swaps, key=lambda pair: swaps[pair])
-        if rms > MOST / 2 and CLEARLY * max(swaps[one, other], LEAST) < rms and swaps[one, other] < others[row]:
+        if (
+            rms > MAX_RMS / 2
+            and MIN_RESIDUAL_RATIO * max(swaps[one, other], MIN_RMS) < rms
+            and swaps[one, other] < others[row]
+        ):
             raise ValueError(
                 f"pairs {one + 1} and {other + 1} (below the header) are swapped: the other way round all fit to "
                 f"{1e3 * swaps[one, other]:.1f} mm. Exchange their px,py,pz."
             )
-        if rms > MOST / 2 and CLEARLY * max(others[row], LEAST) < rms:
+        if rms > MAX_RMS / 2 and MIN_RESIDUAL_RATIO * max(others[row], MIN_RMS) < rms:
             raise ValueError(
                 f"pair {row + 1} (below the header) fits worse than the others (error {1e3 * others[row]:.1f} mm "
                 "without it): touch it again, or leave it out."
             )
-    if not rms <= MOST:
+    if not rms <= MAX_RMS:
         raise ValueError(
-            f"the pairs stay {1e3 * rms:.1f} mm apart (rms), and up to {1e3 * MOST:.0f} are taken: see whether "
+            f"the pairs stay {1e3 * rms:.1f} mm apart (rms), and up to {1e3 * MAX_RMS:.0f} are taken: see whether "
             "each row names the same place twice."
         )
 
 
-def _if_swapped(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[int, int], float]:
+def _compute_swapped_rms(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[int, int], float]:
     """Compute the rms residual [m] with the patient's points of two pairs swapped, by these two pairs."""
     out = {}
     for pair in combinations(range(len(scan)), 2):
         other = patient.copy()
         other[list(pair)] = patient[list(pair[::-1])]
-        out[pair] = _rms(_fitted(scan, other)[1])
+        out[pair] = _compute_rms(_fit_rigid(scan, other)[1])
     return out
 
 
-def _fitted(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fit_rigid(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit T_patient_scan (4, 4); return it and the residuals (n, 3) [m]."""
     middle, there = scan.mean(axis=0), patient.mean(axis=0)
     T = np.eye(4)
@@ -220,7 +233,7 @@ def compute_jacobian(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.
     )
 
 
-def _widened(normal: np.ndarray, freedom: int) -> np.ndarray:
+def _widen_covariance(normal: np.ndarray, freedom: int) -> np.ndarray:
     """Compute the covariance (6, 6) of a normal matrix, widened because its scatter is estimated from few numbers."""
     inverse = 3.0 * f.ppf(LEVEL, 3, freedom) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal)
     return 0.5 * (inverse + inverse.T)
@@ -228,14 +241,14 @@ def _widened(normal: np.ndarray, freedom: int) -> np.ndarray:
 
 def _scatter(off: np.ndarray, freedom: int) -> float:
     """Estimate the residuals' standard deviation along one axis [m], at least `LEAST`."""
-    return max(float(np.sqrt((off**2).sum() / freedom)), LEAST)
+    return max(float(np.sqrt((off**2).sum() / freedom)), MIN_RMS)
 
 
-def _rms(off: np.ndarray) -> float:
+def _compute_rms(off: np.ndarray) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-FALSE_ALARM = 0.05  # False-alarm rate: share of valid sets in which a pair is reported as suspect.
+FALSE_ALARM_RATE = 0.05  # False-alarm rate: share of valid sets in which a pair is reported as suspect.
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +281,7 @@ class PairResiduals:
     @property
     def suspect(self) -> bool:
         """True if the worst pair fits worse than in all but `FALSE_ALARM` of valid sets."""
-        return self.chance < FALSE_ALARM
+        return self.chance < FALSE_ALARM_RATE
 
 
 def compute_pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResiduals:
@@ -286,7 +299,7 @@ def compute_pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResidua
     found = register_points(scan, patient)
     T, count = found.T_patient_scan, len(scan)
     off = scan @ T[:3, :3].T + T[:3, 3] - patient
-    if count == FEWEST_PAIRS:
+    if count == MIN_PAIRS:
         # Two pairs, the remainder of three, determine no registration.
         none = np.full(count, np.nan)
         return PairResiduals(np.linalg.norm(off, axis=1), none, none, np.nan)
@@ -296,7 +309,7 @@ def compute_pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResidua
     free = np.stack([np.eye(3) - hat[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(count)])
     left_out = np.linalg.solve(free, off[..., None])[..., 0]
     own = np.einsum("ni,ni->n", off, left_out)
-    others = np.maximum((np.square(off).sum() - own) / freedom, LEAST**2)
+    others = np.maximum((np.square(off).sum() - own) / freedom, MIN_RMS**2)
     squares = own / (3.0 * others)
     chance = min(1.0, count * float(f.sf(squares.max(), 3, freedom)))
     return PairResiduals(np.linalg.norm(off, axis=1), np.linalg.norm(left_out, axis=1), np.sqrt(squares), chance)

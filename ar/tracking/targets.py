@@ -15,13 +15,13 @@ import numpy as np
 
 from ..optics.camera import Camera
 
-MARKERS = cv2.aruco.DICT_4X4_250  # ArUco dictionary of the targets.
-MARKER = 0.75  # Side of a marker as a share of its square.
+MARKER_DICTIONARY = cv2.aruco.DICT_4X4_250  # ArUco dictionary of the targets.
+MARKER_RATIO = 0.75  # Side of a marker as a share of its square.
 Window = tuple[slice, slice]
 """Rows and columns of an image, with start and stop."""
 # Smallest and largest width of the adaptive threshold's window [pixel], for all and for known targets.
-THOROUGH, QUICK = (5, 25), (15, 15)
-SMALLEST = 16  # Smallest side of an image part that can hold a marker [pixel].
+SEARCH_WINDOWS, TRACKING_WINDOWS = (5, 25), (15, 15)
+MIN_PART_SIDE = 16  # Smallest side of an image part that can hold a marker [pixel].
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +59,9 @@ class Face:
     @cached_property
     def board(self) -> cv2.aruco.CharucoBoard:
         """Board of OpenCV, in metres."""
-        dictionary = cv2.aruco.getPredefinedDictionary(MARKERS)
+        dictionary = cv2.aruco.getPredefinedDictionary(MARKER_DICTIONARY)
         return cv2.aruco.CharucoBoard(
-            (self.columns, self.rows), self.square, MARKER * self.square, dictionary, self.ids
+            (self.columns, self.rows), self.square, MARKER_RATIO * self.square, dictionary, self.ids
         )
 
     @cached_property
@@ -108,8 +108,8 @@ def is_seen_from_front(T_camera_face: np.ndarray) -> bool:
 
 
 CUBE_SQUARE = 8e-3  # Side of a square of the cube's faces [m].
-BORDER = 4e-3  # Width of the white border round the squares of a face [m].
-TIP = 150e-3  # Distance of the tool's tip from the centre of its cube along the shaft [m].
+BORDER_WIDTH = 4e-3  # Width of the white border round the squares of a face [m].
+TIP_DISTANCE = 150e-3  # Distance of the tool's tip from the centre of its cube along the shaft [m].
 
 
 @lru_cache
@@ -119,7 +119,7 @@ def build_tool_cube() -> Target:
     The faces look along +x, +y and +z, so that a camera before the corner between them sees all three. The tool's tip
     is nominally at (0, 0, -150) mm.
     """
-    half, wide = 2.5 * CUBE_SQUARE, 2.5 * CUBE_SQUARE + BORDER
+    half, wide = 2.5 * CUBE_SQUARE, 2.5 * CUBE_SQUARE + BORDER_WIDTH
     # Columns: right and down of a face as it is seen from outside, and into the cube.
     axes = (
         np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
@@ -187,8 +187,11 @@ class Detector:
     _boards: dict[tuple[str, int], cv2.aruco.CharucoDetector] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        quick = {target.name: cv2.aruco.ArucoDetector(_codes([target]), _parameters(*QUICK)) for target in self.targets}
-        thorough = cv2.aruco.ArucoDetector(_codes(self.targets), _parameters(*THOROUGH))
+        quick = {
+            target.name: cv2.aruco.ArucoDetector(_build_dictionary([target]), _build_parameters(*TRACKING_WINDOWS))
+            for target in self.targets
+        }
+        thorough = cv2.aruco.ArucoDetector(_build_dictionary(self.targets), _build_parameters(*SEARCH_WINDOWS))
         boards = {
             (target.name, number): cv2.aruco.CharucoDetector(face.board)
             for target in self.targets
@@ -203,20 +206,22 @@ class Detector:
 
         Only targets of these `names` are detected; without any, all.
         """
-        corners, known = _markers(self._thorough, self.targets, np.ascontiguousarray(grey))
+        corners, known = _detect_markers(self._thorough, self.targets, np.ascontiguousarray(grey))
         wanted = [target for target in self.targets if not names or target.name in names]
-        found = {target.name: self._between(target, grey, corners, known) for target in wanted}
+        found = {target.name: self._interpolate_corners(target, grey, corners, known) for target in wanted}
         return {name: each for name, each in found.items() if len(each.points)}
 
     def detect_in_window(self, target: Target, grey: np.ndarray, window: Window) -> DetectedCorners | None:
         """Detect corners of one target in a window of an image (H, W) uint8, if any: faster, with one threshold."""
         part = np.ascontiguousarray(grey[window])
-        if min(part.shape) < SMALLEST:
+        if min(part.shape) < MIN_PART_SIDE:
             return None
-        found = self._between(target, part, *_markers(self._quick[target.name], [target], part))
+        found = self._interpolate_corners(target, part, *_detect_markers(self._quick[target.name], [target], part))
         return replace(found, pixels=found.pixels + [window[1].start, window[0].start]) if len(found.points) else None
 
-    def _between(self, target: Target, grey: np.ndarray, markers: np.ndarray, ids: np.ndarray) -> DetectedCorners:
+    def _interpolate_corners(
+        self, target: Target, grey: np.ndarray, markers: np.ndarray, ids: np.ndarray
+    ) -> DetectedCorners:
         """Interpolate the chessboards' corners of a target between its markers, (n, 1, 4, 2) of numbers (n,)."""
         points, pixels, on = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, int)]
         for number, face in enumerate(target.faces):
@@ -250,27 +255,27 @@ def find_window(camera: Camera, points: np.ndarray, share: float, least: float) 
     return None if left >= right or top >= bottom else (slice(top, bottom), slice(left, right))
 
 
-def _markers(
+def _detect_markers(
     detector: cv2.aruco.ArucoDetector, targets: Sequence[Target], grey: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Detect corners (n, 1, 4, 2) [pixel] of markers in an image, and their numbers (n,)."""
     corners, ids, _ = detector.detectMarkers(grey)
     which = np.zeros(0, int) if ids is None else np.asarray(ids, int).reshape(-1)
-    return np.asarray(corners, np.float32).reshape(-1, 1, 4, 2), _numbers(targets)[which]
+    return np.asarray(corners, np.float32).reshape(-1, 1, 4, 2), _list_numbers(targets)[which]
 
 
-def _numbers(targets: Sequence[Target]) -> np.ndarray:
+def _list_numbers(targets: Sequence[Target]) -> np.ndarray:
     """Return the marker numbers (n,) of targets, sorted."""
     return np.sort(np.concatenate([face.ids for target in targets for face in target.faces]))
 
 
-def _codes(targets: Sequence[Target]) -> cv2.aruco.Dictionary:
+def _build_dictionary(targets: Sequence[Target]) -> cv2.aruco.Dictionary:
     """Return a dictionary of the targets' markers alone: comparing candidates with each takes most of the time."""
-    whole = cv2.aruco.getPredefinedDictionary(MARKERS)
-    return cv2.aruco.Dictionary(whole.bytesList[_numbers(targets)], whole.markerSize)
+    whole = cv2.aruco.getPredefinedDictionary(MARKER_DICTIONARY)
+    return cv2.aruco.Dictionary(whole.bytesList[_list_numbers(targets)], whole.markerSize)
 
 
-def _parameters(least: int, most: int) -> cv2.aruco.DetectorParameters:
+def _build_parameters(least: int, most: int) -> cv2.aruco.DetectorParameters:
     """Build detector parameters with threshold windows of two widths [pixel], or of one."""
     found = cv2.aruco.DetectorParameters()
     found.adaptiveThreshWinSizeMin, found.adaptiveThreshWinSizeMax = least, most

@@ -8,20 +8,20 @@ import numpy as np
 
 from .rigid import build_cross_matrices, compute_angles
 
-FEWEST_POSES = 4  # Minimum number of pairs of poses.
+MIN_POSES = 4  # Minimum number of pairs of poses.
 # Smallest rotation of a motion that is used [rad]: the axis of a smaller one is uncertain.
-LEAST_TURN = np.radians(8.0)
+MIN_TURN = np.radians(8.0)
 # Largest rotation of a motion that is used [rad]: near pi, the sign of its axis is uncertain.
-MOST_TURN = np.radians(170.0)
-LEAST_SPREAD = np.radians(8.0)  # Smallest root mean square angle of the axes from their closest common axis [rad].
-MOST_MOTIONS = 2000  # Maximum number of motions, the largest first.
-MOST_POSES = 300  # Maximum number of poses whose pairs are all examined, spread evenly over all.
+MAX_TURN = np.radians(170.0)
+MIN_AXIS_SPREAD = np.radians(8.0)  # Smallest root mean square angle of the axes from their closest common axis [rad].
+MAX_MOTIONS = 2000  # Maximum number of motions, the largest first.
+MAX_POSES = 300  # Maximum number of poses whose pairs are all examined, spread evenly over all.
 # Largest root mean square residual angle of motions [rad]: two trackers with noise of 0.5 degrees give 1 degree.
-LARGEST_TURN = np.radians(2.0)
+MAX_RESIDUAL_TURN = np.radians(2.0)
 # Largest root mean square residual distance of motions [m]: two trackers with noise of 0.5 degrees give 7 mm over 0.7
 # m.
-LARGEST_SHIFT = 10e-3
-TURN = "Turn the bodies by 30 degrees or more, about at least two different axes."  # Remedy in error messages.
+MAX_RESIDUAL_SHIFT = 10e-3
+REMEDY = "Turn the bodies by 30 degrees or more, about at least two different axes."  # Remedy in error messages.
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +52,12 @@ class HandEye:
     @property
     def misfit(self) -> str:
         """Description of residuals and their limits; empty within the limits."""
-        if self.turn <= LARGEST_TURN and self.shift <= LARGEST_SHIFT:
+        if self.turn <= MAX_RESIDUAL_TURN and self.shift <= MAX_RESIDUAL_SHIFT:
             return ""
         found = (
             f"motions of the bodies differ by {np.degrees(self.turn):.1f} degrees and {1e3 * self.shift:.1f} mm (rms)"
         )
-        return f"{found}: at most {np.degrees(LARGEST_TURN):.0f} and {1e3 * LARGEST_SHIFT:.0f} are required"
+        return f"{found}: at most {np.degrees(MAX_RESIDUAL_TURN):.0f} and {1e3 * MAX_RESIDUAL_SHIFT:.0f} are required"
 
 
 def solve_hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
@@ -73,39 +73,41 @@ def solve_hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
     """
     if len(first) != len(second):
         raise ValueError(f"{len(first)} and {len(second)} poses: give both bodies' poses at the same times.")
-    if len(first) < FEWEST_POSES:
-        raise ValueError(f"{len(first)} poses are too few: record {FEWEST_POSES} or more. {TURN}")
-    A, B, ends = _motions(first, second)
+    if len(first) < MIN_POSES:
+        raise ValueError(f"{len(first)} poses are too few: record {MIN_POSES} or more. {REMEDY}")
+    A, B, ends = _select_motions(first, second)
     (a, a_dual), (b, b_dual) = to_dual_quaternions(A), to_dual_quaternions(B)
     axes = a[:, 1:] / np.linalg.norm(a[:, 1:], axis=1, keepdims=True)
     across = 1.0 - np.linalg.eigvalsh(axes.T @ axes / len(axes))[-1]
     spread = float(np.arcsin(np.sqrt(np.clip(across, 0.0, 1.0))))
-    if spread < LEAST_SPREAD:
+    if spread < MIN_AXIS_SPREAD:
         raise ValueError(
             f"the axes of all {len(A)} motions are parallel, to {np.degrees(spread):.1f} degrees: they leave open "
-            f"where along the axis one body lies in the other. {TURN}"
+            f"where along the axis one body lies in the other. {REMEDY}"
         )
-    X = _solved(a, a_dual, b, b_dual)
+    X = _solve_transform(a, a_dual, b, b_dual)
     left, right = A @ X, X @ B
     turns = compute_angles(left[:, :3, :3] @ right[:, :3, :3].transpose(0, 2, 1))
     shifts = np.linalg.norm(left[:, :3, 3] - right[:, :3, 3], axis=1)
     squares, counts = (np.bincount(ends.ravel(), each, len(first)) for each in (np.tile(shifts**2, 2), None))
-    return HandEye(X, _rms(turns), _rms(shifts), len(A), spread, np.sqrt(squares / np.maximum(counts, 1)))
+    return HandEye(
+        X, _compute_rms(turns), _compute_rms(shifts), len(A), spread, np.sqrt(squares / np.maximum(counts, 1))
+    )
 
 
-def _motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _select_motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Select motions of both bodies (m, 4, 4) with the largest rotations, and the poses (2, m) that they connect."""
-    kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), MOST_POSES)).round().astype(int))
+    kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), MAX_POSES)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
     A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
     angles = np.array([compute_angles(M[:, :3, :3]) for M in (A, B)])
-    good = np.flatnonzero((angles.min(axis=0) > LEAST_TURN) & (angles.max(axis=0) < MOST_TURN))
-    if len(good) < FEWEST_POSES:
+    good = np.flatnonzero((angles.min(axis=0) > MIN_TURN) & (angles.max(axis=0) < MAX_TURN))
+    if len(good) < MIN_POSES:
         raise ValueError(
-            f"{len(good)} motions turn the bodies by more than {np.degrees(LEAST_TURN):.0f} degrees, and "
-            f"{FEWEST_POSES} are needed. {TURN}"
+            f"{len(good)} motions turn the bodies by more than {np.degrees(MIN_TURN):.0f} degrees, and "
+            f"{MIN_POSES} are needed. {REMEDY}"
         )
-    best = good[np.argsort(-angles[0, good], kind="stable")[:MOST_MOTIONS]]
+    best = good[np.argsort(-angles[0, good], kind="stable")[:MAX_MOTIONS]]
     return A[best], B[best], kept[[start[best], end[best]]]
 
 
@@ -120,17 +122,17 @@ def to_dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     real = np.linalg.eigh(N)[1][:, :, -1]
     real *= np.where(real[:, :1] < 0.0, -1.0, 1.0)
     shift = np.concatenate([np.zeros((len(T), 1)), T[:, :3, 3]], axis=1)
-    return real, 0.5 * _product(shift, real)
+    return real, 0.5 * _multiply_quaternions(shift, real)
 
 
-def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+def _multiply_quaternions(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Multiply quaternions (..., 4), scalars first."""
     scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
     vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
     return np.concatenate([scalar, vector], axis=-1)
 
 
-def _solved(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray) -> np.ndarray:
+def _solve_transform(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray) -> np.ndarray:
     """Solve for X (4, 4) from real and dual parts (m, 4) of motions."""
     rows = np.zeros((len(a), 6, 8))
     for place, one, other in ((0, a, b), (3, a_dual, b_dual)):
@@ -154,18 +156,18 @@ def _solved(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray
     X = np.eye(4)
     x, y = real[0], real[1:]
     X[:3, :3] = (x * x - y @ y) * np.eye(3) + 2.0 * np.outer(y, y) + 2.0 * x * build_cross_matrices(y[None])[0]
-    X[:3, 3] = 2.0 * _product(dual, real * [1.0, -1.0, -1.0, -1.0])[1:]
+    X[:3, 3] = 2.0 * _multiply_quaternions(dual, real * [1.0, -1.0, -1.0, -1.0])[1:]
     return X
 
 
-def _rms(values: np.ndarray) -> float:
+def _compute_rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.square(values).mean()))
 
 
-FEWEST_PIVOT_POSES = 10  # Minimum number of poses of a pivot calibration.
-LEAST_TILT = np.radians(5.0)  # Smallest root mean square rotation angle of any direction in the tool [rad].
+MIN_PIVOT_POSES = 10  # Minimum number of poses of a pivot calibration.
+MIN_TILT = np.radians(5.0)  # Smallest root mean square rotation angle of any direction in the tool [rad].
 # Largest root mean square distance [m]: tracker noise of 0.5 mm and 0.5 degrees, at a tip 300 mm away, gives 2.7 mm.
-LARGEST_RMS = 3e-3
+MAX_RMS = 3e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,9 +200,9 @@ class Pivot:
     @property
     def misfit(self) -> str:
         """Description of the residual and its limit; empty within the limit."""
-        if self.rms <= LARGEST_RMS:
+        if self.rms <= MAX_RMS:
             return ""
-        return f"the tip moves by {1e3 * self.rms:.1f} mm (rms): at most {1e3 * LARGEST_RMS:.0f} mm are required"
+        return f"the tip moves by {1e3 * self.rms:.1f} mm (rms): at most {1e3 * MAX_RMS:.0f} mm are required"
 
 
 def calibrate_pivot(poses: np.ndarray) -> Pivot:
@@ -214,18 +216,16 @@ def calibrate_pivot(poses: np.ndarray) -> Pivot:
         Too few poses, or too little rotation.
     """
     count = len(poses)
-    if count < FEWEST_PIVOT_POSES:
-        raise ValueError(
-            f"{count} poses are too few: hold the tip in one place, and record {FEWEST_PIVOT_POSES} or more."
-        )
+    if count < MIN_PIVOT_POSES:
+        raise ValueError(f"{count} poses are too few: hold the tip in one place, and record {MIN_PIVOT_POSES} or more.")
     turns, places = poses[:, :3, :3], poses[:, :3, 3]
     mean = turns.mean(axis=0)
     # The tip's normal matrix over n, after the centre is eliminated: rotation of each direction in the tool.
     tilt = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
-    if tilt < LEAST_TILT:
+    if tilt < MIN_TILT:
         raise ValueError(
             f"a direction in the tool turns by {np.degrees(tilt):.1f} degrees only (rms), and "
-            f"{np.degrees(LEAST_TILT):.0f} are needed: tilt the tool by 30 degrees to all sides while its tip stays."
+            f"{np.degrees(MIN_TILT):.0f} are needed: tilt the tool by 30 degrees to all sides while its tip stays."
         )
     system = np.concatenate([turns, np.broadcast_to(-np.eye(3), (count, 3, 3))], axis=2).reshape(-1, 6)
     solution = np.linalg.lstsq(system, -places.ravel(), rcond=None)[0]

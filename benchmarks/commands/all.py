@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from scenes.commands.interrupt import INTERRUPTED, interrupt_on_termination
+from scenes.commands.interrupt import INTERRUPTED_CODE, interrupt_on_termination
 from scenes.options.outputs import add_force, check_output_path
 from scenes.script.shipped_files import get_template_path
 from sim.errors import InputError
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
             record = read_record(args.source) if args.source else _measured(args, stop_if_asked)
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on from {args.json or OUT}", file=sys.stderr)
-        return INTERRUPTED
+        return INTERRUPTED_CODE
     record = _only(record, args.only)
     code = 0
     if not args.source:

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
-    from scenes.analysis.budget import PROMISED
+    from scenes.analysis.budget import MAX_LIVE_ERROR
     from scenes.analysis.measurement import describe_machine
     from scenes.script.scene import find_scene
     from scenes.script.site import build_craniotomy_frame
@@ -69,10 +69,14 @@ def run(args: argparse.Namespace) -> int:
         found.append(tally(ride, frames, errors(sample, scene, site, args.element)))
     where = f"{describe_machine(args.device)}; {len(site.anatomy.mesh.nodes)} nodes, {args.element}"
     if args.json:
-        print(json.dumps({"machine": where, "promised_mm": 1e3 * PROMISED, "rides": [asdict(item) for item in found]}))
+        print(
+            json.dumps(
+                {"machine": where, "promised_mm": 1e3 * MAX_LIVE_ERROR, "rides": [asdict(item) for item in found]}
+            )
+        )
     else:
         _print(where, found)
-    return 0 if all(item.good and item.error <= 1e3 * PROMISED for item in found) else 1
+    return 0 if all(item.good and item.error <= 1e3 * MAX_LIVE_ERROR for item in found) else 1
 
 
 def _print(where: str, rides: Sequence[Tally]) -> None:

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from scenes.analysis.measurement import describe_machine
     from sim.effects import ToolContact
     from sim.runtime.device import parse_device_names
-    from surrogate.data.tool_poses import ROUND, choose_ball
+    from surrogate.data.tool_poses import BALL_PRESETS, choose_ball
 
     from ..studies.robustness import Trial
     from ..studies.throughput import drawn, rows, together
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
     anatomy = read_anatomy(args.anatomy or get_template_path())
     trial = Trial(anatomy, (), args.element, devices[0], batch)
-    sets = drawn(anatomy, args.presets or (ROUND if args.poses else PRESETS), count, args.poses)
+    sets = drawn(anatomy, args.presets or (BALL_PRESETS if args.poses else PRESETS), count, args.poses)
     groups: list[tuple[dict[str, Drawn], tuple[Effect, ...]]] = [(sets, ())]
     if args.poses:
         groups = [({name: loads}, (ToolContact((choose_ball(name),)),)) for name, loads in sets.items()]

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sim.arguments import LARGEST
+from sim.arguments import MAX_MAGNITUDE
 
 Place = tuple[str | int | Mapping[str, str | float], ...]
 """The way to a number in the JSON of a bench.
@@ -39,7 +39,7 @@ def number_at(said: Any, place: Place) -> float | None:
         number = math.nan if isinstance(said, bool) else float(said)
     except (LookupError, TypeError, ValueError, OverflowError):
         return None
-    return number if 0.0 <= number <= LARGEST else None
+    return number if 0.0 <= number <= MAX_MAGNITUDE else None
 
 
 def _fits(value: object, wanted: str | float) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.link.answer import NOT_SEEN, CameraView, PoseResult
+from scenes.link.answer import NO_TARGETS, CameraView, PoseResult
 from scenes.link.frame import HEADER, BadMessageError, pack_message, read_header, to_stamp, to_time
 from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.link.messages import Code, SentMesh, encode_polydata, encode_status, transform
@@ -54,9 +54,11 @@ class Moved:
         """The pose's shift, as the motion of a brain that is known."""
         body = heard.find_relative(heard.names.tool, now)
         if isinstance(body, str):
-            return PoseResult(0, TrackingResult(moment, TumourState.NO_TOOL, body, NOT_SEEN, BrainMotion(self._points)))
+            return PoseResult(
+                0, TrackingResult(moment, TumourState.NO_TOOL, body, NO_TARGETS, BrainMotion(self._points))
+            )
         motion = BrainMotion(self._points + body.T[:3, 3], True)
-        return PoseResult(body.stamp, TrackingResult(moment, TumourState.GOOD, "", NOT_SEEN, motion))
+        return PoseResult(body.stamp, TrackingResult(moment, TumourState.GOOD, "", NO_TARGETS, motion))
 
     def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
         """No camera is listened to."""

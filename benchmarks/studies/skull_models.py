@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.analysis.measurement import time_work
-from sim.accuracy import STRAINED
+from sim.accuracy import NO_STRAIN_LIMIT
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, join_deformations
 from sim.effects import Bonded, build_push_effects
@@ -88,7 +88,8 @@ def _answered(
         effects = [TORN[skull] if isinstance(one, Bonded) else one for one in build_push_effects(anatomy, tissue)]
         each = [loads.select(np.array([row])) for row in range(len(loads))]
         found = [
-            time_work(solve_with_debonding, anatomy, effects, load, STRAINED, device, tearing=tearing) for load in each
+            time_work(solve_with_debonding, anatomy, effects, load, NO_STRAIN_LIMIT, device, tearing=tearing)
+            for load in each
         ]
         good = np.array([one.rested and one.answer.outcome[0].good for one, _ in found])
         return (
@@ -96,6 +97,6 @@ def _answered(
             good,
             float(np.mean([seconds for _, seconds in found])),
         )
-    fem = Fem(anatomy, build_push_effects(anatomy, tissue, skull), STRAINED, device)
+    fem = Fem(anatomy, build_push_effects(anatomy, tissue, skull), NO_STRAIN_LIMIT, device)
     answer, seconds = time_work(fem.deform, loads)
     return answer, np.array([outcome.good for outcome in answer.outcome]), seconds / len(loads)

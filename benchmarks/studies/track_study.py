@@ -19,7 +19,7 @@ from ar.optics.camera import Camera
 from ar.optics.lens import Lens
 from ar.tracking.drawn import render_targets
 from ar.tracking.pose import Pose, Tracker, Verdict
-from ar.tracking.targets import MARKER, TIP, build_tool_cube
+from ar.tracking.targets import MARKER_RATIO, TIP_DISTANCE, build_tool_cube
 
 # The camera of the published trials: pixels, focal length [pixel], how far its targets are [m], and a usual lens.
 WIDTH, HEIGHT, FOCAL, AWAY = 1280, 960, 1400.0, 0.4
@@ -162,8 +162,8 @@ def calibrate_pivot(count: int, seed: int, point: np.ndarray | None) -> Iterator
         axis = _direction(u[0], u[1])
         T = _facing(Rotation.from_rotvec(np.radians(LEANING) * np.cbrt(u[2]) * axis))
         tip = (2.0 * u[3:] - 1.0) * TOUCHED if point is None else point
-        middle = _facing(Rotation.identity())[:3, :3] @ [0.0, 0.0, -TIP]
-        T[:3, 3] = [0.0, 0.0, AWAY] + middle + tip - T[:3, :3] @ [0.0, 0.0, -TIP]
+        middle = _facing(Rotation.identity())[:3, :3] @ [0.0, 0.0, -TIP_DISTANCE]
+        T[:3, 3] = [0.0, 0.0, AWAY] + middle + tip - T[:3, :3] @ [0.0, 0.0, -TIP_DISTANCE]
         yield T
 
 
@@ -195,7 +195,7 @@ def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
         begun = time.perf_counter()
         again = tracker.track(picture, first)  # as it is followed
         seconds = time.perf_counter() - begun
-        tip = np.array([0.0, 0.0, -TIP])
+        tip = np.array([0.0, 0.0, -TIP_DISTANCE])
         pose: Pose | None = again.poses.get(cube.name) if again.verdicts[cube.name] is Verdict.GOOD else None
         found, covariance = (None, None) if pose is None else pose.point(tip)
         yield Shot(T[:3, :3] @ tip + T[:3, 3], _markers(camera, T), found, covariance, seconds)
@@ -208,5 +208,5 @@ def _markers(camera: Camera, T: np.ndarray) -> float:
         pixels = camera.project(face.outline @ T[:3, :3].T + T[:3, 3])[0]
         (x, y), (x_next, y_next) = pixels.T, np.roll(pixels, -1, axis=0).T
         area = 0.5 * float(np.sum(x * y_next - x_next * y))  # negative where it is seen from behind
-        sides.append(MARKER * np.sqrt(max(area, 0.0) / (face.columns * face.rows)))
+        sides.append(MARKER_RATIO * np.sqrt(max(area, 0.0) / (face.columns * face.rows)))
     return float(max(sides))

@@ -13,20 +13,20 @@ from ..play.deformers import PatientSetup
 from ..script.scene import Scene
 from .measurement import time_work
 
-TIMED = 24  # Number of frames that are timed, after one that is not.
-PROMISED = 5e-5  # Largest distance of a node from the converged solution at the accuracy LIVE [m].
+TIMED_FRAMES = 24  # Number of frames that are timed, after one that is not.
+MAX_LIVE_ERROR = 5e-5  # Largest distance of a node from the converged solution at the accuracy LIVE [m].
 
 
 def time_offers(theatre: PatientSetup, scene: Scene) -> list[Offer]:
     """One offer for each deformer that states an error, timed on moments of the scene, as they are played."""
     made = []
-    times = scene.times[np.linspace(0, len(scene.times) - 1, TIMED + 1).astype(int)]
+    times = scene.times[np.linspace(0, len(scene.times) - 1, TIMED_FRAMES + 1).astype(int)]
     loads = [scene.build_loads(theatre.site, scene.path(float(time)), float(time)) for time in times]
     for name in theatre.list_deformers(scene):
         deformer = theatre.build_deformer(name, scene)
         forgets = isinstance(deformer, Learned) and not deformer.series
         seconds, last = [], None
-        error_mm = 1e3 * _stated(deformer)
+        error_mm = 1e3 * _get_reported_error(deformer)
         if np.isnan(error_mm):
             continue
         for load in loads:
@@ -36,8 +36,8 @@ def time_offers(theatre: PatientSetup, scene: Scene) -> list[Offer]:
     return made
 
 
-def _stated(deformer: Deformer) -> float:
+def _get_reported_error(deformer: Deformer) -> float:
     """Return the error that a deformer states of itself [m]."""
     if isinstance(deformer, Guarded):
         return float(np.fmin(deformer.model.bound, deformer.limit))
-    return deformer.bound if isinstance(deformer, Learned) else PROMISED
+    return deformer.bound if isinstance(deformer, Learned) else MAX_LIVE_ERROR

@@ -18,11 +18,11 @@ from ar.tracking.targets import build_patient_reference
 from sim.errors import InputError
 from surrogate.locating.calibration import RADIUS_SQUARED
 
-from ..script.priors import MESH, OF_REGISTRATION, OF_SEGMENTATION, REGISTRATION, SEGMENTATION
+from ..script.priors import MESH, REGISTRATION, REGISTRATION_PRIOR, SEGMENTATION, SEGMENTATION_PRIOR
 from ..script.site import CraniotomyFrame
 from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
-from .tracking_errors import CORNER, change_calibration, compute_row_delay, project_by_rows, project_corners
+from .tracking_errors import CORNER_NOISE, change_calibration, compute_row_delay, project_by_rows, project_corners
 from .uncertainty import SurfaceMotions, compute_error
 
 # Names of contributors to the overlay error.
@@ -32,7 +32,7 @@ TECHNICAL = (CALIBRATION, MARKERS, LATENCY, SHUTTER, SURROGATE, MESH)
 """Contributors of the system itself."""
 CLINICAL = (*TECHNICAL, REGISTRATION, SEGMENTATION, PARAMETERS)
 """Contributors including unmeasured properties of the patient."""
-CALIBRATIONS = 100  # Number of sampled calibrations.
+CALIBRATION_COUNT = 100  # Number of sampled calibrations.
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class Filmed:
     own_mesh: np.ndarray
     surrogate: float = 0.0
     registration: Registration | None = None
-    corner: float = CORNER
+    corner: float = CORNER_NOISE
     latency: float = 0.0
     clock: float = 5e-3
 
@@ -106,7 +106,7 @@ class Filmed:
         scale = np.sqrt(np.diag(self.covariance))
         scale[scale == 0.0] = 1.0  # exact inputs
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        steps = np.random.default_rng(0).standard_normal((CALIBRATIONS, 9)) * np.sqrt(values.clip(0.0))
+        steps = np.random.default_rng(0).standard_normal((CALIBRATION_COUNT, 9)) * np.sqrt(values.clip(0.0))
         return tuple(change_calibration(self.calibration, step) for step in scale * (steps @ vectors.T))
 
     @cached_property
@@ -148,11 +148,11 @@ def sample_errors(filmed: Filmed, contributors: Sequence[str], count: int, seed:
     InputError
         A reference that the camera does not see.
     """
-    rows = [_compared(*sample) for sample in _samples(filmed, frozenset(contributors), count, seed)]
+    rows = [_compare_tumours(*sample) for sample in _generate_samples(filmed, frozenset(contributors), count, seed)]
     return OverlayErrors(*np.array(rows).T)
 
 
-def _samples(
+def _generate_samples(
     filmed: Filmed, contributors: frozenset[str], count: int, seed: int
 ) -> Iterator[tuple[Camera, Camera, np.ndarray, np.ndarray]]:
     """Yield the true and the estimated camera, and the true and the drawn tumour surface (n, 3) [m]."""
@@ -163,24 +163,24 @@ def _samples(
         return value if name in contributors else np.zeros_like(value)
 
     for number in range(count):
-        random, time, body = _begun(filmed, seed, number)
+        random, time, body = _sample_time_and_body(filmed, seed, number)
         late = float(of(LATENCY, np.array(filmed.latency + filmed.clock * random.standard_normal())))
-        drawn = int(random.integers(CALIBRATIONS))
+        drawn = int(random.integers(CALIBRATION_COUNT))
         taken = filmed.believed[drawn] if CALIBRATION in contributors else filmed.calibration
         off = of(MARKERS, filmed.corner * random.standard_normal((corners, 2)))
         aside = of(SURROGATE, filmed.surrogate / np.sqrt(RADIUS_SQUARED) * random.standard_normal(3))
         shift = of(REGISTRATION, _shift(filmed, random.standard_normal(6)))
-        wide = of(SEGMENTATION, OF_SEGMENTATION.range[1] * random.standard_normal(1))
+        wide = of(SEGMENTATION, SEGMENTATION_PRIOR.range[1] * random.standard_normal(1))
         mesh = of(MESH, (filmed.meshes if PARAMETERS in contributors else filmed.own_mesh)[body])
         readout = filmed.calibration.readout if SHUTTER in contributors else 0.0
         motion = filmed.field + (filmed.off[body] if PARAMETERS in contributors else 0.0)
         surface = filmed.rest + (1.0 + mesh) * motion
-        true, then = _cameras(filmed, time, late, readout, surface.mean(axis=0))
+        true, then = _build_cameras(filmed, time, late, readout, surface.mean(axis=0))
         believed = taken.build_camera(then.T_camera_world)
         if taken is not filmed.calibration or off.any() or readout:
             found = project_corners(then, target, filmed.T_scan_patient, off)
             if readout:
-                at = partial(_camera_after, filmed, time - late)
+                at = partial(_build_delayed_camera, filmed, time - late)
                 found = project_by_rows(found, at, readout, filmed.T_scan_patient)
             known = then.T_camera_world @ filmed.T_scan_patient
             _, pose = find_pose(believed, target, found, known)
@@ -188,26 +188,28 @@ def _samples(
                 raise InputError("the camera does not see the patient's reference: take a path that keeps it in sight.")
             believed = taken.build_camera(pose.T_camera_target @ np.linalg.inv(filmed.T_scan_patient))
         shown = filmed.rest + filmed.field - late * filmed.velocity + aside + wide * filmed.normals
-        yield true, believed, surface, shown + _registered(filmed, shift, shown)
+        yield true, believed, surface, shown + _compute_registration_shift(filmed, shift, shown)
 
 
-def _begun(filmed: Filmed, seed: int, number: int) -> tuple[np.random.Generator, float, int]:
+def _sample_time_and_body(filmed: Filmed, seed: int, number: int) -> tuple[np.random.Generator, float, int]:
     """Return the numbers of a sample, of which the first say its time [s] and its body."""
     random = np.random.default_rng([seed, number])
     return random, random.uniform(0.0, filmed.duration), int(random.integers(len(filmed.bodies)))
 
 
-def _cameras(filmed: Filmed, time: float, late: float, readout: float, middle: np.ndarray) -> tuple[Camera, Camera]:
+def _build_cameras(
+    filmed: Filmed, time: float, late: float, readout: float, middle: np.ndarray
+) -> tuple[Camera, Camera]:
     """Return the camera that sees the tumour's `middle` (3,) [m] in the image of a time [s], and the tracked camera."""
-    true = _camera_after(filmed, time, 0.0)
-    then = _camera_after(filmed, time, -late) if late else true
+    true = _build_delayed_camera(filmed, time, 0.0)
+    then = _build_delayed_camera(filmed, time, -late) if late else true
     if readout:
         row = float(true.project(middle[None])[0][0, 1])
-        true = _camera_after(filmed, time, readout * compute_row_delay(true, row))
+        true = _build_delayed_camera(filmed, time, readout * compute_row_delay(true, row))
     return true, then
 
 
-def _camera_after(filmed: Filmed, time: float, seconds: float) -> Camera:
+def _build_delayed_camera(filmed: Filmed, time: float, seconds: float) -> Camera:
     """Return the true camera at a delay after a time [s]."""
     return filmed.viewpoint.build_camera(filmed.site, time + seconds)
 
@@ -215,13 +217,13 @@ def _camera_after(filmed: Filmed, time: float, seconds: float) -> Camera:
 def _shift(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
     """Return an error of registration (6,): a shift [m] and a turn [rad] in the frame of the patient's reference."""
     if filmed.registration is None:
-        return np.append(OF_REGISTRATION.range[1] * numbers[:3], np.zeros(3))
+        return np.append(REGISTRATION_PRIOR.range[1] * numbers[:3], np.zeros(3))
     scale = np.repeat([1.0, 0.1], 3)  # so that metres and radians are alike
     root = np.linalg.cholesky(filmed.registration.covariance / np.outer(scale, scale) + 1e-18 * np.eye(6))
     return scale * (root @ numbers)
 
 
-def _registered(filmed: Filmed, error: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _compute_registration_shift(filmed: Filmed, error: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the displacement (n, 3) [m] of scan points (n, 3) by a registration error (6,)."""
     if filmed.registration is None:
         return np.broadcast_to(error[:3], points.shape)
@@ -231,7 +233,7 @@ def _registered(filmed: Filmed, error: np.ndarray, points: np.ndarray) -> np.nda
     return turn.apply(arm) - arm + shift
 
 
-def _compared(
+def _compare_tumours(
     true: Camera, believed: Camera, surface: np.ndarray, shown: np.ndarray
 ) -> tuple[float, float, float, float]:
     """Compare the drawn tumour with the true one: centre across and along the line of sight, in pixels; worst point."""
@@ -283,7 +285,9 @@ def compute_budget(
     if twins is None:
         return budget
     within = sample_errors(twins, CLINICAL, count, seed + 1).worst <= budget.band
-    return replace(budget, held=_share(within, [_begun(twins, seed + 1, number)[2] for number in range(count)]))
+    return replace(
+        budget, held=_share(within, [_sample_time_and_body(twins, seed + 1, number)[2] for number in range(count)])
+    )
 
 
 def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | None]:

@@ -56,22 +56,22 @@ def solve_cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto"
         cortex = open_cortex(anatomy)
         places = [cortex.place(*place) for place in PLACES]
         forces = stack([push(place.point, FORCE * place.inward, FOOTPRINT) for place in places])
-        study = SensitivityStudy(anatomy, forces, _body(DEFAULT), device=device)
+        study = SensitivityStudy(anatomy, forces, _build_body_variant(DEFAULT), device=device)
         default = study.build_fem(study.body).deform(forces)
         motions = match_motion(anatomy, forces, default)
         for combination in product(*(levels[name] for name in DEFAULT)):
             chosen = dict(zip(DEFAULT, combination, strict=True))
-            fem = study.build_fem(_body(chosen))
-            moved = [_motion(fem, anatomy, loads) for loads in (forces, motions)]
+            fem = study.build_fem(_build_body_variant(chosen))
+            moved = [_compute_mean_motion(fem, anatomy, loads) for loads in (forces, motions)]
             yield Cell({"opening [mm]": opening, "depth [mm]": depth, **chosen}, *moved)
 
 
-def _body(chosen: Mapping[str, str | float]) -> BodyVariant:
+def _build_body_variant(chosen: Mapping[str, str | float]) -> BodyVariant:
     tissue = replace(BRAIN, poisson=float(chosen["nu"]))
     return BodyVariant(tissue, float(chosen["tumour's stiffness"]), str(chosen["skull"]))
 
 
-def _motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
+def _compute_mean_motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
     answer = fem.deform(loads, at=anatomy.tumour_nodes)
     if not all(outcome.good for outcome in answer.outcome):
         return float("nan")
@@ -102,12 +102,12 @@ def compute_variance_shares(found: Sequence[Cell], what: str = "force") -> dict[
 
 def build_panels(found: Sequence[Cell]) -> list[ChartPanel]:
     """Plot the motion over the tumour's depth, one panel per craniotomy: skulls, Poisson's ratios of the default."""
-    chosen = [{**DEFAULT, "nu": nu} for nu in _levels(found, "nu")]
-    chosen += [{**DEFAULT, "skull": skull} for skull in _levels(found, "skull") if skull != DEFAULT["skull"]]
+    chosen = [{**DEFAULT, "nu": nu} for nu in _list_levels(found, "nu")]
+    chosen += [{**DEFAULT, "skull": skull} for skull in _list_levels(found, "skull") if skull != DEFAULT["skull"]]
     motions = [cell.force for cell in found if np.isfinite(cell.force)]
     span = 0.8 * min(motions), 1.5 * max(motions)  # the same for all openings
     out = []
-    for opening in _levels(found, "opening [mm]"):
+    for opening in _list_levels(found, "opening [mm]"):
         curves = []
         for body in chosen:
             here = {**body, "opening [mm]": opening}
@@ -121,5 +121,5 @@ def build_panels(found: Sequence[Cell]) -> list[ChartPanel]:
     return out
 
 
-def _levels(found: Sequence[Cell], name: str) -> list[str | float]:
+def _list_levels(found: Sequence[Cell], name: str) -> list[str | float]:
     return list(dict.fromkeys(cell.levels[name] for cell in found))

@@ -18,14 +18,14 @@ with require_extra("report", "a chart needs"):
 
 WIDTH, HEIGHT = 640, 480  # Default size of a chart [pixel].
 DPI = 100  # Resolution of a chart [pixel/inch].
-PALE = 0.35  # Opacity of pale dots.
-FAINT = "0.45"  # Grey level of pale names, 0 to 1.
-DOT = 7.0  # Diameter of a dot [pt].
-GAP = 6.0  # Distance of a name from the centre of its dot [pt].
+PALE_OPACITY = 0.35  # Opacity of pale dots.
+NAME_GREY = "0.45"  # Grey level of pale names, 0 to 1.
+DOT_DIAMETER = 7.0  # Diameter of a dot [pt].
+NAME_DISTANCE = 6.0  # Distance of a name from the centre of its dot [pt].
 SIDES = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, -1), (-1, 1))
 """Sides of a dot where its name may be (right, up), the best first."""
 # Matplotlib's text alignment, horizontal and vertical, by the side of the dot.
-ACROSS, UP = {-1: "right", 0: "center", 1: "left"}, {-1: "top", 0: "center", 1: "bottom"}
+HORIZONTAL_ALIGNMENT, VERTICAL_ALIGNMENT = {-1: "right", 0: "center", 1: "left"}, {-1: "top", 0: "center", 1: "bottom"}
 
 
 @dataclass(frozen=True)
@@ -74,17 +74,17 @@ def draw_panels(panels: Sequence[ChartPanel]) -> np.ndarray:
     """
     if not panels:
         raise ValueError("a chart without panels shows nothing: give at least one.")
-    return np.hstack([_drawn(panel) for panel in panels])
+    return np.hstack([_draw_panel(panel) for panel in panels])
 
 
-def _drawn(panel: ChartPanel) -> np.ndarray:
+def _draw_panel(panel: ChartPanel) -> np.ndarray:
     pairs = [point for curve in panel.curves for point in curve.points] + [(dot.x, dot.y) for dot in panel.dots]
     points = np.array(pairs, float).reshape(-1, 2)
     if not len(points) or not (points > 0.0).all():
         raise ValueError(f"{panel.title}: logarithmic axes show positive numbers, and at least one point.")
     figure = Figure((panel.size[0] / DPI, panel.size[1] / DPI), DPI, layout="constrained")
     canvas, axes = FigureCanvasAgg(figure), figure.add_subplot()
-    x_range, y_range = _range(points[:, 0]), panel.y_range or _range(points[:, 1])
+    x_range, y_range = _compute_axis_limits(points[:, 0]), panel.y_range or _compute_axis_limits(points[:, 1])
     axes.set(title=panel.title, xlabel=panel.x, ylabel=panel.y, xscale="log", yscale="log", xlim=x_range, ylim=y_range)
     for axis, (low, high) in ((axes.xaxis, x_range), (axes.yaxis, y_range)):
         axis.set_major_formatter("{x:g}")
@@ -93,16 +93,22 @@ def _drawn(panel: ChartPanel) -> np.ndarray:
     axes.grid(which="both", color="0.9")
     axes.set_axisbelow(True)
     for x, name in panel.marks:
-        axes.axvline(x, color=FAINT, linestyle="--", linewidth=1.0)
-        axes.annotate(name, (x, 0.0), (5, 8), ("data", "axes fraction"), "offset points", color=FAINT, size="small")
+        axes.axvline(x, color=NAME_GREY, linestyle="--", linewidth=1.0)
+        axes.annotate(name, (x, 0.0), (5, 8), ("data", "axes fraction"), "offset points", color=NAME_GREY, size="small")
     for curve in panel.curves:
         axes.plot(*np.array(sorted(curve.points)).reshape(-1, 2).T, marker="o", markersize=5, label=curve.name)
     groups = {group: f"C{number}" for number, group in enumerate({dot.group: 0 for dot in panel.dots})}
     for group, colour in groups.items():
-        axes.plot([], [], "o", color=colour, markersize=DOT, label=group)
+        axes.plot([], [], "o", color=colour, markersize=DOT_DIAMETER, label=group)
     for dot in sorted(panel.dots, key=lambda dot: not dot.pale):  # pale ones first, so that they cover nothing
         axes.plot(
-            dot.x, dot.y, "o", color=groups[dot.group], markersize=DOT, markeredgewidth=0, alpha=PALE if dot.pale else 1
+            dot.x,
+            dot.y,
+            "o",
+            color=groups[dot.group],
+            markersize=DOT_DIAMETER,
+            markeredgewidth=0,
+            alpha=PALE_OPACITY if dot.pale else 1,
         )
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize="small")
@@ -115,18 +121,26 @@ def _drawn(panel: ChartPanel) -> np.ndarray:
 
 def _name(axes: Axes, dots: Sequence[Dot]) -> None:
     """Write the name of each dot where it overlaps least; that of a pale dot without free space is left out."""
-    reach = 0.5 * DOT * DPI / 72.0
+    reach = 0.5 * DOT_DIAMETER * DPI / 72.0
     centres = axes.transData.transform([(dot.x, dot.y) for dot in dots])
     taken = [Bbox([centre - reach, centre + reach]) for centre in centres]
     legend, frame = axes.get_legend(), axes.get_window_extent()
     taken += [legend.get_window_extent()] if legend else []
     for dot in sorted((dot for dot in dots if dot.name), key=lambda dot: dot.pale):
         names = [
-            axes.annotate(dot.name, (dot.x, dot.y), (GAP * right, GAP * up), textcoords="offset points", size="small")
+            axes.annotate(
+                dot.name,
+                (dot.x, dot.y),
+                (NAME_DISTANCE * right, NAME_DISTANCE * up),
+                textcoords="offset points",
+                size="small",
+            )
             for right, up in SIDES
         ]
         for name, (right, up) in zip(names, SIDES, strict=True):
-            name.set(ha=ACROSS[right], va=UP[up], color=FAINT if dot.pale else "black")
+            name.set(
+                ha=HORIZONTAL_ALIGNMENT[right], va=VERTICAL_ALIGNMENT[up], color=NAME_GREY if dot.pale else "black"
+            )
         boxes = [name.get_window_extent() for name in names]
         overlaps = [box.count_overlaps(taken) + (not _is_within(box, frame)) for box in boxes]
         best = int(np.argmin(overlaps))
@@ -141,7 +155,7 @@ def _is_within(box: Bbox, frame: Bbox) -> bool:
     return frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
 
 
-def _range(values: np.ndarray) -> tuple[float, float]:
+def _compute_axis_limits(values: np.ndarray) -> tuple[float, float]:
     """Limits of an axis: a margin round the values, and at least a factor of ten apart."""
     low, high = float(values.min()) / 1.4, float(values.max()) * 1.4
     spare = max(10.0 * low / high, 1.0) ** 0.5

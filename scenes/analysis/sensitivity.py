@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.accuracy import STRAINED, Accuracy
+from sim.accuracy import NO_STRAIN_LIMIT, Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.deformation import Deformation, guess
 from sim.discretisation.footprint import compute_footprint_weights
@@ -153,7 +153,7 @@ class SensitivityStudy:
     anatomy: Anatomy
     loads: Loads
     body: BodyVariant
-    accuracy: Accuracy = STRAINED
+    accuracy: Accuracy = NO_STRAIN_LIMIT
     device: str = "auto"
 
     def build_fem(self, body: BodyVariant) -> Fem:

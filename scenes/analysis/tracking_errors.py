@@ -14,11 +14,11 @@ from ar.optics.lens import Lens
 from ar.tracking.intrinsics import BoardView, compute_intrinsics_covariance
 from ar.tracking.targets import DetectedCorners, Target, build_calibration_board, is_seen_from_front
 
-CORNER = 0.1
+CORNER_NOISE = 0.1
 """Standard deviation of a corner per axis [pixel]: by default twice that of sharp images (`benchmarks track`)."""
-VIEWS = 24  # Number of views of a typical calibration.
-TILT = np.radians(35.0)  # Largest tilt of the board in its views [rad].
-WIDE = (0.45, 0.8)  # Range of the board's width relative to the image width.
+VIEW_COUNT = 24  # Number of views of a typical calibration.
+MAX_TILT = np.radians(35.0)  # Largest tilt of the board in its views [rad].
+BOARD_WIDTHS = (0.45, 0.8)  # Range of the board's width relative to the image width.
 
 
 def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
@@ -29,16 +29,18 @@ def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarr
     random, board = np.random.default_rng(seed), build_calibration_board().faces[0]
     points = board.corners - np.array([*(0.5 * board.size), 0.0])
     camera, views, poses = calibration.build_camera(np.eye(4)), [], []
-    for number in range(VIEWS):
-        way = 2.0 * np.pi * number / VIEWS
-        turn = TILT * random.uniform(0.5, 1.0) * np.array([np.cos(way), np.sin(way), 0.3 * random.standard_normal()])
-        depth = board.size[0] * calibration.focal[0] / (random.uniform(*WIDE) * calibration.width)
+    for number in range(VIEW_COUNT):
+        way = 2.0 * np.pi * number / VIEW_COUNT
+        turn = (
+            MAX_TILT * random.uniform(0.5, 1.0) * np.array([np.cos(way), np.sin(way), 0.3 * random.standard_normal()])
+        )
+        depth = board.size[0] * calibration.focal[0] / (random.uniform(*BOARD_WIDTHS) * calibration.width)
         aside = 0.25 * random.uniform(-1.0, 1.0, 2) * np.array([calibration.width, calibration.height])
         shift = depth * np.array([*(aside / calibration.focal), 1.0])
         at = points @ Rotation.from_rotvec(turn).as_matrix().T + shift
         pixels, _ = camera.project(at)
         inside = np.isfinite(pixels).all(axis=1)
-        noisy = pixels + CORNER * random.standard_normal(pixels.shape)
+        noisy = pixels + CORNER_NOISE * random.standard_normal(pixels.shape)
         views.append(BoardView(str(number), points[inside], noisy[inside], 1.0))
         poses.append((turn, shift))
     return compute_intrinsics_covariance(calibration, views, poses)[0]

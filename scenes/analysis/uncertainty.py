@@ -19,19 +19,19 @@ from sim.skulls import Bonded, SkullContact, Slide
 from ..play.deformers import PatientSetup
 from ..play.stage import Stage
 from ..script.priors import (
+    COMBINED,
     MESH,
-    OF_MESH,
-    OF_MESH_SINKING,
-    OF_MESH_SLIDING,
-    OF_REGISTRATION,
-    OF_SEGMENTATION,
+    MESH_PRIOR,
     POISSON,
     RATIO,
     REGISTRATION,
+    REGISTRATION_PRIOR,
     SEGMENTATION,
+    SEGMENTATION_PRIOR,
+    SINKING_MESH_PRIOR,
     SKULL,
+    SLIDING_MESH_PRIOR,
     STIFFNESS,
-    TOGETHER,
     TOOL,
     ParameterPrior,
     PatientSample,
@@ -43,10 +43,10 @@ from ..script.tool_paths import Path, Touch
 from ..script.uncertainty import LEVEL, Uncertainty, mark_of
 
 ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)  # Samples with inverted tetrahedra are counted, not left out.
-MOMENTS = 5  # Number of times of a scene that are solved.
-LEAST = 0.8  # Minimum share of the samples with an equilibrium.
-PARTS = 4  # Number of load steps for a time that is not reached in one step.
-SHIFTS = 200  # Number of sampled errors of registration and segmentation for each body.
+SOLVED_TIMES = 5  # Number of times of a scene that are solved.
+MIN_SOLVED_SHARE = 0.8  # Minimum share of the samples with an equilibrium.
+LOAD_STEPS = 4  # Number of load steps for a time that is not reached in one step.
+SHIFT_COUNT = 200  # Number of sampled errors of registration and segmentation for each body.
 SKULL_EFFECTS = Bonded | Slide | SkullContact  # Effects of the skull on the brain.
 
 
@@ -101,7 +101,7 @@ def apply_sample(scene: Scene, draw: PatientSample) -> Scene:
     def other(effect: Effect) -> Effect:
         return elasticity if isinstance(effect, Elasticity) else skull if isinstance(effect, SKULL_EFFECTS) else effect
 
-    return replace(scene, effects=tuple(map(other, scene.effects)), path=_aside(scene.path, draw.tip))
+    return replace(scene, effects=tuple(map(other, scene.effects)), path=_shift_path(scene.path, draw.tip))
 
 
 def list_skulls(scene: Scene) -> tuple[str, ...]:
@@ -119,8 +119,8 @@ def get_skull_model(scene: Scene) -> str | None:
 def find_mesh_prior(scene: Scene, skull: str | None) -> ParameterPrior:
     """Return the prior of a scene's mesh error for a skull model."""
     if skull in (None, "bonded"):
-        return OF_MESH
-    return OF_MESH_SINKING if any(isinstance(effect, Gravity) for effect in scene.effects) else OF_MESH_SLIDING
+        return MESH_PRIOR
+    return SINKING_MESH_PRIOR if any(isinstance(effect, Gravity) for effect in scene.effects) else SLIDING_MESH_PRIOR
 
 
 def sample_mesh_errors(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
@@ -167,7 +167,7 @@ def get_tumour_tissue(scene: Scene) -> Material:
     return tumour if isinstance(tumour, Material) else brain
 
 
-def _aside(path: Path, tip: Sequence[float]) -> Path:
+def _shift_path(path: Path, tip: Sequence[float]) -> Path:
     """Return a path shifted by (3,) [m]: right, up, inwards."""
 
     def aside(time: float) -> Touch:
@@ -179,7 +179,7 @@ def _aside(path: Path, tip: Sequence[float]) -> Path:
 
 def list_moments(scene: Scene) -> tuple[float, ...]:
     """Return the times [s] of a scene that are solved."""
-    return tuple(np.linspace(0.0, scene.duration, MOMENTS).tolist())
+    return tuple(np.linspace(0.0, scene.duration, SOLVED_TIMES).tolist())
 
 
 def solve_nominal(theatre: PatientSetup, scene: Scene) -> SurfaceMotions:
@@ -226,15 +226,17 @@ def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
     for time in list_moments(scene):
         answer = gone_to([time], last)
         if answer is None and time > before:
-            answer = gone_to(np.linspace(before, time, 1 + PARTS)[1:].tolist(), last)
+            answer = gone_to(np.linspace(before, time, 1 + LOAD_STEPS)[1:].tolist(), last)
         if answer is None:
             return None
         last, before, inverted = answer, time, max(inverted, int(answer.inverted[0]))
-        found.append(_surface(stage.select_stage(scene.build_loads(theatre.site, scene.path(time), time)), last))
+        found.append(
+            _get_tumour_motion(stage.select_stage(scene.build_loads(theatre.site, scene.path(time), time)), last)
+        )
     return SolvedMotions(tuple(found), inverted)
 
 
-def _surface(stage: Stage, answer: Deformation) -> np.ndarray:
+def _get_tumour_motion(stage: Stage, answer: Deformation) -> np.ndarray:
     return answer.restrict(stage.tumour_vertices).displacement[0]
 
 
@@ -258,7 +260,7 @@ def filter_sound_draws(scene: Scene, draws: Sequence[PatientSample], answers: It
         Too few draws with an equilibrium.
     """
     sound = find_sound_draws(draws, answers)
-    if len(sound) < LEAST * len(draws):
+    if len(sound) < MIN_SOLVED_SHARE * len(draws):
         raise InputError(f"of {len(draws)} draws of the scene {scene.name} {len(sound)} have an equilibrium: too few.")
     return sound
 
@@ -281,7 +283,7 @@ def estimate_uncertainty(
     answers = tuple(answers)
     sound = filter_sound_draws(scene, draws, answers)
     folded = sum(answer is not None and answer.inverted > 0 for answer in answers)
-    kept, shifts = [draw for draw, _ in sound], sample_rigid_errors(SHIFTS, seed)
+    kept, shifts = [draw for draw, _ in sound], sample_rigid_errors(SHIFT_COUNT, seed)
     meshes = sample_mesh_errors(scene, kept)
     rows = []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
@@ -340,10 +342,10 @@ def split_contributions(
         last = first + column.shape[1]
         found[name] = compute_field_size((column @ slope[first:last]).reshape(off.shape))
         first = last
-    found[TOGETHER] = compute_field_size(off - (design @ slope).reshape(off.shape))
+    found[COMBINED] = compute_field_size(off - (design @ slope).reshape(off.shape))
     found[MESH] = compute_field_size(estimate_mesh_deviations(scene, draws)[:, None, None] * motion)
-    found[REGISTRATION] = float(np.sqrt(3.0)) * OF_REGISTRATION.range[1]
-    return found | {SEGMENTATION: OF_SEGMENTATION.range[1]}
+    found[REGISTRATION] = float(np.sqrt(3.0)) * REGISTRATION_PRIOR.range[1]
+    return found | {SEGMENTATION: SEGMENTATION_PRIOR.range[1]}
 
 
 def collect_contributor_values(draws: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:
@@ -385,8 +387,8 @@ def measure_coverage(
             f"{len(sound)} of {len(draws)} synthetic patients of the scene {scene.name} have an equilibrium: too few."
         )
     meshes, inside = sample_mesh_errors(scene, [draw for draw, _ in sound]), []
-    shift, wide = sample_rigid_errors(SHIFTS * len(sound), seed)  # a different one for each patient
-    each = list(zip(shift.reshape(len(sound), SHIFTS, 3), wide.reshape(len(sound), SHIFTS), strict=True))
+    shift, wide = sample_rigid_errors(SHIFT_COUNT * len(sound), seed)  # a different one for each patient
+    each = list(zip(shift.reshape(len(sound), SHIFT_COUNT, 3), wide.reshape(len(sound), SHIFT_COUNT), strict=True))
     for moment in range(1, len(still.times)):
         motion = np.stack([answer[moment] for _, answer in sound])
         off = compute_error(motion, still.fields[moment], meshes)

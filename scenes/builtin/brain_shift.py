@@ -8,13 +8,13 @@ from sim.material import MATERIALS
 from ..script.head_posture import build_drained_turn
 from ..script.scene import Scene
 
-SLOW = MATERIALS["drained"].tissue  # Drained tissue: fluid leaves it in minutes.
+DRAINED_TISSUE = MATERIALS["drained"].tissue  # Drained tissue: fluid leaves it in minutes.
 
 SCENE = Scene(
     "brain_shift",
     __doc__ or "",
     duration=6.0,
-    effects=(Elasticity(SLOW), Held(), SkullContact(), Gravity()),
+    effects=(Elasticity(DRAINED_TISSUE), Held(), SkullContact(), Gravity()),
     tool=None,
     lying=build_drained_turn(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0), to=0.5),
 )

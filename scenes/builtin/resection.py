@@ -7,13 +7,13 @@ from ..script.debulking import Debulking
 from ..script.head_posture import build_drainage
 from ..script.scene import Scene
 
-SLOW = MATERIALS["drained"].tissue  # Drained tissue: fluid leaves it in minutes.
+DRAINED_TISSUE = MATERIALS["drained"].tissue  # Drained tissue: fluid leaves it in minutes.
 
 SCENE = Scene(  # Without weight nothing would move: the model is free of stress in the scan.
     "resection",
     __doc__ or "",
     duration=5.0,
-    effects=(Elasticity(SLOW), Held(), SkullContact(), Gravity()),
+    effects=(Elasticity(DRAINED_TISSUE), Held(), SkullContact(), Gravity()),
     tool=None,
     lying=build_drainage(1.5, to=0.3),
     surgery=Debulking(times=(2.0, 2.7, 3.4, 4.1)),

@@ -52,7 +52,7 @@ PRESETS = {  # Values of the options that differ from the default, by preset.
     # Tonutti et al. 2017: forces act 20 mm from the centre of a tumour of 12 mm radius; 98 cm2 of exposed cortex.
     "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
-NOTED = 3.0
+MIN_REPORTED_LOSS = 3.0
 """Smallest share of the tumour's volume missing from the mesh that is reported [%]."""
 
 
@@ -91,10 +91,10 @@ def run(args: argparse.Namespace) -> int:
     check_output_path(args.out, ".vtu", args.force, read)
     beside = to_intensity_path(args.out)
     check_output_path(beside, ".gz", args.force, read)
-    chosen = {**DEFAULTS, **PRESETS[args.preset], **_given(args)}
+    chosen = {**DEFAULTS, **PRESETS[args.preset], **_get_given_options(args)}
     plan = MeshPlan(args.nodes, 1e-3 * chosen["craniotomy"], fine_opening=args.fine_opening)
     with time_stage("labels" if args.labels else "head" if args.mask or args.head else "template"):
-        subject = place_craniotomy(_subject(args, chosen), args)
+        subject = place_craniotomy(_build_subject(args, chosen), args)
     for note in subject.notes:
         print(f"{describe_source(args)}: {note}", file=sys.stderr)
     print(f"sulcus anatomy: meshing with about {plan.nodes} nodes ...", file=sys.stderr)
@@ -114,9 +114,9 @@ def run(args: argparse.Namespace) -> int:
     if any(lost):
         said = describe_lost_pieces(subject.pieces, lost)
         print(f"{args.out}: does not hold {said}: where they matter, ask for more nodes.", file=sys.stderr)
-    figures = _figures(args, anatomy, subject, lost)
+    figures = _summarise_anatomy(args, anatomy, subject, lost)
     missed = figures["tumour_volume_error_percent"]
-    if abs(missed) > NOTED:
+    if abs(missed) > MIN_REPORTED_LOSS:
         print(
             f"{args.out}: holds {abs(missed):.1f} % {'less' if missed < 0.0 else 'more'} tumour than "
             f"{describe_source(args)}: where that matters, ask for more nodes.",
@@ -128,15 +128,15 @@ def run(args: argparse.Namespace) -> int:
             print(f"{args.out}: {said}: where it matters, ask for more nodes.", file=sys.stderr)
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
     summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}
-    print(json.dumps(summary) if args.json else _sentences(summary))
+    print(json.dumps(summary) if args.json else _format_report(summary))
     return 0
 
 
-def _given(args: argparse.Namespace) -> dict[str, float | str]:
+def _get_given_options(args: argparse.Namespace) -> dict[str, float | str]:
     return {name: getattr(args, name) for name in DEFAULTS if getattr(args, name) is not None}
 
 
-def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
+def _build_subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
         for name in ("brain", "tumour", "convention", "tumour_in", "axes", *PART_LABELS, *SEPTA, "regions"):
             if getattr(args, name):
@@ -149,12 +149,14 @@ def _subject(args: argparse.Namespace, chosen: dict) -> Subject:
     return build_masked_subject(read_head_masks(parse_sources(args)), args.t1, regions=parse_regions(args))
 
 
-def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost: list[bool]) -> dict[str, Any]:
+def _summarise_anatomy(
+    args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost: list[bool]
+) -> dict[str, Any]:
     mesh = anatomy.mesh
     volume = mesh.volumes[anatomy.in_tumour].sum()
     error, weight = compute_surface_errors(mesh.nodes, mesh.surface, subject.brain)
     septa = [int((find_held_vertices(mesh, one) & anatomy.held.all(axis=1)).sum()) for one in subject.septa]
-    regions = {name_region(part.label): (_volume(mesh, part), part) for part in subject.parts}
+    regions = {name_region(part.label): (_compute_volume(mesh, part), part) for part in subject.parts}
     return {
         "nodes": len(mesh.nodes),
         "tets": len(mesh.tets),
@@ -183,7 +185,7 @@ def _figures(args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost:
     }
 
 
-def _volume(mesh: TetMesh, part: SubjectPart) -> float:
+def _compute_volume(mesh: TetMesh, part: SubjectPart) -> float:
     """[m^3] of the tetrahedra of a part."""
     return float(mesh.volumes[mesh.mark_elements(part.label)].sum())
 
@@ -194,37 +196,37 @@ def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:
     return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": describe_side(place, low, high)}
 
 
-def _said(place: dict[str, Any]) -> str:
+def _format_place(place: dict[str, Any]) -> str:
     at = ", ".join(f"{value:g}" for value in place["at_mm"])
     return f"{place['side']}, at {at} mm (right, anterior, superior)"
 
 
-def _pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
+def _format_pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
     if len(pieces) == 1:
-        return [f"tumour: {_said(pieces[0])}"]
+        return [f"tumour: {_format_place(pieces[0])}"]
     listed = [
-        f"  piece {number}: {piece['ml']:g} ml, {_said(piece)}{', not in the mesh' if piece['lost'] else ''}"
+        f"  piece {number}: {piece['ml']:g} ml, {_format_place(piece)}{', not in the mesh' if piece['lost'] else ''}"
         for number, piece in enumerate(pieces, start=1)
     ]
     return [f"tumour: {len(pieces)} pieces; the skull is opened over {over}", *listed]
 
 
-def _region(name: str, volume: float, figures: dict) -> str:
+def _format_region(name: str, volume: float, figures: dict) -> str:
     """Return a region's line."""
     missed = figures["regions_volume_error_percent"][name]
     off = "" if missed is None else f" ({missed:+} % of the label's)"
     return f"{name} {volume:g} ml{off}, region {PART_LABELS[name]}{' of the tumour' if name == 'necrosis' else ''}"
 
 
-def _sentences(figures: dict) -> str:
+def _format_report(figures: dict) -> str:
     lines = [
         "{nodes} nodes, {tets} tetrahedra; worst dihedral angle {worst_dihedral_deg} deg",
         "brain {brain_ml:.0f} ml; surface error {surface_error_mean_mm} mm mean, {surface_error_p95_mm} mm p95",
         "tumour {tumour_ml} ml ({tumour_volume_error_percent:+} % of the label's), {tumour_nodes} nodes",
-        *(_region(name, volume, figures) for name, volume in figures["regions_ml"].items()),
+        *(_format_region(name, volume, figures) for name, volume in figures["regions_ml"].items()),
         *(f"{name} {held} nodes that do not move" for name, held in figures["septa_nodes"].items()),
-        *_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
-        f"opening: {_said(figures['opening'])}",
+        *_format_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
+        f"opening: {_format_place(figures['opening'])}",
         "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} at the skull, {held_nodes} held",
         "written to {mesh}" + (", intensities to {t1}" if figures["t1"] else "") + " in {seconds} s",
     ]

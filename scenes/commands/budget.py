@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
     Bodies = list[tuple[PatientSample, tuple[np.ndarray, ...]]]
 
-FEWEST = 8  # Minimum number of bodies to solve.
-FEWEST_SAMPLES = 200  # Minimum number of samples.
+MIN_BODIES = 8  # Minimum number of bodies to solve.
+MIN_SAMPLES = 200  # Minimum number of samples.
 # Mean errors of overlays as published: a headset in 20 patients (10.3171/2025.5.JNS243160), and 35 studies [mm].
-PUBLISHED = (2.2, 2.5)
+PUBLISHED_ERRORS = (2.2, 2.5)
 # Explanation under the table.
 NOTE = """
 "across" and "along" the line of sight: error of the tumour's centre; "worst": maximum surface error, 95th percentile.
@@ -82,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--readout", type=float,
         help="readout time of a rolling shutter [ms] (default: `readout_time` of --camera, or none)",
     )  # fmt: skip
-    parser.add_argument("--draws", type=int, default=24, help=f"number of bodies to solve, >= {FEWEST}")
+    parser.add_argument("--draws", type=int, default=24, help=f"number of bodies to solve, >= {MIN_BODIES}")
     parser.add_argument("--samples", type=int, default=1000, help="number of sampled errors")
     parser.add_argument("--twins", type=int, default=0, help="number of other bodies on which the band is tested")
     add_seed(parser, "the draws")
@@ -105,8 +105,8 @@ def run(args: argparse.Namespace) -> int:
     from ..tracked.filming import place_reference
     from ..tracked.registration_file import describe_other_mesh, read_registration
 
-    check_at_least("--draws", args.draws, FEWEST)
-    check_at_least("--samples", args.samples, FEWEST_SAMPLES)
+    check_at_least("--draws", args.draws, MIN_BODIES)
+    check_at_least("--samples", args.samples, MIN_SAMPLES)
     check_at_least("--twins", args.twins, 0)
     for name, value in (
         ("--corner-noise", args.corner_noise),
@@ -117,40 +117,42 @@ def run(args: argparse.Namespace) -> int:
         if not 0.0 <= value < 1e4:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
     theatre = open_theatre(args.anatomy, args.model, args.device, [args.scene])
-    scene = _seen(args, theatre)
+    scene = _build_filmed_scene(args, theatre)
     calibration, site = scene.viewpoint.calibration, theatre.site
     assert calibration is not None
-    known = _known(args, calibration)
+    known = _read_intrinsic_covariance(args, calibration)
     registration = None
     if args.registration is not None:
         registration = read_registration(args.registration)
         describe_other_mesh(registration, theatre.anatomy, args.registration)
     still = solve_nominal(theatre, scene)
-    bodies = _bodies(args, theatre, scene, args.draws, args.seed)
+    bodies = _sample_bodies(args, theatre, scene, args.draws, args.seed)
     draws = [draw for draw, _ in bodies]
     number = choose_moment(still, [answer for _, answer in bodies], sample_mesh_errors(scene, draws))
     time = still.times[number]
-    own_bodies, meshes, own_mesh = _at(scene, bodies, number)
+    own_bodies, meshes, own_mesh = _extract_motions_at(scene, bodies, number)
     filmed = Filmed(
         site=site, viewpoint=scene.viewpoint, duration=scene.duration, covariance=known, time=time,
         T_scan_patient=place_reference(site, scene.viewpoint.build_camera(site)),
         rest=Stage(scene, site).select_stage(scene.build_loads(site, scene.path(time), time)).tumour_at_rest.vertices,
         field=still.fields[number], normals=still.normals[number], velocity=compute_velocity(still, number),
-        bodies=own_bodies, meshes=meshes, own_mesh=own_mesh, surrogate=_promised(theatre, scene, time),
+        bodies=own_bodies, meshes=meshes, own_mesh=own_mesh, surrogate=_compute_model_bound(theatre, scene, time),
         registration=registration, corner=args.corner_noise, latency=1e-3 * args.latency, clock=1e-3 * args.time_noise,
     )  # fmt: skip
     twins = None
     if args.twins:
-        others, meshes, own_mesh = _at(scene, _bodies(args, theatre, scene, args.twins, args.seed + 1), number)
+        others, meshes, own_mesh = _extract_motions_at(
+            scene, _sample_bodies(args, theatre, scene, args.twins, args.seed + 1), number
+        )
         twins = replace(filmed, bodies=others, meshes=meshes, own_mesh=own_mesh)
     bar = partial(tqdm, unit="part", desc="errors", leave=False, file=sys.stderr)
     found = compute_budget(filmed, args.samples, args.seed, twins, bar)
-    report = _flat(args, filmed, found, split_contributions(filmed.bodies, filmed.field, draws, scene))
-    print(to_json_line(report) if args.json else "\n".join(_lines(report)))
+    report = _collect_figures(args, filmed, found, split_contributions(filmed.bodies, filmed.field, draws, scene))
+    print(to_json_line(report) if args.json else "\n".join(_format_report(report)))
     return 0
 
 
-def _seen(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
+def _build_filmed_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
     """Build the scene with a calibrated camera.
 
     Raises
@@ -177,7 +179,7 @@ def _seen(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
     return replace(filmed, viewpoint=replace(filmed.viewpoint, calibration=rolling))
 
 
-def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
+def _read_intrinsic_covariance(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
     """Return the covariance (9, 9) of the camera's intrinsics.
 
     Raises
@@ -203,7 +205,7 @@ def _known(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
     return covariance
 
 
-def _bodies(args: argparse.Namespace, theatre: PatientSetup, scene: Scene, count: int, seed: int) -> Bodies:
+def _sample_bodies(args: argparse.Namespace, theatre: PatientSetup, scene: Scene, count: int, seed: int) -> Bodies:
     """Sample bodies from the priors and solve the tumour's surface motion; drop those without equilibrium.
 
     Raises
@@ -221,7 +223,7 @@ def _bodies(args: argparse.Namespace, theatre: PatientSetup, scene: Scene, count
     return filter_sound_draws(scene, draws, bar)
 
 
-def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _extract_motions_at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the tumour's surface motion in each body at one time, and the errors of their meshes."""
     from ..analysis.uncertainty import find_mesh_prior, get_skull_model, sample_mesh_errors
 
@@ -230,14 +232,16 @@ def _at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarr
     return np.stack([answer[number] for _, answer in bodies]), sample_mesh_errors(scene, draws), own
 
 
-def _promised(theatre: PatientSetup, scene: Scene, time: float) -> float:
+def _compute_model_bound(theatre: PatientSetup, scene: Scene, time: float) -> float:
     """Return the bound [m] of the model that plays a scene, at a time [s]; 0 where finite elements do."""
     player = theatre.build_player(theatre.select_default(scene), scene)
     number = int(np.abs(scene.times - time).argmin())
     return player.draw(number, time, scene.path(time)).model_error or 0.0
 
 
-def _flat(args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: dict[str, float]) -> dict[str, Any]:
+def _collect_figures(
+    args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: dict[str, float]
+) -> dict[str, Any]:
     """All figures [mm, pixel]."""
     from ..analysis.error_budget import PARAMETERS
 
@@ -253,16 +257,16 @@ def _flat(args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: d
         "latency_ms": args.latency, "clock_ms": args.time_noise, "corner_px": args.corner_noise,
         "readout_ms": 1e3 * calibration.readout,
         "samples": args.samples, "bodies": len(filmed.bodies), "seed": args.seed,
-        "parts": {name: _figures(errors) for name, errors in rows.items()},
+        "parts": {name: _compute_quantiles(errors) for name, errors in rows.items()},
         "inside": {PARAMETERS: inside},
         "largest": {"middle": found.find_largest("middle"), "worst": found.find_largest("worst")},
         "band_mm": 1e3 * found.band, "held_twins": None if found.held is None else found.held[0],
         "held_twins_off": None if found.held is None else found.held[1],
-        "published_mm": list(PUBLISHED),
+        "published_mm": list(PUBLISHED_ERRORS),
     }  # fmt: skip
 
 
-def _figures(errors: OverlayErrors) -> dict[str, dict[str, float]]:
+def _compute_quantiles(errors: OverlayErrors) -> dict[str, dict[str, float]]:
     """Medians and 95th percentiles of one row."""
     columns = {
         "across_mm": 1e3 * errors.across, "along_mm": 1e3 * np.abs(errors.along), "pixels": errors.pixels,
@@ -272,7 +276,7 @@ def _figures(errors: OverlayErrors) -> dict[str, dict[str, float]]:
     return {name: {"p50": low, "p95": high} for name, (low, high) in quantiles.items()}
 
 
-def _lines(report: dict[str, Any]) -> list[str]:
+def _format_report(report: dict[str, Any]) -> list[str]:
     """Return the same in lines."""
     camera = report["camera"]
     lines = [

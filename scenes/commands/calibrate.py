@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from ar.tracking.tracker_calibration import HandEye, Pivot
 
 Found = TypeVar("Found", "Pivot", "HandEye")
-MOST_VIEWS = 40  # Maximum number of views used.
-WANTED_COVER = 0.6  # Share of the image area that corners should cover.
-SAME_TIME = 1e-3  # Largest difference of the times in two files of poses [s].
-STILL = 1e-3  # Motion along each axis below which positions may be in metres by mistake [m].
+MAX_VIEWS = 40  # Maximum number of views used.
+MIN_COVER = 0.6  # Share of the image area that corners should cover.
+TIME_TOLERANCE = 1e-3  # Largest difference of the times in two files of poses [s].
+MIN_MOTION = 1e-3  # Motion along each axis below which positions may be in metres by mistake [m].
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,13 +71,13 @@ def run(args: argparse.Namespace) -> int:
     if len(asked) != 1:
         raise InputError("give a video or a folder of images, --pivot POSES.csv, or --hand-eye A.csv B.csv.")
     if args.pictures is not None:
-        return _camera(args)
+        return _calibrate_camera(args)
     if args.out or args.size:
         raise InputError("--out and --size require images of the board: leave them out, and use --json.")
-    return _tip(args) if args.pivot is not None else _bodies(args)
+    return _calibrate_tip(args) if args.pivot is not None else _calibrate_hand_eye(args)
 
 
-def _camera(args: argparse.Namespace) -> int:
+def _calibrate_camera(args: argparse.Namespace) -> int:
     """Calibrate a camera from images of the board."""
     from ar.tracking.intrinsics import calibrate_intrinsics, choose_views
     from ar.tracking.targets import build_calibration_board
@@ -90,12 +90,12 @@ def _camera(args: argparse.Namespace) -> int:
     suffix = Path(args.out).suffix
     out = check_output_path(args.out, suffix if suffix in SUFFIXES else ".yaml", args.force, [args.pictures])
     table = check_output_path(out.with_suffix(".json"), ".json", args.force, [args.pictures])
-    size = None if args.size is None else _size(args.size)
+    size = None if args.size is None else _parse_image_size(args.size)
     board = build_calibration_board()
     seen = detect_board(args.pictures, board, size)
     try:
         found = calibrate_intrinsics(
-            choose_views(seen.views, board.faces[0], MOST_VIEWS),
+            choose_views(seen.views, board.faces[0], MAX_VIEWS),
             seen.width,
             seen.height,
             f"sulcus calibrate: {out.stem}",
@@ -123,10 +123,8 @@ def _camera(args: argparse.Namespace) -> int:
     print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered:.0f} % of the image")
     for name, value, deviation in zip(report["parameters"], found.values, found.deviations, strict=True):
         print(f"{name} {value:.6g} +- {deviation:.2g}{' px' if name[0] in 'fc' else ''}")
-    if found.covered < WANTED_COVER:
-        print(
-            f"Less than {100.0 * WANTED_COVER:.0f} % is covered: the lens is not known well outside. Add views there."
-        )
+    if found.covered < MIN_COVER:
+        print(f"Less than {100.0 * MIN_COVER:.0f} % is covered: the lens is not known well outside. Add views there.")
     print(f"written: {out}, with its covariance in {table}")
     return 0
 
@@ -138,7 +136,7 @@ def _write_json(path: Path, report: dict) -> None:
         partial.write_text(to_json_line(report) + "\n", encoding="utf-8")
 
 
-def _size(text: str) -> tuple[int, int]:
+def _parse_image_size(text: str) -> tuple[int, int]:
     """Parse the width and height of an image, such as 1280x960."""
     try:
         return parse_size(text)
@@ -147,14 +145,14 @@ def _size(text: str) -> tuple[int, int]:
         raise InputError(message) from error
 
 
-def _tip(args: argparse.Namespace) -> int:
+def _calibrate_tip(args: argparse.Namespace) -> int:
     """Return a tool's tip, from its poses while it pivots."""
     from ar.tracking.tracker_calibration import calibrate_pivot
 
     from ..tracked.pose_file import read_numbered_poses
 
     rows, _, poses = read_numbered_poses(args.pivot)
-    found = _fitted(calibrate_pivot, [args.pivot], [poses], rows)
+    found = _fit_poses(calibrate_pivot, [args.pivot], [poses], rows)
     deviations = 1e3 * np.sqrt(np.diag(found.covariance))
     if args.json:
         report = {
@@ -166,19 +164,19 @@ def _tip(args: argparse.Namespace) -> int:
         }
         print(to_json_line(report))
         return 0
-    print(f"tip in the tool's frame: {_said(1e3 * found.tip, deviations[:3])} mm")
-    print(f"it stood at {_said(1e3 * found.centre, deviations[3:])} mm")
+    print(f"tip in the tool's frame: {_format_values(1e3 * found.tip, deviations[:3])} mm")
+    print(f"it stood at {_format_values(1e3 * found.centre, deviations[3:])} mm")
     print(
         f"rms {1e3 * found.rms:.3f} mm; all directions in the tool turned by {np.degrees(found.tilt):.0f} degrees (rms)"
     )
     return 0
 
 
-def _said(values: np.ndarray, deviations: np.ndarray) -> str:
+def _format_values(values: np.ndarray, deviations: np.ndarray) -> str:
     return ", ".join(f"{value:.3f} +- {off:.2g}" for value, off in zip(values, deviations, strict=True))
 
 
-def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray], rows: np.ndarray) -> Found:
+def _fit_poses(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray], rows: np.ndarray) -> Found:
     """Calibration by `fit` from poses of files; InputError if it fails, or if its residuals exceed its limits."""
     from ar.tracking.rigid import read_conventions
 
@@ -189,7 +187,7 @@ def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray
         raise InputError(f"{names}: {error}") from error
     for file, each in zip(files, poses, strict=True):
         moved = np.ptp(each[:, :3, 3], axis=0).max()
-        if moved < STILL:
+        if moved < MIN_MOTION:
             warnings.warn(f"{file}: positions move by only {1e3 * moved:.2g} mm: are they metres?", stacklevel=1)
     if not found.misfit:
         return found
@@ -207,7 +205,7 @@ def _fitted(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray
     )
 
 
-def _bodies(args: argparse.Namespace) -> int:
+def _calibrate_hand_eye(args: argparse.Namespace) -> int:
     """Estimate the transform between two bodies from poses of both."""
     from ar.tracking.tracker_calibration import solve_hand_eye
 
@@ -215,9 +213,9 @@ def _bodies(args: argparse.Namespace) -> int:
 
     one, other = args.hand_eye
     (rows, times, first), (_, again, second) = read_numbered_poses(one), read_numbered_poses(other)
-    if len(times) != len(again) or np.abs(times - again).max(initial=0.0) > SAME_TIME:
+    if len(times) != len(again) or np.abs(times - again).max(initial=0.0) > TIME_TOLERANCE:
         raise InputError(f"{one} and {other} have rows at different times: keep those that both have, in one order.")
-    found = _fitted(solve_hand_eye, [one, other], [first, second], rows)
+    found = _fit_poses(solve_hand_eye, [one, other], [first, second], rows)
     if args.json:
         report = {
             "rotation": found.X[:3, :3].tolist(),

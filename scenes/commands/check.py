@@ -76,36 +76,36 @@ def run(args: argparse.Namespace) -> int:
         figures = measure(player, player.get_camera, frames, truth)
         broken = figures.find_violations(scene.bounds)
         played = {"scene": scene.name, "deformer": name, "solver": theatre.describe_deformer(name, scene)}
-        promised, error = _errors(frames)
+        promised, error = _find_largest_errors(frames)
         rows.append({**played, "frames": len(frames), **figures.to_row(), "broken": broken})
         against = list_objections(frames)
         rows[-1] |= {
-            "model_error_mm": _mm(promised),
-            "tumour_error_mm": _mm(error.bound),
+            "model_error_mm": _to_millimetres(promised),
+            "tumour_error_mm": _to_millimetres(error.bound),
             "largest_part": error.largest,
             "tumour_error_is_a_guess": error.guess,
             "objections": against,
-            "tumour_error_unobserved_mm": _mm(error.prior),
+            "tumour_error_unobserved_mm": _to_millimetres(error.prior),
         }
         print(
-            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_who(scene, name)}: error {figures.error_mm:.3f} "
+            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_describe_compared(scene, name)}: error {figures.error_mm:.3f} "
             f"mm at a motion of {figures.motion_mm:.2f} mm. Outline error {figures.drawn:.1f} px, "
             f"overlap {figures.overlap:.3f} (1 is best). {figures.leaked:.0%} leaks out of the "
-            f"skull{_bond(figures.bond)}{_estimates(figures)}",
+            f"skull{_describe_bond(figures.bond)}{_summarise_estimates(figures)}",
             file=table,
         )
         for sentence in format_errors(promised, error, name != "fem"):
             print(f"{'':11s} {sentence}", file=table)
         for sentence in (*broken, *against):
             print(f"{'':11s} {sentence}", file=table)
-    tracking = _tracking(args, theatre, table) if TRACKING in asked else None
+    tracking = _check_tracking(args, theatre, table) if TRACKING in asked else None
     passed = not any(row["broken"] for row in (*rows, *([] if tracking is None else [tracking])))
     if args.json:
         print(json.dumps({"passed": passed, "scenes": rows, "tracking": tracking}))
     return 0 if passed else 1
 
 
-def _tracking(args: argparse.Namespace, theatre: PatientSetup, table: TextIO) -> dict[str, object]:
+def _check_tracking(args: argparse.Namespace, theatre: PatientSetup, table: TextIO) -> dict[str, object]:
     """Check the overlay on a synthetic video whose markers disappear and return."""
     from ..tracked.drawn_film import build_synthetic_video
     from ..tracked.tracking_checks import build_default_pipeline, measure_tracking
@@ -124,7 +124,7 @@ def _tracking(args: argparse.Namespace, theatre: PatientSetup, table: TextIO) ->
     return {**figures.to_row(), "broken": broken}
 
 
-def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
+def _find_largest_errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
     """Return the maxima over a scene's frames: error bound of the model [m], and tumour position error."""
     from ..play.frame_text import find_worst
 
@@ -132,21 +132,21 @@ def _errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
     return max(promised, default=None), find_worst([frame.tumour_error for frame in frames])
 
 
-def _mm(metres: float | None) -> float | None:
+def _to_millimetres(metres: float | None) -> float | None:
     return None if metres is None else 1e3 * metres
 
 
-def _who(scene: Scene, name: str) -> str:
+def _describe_compared(scene: Scene, name: str) -> str:
     """Describe what is compared with FEM: the tumour of a deformation model, or an estimated one."""
     return f"{name}: the tumour" if scene.sight is None else f"{name} is the reference; tumour estimate"
 
 
-def _bond(share: float) -> str:
+def _describe_bond(share: float) -> str:
     """Describe how close the skull's bond is to its strength, if there is one."""
     return f", bond at {share:.0%} of its strength" if math.isfinite(share) else ""
 
 
-def _estimates(figures: SceneFigures) -> str:
+def _summarise_estimates(figures: SceneFigures) -> str:
     """Summarise the errors of the estimates in a scene with observations."""
     if not math.isfinite(figures.covered):
         return ""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
 
 
-FILMS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 """Endings of video file names."""
 
 
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
 
-    if args.scene.isdecimal() or Path(args.scene).suffix.lower() in FILMS or Path(args.scene).is_dir():
+    if args.scene.isdecimal() or Path(args.scene).suffix.lower() in VIDEO_SUFFIXES or Path(args.scene).is_dir():
         own = f"sulcus overlay {args.scene} --page --camera K.yaml --registration R.json --tool T.json"
         raise InputError(f"{args.scene} is not a scene. For your own video or camera: {own}")
     if not args.seconds > 0.0:

@@ -13,7 +13,14 @@ from ..options.shared_options import add_anatomy, add_device, add_json
 from ..options.theatre_options import add_trajectory, build_requested_scene
 from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
 
-HEAD = ("effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", "")  # Column titles of the table.
+COLUMN_TITLES = (
+    "effect",
+    "ms a frame",
+    "MB on the device",
+    "tumour mm",
+    "cortex mm",
+    "",
+)  # Column titles of the table.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     table = sys.stderr if args.json else sys.stdout
     who = theatre.describe_deformer("fem", scene)
     print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
-    print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}", file=table)
+    print(f"| {' | '.join(COLUMN_TITLES)} |\n|{'---|' * len(COLUMN_TITLES)}", file=table)
     found = []
     count = 1 + len(scene.get_effects_on(theatre.anatomy))
     with tqdm(total=count, unit="effect", leave=False, file=sys.stderr) as bar:

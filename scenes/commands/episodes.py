@@ -16,7 +16,7 @@ from sim.runtime.optional_packages import require_extra
 
 from ..options.outputs import check_output_folder
 from ..options.shared_options import add_json, add_seed, to_json_line
-from .interrupt import INTERRUPTED, interrupt_on_termination
+from .interrupt import INTERRUPTED_CODE, interrupt_on_termination
 
 if TYPE_CHECKING:
     from ..episodes.engine import ProgressListener, RunStatistics
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("plan", metavar="PLAN", help="a plan that ships with sulcus, or your own .toml")
-    parser.add_argument("--count", required=True, type=_positive, help="number of episodes")
-    add_seed(parser, "all draws", _natural)
+    parser.add_argument("--count", required=True, type=_parse_positive, help="number of episodes")
+    add_seed(parser, "all draws", _parse_natural)
     parser.add_argument(
         "--out", required=True, type=Path, metavar="DIR", help="folder of the episodes; an unfinished run is resumed"
     )
     parser.add_argument(
-        "--first", type=_natural, default=0, metavar="K", help="number of the first episode (default: 0)"
+        "--first", type=_parse_natural, default=0, metavar="K", help="number of the first episode (default: 0)"
     )
     who = parser.add_mutually_exclusive_group()
     who.add_argument(
-        "--workers", type=_positive, metavar="K",
+        "--workers", type=_parse_positive, metavar="K",
         help="number of processes on this machine (default: one per core, or per GPU)",
     )  # fmt: skip
     who.add_argument("--scheduler", metavar="ADDRESS", help="the workers of a running Dask scheduler: tcp://HOST:PORT")
@@ -55,12 +55,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--estimate", action="store_true", help="print the estimated time and disk space only, from earlier runs in DIR"
     )
     instead.add_argument(
-        "--slurm", type=_positive, metavar="MACHINES", help="print a script for sbatch with this many machines only"
+        "--slurm",
+        type=_parse_positive,
+        metavar="MACHINES",
+        help="print a script for sbatch with this many machines only",
     )
     add_json(parser)
 
 
-def _whole(text: str, least: int) -> int:
+def _parse_integer(text: str, least: int) -> int:
     try:
         number = int(text)
     except ValueError:
@@ -70,12 +73,12 @@ def _whole(text: str, least: int) -> int:
     return number
 
 
-def _positive(text: str) -> int:
-    return _whole(text, 1)
+def _parse_positive(text: str) -> int:
+    return _parse_integer(text, 1)
 
 
-def _natural(text: str) -> int:
-    return _whole(text, 0)
+def _parse_natural(text: str) -> int:
+    return _parse_integer(text, 0)
 
 
 def _plan(args: argparse.Namespace) -> str:
@@ -95,13 +98,13 @@ def run(args: argparse.Namespace) -> int:
         return _print_estimate(args, plan, out)
     try:
         with interrupt_on_termination() as stop_if_asked:
-            return _made(args, plan, out, stop_if_asked)
+            return _make_episodes(args, plan, out, stop_if_asked)
     except KeyboardInterrupt:
         print(f"stopped; run the same command again to resume in {out}", file=sys.stderr)
-        return INTERRUPTED
+        return INTERRUPTED_CODE
 
 
-def _made(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked: Callable[[], None]) -> int:
+def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked: Callable[[], None]) -> int:
     with require_extra("data", "sulcus episodes needs"):
         from ..episodes.engine import find_still_missing, make_all
     from ..episodes.make import choose_body, make_body, make_episode
@@ -110,7 +113,7 @@ def _made(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked:
 
     before = read_run(out)
     device = before.device if before and args.device == "auto" else args.device
-    with _workers(args, device) as workers:
+    with _start_workers(args, device) as workers:
         run = RunSettings(plan.name, plan.digest, args.seed, workers.device, get_versions())
         first_client = begin(out, run, plan.text, args.force)
         found = list_finished(out)
@@ -124,18 +127,18 @@ def _made(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked:
             partial(make_episode, *given, device=workers.device),
         )
         begun = time.perf_counter()
-        with _progress(out, there, args.count, stop_if_asked) as heard:
+        with _show_progress(out, there, args.count, stop_if_asked) as heard:
             tally = make_all(work, out, run, missing, workers, heard, there)
         seconds = time.perf_counter() - begun
         changed = tally != there
-        lacking = _card(out, list_finished(out) if changed else found, changed)
+        lacking = _update_card(out, list_finished(out) if changed else found, changed)
         _report(args, out, tally, seconds, workers.where, lacking is None and tally.made + tally.skipped > 0)
     if lacking is not None:
         print(lacking, file=sys.stderr)
     return int(tally.failed + tally.lost > 0)
 
 
-def _card(out: Path, numbers: Set[int], changed: bool) -> str | None:
+def _update_card(out: Path, numbers: Set[int], changed: bool) -> str | None:
     """Keep the data sheet up to date; why it is not, in words."""
     from tqdm import tqdm
 
@@ -145,7 +148,7 @@ def _card(out: Path, numbers: Set[int], changed: bool) -> str | None:
     return keep_card(out, numbers, changed, bar)
 
 
-def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
+def _start_workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
     from dask.system import CPU_COUNT
 
     from ..episodes.workers import connect_workers, start_own_workers
@@ -162,7 +165,7 @@ def _workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Wo
 
 
 @contextmanager
-def _progress(
+def _show_progress(
     out: Path, there: RunStatistics, total: int, stop_if_asked: Callable[[], None]
 ) -> Iterator[ProgressListener]:
     """Yield a listener that shows progress (frames per second, failures) and records task durations in the folder."""

@@ -9,7 +9,7 @@ from sim.errors import InputError
 
 from ..options.outputs import add_force, check_output_path
 
-ENDING = ".model.npz"  # Ending of a model file.
+MODEL_SUFFIX = ".model.npz"  # Ending of a model file.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--learner", help="name of the model (default: the one with the smallest error bound)")
     parser.add_argument(
-        "--anatomy", type=Path, help=f"anatomy it was trained on, .vtu (default: MESH.vtu next to MESH{ENDING})"
+        "--anatomy", type=Path, help=f"anatomy it was trained on, .vtu (default: MESH.vtu next to MESH{MODEL_SUFFIX})"
     )
     parser.add_argument(
         "--cortex",
@@ -50,11 +50,11 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{args.model}: no such file. Give a model of `sulcus train`.")
     mesh = args.anatomy
     if mesh is None:
-        if not args.model.name.endswith(ENDING):
+        if not args.model.name.endswith(MODEL_SUFFIX):
             raise InputError(
-                f"{args.model}: is not called MESH{ENDING}, so its mesh is not known. Give the mesh by --anatomy."
+                f"{args.model}: is not called MESH{MODEL_SUFFIX}, so its mesh is not known. Give the mesh by --anatomy."
             )
-        mesh = args.model.with_name(args.model.name.removesuffix(ENDING) + ".vtu")
+        mesh = args.model.with_name(args.model.name.removesuffix(MODEL_SUFFIX) + ".vtu")
     if not mesh.is_file():
         raise InputError(f"{mesh}: no such file, but {args.model} needs its mesh. Give the mesh by --anatomy.")
     models = load(args.model, read_anatomy(mesh))

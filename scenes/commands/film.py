@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from ..tracked.filming import Trouble, VideoFrame
 
 # Kinds of disturbances. Repeated here, so that `--help` does not import the renderer.
-TROUBLES = ("reference", "tool", "bright", "smear", "gap")
+DISTURBANCES = ("reference", "tool", "bright", "smear", "gap")
 # Files that are written next to the video.
-FILES = ("camera.yaml", "camera.json", "registration.json", "tool.json", "truth.npz", "truth.csv")
+WRITTEN_FILES = ("camera.yaml", "camera.json", "registration.json", "tool.json", "truth.npz", "truth.csv")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, "noise and of --registered")
     parser.add_argument(
         "--trouble", type=parse_trouble, action="append", default=[], metavar="KIND:FROM-TO",
-        help=f"disturbance between two times [s]: {', '.join(TROUBLES)}; repeatable",
+        help=f"disturbance between two times [s]: {', '.join(DISTURBANCES)}; repeatable",
     )  # fmt: skip
     parser.add_argument(
         "--registered", type=float, nargs=2, default=(0.0, 0.0), metavar=("MM", "DEGREES"),
@@ -106,14 +106,14 @@ def run(args: argparse.Namespace) -> int:
     shift, turn = args.registered
     taking = Taking(args.blur, args.noise, tuple(Trouble(*each) for each in args.trouble), args.seed)
     theatre = build_requested_theatre(args, args.scene)
-    scene = _scene(args, theatre)
+    scene = _build_scene(args, theatre)
     if all("gap" in taking.list_disturbances(time) for time in scene.times[:: args.every].tolist()):
         raise InputError("no image would be recorded: choose --seconds and --trouble that leave some.")
-    _demand_troubles(taking.troubles, scene.times[:: args.every])
+    _check_disturbances(taking.troubles, scene.times[:: args.every])
     calibration = scene.viewpoint.calibration
     assert calibration is not None
     folder = check_output_folder(args.out, "video and its ground truth")
-    paths = {name: check_output_path(folder / name, Path(name).suffix, args.force) for name in FILES}
+    paths = {name: check_output_path(folder / name, Path(name).suffix, args.force) for name in WRITTEN_FILES}
     player = theatre.build_player(args.deformer or "fem", scene)
     mounts = mount_targets(player)
     shots: list[VideoFrame] = []
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
+def _check_disturbances(troubles: Sequence[Trouble], times: np.ndarray) -> None:
     """Reject a disturbance that contains none of the frame `times` (F,) [s]: it would have no effect."""
     for each in troubles:
         if not ((each.since <= times) & (times < each.until)).any():
@@ -148,7 +148,7 @@ def _demand_troubles(troubles: Sequence[Trouble], times: np.ndarray) -> None:
             )
 
 
-def _scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
+def _build_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
     """Return the scene with its tracked camera, limited to the requested duration."""
     scene = add_targets(args, build_requested_scene(args, args.scene, theatre))
     if args.readout is not None:

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
     out = check_output_path(args.out or to_tissue_path(args.anatomy), ".json", args.force, [args.anatomy, *args.frames])
     find_device(args.device, "float32")
-    frames = _frames(args)
+    frames = _read_frames(args)
     anatomy = read_anatomy(args.anatomy)
     check_frames(anatomy, frames)  # bad frames need not wait for a locator
     if TUMOUR_LABEL in parse_region_tissues(args.region, BRAIN, anatomy.mesh):
@@ -87,14 +87,14 @@ def run(args: argparse.Namespace) -> int:
     save_tissue(out, tissue)
     shutil.rmtree(parts, ignore_errors=True)
     if args.json:
-        print(to_json_line({**_numbers(tissue, out), "outliers": [each.tolist() for each in left_out]}))
+        print(to_json_line({**_summarise_tissue(tissue, out), "outliers": [each.tolist() for each in left_out]}))
     else:
         said = [f"Frame {n}: {describe_left_out(each)}" for n, each in enumerate(left_out, start=1) if len(each)]
         print("\n".join([*said, *format_fit(tissue, out)]))
     return 0
 
 
-def _frames(args: argparse.Namespace) -> list[ObservedFrame]:
+def _read_frames(args: argparse.Namespace) -> list[ObservedFrame]:
     from surrogate.fitting.frame import ObservedFrame, read_tools
     from surrogate.locating.observed_files import read_observation
 
@@ -103,7 +103,7 @@ def _frames(args: argparse.Namespace) -> list[ObservedFrame]:
     return [ObservedFrame(*each) for each in zip(seen, tools, strict=True)]
 
 
-def _numbers(tissue: FittedTissue, out: Path) -> dict[str, object]:
+def _summarise_tissue(tissue: FittedTissue, out: Path) -> dict[str, object]:
     names = ("low", "median", "high")
     young = tissue.stiffness
     return {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # Names of the scenes. Repeated here, so that a command's help does not import scenes.
 NAMES = "press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force, microscope"
-PLAYING = ("demo", "render", "film", "collect", "check", "effects")
+PLAYING_COMMANDS = ("demo", "render", "film", "collect", "check", "effects")
 """Commands that take the scene to play."""
 
 EXAMPLES = {  # Examples in the help of each command.
@@ -137,5 +137,5 @@ next: look at a scene that fails: sulcus render SCENE --out frames""",
 
 def format_guidance(command: str) -> str:
     """Return the text below a command's help."""
-    scenes = f"scenes: {NAMES};\n  `sulcus scenes` says what happens in each\n\n" if command in PLAYING else ""
+    scenes = f"scenes: {NAMES};\n  `sulcus scenes` says what happens in each\n\n" if command in PLAYING_COMMANDS else ""
     return scenes + EXAMPLES[command]

@@ -20,15 +20,23 @@ from sim.material import Tissue
 
 from ..options.tissue_options import check_stiffness
 
-SMALL = 850.0  # Smallest volume of an adult brain with its ventricles [ml]: below, a mask lacks a part.
-LARGE = 2000.0  # Largest volume of an adult brain with its ventricles [ml]: above, a mask contains more than brain.
-MUCH = 0.25  # Largest volume of a tumour relative to the brain: labels of another convention are often larger.
-FAR = 0.040  # Distance from the craniotomy to the tumour above which pressing the cortex moves nothing there [m].
-OBLONG = 2.5  # Ratio of the longest to the shortest edge of a voxel above which surfaces show steps along one axis.
-COVERED = 0.98  # Smallest share of the brain that a T1 in the same space covers.
-THICK = 40.0  # Largest volume of a sheet of dura, a few voxels thick [ml].
+MIN_BRAIN_ML = 850.0  # Smallest volume of an adult brain with its ventricles [ml]: below, a mask lacks a part.
+MAX_BRAIN_ML = (
+    2000.0  # Largest volume of an adult brain with its ventricles [ml]: above, a mask contains more than brain.
+)
+MAX_TUMOUR_SHARE = (
+    0.25  # Largest volume of a tumour relative to the brain: labels of another convention are often larger.
+)
+MAX_TUMOUR_DISTANCE = (
+    0.040  # Distance from the craniotomy to the tumour above which pressing the cortex moves nothing there [m].
+)
+MAX_VOXEL_RATIO = (
+    2.5  # Ratio of the longest to the shortest edge of a voxel above which surfaces show steps along one axis.
+)
+MIN_T1_COVERAGE = 0.98  # Smallest share of the brain that a T1 in the same space covers.
+MAX_SHEET_ML = 40.0  # Largest volume of a sheet of dura, a few voxels thick [ml].
 AXES = ("LR", "PA", "IS")  # Letters of the negative and positive direction of each RAS axis.
-MOST = 4  # Maximum number of pieces that are listed.
+MAX_LISTED_PIECES = 4  # Maximum number of pieces that are listed.
 
 
 @dataclass(frozen=True)
@@ -81,21 +89,21 @@ class Inspection:
         pieces = [
             f"  piece {number}: {volume:.2f} ml, {place}" for number, (volume, place) in enumerate(self.pieces, 1)
         ]
-        shown, hidden = pieces[:MOST], len(pieces) - MOST
+        shown, hidden = pieces[:MAX_LISTED_PIECES], len(pieces) - MAX_LISTED_PIECES
         at = ", ".join(f"{value:.0f}" for value in self.opening)
         return [
-            f"brain {self.brain:.0f} ml; tumour {self.tumour:.2f} ml in {_counted(len(pieces), 'piece')}, "
+            f"brain {self.brain:.0f} ml; tumour {self.tumour:.2f} ml in {_format_count(len(pieces), 'piece')}, "
             f"{self.regions['tumour']}",
             *shown,
             *([f"  and {hidden} smaller"] if hidden > 0 else []),
-            *(f"{name} {volume:.2f} ml: {self._made_of(name)}" for name, volume in self.parts.items()),
+            *(f"{name} {volume:.2f} ml: {self._describe_part(name)}" for name, volume in self.parts.items()),
             f"tumour {self.depth:.0f} mm under the nearest cortex, give or take a voxel of {error:.1f} mm",
             f"opening: {self.place}, at {at} mm (RAS), {self.distance:.0f} mm from the tumour",
             f"voxels {' x '.join(f'{edge:.3g}' for edge in self.voxel)} mm, stored {self.axes} "
             f"({'mirrored, as many scanners do' if self.mirrored else 'not mirrored'}; left is where its affine says)",
         ]
 
-    def _made_of(self, part: str) -> str:
+    def _describe_part(self, part: str) -> str:
         if part in SEPTA:
             return "a wall, which does not move"
         around = "tumour" if part == NECROSIS else "brain"
@@ -132,7 +140,7 @@ def inspect_subject(masks: HeadMasks, subject: Subject, regions: Mapping[int, Ti
         pieces=tuple((1e6 * one.volume, describe_side(one.centre, low, high)) for one in subject.pieces),
         parts={name: voxel * float(mask.sum()) for name, mask in masks.parts.items()},
         regions={
-            name_region(label): _tissue(label, regions)
+            name_region(label): _describe_tissue(label, regions)
             for label in (TUMOUR_LABEL, *(part.label for part in subject.parts))
         },
         depth=1e3 * float(KDTree(subject.cortex).query(subject.interface)[0].min()),
@@ -145,10 +153,10 @@ def inspect_subject(masks: HeadMasks, subject: Subject, regions: Mapping[int, Ti
         warnings=(),
     )
     stiffness = (f"{name_region(label)}: {doubt}" for label, one in regions.items() if (doubt := check_stiffness(one)))
-    return replace(found, warnings=(*subject.notes, *stiffness, *_warnings(found, subject)))
+    return replace(found, warnings=(*subject.notes, *stiffness, *_find_warnings(found, subject)))
 
 
-def _tissue(label: int, regions: Mapping[int, Tissue]) -> str:
+def _describe_tissue(label: int, regions: Mapping[int, Tissue]) -> str:
     """Describe the tissue of a region."""
     tissue = Elasticity(None, regions).get_law(label)
     around = "tumour" if label == NECROSIS_LABEL else "brain"
@@ -165,16 +173,18 @@ def describe_axes(affine: np.ndarray) -> str:
     return "".join(letters)
 
 
-def _warnings(found: Inspection, subject: Subject) -> Iterator[str]:
-    if not SMALL <= found.brain <= LARGE:
-        word, ask = ("small", "is the mask whole") if found.brain < SMALL else ("large", "does the mask hold the skull")
+def _find_warnings(found: Inspection, subject: Subject) -> Iterator[str]:
+    if not MIN_BRAIN_ML <= found.brain <= MAX_BRAIN_ML:
+        word, ask = (
+            ("small", "is the mask whole") if found.brain < MIN_BRAIN_ML else ("large", "does the mask hold the skull")
+        )
         yield f"a brain of {found.brain:.0f} ml is {word} for an adult: {ask}?"
-    if found.tumour > MUCH * found.brain:
+    if found.tumour > MAX_TUMOUR_SHARE * found.brain:
         yield f"the tumour has {100.0 * found.tumour / found.brain:.0f} % of the brain: are these its labels?"
     if found.depth <= max(found.voxel):
         yield "the tumour touches the cortex"
     for septum in subject.septa:
-        if found.parts[septum.name] > THICK:
+        if found.parts[septum.name] > MAX_SHEET_ML:
             yield f"a {septum.name} of {found.parts[septum.name]:.0f} ml is no sheet: are these its labels?"
         if KDTree(septum.points).query(subject.interface)[0].min() <= 1e-3 * max(found.voxel):
             yield f"the tumour touches the {septum.name}, where it does not move"
@@ -183,15 +193,15 @@ def _warnings(found: Inspection, subject: Subject) -> Iterator[str]:
             f"the tumour lies in {len(found.pieces)} pieces, and the skull is opened over one of them: --opening-over "
             "chooses another"
         )
-    if 1e-3 * found.distance > FAR:
+    if 1e-3 * found.distance > MAX_TUMOUR_DISTANCE:
         yield f"the opening lies {found.distance:.0f} mm from the tumour: pressing there will hardly move it"
-    if max(found.voxel) > OBLONG * min(found.voxel):
+    if max(found.voxel) > MAX_VOXEL_RATIO * min(found.voxel):
         yield f"voxels are up to {max(found.voxel):.1f} mm long: surfaces have steps of that size"
     if subject.intensity is not None:
         covered = share_on(subject.intensity.values.shape, subject.intensity.affine, subject.cortex)
-        if covered < COVERED:
+        if covered < MIN_T1_COVERAGE:
             yield f"the T1 holds {100.0 * covered:.0f} % of the brain's surface: is it of the same space?"
 
 
-def _counted(count: int, word: str) -> str:
+def _format_count(count: int, word: str) -> str:
     return f"{count} {word}{'' if count == 1 else 's'}"

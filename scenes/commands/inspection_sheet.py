@@ -19,12 +19,17 @@ from .inspection import Inspection
 Colour = tuple[int, int, int]
 
 SIDE = 480  # Side of a panel [pixel].
-COLUMN = 500  # Width of the column of text [pixel].
-LINE = 22  # Line spacing of the text [pixel].
-SIZE = 16  # Size of the letters [pixel].
+COLUMN_WIDTH = 500  # Width of the column of text [pixel].
+LINE_SPACING = 22  # Line spacing of the text [pixel].
+FONT_SIZE = 16  # Size of the letters [pixel].
 PAD = 14  # Margin of text and scale bar [pixel].
-WIDTH = 58  # Maximum number of letters in a line of text.
-GROUND, TEXT, FAINT, WARNING = (12, 12, 14), (238, 238, 232), (160, 160, 156), (255, 196, 92)  # Colours (RGB).
+MAX_LINE_LENGTH = 58  # Maximum number of letters in a line of text.
+GROUND_COLOUR, TEXT_COLOUR, FAINT_COLOUR, WARNING_COLOUR = (
+    (12, 12, 14),
+    (238, 238, 232),
+    (160, 160, 156),
+    (255, 196, 92),
+)  # Colours (RGB).
 BRAIN: Colour = (104, 116, 138)  # Colour of the brain (RGB).
 COLOURS: dict[str, Colour] = {
     "brain": BRAIN,
@@ -39,10 +44,10 @@ COLOURS: dict[str, Colour] = {
 }
 """Colour of each part; later parts are drawn over earlier ones."""
 CORTEX: Colour = (176, 168, 164)  # Colour of the covered cortex (RGB).
-ROOM = 6e-3  # Margin of a view round the brain [m].
-RIND = 2.2e-3  # Half the thickness of the craniotomy's line in a slice [m].
-TINT = 0.6  # Opacity of colours over a scan.
-SHADOW = 0.45  # Opacity of the tumour's colour over the cortex that hides it.
+VIEW_MARGIN = 6e-3  # Margin of a view round the brain [m].
+HALF_LINE_WIDTH = 2.2e-3  # Half the thickness of the craniotomy's line in a slice [m].
+TINT_OPACITY = 0.6  # Opacity of colours over a scan.
+SHADOW_OPACITY = 0.45  # Opacity of the tumour's colour over the cortex that hides it.
 SIDES = ("LR", "PA", "IS")  # Letters of the negative and positive direction of each RAS axis.
 LIGHT = np.array([-0.4, 0.5, 0.77])  # Direction of the light on the cortex: from the viewer's upper left.
 
@@ -99,14 +104,14 @@ def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject,
     for plane in PLANES:
         right, down = np.array(plane.right), np.array(plane.down)
         across = np.abs(right) + np.abs(down)
-        reach = 0.5 * float(((high - low) * across).max()) + ROOM
+        reach = 0.5 * float(((high - low) * across).max()) + VIEW_MARGIN
         middle = 0.5 * (low + high) * across + centre * (1.0 - across)
         view = InspectionView(f"{plane.name}, through the tumour", right, down, middle, reach)
         colour, names = _slice(view, masks, subject, opened)
-        panels.append(_framed(colour, view))
+        panels.append(_draw_frame(colour, view))
         drawn |= names
-    panels.append(_outside(masks, subject, opened))
-    picture = Image.new("RGB", (2 * SIDE + COLUMN, 2 * SIDE), GROUND)
+    panels.append(_draw_cortex(masks, subject, opened))
+    picture = Image.new("RGB", (2 * SIDE + COLUMN_WIDTH, 2 * SIDE), GROUND_COLOUR)
     for number, panel in enumerate(panels):
         picture.paste(Image.fromarray(panel), (SIDE * (number % 2), SIDE * (number // 2)))
     _write(ImageDraw.Draw(picture), found, [name for name in COLOURS if name in drawn])
@@ -135,36 +140,36 @@ def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.
         **{name: marked(mask) & tumour for name, mask in masks.parts.items() if name == "necrosis"},
         "left out": tumour & ((kept > voxel) | (solid > voxel)),
     }
-    colour = np.tile(np.array(GROUND, float), (len(points), 1))
+    colour = np.tile(np.array(GROUND_COLOUR, float), (len(points), 1))
     tint = 1.0
     if subject.intensity is not None:
         grey = subject.intensity.interpolate(points)
         white = np.quantile(grey[layers["brain"]], 0.98) if layers["brain"].any() else grey.max()
         colour = np.repeat(np.clip(grey / (white or 1.0), 0.0, 1.0)[:, None] * 235.0, 3, axis=1)
-        tint = TINT
+        tint = TINT_OPACITY
     drawn = {name for name, mask in layers.items() if mask.any() and (name != "brain" or subject.intensity is None)}
     for name, mask in layers.items():
         if name in drawn:
-            colour[mask] = _over(colour[mask], COLOURS[name], tint)
-    rind = np.flatnonzero(np.abs(solid) < RIND)
+            colour[mask] = _blend_colour(colour[mask], COLOURS[name], tint)
+    rind = np.flatnonzero(np.abs(solid) < HALF_LINE_WIDTH)
     if len(rind) and opened.any():
         apart = np.linalg.norm(points[rind, None] - subject.site, axis=2)[:, 0]
-        near = rind[apart < np.linalg.norm(subject.cortex[opened] - subject.site, axis=1).max() + RIND]
-        colour[near[_nearest_is(subject.cortex, opened, points[near])]] = COLOURS["opening"]
+        near = rind[apart < np.linalg.norm(subject.cortex[opened] - subject.site, axis=1).max() + HALF_LINE_WIDTH]
+        colour[near[_is_nearest_chosen(subject.cortex, opened, points[near])]] = COLOURS["opening"]
     return np.rint(colour).astype(np.uint8).reshape(SIDE, SIDE, 3), drawn
 
 
-def _over(ground: np.ndarray, colour: Colour, share: float) -> np.ndarray:
+def _blend_colour(ground: np.ndarray, colour: Colour, share: float) -> np.ndarray:
     """Colours (..., 3) with a share of another one."""
     return (1.0 - share) * ground + share * np.array(colour)
 
 
-def _nearest_is(cortex: np.ndarray, chosen: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _is_nearest_chosen(cortex: np.ndarray, chosen: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(n,) bool: whether of the cortex the point nearest to each of `points` (n, 3) is a chosen one."""
     return chosen[KDTree(cortex).query(points)[1]]
 
 
-def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
+def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
     """Return the cortex as seen along the opening's middle, with the tumour's shadow under it."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     inward = 0.5 * (low + high) - subject.site
@@ -180,8 +185,8 @@ def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarr
     reach = float(np.abs(np.stack([across @ right, across @ down])).max(axis=1).mean()) * 0.8
     view = InspectionView("from outside, along the opening", right, down, subject.site, reach)
     cell = max(2.0 * reach / SIDE, 1.5 * float(np.linalg.norm(masks.affine[:3, :3], axis=0).max()))
-    seen = _seen(view, subject.cortex, inward, cell)
-    colour = np.tile(np.array(GROUND, float), (SIDE, SIDE, 1))
+    seen = _rasterise_points(view, subject.cortex, inward, cell)
+    colour = np.tile(np.array(GROUND_COLOUR, float), (SIDE, SIDE, 1))
     there = seen >= 0
     places = subject.cortex[seen[there]]
     normals = compute_gradient(subject.brain, places, probe=cell)
@@ -189,12 +194,12 @@ def _outside(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarr
     light = np.clip(normals @ np.stack([right, -down, -inward], axis=1) @ LIGHT, 0.0, 1.0)
     base = np.where(opened[seen[there]][:, None], COLOURS["opening"], CORTEX)
     colour[there] = base * (0.3 + 0.7 * light)[:, None]
-    shadow = _seen(view, subject.interface, inward, cell) >= 0
-    colour[shadow] = _over(colour[shadow], COLOURS["tumour"], SHADOW)
-    return _framed(np.rint(colour).astype(np.uint8), view)
+    shadow = _rasterise_points(view, subject.interface, inward, cell) >= 0
+    colour[shadow] = _blend_colour(colour[shadow], COLOURS["tumour"], SHADOW_OPACITY)
+    return _draw_frame(np.rint(colour).astype(np.uint8), view)
 
 
-def _seen(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
+def _rasterise_points(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
     """(SIDE, SIDE): the number of the point (n, 3) that each pixel shows, or -1; points are squares of `cell` [m]."""
     off, scale = points - view.middle, 0.5 * SIDE / view.reach
     half = int(np.ceil(0.5 * cell * scale))
@@ -209,45 +214,61 @@ def _seen(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: fl
     return seen
 
 
-def _framed(colour: np.ndarray, view: InspectionView) -> np.ndarray:
+def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
     """Return the panel with its name, the patient's sides and a scale."""
     picture = Image.fromarray(colour)
     ink = ImageDraw.Draw(picture)
     ink.rectangle([0, 0, SIDE - 1, SIDE - 1], outline=(60, 60, 64))
-    font = ImageFont.load_default(SIZE)
+    font = ImageFont.load_default(FONT_SIZE)
     letters = view.find_letters()
     half = SIDE // 2
     for edge, at, anchor in (
         ("left", (8, half), "lm"), ("right", (SIDE - 8, half), "rm"),
         ("top", (half, 6), "ma"), ("bottom", (half, SIDE - 6), "md"),
     ):  # fmt: skip
-        ink.text(at, letters[edge], TEXT, ImageFont.load_default(SIZE + 4), anchor, stroke_width=2, stroke_fill=GROUND)
-    ink.text((8, 6), view.name, TEXT, font, stroke_width=2, stroke_fill=GROUND)
+        ink.text(
+            at,
+            letters[edge],
+            TEXT_COLOUR,
+            ImageFont.load_default(FONT_SIZE + 4),
+            anchor,
+            stroke_width=2,
+            stroke_fill=GROUND_COLOUR,
+        )
+    ink.text((8, 6), view.name, TEXT_COLOUR, font, stroke_width=2, stroke_fill=GROUND_COLOUR)
     bar = 0.5 * SIDE * 0.02 / view.reach
-    ink.line([PAD, SIDE - PAD, PAD + bar, SIDE - PAD], TEXT, 3)
-    ink.text((PAD, SIDE - PAD - 6), "20 mm", TEXT, font, "ld", stroke_width=2, stroke_fill=GROUND)
+    ink.line([PAD, SIDE - PAD, PAD + bar, SIDE - PAD], TEXT_COLOUR, 3)
+    ink.text((PAD, SIDE - PAD - 6), "20 mm", TEXT_COLOUR, font, "ld", stroke_width=2, stroke_fill=GROUND_COLOUR)
     return np.asarray(picture)
 
 
 def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
     """Draw numbers, warnings and colours in the right column."""
     left, top = 2 * SIDE + PAD, PAD
-    rows: list[tuple[str, Colour]] = [("What would be made", TEXT)]
+    rows: list[tuple[str, Colour]] = [("What would be made", TEXT_COLOUR)]
     for text in found.format_lines():
-        rows += [(part, TEXT) for part in textwrap.wrap(text, WIDTH, subsequent_indent="    ")]
-    rows += [("", TEXT), ("Warnings" if found.warnings else "No warnings", WARNING if found.warnings else TEXT)]
+        rows += [(part, TEXT_COLOUR) for part in textwrap.wrap(text, MAX_LINE_LENGTH, subsequent_indent="    ")]
+    rows += [
+        ("", TEXT_COLOUR),
+        ("Warnings" if found.warnings else "No warnings", WARNING_COLOUR if found.warnings else TEXT_COLOUR),
+    ]
     for text in found.warnings:
-        rows += [(part, WARNING) for part in textwrap.wrap(f"- {text}", WIDTH, subsequent_indent="  ")]
-    rows += [("", TEXT), ("Research only; not a medical device.", FAINT)]
+        rows += [(part, WARNING_COLOUR) for part in textwrap.wrap(f"- {text}", MAX_LINE_LENGTH, subsequent_indent="  ")]
+    rows += [("", TEXT_COLOUR), ("Research only; not a medical device.", FAINT_COLOUR)]
     for number, (text, colour) in enumerate(rows):
-        ink.text((left, top + LINE * number), text, colour, ImageFont.load_default(SIZE))
+        ink.text((left, top + LINE_SPACING * number), text, colour, ImageFont.load_default(FONT_SIZE))
     legend = [("tumour that is left out" if name == "left out" else name, [COLOURS[name]]) for name in shown]
     grounds = np.array([COLOURS["opening"], CORTEX])
-    legend.append(("tumour under the opening, and under the skull", _over(grounds, COLOURS["tumour"], SHADOW).tolist()))
+    legend.append(
+        (
+            "tumour under the opening, and under the skull",
+            _blend_colour(grounds, COLOURS["tumour"], SHADOW_OPACITY).tolist(),
+        )
+    )
     for number, (said, colours) in enumerate(reversed(legend)):
-        row = 2 * SIDE - PAD - LINE * (number + 1)
+        row = 2 * SIDE - PAD - LINE_SPACING * (number + 1)
         for part, colour in enumerate(colours):
             wide = 16 // len(colours)
             at = left + wide * part
             ink.rectangle([at, row + 3, at + wide - 1, row + 18], fill=tuple(int(value) for value in colour))
-        ink.text((left + 24, row), said, TEXT, ImageFont.load_default(SIZE))
+        ink.text((left + 24, row), said, TEXT_COLOUR, ImageFont.load_default(FONT_SIZE))

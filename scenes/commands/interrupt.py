@@ -13,11 +13,13 @@ from contextlib import ExitStack, contextmanager
 from types import FrameType
 
 # Exit codes after Ctrl-C (a normal end) and SIGTERM (the shell's code).
-CODES = {signal.SIGINT: 0, signal.SIGTERM: 128 + signal.SIGTERM}
-INTERRUPTED = 128 + signal.SIGINT  # Exit code of a command that Ctrl-C stops during its work and that can be resumed.
-PATIENCE = 0.3  # Maximum time for cleaning up after a signal [s].
+EXIT_CODES = {signal.SIGINT: 0, signal.SIGTERM: 128 + signal.SIGTERM}
+INTERRUPTED_CODE = (
+    128 + signal.SIGINT
+)  # Exit code of a command that Ctrl-C stops during its work and that can be resumed.
+MAX_CLEANUP_TIME = 0.3  # Maximum time for cleaning up after a signal [s].
 # Polling interval of the main thread [s]: a signal may be delivered to another thread, which does not wake it.
-POLL = 0.1
+POLL_INTERVAL = 0.1
 
 
 class Ended(BaseException):
@@ -25,7 +27,7 @@ class Ended(BaseException):
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
-        self.code = CODES[signal.Signals(number)]
+        self.code = EXIT_CODES[signal.Signals(number)]
 
 
 def run_until_ended(work: Callable[[ExitStack], int]) -> int:
@@ -44,21 +46,21 @@ def run_until_ended(work: Callable[[ExitStack], int]) -> int:
         with closing:
             return work(closing)
     result: Future[int] = Future()
-    before = {number: signal.getsignal(number) for number in CODES}
+    before = {number: signal.getsignal(number) for number in EXIT_CODES}
     try:
-        for number in CODES:
+        for number in EXIT_CODES:
             signal.signal(number, leave)
         worker = threading.Thread(target=fulfil_work, args=(result, work, closing), name="work", daemon=True)
         worker.start()
         while worker.is_alive():
-            worker.join(POLL)
+            worker.join(POLL_INTERVAL)
         return result.result()
     except Ended as ended:
-        for number in CODES:
+        for number in EXIT_CODES:
             signal.signal(number, signal.SIG_IGN)
         cleaner = threading.Thread(target=closing.close, name="closing", daemon=True)
         cleaner.start()
-        cleaner.join(PATIENCE)
+        cleaner.join(MAX_CLEANUP_TIME)
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(ended.code)
@@ -78,9 +80,9 @@ def interrupt_on_termination() -> Iterator[Callable[[], None]]:
 
     def receive_input(number: int, frame: FrameType | None) -> None:
         came.set()
-        if not _finalises(frame):
+        if not _is_finalising(frame):
             raise KeyboardInterrupt
-        again = threading.Timer(POLL, lambda: over.is_set() or signal.pthread_kill(main, number))
+        again = threading.Timer(POLL_INTERVAL, lambda: over.is_set() or signal.pthread_kill(main, number))
         again.daemon = True
         again.start()
 
@@ -92,7 +94,7 @@ def interrupt_on_termination() -> Iterator[Callable[[], None]]:
         yield stop_if_asked
         return
     main = threading.get_ident()
-    before = {number: signal.signal(number, receive_input) for number in CODES}
+    before = {number: signal.signal(number, receive_input) for number in EXIT_CODES}
     try:
         yield stop_if_asked
     finally:
@@ -101,7 +103,7 @@ def interrupt_on_termination() -> Iterator[Callable[[], None]]:
             signal.signal(number, handler)
 
 
-def _finalises(frame: FrameType | None) -> bool:
+def _is_finalising(frame: FrameType | None) -> bool:
     """Return True if a frame runs within a finaliser, or within what a garbage collection calls."""
     while frame is not None:
         if frame.f_code.co_name in ("__del__", "_gc_callback") or frame.f_code.co_filename == weakref.__file__:

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     nodes = data.anatomy.tumour_nodes
     truth = data.read_displacement(nodes)[data.good]
     for name, model in models.items():
-        trained, here = _physics(model.training), _physics(data.provenance)
+        trained, here = _get_physics(model.training), _get_physics(data.provenance)
         for what in here:
             if trained[what] != here[what]:
                 raise InputError(
@@ -92,8 +92,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _physics(stated: Mapping[str, str]) -> dict[str, object]:
+def _get_physics(stated: Mapping[str, str]) -> dict[str, object]:
     """Return the properties that two bodies must share to be compared: tissue, with that of regions, and element."""
-    from surrogate.data.answer_rows import BRAIN, read_tissue_statement
+    from surrogate.data.answer_rows import TISSUE_KEY, read_tissue_statement
 
-    return {"tissue": read_tissue_statement(stated) if BRAIN in stated else None, "element": stated.get("element")}
+    return {"tissue": read_tissue_statement(stated) if TISSUE_KEY in stated else None, "element": stated.get("element")}

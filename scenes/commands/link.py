@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from ..tracked.tracked_tool import TrackedTool
 
 # Options with the names of transforms and images.
-NAMES = "--tool-name", "--reference-name", "--camera-name", "--registration-name"
+NAME_OPTIONS = "--tool-name", "--reference-name", "--camera-name", "--registration-name"
 PORT = 18944
 """Default port of OpenIGTLink."""
-FAREWELL = 0.25  # Time for notifying clients before the server stops [s].
+CLOSING_TIME = 0.25  # Time for notifying clients before the server stops [s].
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -127,11 +127,11 @@ def run(args: argparse.Namespace) -> int:
     if not 0 <= args.port < 1 << 16:
         raise InputError(f"--port {args.port}: give a port from 0 to 65535.")
     names = parse_names(args)
-    for option, name in zip(NAMES, (names.tool, names.reference, names.camera, names.registration), strict=True):
+    for option, name in zip(NAME_OPTIONS, (names.tool, names.reference, names.camera, names.registration), strict=True):
         if not (name.strip() and name.isascii() and name.isprintable()):
             raise InputError(f"{option} {name!r}: must be of printable ASCII characters.")
-    if len(names.by_wire) < len(NAMES):
-        raise InputError(f"{', '.join(NAMES)}: must differ in their first 20 characters, which messages carry.")
+    if len(names.by_wire) < len(NAME_OPTIONS):
+        raise InputError(f"{', '.join(NAME_OPTIONS)}: must differ in their first 20 characters, which messages carry.")
     if args.host not in ("127.0.0.1", "localhost", "::1"):
         said = "OpenIGTLink has no password: every program that can reach this address can move the displayed tumour"
         print(f"sulcus link: {said}", file=sys.stderr)
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
             f"--client {args.client}: port {args.port} of this machine is the one that is served here. Give --port "
             f"another one, as --port {args.port % 65535 + 1}, or give --client the port of the other server."
         )
-    return run_until_ended(partial(_linked, args, source))
+    return run_until_ended(partial(_run_link, args, source))
 
 
 def parse_names(args: argparse.Namespace) -> TransformNames:
@@ -200,14 +200,14 @@ def _is_own(family: int, address: tuple) -> bool:
         return True
 
 
-def _linked(args: argparse.Namespace, source: tuple[str, int] | None, closing: ExitStack) -> int:
+def _run_link(args: argparse.Namespace, source: tuple[str, int] | None, closing: ExitStack) -> int:
     from ..link.console import format_address
 
     over = threading.Event()
 
     async def work() -> None:
         session = open_link(args)
-        closing.callback(over.wait, FAREWELL)
+        closing.callback(over.wait, CLOSING_TIME)
         closing.callback(session.end)
         ready = asyncio.get_running_loop().create_future()
         ready.add_done_callback(
@@ -261,7 +261,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
         said += ". All results are unreliable: give --registration with a file of `sulcus register --anatomy`"
     if said:
         print(f"sulcus link: {said}", file=sys.stderr)
-    tool = tool or _tool_of(theatre, args.anatomy)
+    tool = tool or _choose_tool(theatre, args.anatomy)
     scene = apply_tissue_options(args, build_tracked_scene(args, tool.shape), theatre)
     deformer, who = build_mover(args, theatre, scene, True)
     stage, tracking = theatre.build_stage(scene), 1e-3 * args.tracking_noise
@@ -287,7 +287,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
     )
 
 
-def _tool_of(theatre: PatientSetup, path: Path) -> TrackedTool:
+def _choose_tool(theatre: PatientSetup, path: Path) -> TrackedTool:
     """Return the tool that the best model of poses knows, at its tip as PLUS has it: z points away from the shaft."""
     from ..tracked.tracked_tool import TrackedTool
 

@@ -89,13 +89,13 @@ def run(args: argparse.Namespace) -> int:
         }
         write_mesh(out, anatomy.mesh, fields, "RAS")
     if args.json:
-        print(to_json_line(_numbers(found, len(observation.now), locator.regions, out)))
+        print(to_json_line(_summarise_result(found, len(observation.now), locator.regions, out)))
     else:
-        print(_sentences(found, out))
+        print(_format_result(found, out))
     return 0
 
 
-def _numbers(found: Location, points: int, regions: tuple[Region, ...], out: Path | None) -> dict[str, object]:
+def _summarise_result(found: Location, points: int, regions: tuple[Region, ...], out: Path | None) -> dict[str, object]:
     return {
         "centroid_mm": (1e3 * found.centroid).tolist(),
         "covariance_mm2": (1e6 * found.centroid_covariance).tolist(),
@@ -112,7 +112,7 @@ def _numbers(found: Location, points: int, regions: tuple[Region, ...], out: Pat
         "tips_left_out": found.tips_left_out.tolist(),
         "slipped": found.slipped,
         "calibrated": found.calibrated,
-        "warnings": _warnings(found),
+        "warnings": _list_warnings(found),
         "regions": {name_region(one.label): one.ratio for one in regions},
         "milliseconds": 1e3 * found.seconds,
         "of": "the tumour, as far as the causes that were tried go; not of a model",
@@ -120,7 +120,7 @@ def _numbers(found: Location, points: int, regions: tuple[Region, ...], out: Pat
     }
 
 
-def _sentences(found: Location, out: Path | None) -> str:
+def _format_result(found: Location, out: Path | None) -> str:
     x, y, z = (round(value, 1) + 0.0 for value in 1e3 * found.centroid)  # a zero has no sign
     sure = "With a probability of 95 %" if found.calibrated else "As a rough estimate"
     lines = [
@@ -129,11 +129,11 @@ def _sentences(found: Location, out: Path | None) -> str:
         f"The motion explains {found.explained:.0%} of the observations. Causes: {found.named_causes}.",
         f"Estimated registration shift of the observation: {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
     ]
-    lines += _warnings(found)
+    lines += _list_warnings(found)
     return "\n".join(lines if out is None else [*lines, f"written: {out}"])
 
 
-def _warnings(found: Location) -> list[str]:
+def _list_warnings(found: Location) -> list[str]:
     """List remarks that a reader of the result needs, in sentences."""
     said = list(found.warnings)
     if found.slipped:

@@ -82,7 +82,9 @@ def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, reg
             bar.total, bar.n = total, done
             bar.set_description(stage)
 
-        return make_locator(anatomy, seed, device, Causes(regions=regions), folder=_parts(path), progress=progress)
+        return make_locator(
+            anatomy, seed, device, Causes(regions=regions), folder=_to_parts_path(path), progress=progress
+        )
 
 
 def find_locator(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
@@ -141,8 +143,8 @@ def list_regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Regi
 
 def forget_parts(path: Path) -> None:
     """Remove temporary files next to a locator's path."""
-    shutil.rmtree(_parts(path), ignore_errors=True)
+    shutil.rmtree(_to_parts_path(path), ignore_errors=True)
 
 
-def _parts(path: Path) -> Path:
+def _to_parts_path(path: Path) -> Path:
     return path.with_suffix(".parts")

@@ -47,9 +47,9 @@ if TYPE_CHECKING:
     from ..tracked.picture import Painter
     from ..tracked.run import Shown
 
-FILMS = (".mp4", ".gif", ".webp")  # Endings of video file names.
+VIDEO_SUFFIXES = (".mp4", ".gif", ".webp")  # Endings of video file names.
 HOST = "127.0.0.1"  # Address of the page: reachable from this machine only.
-UNSTATED = (  # Warning about a calibration without a covariance.
+NO_COVARIANCE_WARNING = (  # Warning about a calibration without a covariance.
     "{} states no covariance of the camera: the error has no part of its calibration in it. Calibrate yours by `sulcus "
     "calibrate`."
 )
@@ -128,18 +128,18 @@ def run(args: argparse.Namespace) -> int:
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: frame rate [1/s] must be > 0.")
     if camera or args.page:
-        return run_until_ended(partial(_served, args, camera))
+        return run_until_ended(partial(_serve_page, args, camera))
     inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth, args.covered]
     inputs += [*(args.poses or ()), args.hand_eye, args.camera_poses]
     check_pose_options(args)
-    out = None if args.out is None else _film_path(args.out, args.force, inputs)
+    out = None if args.out is None else _check_video_path(args.out, args.force, inputs)
     table = None if args.table is None else check_output_path(args.table, ".csv", args.force, inputs)
-    parts = _parts(args, film=True)
+    parts = _read_parts(args, film=True)
     stage = parts.painter.stage
     truth = None
     if args.truth is not None:
         truth = read_truth(args.truth, stage.anatomy.digest, len(stage.tumour_vertices))
-    shown = _played(args, parts, out)
+    shown = _draw_video(args, parts, out)
     errors = [
         None if truth is None else compute_overlay_error(each.known, truth, parts.calibration, stage) for each in shown
     ]
@@ -148,10 +148,10 @@ def run(args: argparse.Namespace) -> int:
     report = _report(shown, parts.who)
     if truth is not None:
         report["off"] = summarise_errors([each.known for each in shown], errors)
-    return _ended(args, report, shown, out, table)
+    return _print_summary(args, report, shown, out, table)
 
 
-def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
+def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     """Show a video or a live camera on a page, until the time is over or a signal arrives."""
     from ar.page.guard import UnguardedError, check_address
 
@@ -167,39 +167,39 @@ def _served(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     table = None if args.table is None else check_output_path(args.table, ".csv", args.force, [args.camera])
     try:
         check_address(HOST, args.port)
-        parts = _parts(args, film=not camera)
-        shown = (_camera_shown if camera else _film_shown)(args, parts, closing)
+        parts = _read_parts(args, film=not camera)
+        shown = (_show_camera if camera else _show_video)(args, parts, closing)
     except (ValueError, OSError, UnguardedError) as error:
         raise InputError(str(error)) from error
     if table is not None:
         write_rows(table, shown, [None] * len(shown))
     if not shown:
         return 1
-    return _ended(args, _report(shown, parts.who), shown, None, table)
+    return _print_summary(args, _report(shown, parts.who), shown, None, table)
 
 
-def _camera_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
+def _show_camera(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
     from ar.tracking.live_camera import open_camera, read_camera_images, read_newest
 
-    from ..tracked.follower import GAP
+    from ..tracked.follower import MAX_GAP
 
     again = partial(open_camera, int(args.pictures), parts.calibration.width, parts.calibration.height)
     name, source = f"camera {args.pictures}", again()
     if not source.isOpened():
         raise InputError(f"{name} cannot be opened: plug it in, see that no other program has it, and give its number.")
-    return _page(args, parts, closing, name).watch(
-        read_newest(read_camera_images(source, name, again), GAP), args.seconds
+    return _build_page(args, parts, closing, name).watch(
+        read_newest(read_camera_images(source, name, again), MAX_GAP), args.seconds
     )
 
 
-def _film_shown(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
+def _show_video(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
     from ..tracked.seekable_film import SeekableFilm
 
     film = SeekableFilm(Path(args.pictures), args.rate)
-    return _page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)
+    return _build_page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)
 
 
-def _page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str, frames: int = 0) -> OverlayPage:
+def _build_page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str, frames: int = 0) -> OverlayPage:
     from ..tracked.page import OverlayPage
 
     page = OverlayPage(parts.follower, parts.painter, name, parts.who, HOST, args.port, frames, list_addresses(args))
@@ -209,22 +209,22 @@ def _page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str,
     return page
 
 
-def _ended(
+def _print_summary(
     args: argparse.Namespace, report: dict[str, object], shown: list[Shown], out: Path | None, table: Path | None
 ) -> int:
     """Print the summary of a run; return 1 if the tumour position is reliable in no frame."""
     report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
-    print(to_json_line(report) if args.json else _words(report))
+    print(to_json_line(report) if args.json else _format_report(report))
     return 0 if any(each.known.relied for each in shown) else 1
 
 
-def _film_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
-    if path.suffix not in FILMS:
-        raise InputError(f"{path}: unsupported video type: expected {', '.join(FILMS)}.")
+def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
+    if path.suffix not in VIDEO_SUFFIXES:
+        raise InputError(f"{path}: unsupported video type: expected {', '.join(VIDEO_SUFFIXES)}.")
     return check_output_path(path, path.suffix, force, inputs)
 
 
-def _parts(args: argparse.Namespace, film: bool) -> Parts:
+def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
     """Read the inputs of a run; those that are read quickly come first."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
@@ -247,7 +247,9 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     calibration, registration = read_calibration(args.camera), read_registration(args.registration)
     intrinsic = read_intrinsic_covariance(args.camera)
     if intrinsic is None:
-        print(f"sulcus overlay: {UNSTATED.format(Path(args.camera).with_suffix('.json'))}", file=sys.stderr)
+        print(
+            f"sulcus overlay: {NO_COVARIANCE_WARNING.format(Path(args.camera).with_suffix('.json'))}", file=sys.stderr
+        )
     if film:
         check_video(Path(args.pictures), args.rate, calibration, args.camera)
     tool = None if args.tool is None else read_tool(args.tool)
@@ -266,7 +268,7 @@ def _parts(args: argparse.Namespace, film: bool) -> Parts:
     return Parts(calibration, follower, Painter(stage, tool, args.style, device), who)
 
 
-def _played(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
+def _draw_video(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
     """Draw all frames, into a video if requested; return them without their colours."""
     from ar.screen import write_film
     from ar.tracking.pictures import read_frame_rate, read_video
@@ -311,7 +313,7 @@ def _report(shown: list[Shown], who: str) -> dict[str, object]:
     }
 
 
-def _words(report: dict) -> str:
+def _format_report(report: dict) -> str:
     """Return the same for people."""
     count, latency = report["pictures"], report["latency"]
     lines = [f"{count} images; motion by {report['motion_by']}"]

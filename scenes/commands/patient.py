@@ -22,7 +22,7 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.journal import open_journal as opened_journal
 from sim.runtime.partial_files import to_unfinished_path
 from sim.runtime.timing import listen_to_stages
-from surrogate.data.splits import APART, FEWEST
+from surrogate.data.splits import CALIBRATION_STRIDE, MIN_DISCS
 from surrogate.data.tool_loads import PRESETS
 
 from ..options.outputs import add_force, check_output_path
@@ -34,7 +34,7 @@ from ..options.placement_options import (
 )
 from ..options.shared_options import add_devices, add_json
 from ..options.subject_options import add_label_arguments, label_words, parse_regions, parse_sources
-from ..options.tissue_options import OWN, add_element_argument, add_region_argument, parse_region_tissues
+from ..options.tissue_options import NON_BRAIN_REGIONS, add_element_argument, add_region_argument, parse_region_tissues
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -86,12 +86,14 @@ def run(args: argparse.Namespace) -> int:
     regions = parse_region_tissues(args.region, replace(BRAIN, law=args.material))
     strange = set(regions) - set(REGION_NAMES.values())
     if strange:
-        raise InputError(f"--region {min(strange)}: a patient has no such region. Choose from {', '.join(OWN)}.")
+        raise InputError(
+            f"--region {min(strange)}: a patient has no such region. Choose from {', '.join(NON_BRAIN_REGIONS)}."
+        )
     # A part of another stiffness must be a region.
     args.regions = (*args.regions, *(name for name, label in PART_LABELS.items() if label in regions))
     note = to_unfinished_path(args.out)
     resumed = note.exists() and not args.force
-    check_output_path(args.out, ".vtu", args.force, _inputs(args), resumed or args.inspect)
+    check_output_path(args.out, ".vtu", args.force, _list_inputs(args), resumed or args.inspect)
     if args.inspect:
         return _inspect(args, plan, regions)
     from sim.runtime.device import parse_device_names
@@ -103,11 +105,13 @@ def run(args: argparse.Namespace) -> int:
 
     data, model = args.out.with_suffix(".h5"), to_model_path(args.out)
     for path, suffix in ((data, ".h5"), (model, ".npz")):
-        check_output_path(path, suffix, args.force, _inputs(args), resumed)
+        check_output_path(path, suffix, args.force, _list_inputs(args), resumed)
     parse_device_names(args.device)
     check_learners(parse_learners(args.learners), of_poses=False, where=str(data))
-    if args.count - args.count // APART < FEWEST + 1:
-        raise InputError(f"--count {args.count} is too few to learn from and to leave {FEWEST} discs out: give more.")
+    if args.count - args.count // CALIBRATION_STRIDE < MIN_DISCS + 1:
+        raise InputError(
+            f"--count {args.count} is too few to learn from and to leave {MIN_DISCS} discs out: give more."
+        )
     force = ["--force"] if args.force else []
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
     steps = [
@@ -123,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
     began = time.perf_counter()
     if args.force:
         note.unlink(missing_ok=True)
-    changed = [path.stat().st_mtime for path in _inputs(args) if path.exists()]
+    changed = [path.stat().st_mtime for path in _list_inputs(args) if path.exists()]
     begun = {"anatomy": shlex.join(steps[0]), "inputs": f"of {datetime.fromtimestamp(max(changed, default=0))}"}
     with listen_to_stages() as seconds, opened_journal(note, begun) as journal:
         try:
@@ -145,12 +149,14 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"anatomy": str(args.out), "model": str(model), "seconds": seconds, "total": whole}))
     else:
-        print(f"{_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}{_physics(args)}")
-        print(f"for the error of the tumour: sulcus uncertainty press --anatomy {args.out}{_physics(args)}")
+        print(f"{_format_shares(seconds, whole)}\nready: sulcus demo --anatomy {args.out}{_format_scene_options(args)}")
+        print(
+            f"for the error of the tumour: sulcus uncertainty press --anatomy {args.out}{_format_scene_options(args)}"
+        )
     return 0
 
 
-def _inputs(args: argparse.Namespace) -> list[Path]:
+def _list_inputs(args: argparse.Namespace) -> list[Path]:
     return [path for path in (args.labels, args.mask, args.tumour_in, args.t1) if path is not None]
 
 
@@ -163,7 +169,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
 
     began = time.perf_counter()
     picture = args.out.with_suffix(".inspect.png")
-    check_output_path(picture, ".png", True, _inputs(args))  # a preview, which is drawn until it looks right
+    check_output_path(picture, ".png", True, _list_inputs(args))  # a preview, which is drawn until it looks right
     masks = read_head_masks(parse_sources(args))
     subject = place_craniotomy(build_masked_subject(masks, args.t1, regions=parse_regions(args)), args)
     found = inspect_subject(masks, subject, regions)
@@ -179,7 +185,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
     return 0
 
 
-def _physics(args: argparse.Namespace) -> str:
+def _format_scene_options(args: argparse.Namespace) -> str:
     """Return the options that a scene needs to match these data: tissue, element and planned trajectory."""
     tissue = "" if args.material == BRAIN.law else f" --material {args.material}"
     element = "" if args.element in (None, RECOMMENDED) else f" --element {args.element}"
@@ -187,6 +193,6 @@ def _physics(args: argparse.Namespace) -> str:
     return tissue + element + ("" if trajectory is None else f" --trajectory {trajectory}")
 
 
-def _shares(seconds: Mapping[str, float], whole: float) -> str:
+def _format_shares(seconds: Mapping[str, float], whole: float) -> str:
     rows = [f"  {name:<16}{took:8.1f} s{100.0 * took / whole:6.1f} %" for name, took in seconds.items()]
     return "\n".join([f"label volume to surrogate in {whole:.1f} s:", *rows])

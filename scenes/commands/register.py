@@ -63,18 +63,18 @@ def run(args: argparse.Namespace) -> int:
         else:
             traced = read_columns(args.surface, {("px", "py", "pz")})
             seen = 1e-3 * np.column_stack([traced[name] for name in ("px", "py", "pz")])
-            found = refine_registration(scan, patient, seen, _nearest_on(anatomy))
+            found = refine_registration(scan, patient, seen, _build_nearest(anatomy))
         fits = compute_pair_residuals(scan, patient)
     except ValueError as error:
         raise InputError(f"{source}: {error}") from error
     found = found if anatomy is None else replace(found, scanned=describe_scan(anatomy))
     write_registration(out, found)
-    target = None if anatomy is None else _error_at_tumour(found, anatomy)
+    target = None if anatomy is None else _compute_tumour_error(found, anatomy)
     if args.json:
         figures = {} if target is None else {"tumour_p95_mm": 1e3 * target[1], "along_mm": target[0].tolist()}
-        print(to_json_line({"out": str(out), **as_stored(found), **figures, **_stored(fits)}))
+        print(to_json_line({"out": str(out), **as_stored(found), **figures, **_summarise_residuals(fits)}))
         return 0
-    print("\n".join(_table(fits)))
+    print("\n".join(_format_table(fits)))
     print(f"{found.pairs} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not the error at the tumour")
     if target is None:
         print("give --anatomy for that error")
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _stored(fits: PairResiduals) -> dict[str, object]:
+def _summarise_residuals(fits: PairResiduals) -> dict[str, object]:
     """Summarise the residuals of the pairs for JSON."""
     return {
         "residuals_mm": (1e3 * fits.off).tolist(),
@@ -96,7 +96,7 @@ def _stored(fits: PairResiduals) -> dict[str, object]:
     }
 
 
-def _table(fits: PairResiduals) -> list[str]:
+def _format_table(fits: PairResiduals) -> list[str]:
     """Format the residuals: a row for each pair, and a warning about the worst one."""
     if np.isnan(fits.chance):
         rows = [f"{row + 1:4d} {1e3 * off:7.2f} mm" for row, off in enumerate(fits.off)]
@@ -113,7 +113,7 @@ def _table(fits: PairResiduals) -> list[str]:
     return lines
 
 
-def _nearest_on(anatomy: Anatomy) -> Nearest:
+def _build_nearest(anatomy: Anatomy) -> Nearest:
     """Return the nearest place on the surface of the brain, and its normal."""
     from sim.geometry.closest_point import find_closest_points
 
@@ -128,7 +128,7 @@ def _nearest_on(anatomy: Anatomy) -> Nearest:
     return nearest
 
 
-def _error_at_tumour(found: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
+def _compute_tumour_error(found: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
     """Deviations (3,) [mm] along the reference's axes at the tumour's middle, and the radius [m] that 95 % stay in."""
     from surrogate.locating.locator import compute_radius
 

@@ -17,7 +17,7 @@ from sim.errors import InputError
 
 from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_devices, add_json
-from .interrupt import INTERRUPTED
+from .interrupt import INTERRUPTED_CODE
 
 if TYPE_CHECKING:
     from ..report.page import Section
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Numbers of loads of a short and of a full report: simulated where no data are given; compared with the reference;
 # beyond the training range.
-QUICK, WHOLE = (256, 8, 24), (3000, 64, 120)
+QUICK_COUNTS, FULL_COUNTS = (256, 8, 24), (3000, 64, 120)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size.add_argument(
         "--quick",
         action="store_true",
-        help=f"small report with {QUICK[0]} simulated loads, few comparisons and one mesh: minutes instead of hours",
+        help=f"small report with {QUICK_COUNTS[0]} simulated loads, few comparisons and one mesh: minutes instead of hours",
     )
     size.add_argument(
         "--full", action="store_true", help="every combination of law, element, mesh, tolerance and precision"
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--loads",
         type=int,
         metavar="N",
-        help=f"number of loads compared with the reference (default: {WHOLE[1]}; with --quick {QUICK[1]})",
+        help=f"number of loads compared with the reference (default: {FULL_COUNTS[1]}; with --quick {QUICK_COUNTS[1]})",
     )
     add_force(parser)
     add_json(parser)
@@ -61,15 +61,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a row could not be measured."""
     try:
-        sections = _measured(args)
+        sections = _measure_sections(args)
     except KeyboardInterrupt:
         print(f"stopped; run the same command again to resume from {args.out}", file=sys.stderr)
-        return INTERRUPTED
-    _say(args, sections)
+        return INTERRUPTED_CODE
+    _print_sections(args, sections)
     return 0 if all(row.state == "measured" for part in sections for row in part.rows) else 1
 
 
-def _measured(args: argparse.Namespace) -> list[Section]:
+def _measure_sections(args: argparse.Namespace) -> list[Section]:
     """Measure the rows of each data set; rewrite the page after each."""
     from sim.runtime.device import parse_device_names
 
@@ -83,7 +83,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     several = parse_device_names(args.device)
     device = args.device if len(several) == 1 else several[0]
     check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "rows").is_dir())
-    count, loads, beyond = QUICK if args.quick else WHOLE
+    count, loads, beyond = QUICK_COUNTS if args.quick else FULL_COUNTS
     if args.loads is not None and args.loads < 1:
         raise InputError(f"--loads {args.loads} plays nothing: give at least 1.")
     if args.data and args.anatomy:
@@ -93,7 +93,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
     paths = args.data
     if not paths:
         paths = [args.out / "palpation.h5"]
-        _simulated(paths[0], args, count)
+        _simulate_data(paths[0], args, count)
     studies = [ReportStudy(path, args.out, device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
     sections = []
     for study in studies:
@@ -114,7 +114,7 @@ def _measured(args: argparse.Namespace) -> list[Section]:
             for row in measure_rows(study, specs):
                 found.append(row)
                 bar.update()
-        sections.append(Section(study.data.stem, _about(study), tuple(found)))
+        sections.append(Section(study.data.stem, _describe_study(study), tuple(found)))
         write_report(args.out, describe_machine(device), sections)
     return sections
 
@@ -126,7 +126,7 @@ def _tabulate(study: ReportStudy, bar: tqdm) -> None:
     bar.set_postfix_str("")
 
 
-def _simulated(path: Path, args: argparse.Namespace, count: int) -> None:
+def _simulate_data(path: Path, args: argparse.Namespace, count: int) -> None:
     """Make a data set, or go on with it."""
     from . import simulate
 
@@ -139,7 +139,7 @@ def _simulated(path: Path, args: argparse.Namespace, count: int) -> None:
             raise KeyboardInterrupt
 
 
-def _about(study: ReportStudy) -> tuple[str, ...]:
+def _describe_study(study: ReportStudy) -> tuple[str, ...]:
     from ..report.reference import get_reference
     from ..report.study import KINDS
 
@@ -155,7 +155,7 @@ def _about(study: ReportStudy) -> tuple[str, ...]:
     )
 
 
-def _say(args: argparse.Namespace, sections: Sequence[Section]) -> None:
+def _print_sections(args: argparse.Namespace, sections: Sequence[Section]) -> None:
     page = args.out / "index.html"
     if args.json:
         print(json.dumps({"page": str(page), "sections": [asdict(section) for section in sections]}))

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from ..analysis.sensitivity import Change, SensitivityRow, SensitivityStudy
 
 # Column titles of the table.
-HEAD = ("what", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
-WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
+COLUMN_TITLES = ("what", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
+COLUMN_WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
 """Widths of the table's columns [characters]: a line fits into 120."""
 # Explanation under the table.
 NOTE = """
@@ -39,7 +39,7 @@ vertex and the maximum. Tool errors are computed for more and less, about two ax
 """
 
 # Influence of the element on the rows of nu, measured by `python -m benchmarks elements` on the default brain.
-LOCKING = {
+LOCKING_NOTES = {
     "p1": "Linear tetrahedra lock as nu approaches 0.5: much of its effect here is locking. Use --element smoothed.",
     "smoothed": "Smoothed elements, because linear ones lock as nu nears 0.5; at 0.495 these still lose about 5 %.",
     "p2": "Quadratic elements lock little: at nu 0.495 they still lose about 4 %.",
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out:
         check_output_path(args.out, ".csv", args.force)
     if args.factorial:
-        return _factorial(args)
+        return _run_factorial(args)
     theatre = open_theatre(args.anatomy, args.model, args.device)
     anatomy = theatre.anatomy
     pushed = (model for model in theatre.models.values() if model.tool is None)
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     where = describe_machine(args.device)
     lines = sys.stderr if args.json else sys.stdout
     print(
-        f"{where}\n\n{_opening(study, args.tool_preset)}\n\n{_line(HEAD)}\n{_line(['-' * width for width in WIDTHS])}",
+        f"{where}\n\n{_describe_study(study, args.tool_preset)}\n\n{_format_row(COLUMN_TITLES)}\n{_format_row(['-' * width for width in COLUMN_WIDTHS])}",
         file=lines,
         flush=True,
     )
@@ -103,23 +103,23 @@ def run(args: argparse.Namespace) -> int:
         for row in measure_variants(study, changed):
             found.append(row)
             what = (row.variant.what, row.variant.default, row.variant.now)
-            bar.write(_line((*what, *_cells(row.force), *_cells(row.motion))), file=lines)
+            bar.write(_format_row((*what, *_format_cells(row.force), *_format_cells(row.motion))), file=lines)
             bar.update()
-    table = [_flat(row) for row in found]
+    table = [_flatten_row(row) for row in found]
     if args.out:
         write_table(args.out, table)
     failed = sum(row.force.failed + row.motion.failed for row in found)
     if args.json:
         stated = {"preset": args.tool_preset, "loads": len(loads), "seed": args.seed, "default": asdict(body)}
-        surrogate = _stated(model) if model else None
+        surrogate = _get_reported_error(model) if model else None
         whole = {"machine": where, **stated, "failed": failed, "surrogate": surrogate, "rows": table}
         print(to_json_line(whole))
     else:
-        print("\n".join([*_bound(model), NOTE, *_remarks(study, args.compare, model, failed)]))
+        print("\n".join([*_bound(model), NOTE, *_list_remarks(study, args.compare, model, failed)]))
     return 1 if failed else 0
 
 
-def _factorial(args: argparse.Namespace) -> int:
+def _run_factorial(args: argparse.Namespace) -> int:
     """Every combination: which factors decide, alone and together; 1 if a solve did not converge."""
     from math import prod
 
@@ -154,7 +154,7 @@ def _factorial(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _opening(study: SensitivityStudy, preset: str) -> str:
+def _describe_study(study: SensitivityStudy, preset: str) -> str:
     tissue, skull = study.body.tissue, study.body.skull if study.anatomy.slide_normal.any() else "none"
     return (
         f"{len(study.loads)} {preset} loads on {len(study.anatomy.mesh.nodes)} vertices. By default: element "
@@ -168,34 +168,34 @@ def _bound(model: Learned | None) -> list[str]:
     if model is None or not np.isfinite(model.bound):
         return []
     bound = ("", f"{1e3 * model.bound:.3f}", "", "")
-    return [_line(("surrogate's error", "", model.training.get("learner", "learnt"), *bound, *[""] * 4))]
+    return [_format_row(("surrogate's error", "", model.training.get("learner", "learnt"), *bound, *[""] * 4))]
 
 
-def _cells(change: Change) -> tuple[str, ...]:
+def _format_cells(change: Change) -> tuple[str, ...]:
     if not change.solves:
         return ("none", "solved", "", "")
     lengths = (change.mean_mm, change.worst95_mm)
     return *(f"{length:.3f}" for length in lengths), f"{change.percent:.1f}", f"{change.motion:.3f}"
 
 
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(f'{cell:<{width}}' for cell, width in zip(cells, WIDTHS, strict=True))} |"
+def _format_row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(f'{cell:<{width}}' for cell, width in zip(cells, COLUMN_WIDTHS, strict=True))} |"
 
 
-def _remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
+def _list_remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
     """List remarks that a reader of the table needs, in sentences."""
     said = []
     if failed:
         said.append(f"{failed} solves did not converge: they and their comparisons are excluded.")
     if model is not None and _bound(model):
-        stated = _stated(model)
+        stated = _get_reported_error(model)
         said.append(
             f"Surrogate error: reported bound on held-out {stated['preset']} loads relative to its own "
             f"FEM with element {stated['element']}. Use --compare for the error of that element."
         )
     else:
         said.append("No surrogate error is given: there is no model with a bound next to this anatomy (--model).")
-    said.append(LOCKING[study.body.element])
+    said.append(LOCKING_NOTES[study.body.element])
     if not beside:
         said.append("The discretisation error is not available: --compare p2 compares quadratic elements on this mesh.")
     if not study.anatomy.slide_normal.any():
@@ -203,14 +203,14 @@ def _remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | No
     return said
 
 
-def _stated(model: Learned) -> dict[str, Any]:
+def _get_reported_error(model: Learned) -> dict[str, Any]:
     """Read the reported error of a model."""
     training = model.training
     about = {name: training.get(name, "unknown") for name in ("learner", "preset")}
     return {**about, "element": training.get("element", "p1"), "bound_mm": 1e3 * model.bound}
 
 
-def _flat(row: SensitivityRow) -> dict[str, Any]:
+def _flatten_row(row: SensitivityRow) -> dict[str, Any]:
     variant = row.variant
     sides = {"force": row.force, "motion": row.motion}
     figures = {f"{side} {name}": value for side, change in sides.items() for name, value in asdict(change).items()}

@@ -32,7 +32,7 @@ from surrogate.data.crew import LazyFem, open_solvers
 from surrogate.data.dataset import read_outcomes
 from surrogate.data.holding import HISTORY, sample_times
 from surrogate.data.simulate import SimulatedRows, simulate
-from surrogate.data.tool_loads import BEYOND_TISSUE, PRESETS, compute_rejected_share, describe_rejected, draw
+from surrogate.data.tool_loads import OVERLOAD_PRESETS, PRESETS, compute_rejected_share, describe_rejected, draw
 from surrogate.data.tool_poses import choose_ball, draw_poses
 
 from ..options.outputs import add_force, check_output_path, find_begun_batch, read_statements, remove_data
@@ -45,10 +45,10 @@ from ..options.tissue_options import (
     parse_tissue,
 )
 from ..script.shipped_files import get_template_path
-from .interrupt import INTERRUPTED, interrupt_on_termination
+from .interrupt import INTERRUPTED_CODE, interrupt_on_termination
 
-SMALLEST_MM = 0.1  # Smallest size of a tool that presses on a brain [mm].
-LARGEST_MM = 200.0  # Largest size of a tool that presses on a brain [mm].
+MIN_TOOL_MM = 0.1  # Smallest size of a tool that presses on a brain [mm].
+MAX_TOOL_MM = 200.0  # Largest size of a tool that presses on a brain [mm].
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -109,9 +109,9 @@ def run(args: argparse.Namespace) -> int:
             print(f"{args.anatomy}: has no tumour: `sulcus train` will reject the data.", file=sys.stderr)
         elasticity = parse_elasticity(args, anatomy.mesh)
         tissue = parse_tissue(args)
-        tool, loads = _drawn(args, anatomy, tissue)
+        tool, loads = _sample_loads(args, anatomy, tissue)
     precision = "float32" if args.tolerance >= 1e-4 else "float64"
-    accuracy = Accuracy(args.tolerance, precision=precision, limit_strain=args.tool_preset not in BEYOND_TISSUE)
+    accuracy = Accuracy(args.tolerance, precision=precision, limit_strain=args.tool_preset not in OVERLOAD_PRESETS)
     effects: tuple[Effect, ...] = (*build_push_effects(anatomy, elasticity, args.skull), NodalForce())
     if tool is not None:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
@@ -149,14 +149,14 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             bar.close()  # its line ends
             print(f"stopped; run the same command again to resume from {to_unfinished_path(out)}", file=sys.stderr)
-            return INTERRUPTED
+            return INTERRUPTED_CODE
     _report(args, solver.description, len(loads), solved)
     return 0
 
 
-def _drawn(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
+def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
     """Return the tool of pose control, or None, and sampled loads, with times for viscoelastic tissue."""
-    asked = _asked(args)
+    asked = _build_requested_tool(args)
     if not args.pose_control:
         if asked is not None:
             raise InputError(
@@ -168,7 +168,7 @@ def _drawn(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[
     return tool, Loads(loads.causes, sample_times(len(loads), args.seed)) if tissue.prony else loads
 
 
-def _asked(args: argparse.Namespace) -> BuiltIn | None:
+def _build_requested_tool(args: argparse.Namespace) -> BuiltIn | None:
     """Return the tool that the options name, if they name one.
 
     Raises
@@ -177,10 +177,10 @@ def _asked(args: argparse.Namespace) -> BuiltIn | None:
         A size in millimetres that no such tool has.
     """
     for name, sizes in (("ball", [args.ball]), ("capsule", args.capsule), ("blade", args.blade)):
-        if sizes and sizes[0] is not None and not all(SMALLEST_MM <= size <= LARGEST_MM for size in sizes):
+        if sizes and sizes[0] is not None and not all(MIN_TOOL_MM <= size <= MAX_TOOL_MM for size in sizes):
             raise InputError(
                 f"--{name} {' '.join(f'{size:g}' for size in sizes)}: sizes are in millimetres: give "
-                f"{SMALLEST_MM:g} to {LARGEST_MM:g} each."
+                f"{MIN_TOOL_MM:g} to {MAX_TOOL_MM:g} each."
             )
     if args.ball is not None:
         return Ball(args.ball / 1e3)

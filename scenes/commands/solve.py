@@ -8,11 +8,11 @@ import time
 
 import numpy as np
 
-from sim.accuracy import FLOOR, Accuracy
+from sim.accuracy import MIN_TOLERANCE, Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import UNITS, MeshFile, read_mesh, write_mesh
 from sim.deformation import Deformation, guess
-from sim.diagnostics.stretch import LEAST, MOST
+from sim.diagnostics.stretch import MAX_STRETCH, MIN_STRETCH
 from sim.effects import SKULLS, Effect, Held, NodalForce
 from sim.errors import InputError
 from sim.fem import Fem
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--precision",
         default="float64",
         choices=("float32", "float64"),
-        help=f"scalar type of the solver: float32 is faster, with tolerances of at least {FLOOR['float32']:g}",
+        help=f"scalar type of the solver: float32 is faster, with tolerances of at least {MIN_TOLERANCE['float32']:g}",
     )
     parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file")
     add_device(parser)
@@ -94,10 +94,10 @@ def run(args: argparse.Namespace) -> int:
     least, most = deformation.stretch[:, 0]
     if inverted:
         notes.append(f"{inverted} tetrahedra are inverted: the load is too strong for this mesh. Give a weaker one")
-    if least < LEAST or most > MOST:
+    if least < MIN_STRETCH or most > MAX_STRETCH:
         notes.append(
             f"stretches are {least:.2g} to {most:.2g}; {1e6 * deformation.strained[0]:.2g} ml leave the "
-            f"range of {LEAST} to {MOST} that was measured on brain tissue"
+            f"range of {MIN_STRETCH} to {MAX_STRETCH} that was measured on brain tissue"
         )
     if bond > 1.0:
         notes.append(f"the bond on the skull bears {bond:.2g} times its strength: it would tear, which is not computed")
@@ -139,7 +139,7 @@ def start_of(file: MeshFile, name: str, metre: float) -> Deformation | None:
     """
     if "start" not in file.point_data:
         return None
-    return guess(metre * _field(name, "start", file.point_data["start"], {(len(file.mesh.nodes), 3)})[None])
+    return guess(metre * _check_field(name, "start", file.point_data["start"], {(len(file.mesh.nodes), 3)})[None])
 
 
 def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:
@@ -154,7 +154,7 @@ def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Load
     count, notes = len(mesh.nodes), []
     if "fixed" not in data:
         raise InputError(f"{name}: has no point data `fixed`: mark the nodes that are held, (V,) or (V, 3).")
-    fixed = _field(name, "fixed", data["fixed"], {(count,), (count, 1), (count, 3)})
+    fixed = _check_field(name, "fixed", data["fixed"], {(count,), (count, 1), (count, 3)})
     held = np.broadcast_to(fixed.reshape(count, -1) != 0.0, (count, 3)).copy()
     orphan = np.ones(count, bool)
     orphan[mesh.table] = False
@@ -163,10 +163,10 @@ def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Load
         held[orphan] = True
     normal = np.zeros((count, 3))
     if "slide_normal" in data:
-        normal = _field(name, "slide_normal", data["slide_normal"], {(count, 3)})
+        normal = _check_field(name, "slide_normal", data["slide_normal"], {(count, 3)})
     causes: list[Cause] = []
     if "force" in data:
-        force = _field(name, "force", data["force"], {(count, 3)})
+        force = _check_field(name, "force", data["force"], {(count, 3)})
         if force[orphan].any():
             notes.append("forces on nodes that belong to no tetrahedron are left out")
         causes.append(Nodal(np.where(orphan[:, None], 0.0, force)[None]))
@@ -177,7 +177,7 @@ def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Load
             if free.any():
                 notes.append(f"`prescribed` is ignored on {free.sum()} components that are not `fixed`")
             stored = np.where(held & ~orphan[:, None], stored, 0.0)
-        prescribed = metre * _field(name, "prescribed", stored, {(count, 3)})
+        prescribed = metre * _check_field(name, "prescribed", stored, {(count, 3)})
         most, size = np.linalg.norm(prescribed, axis=1).max(), np.ptp(mesh.nodes[~orphan], axis=0).max()
         if most > size:
             notes.append(
@@ -194,7 +194,7 @@ def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Load
     return Anatomy(mesh, held, normal, np.zeros(count, bool)), Loads(tuple(causes)), notes
 
 
-def _field(name: str, key: str, values: np.ndarray, shapes: set[tuple[int, ...]]) -> np.ndarray:
+def _check_field(name: str, key: str, values: np.ndarray, shapes: set[tuple[int, ...]]) -> np.ndarray:
     values = np.asarray(values)
     if values.shape not in shapes:
         allowed = " or ".join(str(shape) for shape in sorted(shapes))

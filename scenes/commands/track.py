@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         Images or a camera that cannot be read; images of another size or focal length than the camera's. A rate
         that is not above 0, a body in its own frame.
     """
-    from ar.tracking.targets import TIP
+    from ar.tracking.targets import TIP_DISTANCE
 
     from ..tracked.calibration_file import read_calibration
     from ..tracked.elsewhere import follow_body
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
             f"the {args.body} is at rest in its own frame: choose --reference-frame camera, or another --body."
         )
     out = check_output_path(args.out, ".csv", args.force, [args.pictures, Path(args.camera)])
-    tip = np.array([0.0, 0.0, -TIP]) if args.tip is None else 1e-3 * np.array(args.tip)
+    tip = np.array([0.0, 0.0, -TIP_DISTANCE]) if args.tip is None else 1e-3 * np.array(args.tip)
     if not np.isfinite(tip).all():
         raise InputError("--tip has a number that is not finite: give three numbers in millimetres.")
     calibration = read_calibration(args.camera)

@@ -16,14 +16,14 @@ from sim.runtime.device import parse_device_names
 from sim.runtime.partial_files import to_unfinished_path
 from sim.runtime.timing import time_stage
 from surrogate.data.dataset import Dataset, read_dataset
-from surrogate.data.splits import APART
+from surrogate.data.splits import CALIBRATION_STRIDE
 from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
 from surrogate.evaluation.score import find_best, format_scores
 from surrogate.model.guarded import describe_error, get_held_out_error
 from surrogate.model.learned import Learned
 from surrogate.model.store import save
-from surrogate.training.expansion import EXPANDED, Expansion
-from surrogate.training.train import FEWEST_APART, LEARNERS, OF_POSES, Trained, list_learners, train
+from surrogate.training.expansion import SERIES_MODELS, Expansion
+from surrogate.training.train import LEARNERS, MIN_CALIBRATION_LOADS, POSE_LEARNERS, Trained, list_learners, train
 
 from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_devices, add_json
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="MODEL.npz", help="output file of all models")
     parser.add_argument(
         "--learners",
-        help=f"model types: {', '.join(LEARNERS)}, or for poses {', '.join(OF_POSES)}, separated by commas (default: "
+        help=f"model types: {', '.join(LEARNERS)}, or for poses {', '.join(POSE_LEARNERS)}, separated by commas (default: "
         "all that the data can train)",
     )
     parser.add_argument("--most", type=int, metavar="LOADS", help="maximum number of training loads (default: all)")
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         to_unfinished_path(out).unlink(missing_ok=True)
     failed = int(np.sum(~data.good))
     preset = "" if data.tool is not None else data.provenance.get("preset", "")
-    show = _for_machines if args.json else _for_people
+    show = _format_json if args.json else _format_text
     print(show(trained, args.out, failed, preset))
     return 0
 
@@ -87,22 +87,22 @@ def parse_learners(words: str) -> list[str]:
 def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
     """List notes on slow parts and on results that need more loads, in sentences."""
     notes, good = [], int(data.good.sum())
-    expanded = [name for name in learners if name in EXPANDED]
+    expanded = [name for name in learners if name in SERIES_MODELS]
     if expanded:
         notes.append(
             f"{' and '.join(expanded)} begin with a table that the finite elements fill, which takes minutes on a CPU; "
             "the bar counts its places."
         )
-    if good // APART < FEWEST_APART:
+    if good // CALIBRATION_STRIDE < MIN_CALIBRATION_LOADS:
         notes.append(
-            f"of {good} loads {good // APART} calibrate error bounds; at least {FEWEST_APART} are needed: the "
+            f"of {good} loads {good // CALIBRATION_STRIDE} calibrate error bounds; at least {MIN_CALIBRATION_LOADS} are needed: the "
             "models will have one bound for all loads instead of one for each. "
-            f"`sulcus simulate --count {APART * FEWEST_APART}` gives enough."
+            f"`sulcus simulate --count {CALIBRATION_STRIDE * MIN_CALIBRATION_LOADS}` gives enough."
         )
     return notes
 
 
-def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
+def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
     notes = [f"{failed} cases that did not converge were excluded."] if failed else []
     notes += [words for words in [describe_rejected(preset)] if words]
     bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
@@ -120,32 +120,32 @@ def _for_people(trained: Trained, out: str, failed: int, preset: str) -> str:
                 for name, found in trained.distance_left_out.items()
             ),
             *(f"on those discs, the tool's force by {name}: {found}" for name, found in trained.force.items()),
-            f"the models written were trained on {trained.training_loads} loads; {_calibration(trained)}",
+            f"the models written were trained on {trained.training_loads} loads; {_describe_calibration(trained)}",
             f"written: {out}",
         ]
     )
 
 
-def _calibration(trained: Trained) -> str:
-    if trained.calibrated < FEWEST_APART:
+def _describe_calibration(trained: Trained) -> str:
+    if trained.calibrated < MIN_CALIBRATION_LOADS:
         few = f"{trained.calibrated} other loads are too few to calibrate a bound for each load"
         return f"{few}: images show the maximum vertex error above for every load, which is not calibrated"
     return f"{trained.calibrated} other loads calibrated the bounds"
 
 
-def _stated(model: Learned) -> dict[str, object]:
+def _describe_error(model: Learned) -> dict[str, object]:
     """Describe the model's own reported errors, next to its score."""
     known = get_held_out_error(model)
     discs = None if known.left_out is None else asdict(known.left_out)
     return {"bound_mm": 1e3 * known.bound, "discs": discs, "weak": known.weak}
 
 
-def _for_machines(trained: Trained, out: str, failed: int, preset: str) -> str:
+def _format_json(trained: Trained, out: str, failed: int, preset: str) -> str:
     split = trained.split
     return json.dumps(
         {
             "out": out,
-            "scores": [{**asdict(row), **_stated(trained.models[row.name])} for row in trained.scores],
+            "scores": [{**asdict(row), **_describe_error(trained.models[row.name])} for row in trained.scores],
             "winner": find_best(trained.scores).name,
             "motion_mm": 1e3 * trained.motion,
             "discs": len(split.centres),

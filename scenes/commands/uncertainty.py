@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
     from ..script.uncertainty import Uncertainty
 
-FEWEST = 8  # Minimum number of bodies to solve.
+MIN_BODIES = 8  # Minimum number of bodies to solve.
 # Explanation under the table.
 NOTE = """
 Two separate errors. "model": difference from FEM on the same mesh. "tumour": maximum distance between the predicted
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
-    parser.add_argument("--draws", type=int, default=40, help=f"number of sampled bodies to solve, >= {FEWEST}")
+    parser.add_argument("--draws", type=int, default=40, help=f"number of sampled bodies to solve, >= {MIN_BODIES}")
     parser.add_argument(
         "--twins",
         type=int,
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     from ..script.shipped_files import get_template_path
     from ..script.uncertainty import read_uncertainties, to_uncertainty_path, write_uncertainties
 
-    check_at_least("--draws", args.draws, FEWEST)
+    check_at_least("--draws", args.draws, MIN_BODIES)
     check_at_least("--twins", args.twins, 2 if args.twins else 0)
     names = args.scenes or SCENES
     theatre = open_theatre(args.anatomy, args.model, args.device, names)
@@ -113,8 +113,8 @@ def run(args: argparse.Namespace) -> int:
             tried = bar(solve_ensemble(theatre, scene, twins), total=len(twins))
             found = measure_coverage(scene, still, found, twins, tried, args.seed + 1)
         write_uncertainties(out, [found])
-        rows.append(_flat(theatre, scene, found))
-        print("\n".join(_lines(rows[-1])), file=lines, flush=True)
+        rows.append(_summarise_scene(theatre, scene, found))
+        print("\n".join(_format_lines(rows[-1])), file=lines, flush=True)
     if args.json:
         print(to_json_line({"seed": args.seed, "out": str(out), "scenes": rows}))
     else:
@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _flat(theatre: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, Any]:
+def _summarise_scene(theatre: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, Any]:
     """Figures of a scene, at the moment when the tumour may be farthest off [mm]."""
     from ..play.frame_text import format_errors
 
@@ -144,7 +144,7 @@ def _flat(theatre: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, 
     }  # fmt: skip
 
 
-def _lines(row: dict[str, Any]) -> Sequence[str]:
+def _format_lines(row: dict[str, Any]) -> Sequence[str]:
     """Return the same in lines."""
     lines = [f"{row['scene']}:", *(f"  {line}" for line in row["said"])]
     lines.append(

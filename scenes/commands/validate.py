@@ -14,7 +14,7 @@ from ..options.shared_options import add_device, add_json, to_json_line
 if TYPE_CHECKING:
     from ..episodes.reading.validation import Report
 
-MOST_SAID = 50  # Maximum number of files that are listed one by one.
+MAX_LISTED_FILES = 50  # Maximum number of files that are listed one by one.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,8 +93,8 @@ def format_reports(reports: list[Report], broken: list[Report]) -> list[str]:
     """Format the faults of each file, the files that could not be checked, and statistics of all complete ones."""
     said = [f"{report.path}: {problem}" for report in broken for problem in report.problems]
     said = [
-        *said[:MOST_SAID],
-        *([f"and {len(said) - MOST_SAID} more: --json has all"] if len(said) > MOST_SAID else []),
+        *said[:MAX_LISTED_FILES],
+        *([f"and {len(said) - MAX_LISTED_FILES} more: --json has all"] if len(said) > MAX_LISTED_FILES else []),
     ]
     skipped: dict[str, int] = {}
     for report in reports:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from ..warp.moment import DeformedAnatomy
 
 ORDERS = ("linear", "cubic")  # Interpolations of images.
-HARDEST = 20.0  # Largest accepted force [N]: more is a typing error.
-FARTHEST = 20.0  # Largest accepted distance from the open cortex [mm]: more is a typing error.
+MAX_FORCE = 20.0  # Largest accepted force [N]: more is a typing error.
+MAX_DISTANCE = 20.0  # Largest accepted distance from the open cortex [mm]: more is a typing error.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -132,10 +132,10 @@ def check_warp_options(args: argparse.Namespace) -> None:
         A missing or unused option, or an invalid value; two images with the same output name.
     """
     from ..warp.images import to_warped_name
-    from ..warp.places import COARSEST, FINEST
+    from ..warp.places import MAX_SPACING, MIN_SPACING
 
-    if args.spacing is not None and not 1e3 * FINEST <= args.spacing <= 1e3 * COARSEST:
-        raise InputError(f"--spacing {args.spacing:g}: give {1e3 * FINEST:g} to {1e3 * COARSEST:g} mm.")
+    if args.spacing is not None and not 1e3 * MIN_SPACING <= args.spacing <= 1e3 * MAX_SPACING:
+        raise InputError(f"--spacing {args.spacing:g}: give {1e3 * MIN_SPACING:g} to {1e3 * MAX_SPACING:g} mm.")
     if args.scene is None and (args.frame_number is not None or args.sequence is not None):
         raise InputError("--frame-number and --sequence are of a --scene: give one, or leave them out.")
     if args.scene is None and args.trajectory is not None:
@@ -179,15 +179,15 @@ def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float,
     from ..script.tool_paths import Touch
 
     *place, newton = asked
-    if not 0.0 < newton <= HARDEST:
-        raise InputError(f"--load: a force of {newton:g} N is no push on a brain; give 0 to {HARDEST:g} N.")
+    if not 0.0 < newton <= MAX_FORCE:
+        raise InputError(f"--load: a force of {newton:g} N is no push on a brain; give 0 to {MAX_FORCE:g} N.")
     point, site = 1e-3 * np.array(place), theatre.site
     nearest = site.find_nearest(point).point if np.isfinite(point).all() else np.full(3, np.inf)
     apart = 1e3 * float(np.linalg.norm(nearest - point))
-    if not apart <= FARTHEST:
+    if not apart <= MAX_DISTANCE:
         middle = ", ".join(f"{1e3 * value:.0f}" for value in site.origin)
         raise InputError(
-            f"--load: the place is {apart:.0f} mm from the open cortex; {FARTHEST:g} mm is the most. The middle of the "
+            f"--load: the place is {apart:.0f} mm from the open cortex; {MAX_DISTANCE:g} mm is the most. The middle of the "
             f"open cortex is at {middle} mm (RAS)."
         )
     arm = nearest - site.origin

@@ -22,7 +22,7 @@ from sim.fem import Fem
 from sim.material import Material
 from surrogate.data.answer_rows import describe_tissue_source
 from surrogate.data.dataset import read_dataset
-from surrogate.data.simulate import OF_ITS_MAKING, simulate
+from surrogate.data.simulate import CREATION_KEYS, simulate
 from surrogate.data.tool_loads import draw as draw_loads
 from surrogate.model.applicability import find_rejection
 from surrogate.model.learned import Learned
@@ -38,11 +38,11 @@ from .half_made import DATA, TABLE, check_resumed, forget
 from .plan import NO_LEARNER, Bodies, EpisodePlan, compute_anatomy_digest, list_fields, to_ratio_key
 from .run_folder import BODIES, get_versions
 
-TRIES = 6  # Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
+MAX_ATTEMPTS = 6  # Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
 PRESET = "palpation"  # Preset of the training loads.
-TOGETHER = 512
+BATCH_SIZE = 512
 """Number of load cases that a GPU solves together while a model is trained: other processes need its memory, too."""
-ANATOMY, ABOUT = "anatomy.vtu", "body.json"  # File names in a body's folder: mesh, sampled values.
+ANATOMY_FILE, BODY_FILE = "anatomy.vtu", "body.json"  # File names in a body's folder: mesh, sampled values.
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class EpisodeBody:
     @property
     def anatomy(self) -> Path:
         """Path of its anatomy; scan and model are next to it."""
-        return self.folder / ANATOMY
+        return self.folder / ANATOMY_FILE
 
     @property
     def tissue(self) -> Elasticity:
@@ -84,7 +84,7 @@ class EpisodeBody:
 def get_tissue(values: Mapping[str, Any]) -> Elasticity:
     """Return the tissue of drawn values."""
     law, young, poisson = (values[f"bodies.tissue.{name}"] for name in ("law", "young_pa", "poisson"))
-    ratio = {name: values.get(_ratio(name), 1.0) for name in ("tumour", *PART_LABELS)}
+    ratio = {name: values.get(_to_ratio_name(name), 1.0) for name in ("tumour", *PART_LABELS)}
     times = {**ratio, "necrosis": ratio["necrosis"] * ratio["tumour"]}
     regions = {
         REGION_NAMES[name]: Material(law, times[name] * young, poisson) for name, one in ratio.items() if one != 1.0
@@ -92,14 +92,16 @@ def get_tissue(values: Mapping[str, Any]) -> Elasticity:
     return Elasticity(Material(law, young, poisson), regions)
 
 
-def _ratio(region: str) -> str:
+def _to_ratio_name(region: str) -> str:
     """Under which name a region's stiffness is drawn."""
     return f"bodies.tissue.{to_ratio_key(region)}"
 
 
-def _of_regions_in(values: Mapping[str, Any], anatomy: Anatomy) -> dict[str, Any]:
+def _drop_absent_regions(values: Mapping[str, Any], anatomy: Anatomy) -> dict[str, Any]:
     """Return the sampled values without the stiffness of regions that an anatomy does not have."""
-    absent = {_ratio(name) for name, label in PART_LABELS.items() if not anatomy.mesh.mark_elements(label).any()}
+    absent = {
+        _to_ratio_name(name) for name, label in PART_LABELS.items() if not anatomy.mesh.mark_elements(label).any()
+    }
     return {name: value for name, value in values.items() if name not in absent}
 
 
@@ -134,15 +136,15 @@ def write_body(
         No anatomy could be meshed in `TRIES` draws; an own anatomy that cannot be read; loads that train nothing.
     """
     bodies = plan.contents.bodies
-    anatomy, scan, values = _anatomy(plan, seed, number)
+    anatomy, scan, values = _sample_anatomy(plan, seed, number)
     body = EpisodeBody(folder, values)
     write_anatomy(body.anatomy, anatomy)
     if scan is not None:
         write_intensity(to_intensity_path(body.anatomy), scan)
     before = False
-    if bodies.learner.name != NO_LEARNER and not _shipped(body, anatomy):
+    if bodies.learner.name != NO_LEARNER and not _can_use_shipped_model(body, anatomy):
         before = _train(body, anatomy, plan, seed, number, device, others)
-    (folder / ABOUT).write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    (folder / BODY_FILE).write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
     return before
 
 
@@ -154,14 +156,14 @@ def read_body(folder: Path) -> EpisodeBody:
     InputError
         A file that is missing, or is none.
     """
-    path = folder / ABOUT
+    path = folder / BODY_FILE
     try:
         return EpisodeBody(folder, json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: is not a body of a data set ({error}). Make the episodes again.") from error
 
 
-def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
+def _sample_anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
     """Return an anatomy, its scan, and the sampled parameters."""
     bodies = plan.contents.bodies
     values = sample_body(bodies, seed, number)
@@ -173,9 +175,9 @@ def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intens
             raise InputError(f"{path}: has changed since the plan was read. Begin another folder with it.")
         known = {name: value for name, value in values.items() if not name.startswith("bodies.tumour.")}
         anatomy = read_anatomy(path)
-        return anatomy, read_intensity(scan) if scan.is_file() else None, _of_regions_in(known, anatomy)
+        return anatomy, read_intensity(scan) if scan.is_file() else None, _drop_absent_regions(known, anatomy)
     refused: list[str] = []
-    for attempt in range(TRIES):
+    for attempt in range(MAX_ATTEMPTS):
         values = sample_body(bodies, seed, number, attempt)
         about = {name: values[f"bodies.tumour.{name}"] for name in ("shape", "site", "seed")}
         radius, cover, opening = (1e-3 * values[f"bodies.tumour.{each}_mm"] for each in ("radius", "cover", "opening"))
@@ -186,11 +188,11 @@ def _anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intens
             refused.append(str(error))
             continue
         scan = subject.intensity and subject.intensity.crop(anatomy.mesh.nodes[anatomy.craniotomy], anatomy.mesh)
-        return anatomy, scan, _of_regions_in(values, anatomy)
-    raise InputError(f"none of {TRIES} anatomies that were drawn can be meshed; the last: {refused[-1]}")
+        return anatomy, scan, _drop_absent_regions(values, anatomy)
+    raise InputError(f"none of {MAX_ATTEMPTS} anatomies that were drawn can be meshed; the last: {refused[-1]}")
 
 
-def _shipped(body: EpisodeBody, anatomy: Anatomy) -> bool:
+def _can_use_shipped_model(body: EpisodeBody, anatomy: Anatomy) -> bool:
     """Return True if the shipped model applies to this body."""
     if body.drawn["bodies.anatomies"] != "template":
         return False
@@ -217,20 +219,20 @@ def _train(
     before = check_resumed(data, all_stated, others)
     simulate(data, fem, draw_loads(PRESET, anatomy, learner.loads, first), stated)
     known = read_dataset(data)
-    batch = TOGETHER if fem.problem.device.on_cuda else None
+    batch = BATCH_SIZE if fem.problem.device.on_cuda else None
     expansion = Expansion(known, device, kept=data.with_suffix(TABLE), batch=batch)
     trained = train(known, [learner.name], expansion=expansion)
-    save(to_model_path(body.anatomy), {name: _undated(model) for name, model in trained.models.items()})
+    save(to_model_path(body.anatomy), {name: _remove_training_dates(model) for name, model in trained.models.items()})
     forget(data)
     return before
 
 
-def _undated(model: Learned) -> Learned:
+def _remove_training_dates(model: Learned) -> Learned:
     """Return a model without the training metadata that differ from run to run."""
-    return replace(model, training={key: text for key, text in model.training.items() if key not in OF_ITS_MAKING})
+    return replace(model, training={key: text for key, text in model.training.items() if key not in CREATION_KEYS})
 
 
-MOST_SAID = 10
+MAX_LISTED_BODIES = 10
 """Maximum number of bodies that are listed one by one."""
 
 
@@ -240,7 +242,7 @@ def list_model_errors(folder: Path) -> dict[int, HeldOutError]:
     for path in sorted((folder / BODIES).glob("[0-9]*")):
         with suppress(InputError, ValueError):  # bodies without a readable model play nothing
             found[int(path.name)] = min(
-                read_reported_errors(to_model_path(path / ANATOMY)).values(), key=lambda one: one.bound
+                read_reported_errors(to_model_path(path / ANATOMY_FILE)).values(), key=lambda one: one.bound
             )
     return found
 
@@ -258,8 +260,8 @@ def describe_weak(models: Mapping[int, HeldOutError]) -> list[str]:
     return [
         f"{len(weak)} of {len(models)} bodies with a model have a weak one, by loads on cortex that it was not trained "
         "on. More `bodies.learner.loads`, or another learner, make better ones: in a new plan and folder.",
-        *(f"- body {number}: {one}" for number, one in list(weak.items())[:MOST_SAID]),
-        *([f"- and {len(weak) - MOST_SAID} more"] if len(weak) > MOST_SAID else []),
+        *(f"- body {number}: {one}" for number, one in list(weak.items())[:MAX_LISTED_BODIES]),
+        *([f"- and {len(weak) - MAX_LISTED_BODIES} more"] if len(weak) > MAX_LISTED_BODIES else []),
     ]
 
 

@@ -7,9 +7,9 @@ from hashlib import sha256
 import h5py
 import numpy as np
 
-SUM = "sha256"
+CHECKSUM_ATTRIBUTE = "sha256"
 """Attribute that contains the checksum of a data set or of the file."""
-LISTED = "arrays"
+ARRAYS_ATTRIBUTE = "arrays"
 """Attribute of the file that lists the data sets it was written with."""
 
 
@@ -38,7 +38,7 @@ def compute_file_digest(file: h5py.File) -> str:
     found = sha256()
     for item in (file, *list_datasets(file)):
         for name in sorted(item.attrs):
-            if item is file and name == SUM:
+            if item is file and name == CHECKSUM_ATTRIBUTE:
                 continue
             value = item.attrs[name]
             said = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
@@ -49,31 +49,31 @@ def compute_file_digest(file: h5py.File) -> str:
 def write_checksums(file: h5py.File) -> None:
     """State the names of all data sets, the checksum of each, and that of the file."""
     for data in list_datasets(file):
-        data.attrs[SUM] = compute_digest(data)
-    file.attrs[LISTED] = " ".join(_names_of(file))
-    file.attrs[SUM] = compute_file_digest(file)
+        data.attrs[CHECKSUM_ATTRIBUTE] = compute_digest(data)
+    file.attrs[ARRAYS_ATTRIBUTE] = " ".join(_list_names(file))
+    file.attrs[CHECKSUM_ATTRIBUTE] = compute_file_digest(file)
 
 
 def find_broken(file: h5py.File) -> list[str]:
     """List the differences from the recorded checksums; empty for a file without checksums."""
-    if SUM not in file.attrs:
+    if CHECKSUM_ATTRIBUTE not in file.attrs:
         return []
     found = [
         f"{data.name}: is not as it was written"
         for data in list_datasets(file)
-        if data.attrs.get(SUM) != compute_digest(data)
+        if data.attrs.get(CHECKSUM_ATTRIBUTE) != compute_digest(data)
     ]
-    if LISTED in file.attrs:
-        there, written = _names_of(file), str(file.attrs[LISTED]).split()
+    if ARRAYS_ATTRIBUTE in file.attrs:
+        there, written = _list_names(file), str(file.attrs[ARRAYS_ATTRIBUTE]).split()
         gone = [f"{name}: is gone; it was there when the file was written" for name in written if name not in there]
         gone += [f"{name}: was not there when the file was written" for name in there if name not in written]
         if gone:
             return [*gone, *(words for words in found if words.partition(": ")[0] in written)]
-    if file.attrs[SUM] != compute_file_digest(file):
-        arrays = "" if LISTED in file.attrs else ", or an array is gone: the file does not name those it had"
+    if file.attrs[CHECKSUM_ATTRIBUTE] != compute_file_digest(file):
+        arrays = "" if ARRAYS_ATTRIBUTE in file.attrs else ", or an array is gone: the file does not name those it had"
         found.append(f"attributes are not as they were written{arrays}")
     return found
 
 
-def _names_of(file: h5py.File) -> list[str]:
+def _list_names(file: h5py.File) -> list[str]:
     return [str(data.name) for data in list_datasets(file)]

@@ -21,17 +21,17 @@ from sim.errors import InputError
 
 from .run_folder import Failure, RunSettings, list_failed, list_failures, mark_failed, to_episode_name, unmark
 from .tasks import Made, RunWork, TaskOutcome, try_task
-from .workers import MOST_DEATHS, Workers, describe_scheduler_end
+from .workers import MAX_WORKER_DEATHS, Workers, describe_scheduler_end
 
-RETRIES = 3
+MAX_RETRIES = 3
 """Number of retries of a task that raises an error."""
-AHEAD = 3
+TASKS_PER_WORKER = 3
 """Number of episodes assigned to each worker: one is made while others wait, so that no worker is idle."""
-POLL = 1.0
+POLL_INTERVAL = 1.0
 """Interval between counts of the workers [s]."""
 EPISODE, BODY = "episode", "body"
 """Kinds of tasks."""
-GRACE = 60
+GRACE_TIME = 60
 """Warning time before the end of a job [s]."""
 
 
@@ -121,7 +121,7 @@ def make_all(
     def hand_out(kind: str, number: int, make: Callable[[int], Made], *needed: Future) -> Future:
         future = workers.client.submit(
             try_task, make, number, folder, run, *needed,
-            key=f"{kind}-{number}-{token}", retries=RETRIES, resources=workers.needs,
+            key=f"{kind}-{number}-{token}", retries=MAX_RETRIES, resources=workers.needs,
         )  # fmt: skip
         busy[str(future.key)] = kind, number, future
         future.add_done_callback(ended.put)
@@ -151,17 +151,17 @@ def make_all(
     try:
         while True:
             handed_out = sum(kind == EPISODE for kind, _, _ in busy.values())
-            for number in islice(waiting, max(0, AHEAD * max(count, 1) - handed_out)):
+            for number in islice(waiting, max(0, TASKS_PER_WORKER * max(count, 1) - handed_out)):
                 body = work.body_of(number)
                 if body not in bodies:
                     bodies[body] = hand_out(BODY, body, work.make_body)
                 hand_out(EPISODE, number, work.make_episode, bodies[body])
             if not busy:
                 return tally
-            for future, outcome in _outcomes(_drained(ended), workers, ended):
+            for future, outcome in _collect_outcomes(_collect_ended(ended), workers, ended):
                 kind, number, _ = busy.pop(str(future.key))
                 note(kind, replace(outcome, number=number))
-            if monotonic() - counted > POLL:
+            if monotonic() - counted > POLL_INTERVAL:
                 count, counted = workers.count(), monotonic()
                 heard(EPISODE, None, count)
     finally:
@@ -169,27 +169,27 @@ def make_all(
             workers.client.cancel([future for _, _, future in busy.values()])
 
 
-def _drained(ended: SimpleQueue[Future]) -> list[Future]:
+def _collect_ended(ended: SimpleQueue[Future]) -> list[Future]:
     """All that have ended, after a while at the latest."""
     found = []
     try:
-        found.append(ended.get(timeout=POLL))
+        found.append(ended.get(timeout=POLL_INTERVAL))
         while True:
             found.append(ended.get_nowait())
     except Empty:
         return found
 
 
-def _outcomes(
+def _collect_outcomes(
     futures: Sequence[Future], workers: Workers, ended: SimpleQueue[Future]
 ) -> Iterator[tuple[Future, TaskOutcome]]:
     """Collect the results of finished tasks; those whose worker died with its result will finish again."""
     for future in futures:
         if future.status == "error":
-            yield future, TaskOutcome(0, failed=_reason(future.exception()), lost=True)
+            yield future, TaskOutcome(0, failed=_describe_failure(future.exception()), lost=True)
             continue
         try:  # briefly, as the worker may have to be restarted
-            outcome = future.result(timeout=POLL)
+            outcome = future.result(timeout=POLL_INTERVAL)
         except TimeoutError:
             future.add_done_callback(ended.put)
         except CancelledError as error:  # state of all futures when the scheduler is gone
@@ -198,9 +198,9 @@ def _outcomes(
             yield future, outcome
 
 
-def _reason(error: object) -> str:
+def _describe_failure(error: object) -> str:
     if isinstance(error, KilledWorker):
-        return f"its worker was killed {MOST_DEATHS} times, probably out of memory"
+        return f"its worker was killed {MAX_WORKER_DEATHS} times, probably out of memory"
     return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
 
 
@@ -233,7 +233,7 @@ def write_sbatch_script(command: Sequence[str], machines: int, device: str, name
         "--time=24:00:00",
         "--requeue",
         "--open-mode=append",
-        f"--signal=B:TERM@{GRACE}",
+        f"--signal=B:TERM@{GRACE_TIME}",
     ]
     return "\n".join(
         [

@@ -34,7 +34,7 @@ from surrogate.model.learned import Learned
 
 from ..play.deformers import PatientSetup
 from ..play.player import STAGES, Frame, Player
-from ..play.reference import TOGETHER, solve_reference_frames
+from ..play.reference import BATCH_FRAMES, solve_reference_frames
 from ..play.stage import NAMES, Stage
 from .checksums import write_checksums
 from .png import encode_png
@@ -138,7 +138,7 @@ class EpisodeRecording:
     fem: Fem | OperatedFem | None = None
 
 
-WHOLE = EpisodeRecording()
+FULL_RECORDING = EpisodeRecording()
 """Default recording: all contents, FEM in every frame."""
 
 
@@ -149,7 +149,7 @@ def collect(
     deformer: str,
     progress: Callable[[Iterable], Iterable],
     solved: Callable[[int], object] = lambda more: None,
-    recording: EpisodeRecording = WHOLE,
+    recording: EpisodeRecording = FULL_RECORDING,
 ) -> dict[str, object]:
     """Play a scene and write its episode, whole or not at all; return its contents.
 
@@ -167,7 +167,7 @@ def collect(
         pictures = file.create_group("pictures")
         stores: dict[str, h5py.Dataset] = {}
         rows, loads = [], []  # a frame itself holds seven megabytes
-        for frame in progress(player.play_frames(together=1 if recording.dated else TOGETHER)):
+        for frame in progress(player.play_frames(together=1 if recording.dated else BATCH_FRAMES)):
             for name, code in encode_frame(frame, player, recording, right).items():
                 if name not in stores:
                     stores[name] = pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
@@ -194,14 +194,14 @@ def encode_frame(
     tumour = player.stage.select_stage(frame.loads).build_tumour(player.estimate_positions(frame))
     mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles, player.stage.device)
     depth = np.minimum(np.rint(picture.depth / DEPTH_SCALE), np.iinfo(np.uint16).max).astype(np.uint16)
-    found = {"colour": _jpeg(recording.grain(2 * frame.number, picture.colour))}
+    found = {"colour": _encode_jpeg(recording.grain(2 * frame.number, picture.colour))}
     if recording.overlay:
-        found["overlay"] = _jpeg(frame.shown)
+        found["overlay"] = _encode_jpeg(frame.shown)
     if right is not None:
         seen = right.select_stage(frame.loads).render(
-            _right(player, frame), player.compute_positions(frame.deformation), frame.pose
+            _build_right_camera(player, frame), player.compute_positions(frame.deformation), frame.pose
         )
-        found["colour_right"] = _jpeg(recording.grain(2 * frame.number + 1, seen.colour))
+        found["colour_right"] = _encode_jpeg(recording.grain(2 * frame.number + 1, seen.colour))
     return found | {
         "depth": encode_png(depth),
         "segmentation": encode_png(picture.segmentation),
@@ -209,12 +209,12 @@ def encode_frame(
     }
 
 
-def _jpeg(colour: np.ndarray) -> np.ndarray:
+def _encode_jpeg(colour: np.ndarray) -> np.ndarray:
     read = cv2.cvtColor(colour, cv2.COLOR_RGB2BGR)
     return cv2.imencode(".jpg", read, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].ravel()
 
 
-def _right(player: Player, frame: Frame) -> Camera:
+def _build_right_camera(player: Player, frame: Frame) -> Camera:
     """Return the camera of the right eye."""
     return replace(player.scene.viewpoint, eye="right").build_camera(player.site, frame.time)
 
@@ -232,7 +232,7 @@ def collect_numbers_of_frame(frame: Frame, player: Player, dated: bool = True) -
         **(collect_reactions(frame.deformation) if player.scene.posed else {}),
         "tumour_predicted": player.estimate_positions(frame)[nodes],
         "cortex_predicted": player.compute_positions(frame.deformation)[cortex],
-        **({"T_camera_world_right": _right(player, frame).T_camera_world} if right else {}),
+        **({"T_camera_world_right": _build_right_camera(player, frame).T_camera_world} if right else {}),
         "tumour_left": ~player.stage.select_stage(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],

@@ -11,12 +11,12 @@ from sim.errors import InputError
 
 from .engine import BODY, EPISODE
 from .rates import Rate
-from .tasks import FIRST, LATER, OF_BODY, OF_PROCESS
+from .tasks import FIRST, FIRST_OF_BODY, FIRST_OF_PROCESS, NOT_FIRST
 
 DAY = 86400.0  # One day [s].
 UNITS = (DAY, "days"), (3600.0, "h"), (60.0, "min")
 """Units of printed times [s], the longest first; a unit is used from twice its length."""
-PROCESSES = (1, 8, 64, 512)
+PROCESS_COUNTS = (1, 8, 64, 512)
 """Numbers of processes for which the time is printed."""
 
 
@@ -63,7 +63,7 @@ class RunEstimate:
         each = self.episodes / processes
         further = self.bodies * -np.expm1(-each / self.bodies) - 1.0  # bodies that the episodes of one process use
         parts = (self.start, 1.0), (self.opening, max(0.0, further)), (self.seconds, 1.0 / processes)
-        return _added([Amount(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
+        return _add_amounts([Amount(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
 
 
 def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEstimate:
@@ -81,34 +81,34 @@ def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEs
         )
     counts = {EPISODE: episodes, BODY: bodies}
     by = {first: [rate for rate in own[EPISODE] if rate.first == first] for first in FIRST}
-    apart = len(by[LATER]) > 1
+    apart = len(by[NOT_FIRST]) > 1
 
     def amount(what: str, those: Mapping[str, Sequence[Rate]]) -> Amount:
-        return _added(
+        return _add_amounts(
             [_sum([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
         )
 
     return RunEstimate(
         episodes=episodes, bodies=bodies, measured=len(own[EPISODE]), measured_bodies=len(own[BODY]),
-        seconds=amount("seconds", {**own, EPISODE: by[LATER] if apart else own[EPISODE]}),
+        seconds=amount("seconds", {**own, EPISODE: by[NOT_FIRST] if apart else own[EPISODE]}),
         frames=amount("frames", {EPISODE: own[EPISODE]}),
         bytes=amount("bytes", own),
-        start=_longer(by[OF_PROCESS], by[LATER] if apart else []),
-        opening=_longer(by[OF_BODY], by[LATER] if apart else []),
+        start=_compute_extra_time(by[FIRST_OF_PROCESS], by[NOT_FIRST] if apart else []),
+        opening=_compute_extra_time(by[FIRST_OF_BODY], by[NOT_FIRST] if apart else []),
         apart=apart,
     )  # fmt: skip
 
 
-def _longer(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
+def _compute_extra_time(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
     """Return the mean extra time of first episodes [s]; the error of a single measurement is the whole time."""
     if not (first and others):
         return Amount(np.nan, np.nan)
-    one, other = (_mean([rate.seconds for rate in those]) for those in (first, others))
+    one, other = (_compute_mean([rate.seconds for rate in those]) for those in (first, others))
     longer, error = max(0.0, one.mean - other.mean), float(np.hypot(one.error, other.error))
     return Amount(longer, error if np.isfinite(error) else longer)
 
 
-def _mean(values: Sequence[float]) -> Amount:
+def _compute_mean(values: Sequence[float]) -> Amount:
     """Return a mean and its standard error."""
     error = float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return Amount(float(np.mean(values)), error)
@@ -116,11 +116,11 @@ def _mean(values: Sequence[float]) -> Amount:
 
 def _sum(values: Sequence[float], count: int) -> Amount:
     """Return the total of `count` such values with the standard error of their mean; exact if all were measured."""
-    mean = _mean(values)
+    mean = _compute_mean(values)
     return Amount(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
 
 
-def _added(amounts: Sequence[Amount]) -> Amount:
+def _add_amounts(amounts: Sequence[Amount]) -> Amount:
     """Return a sum of independent amounts."""
     return Amount(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
 
@@ -129,14 +129,14 @@ def format_estimate(estimate: RunEstimate) -> list[str]:
     """Return a table of it."""
     found = estimate
     rows = [
-        ("disk", _plus_minus(found.bytes, 1e9, "GB")),
-        ("frames", _plus_minus(found.frames, 1e6, "million")),
-        ("work of one process", _time(found.seconds)),
-        ("start of a process", _time(found.start)),
-        ("its first on a body", _time(found.opening)),
+        ("disk", _format_amount(found.bytes, 1e9, "GB")),
+        ("frames", _format_amount(found.frames, 1e6, "million")),
+        ("work of one process", _format_time(found.seconds)),
+        ("start of a process", _format_time(found.start)),
+        ("its first on a body", _format_time(found.opening)),
         *(
-            (f"time of {count} process{'es' * (count > 1)}", _time(found.estimate_duration(count)))
-            for count in PROCESSES
+            (f"time of {count} process{'es' * (count > 1)}", _format_time(found.estimate_duration(count)))
+            for count in PROCESS_COUNTS
         ),
         ("processes for one day", f"{int(np.ceil(found.seconds.mean / DAY))}"),
     ]
@@ -156,12 +156,12 @@ def format_estimate(estimate: RunEstimate) -> list[str]:
     return said
 
 
-def _time(amount: Amount) -> str:
+def _format_time(amount: Amount) -> str:
     unit, word = next((each for each in UNITS if amount.mean >= 2.0 * each[0]), (1.0, "s"))
-    return _plus_minus(amount, unit, word)
+    return _format_amount(amount, unit, word)
 
 
-def _plus_minus(amount: Amount, unit: float, word: str) -> str:
+def _format_amount(amount: Amount, unit: float, word: str) -> str:
     if not np.isfinite(amount.mean):
         return "not known"
     margin = f"{amount.error / unit:.2g}" if np.isfinite(amount.error) else "not known"

@@ -11,7 +11,7 @@ import numpy as np
 
 from sim.effects import Effect, Gravity, Retraction, ToolContact, ToolForce
 
-from ..builtin.retract import RELAXING
+from ..builtin.retract import RELAXING_BRAIN
 from ..script.camera_paths import sample_wandering
 from ..script.debulking import Debulking
 from ..script.head_posture import Lie, build_drained_turn, get_supine_pose
@@ -19,9 +19,9 @@ from ..script.tool import Blade, Instrument, Probe
 from ..script.tool_paths import Path, Touch, draw, keep_idle, lay, palpate, press, slide, smooth
 from .draws import Number, ValueLimits
 
-PRONY = RELAXING.prony
+PRONY = RELAXING_BRAIN.prony
 """Relaxation of tissue under a spatula."""
-REST = 0.3  # Share of the time between two places in which the tool is lifted and moves on.
+REST_SHARE = 0.3  # Share of the time between two places in which the tool is lifted and moves on.
 
 
 class FamilyMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -215,9 +215,9 @@ def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
         number = min(int(time / takes), count - 1)
         share = time / takes - number
         # On to the next place in the last part, lifted; down and up again before it.
-        on = smooth((share - (1.0 - REST)) / REST)
+        on = smooth((share - (1.0 - REST_SHARE)) / REST_SHARE)
         x, y = (1.0 - on) * places[number] + on * places[min(number + 1, count - 1)]
-        half = 0.5 * (1.0 - REST)
+        half = 0.5 * (1.0 - REST_SHARE)
         return Touch(float(x), float(y), float(forces[number] * (smooth(share / half) - smooth(share / half - 1.0))))
 
     return Scenario(path, probe)

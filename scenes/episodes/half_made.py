@@ -42,7 +42,7 @@ def check_resumed(data: Path, stated: Mapping[str, str], others: Sequence[Path])
         with write_atomically(data.with_suffix(NOTE), NOTE, sweep=False) as partial:
             partial.write_text(said, encoding="utf-8")
     alike = [data, *(each for other in others if _is_of(each := other / data.name, said))]
-    *_, (whole, size, best) = sorted(max(_kept(each), default=(False, 0, each)) for each in alike)
+    *_, (whole, size, best) = sorted(max(_find_kept_files(each), default=(False, 0, each)) for each in alike)
     if size:
         _copy(best, data if whole else to_unfinished_path(data))
     for table in (each.with_suffix(TABLE) for each in alike):
@@ -65,23 +65,23 @@ def _copy(source: Path, target: Path) -> None:
 
 def is_begun(folder: Path) -> bool:
     """Return True if a folder contains solved loads of a body."""
-    return any(path.exists() for path in _files(folder / DATA)[1:])
+    return any(path.exists() for path in _list_files(folder / DATA)[1:])
 
 
 def clear_folder(folder: Path) -> None:
     """Make a folder, or empty it of all but what was solved for a body."""
     folder.mkdir(parents=True, exist_ok=True)
-    for path in set(folder.iterdir()) - set(_files(folder / DATA)):
+    for path in set(folder.iterdir()) - set(_list_files(folder / DATA)):
         path.unlink()
 
 
 def forget(data: Path) -> None:
     """Remove a data set, or what there is of it, and its table."""
-    for path in _files(data):
+    for path in _list_files(data):
         path.unlink(missing_ok=True)
 
 
-def _files(data: Path) -> tuple[Path, ...]:
+def _list_files(data: Path) -> tuple[Path, ...]:
     """Return the paths of the description of the loads, the solved part, the complete data set, and the table."""
     return data.with_suffix(NOTE), to_unfinished_path(data), data, data.with_suffix(TABLE)
 
@@ -92,7 +92,7 @@ def _is_of(data: Path, said: str) -> bool:
     return False
 
 
-def _kept(data: Path) -> Iterator[tuple[bool, int, Path]]:
+def _find_kept_files(data: Path) -> Iterator[tuple[bool, int, Path]]:
     """Return whether a file is the complete data set, its size, and its name."""
     for path in (data, to_unfinished_path(data)):
         with suppress(OSError):

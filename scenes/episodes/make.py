@@ -23,7 +23,7 @@ from sim.runtime.partial_files import list_partials, to_partial_path
 from ..play.deformers import PatientSetup
 from ..play.reference import build_reference_fem
 from ..script.scene import Scene
-from .bodies import ABOUT, EpisodeBody, read_body, write_body
+from .bodies import BODY_FILE, EpisodeBody, read_body, write_body
 from .draws import build_generator
 from .episode import EpisodeRecording, collect
 from .half_made import clear_folder, is_begun
@@ -75,9 +75,9 @@ def sense_columns(
     return found
 
 
-KEPT = 2
+MAX_CACHE_SIZE = 2
 """Number of bodies that a process keeps open, and number of FEM solvers that each of them keeps."""
-PASSING = OSError, MemoryError
+TRANSIENT_ERRORS = OSError, MemoryError
 """Errors of the disk, or of other processes on the same GPU: a retry may succeed."""
 
 
@@ -103,9 +103,9 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
     process discards its own copy: both are equal. Loads that were solved before are not solved again.
     """
     path = to_body_path(folder, number)
-    if (path / ABOUT).is_file():
+    if (path / BODY_FILE).is_file():
         return Made(path, skipped=True)
-    if path.exists() and not (path / ABOUT).is_file():  # asked again, as another may have made it meanwhile
+    if path.exists() and not (path / BODY_FILE).is_file():  # asked again, as another may have made it meanwhile
         return Made(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
     resumed = False
     try:
@@ -113,8 +113,8 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
             clear_folder(partial)
             resumed = write_body(partial, plan, seed, number, device, list_partials(path))
     except InputError as error:
-        whole = (path / ABOUT).is_file()  # another process was faster
-        if not whole and isinstance(error.__cause__, PASSING):
+        whole = (path / BODY_FILE).is_file()  # another process was faster
+        if not whole and isinstance(error.__cause__, TRANSIENT_ERRORS):
             raise
         rmtree(to_partial_path(path), ignore_errors=True)
         if not whole:
@@ -132,9 +132,11 @@ def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device
     if path.is_file():
         return Made(path, skipped=True)
     try:
-        report = _collected(path, plan, seed, number, to_body_path(folder, choose_body(plan, seed, number)), device)
+        report = _collect_episode(
+            path, plan, seed, number, to_body_path(folder, choose_body(plan, seed, number)), device
+        )
     except InputError as error:
-        if isinstance(error.__cause__, PASSING):
+        if isinstance(error.__cause__, TRANSIENT_ERRORS):
             raise
         return Made(path, failed=str(error))
     return Made(path, int(str(report["frames"])), path.stat().st_size)
@@ -152,20 +154,22 @@ class Opened:
         """Those of a scene; the last few are kept, for to make them takes as long as some frames."""
         asked = repr(scene.get_effects_on(self.theatre.anatomy))
         if asked not in self.made:
-            if len(self.made) >= KEPT:
+            if len(self.made) >= MAX_CACHE_SIZE:
                 self.made.clear()
             self.made[asked] = build_reference_fem(self.theatre, scene)
         return self.made[asked]
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=MAX_CACHE_SIZE)
 def open_body(place: Path, device: str) -> Opened:
     """Return a body that was made, read once for many episodes; InputError as `read_body`."""
     body = read_body(place)
     return Opened(body, body.open_theatre(device))
 
 
-def _collected(path: Path, plan: EpisodePlan, seed: int, number: int, place: Path, device: str) -> Mapping[str, Any]:
+def _collect_episode(
+    path: Path, plan: EpisodePlan, seed: int, number: int, place: Path, device: str
+) -> Mapping[str, Any]:
     """Play an episode and write its file."""
     contents = plan.contents
     opened, asked = open_body(place, device), sample_episode(contents, seed, number)

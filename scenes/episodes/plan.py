@@ -25,16 +25,16 @@ from ..script.camera_paths import PATHS
 from .draws import Distribution, Number, ValueLimits, Word, check_spread
 from .families import FamilyMotions
 
-KINDS = {
+TYPE_NAMES = {
     "object": "a table", "array": "a list", "str": "text in quotation marks", "float": "a number",
     "int": "a whole number", "bool": "true or false", "null": "nothing",
 }  # fmt: skip
 """Kinds of values, by the names that msgspec has for them."""
-SHIPPED = Path(__file__).parent.parent / "data" / "plans"
+SHIPPED_PLANS = Path(__file__).parent.parent / "data" / "plans"
 """Folder of the shipped plans."""
 NO_LEARNER = "none"
 """Learner of bodies without a model: FEM computes the deformation."""
-MOST_BYTES = 200_000
+MAX_PLAN_BYTES = 200_000
 """Maximum size of a plan's text [bytes]: every episode contains it."""
 FIXED = "fixed"
 """Path of a static camera."""
@@ -49,24 +49,24 @@ def format_msgspec_error(error: str) -> str:
     table = place.rstrip("`")
     strange, missing = (re.search(rf"{kind} field `(.*?)`", words) for kind in ("unknown", "required"))
     if strange is not None:
-        return f"{_within(table, strange[1])}: there is no such key: look how it is spelled."
+        return f"{_join_key(table, strange[1])}: there is no such key: look how it is spelled."
     if missing is not None:
-        return f"{_within(table, missing[1])}: is missing. Give it."
+        return f"{_join_key(table, missing[1])}: is missing. Give it."
     if table and words.startswith("Expected"):
-        return f"{table}: {_named(words)}."
+        return f"{table}: {_format_types(words)}."
     return f"{table and f'{table}: '}{words}."
 
 
-def _within(table: str, key: str) -> str:
+def _join_key(table: str, key: str) -> str:
     return f"{table}.{key}" if table else key
 
 
-def _named(words: str) -> str:
+def _format_types(words: str) -> str:
     """Format the expected types by their names."""
 
     def kinds(found: re.Match) -> str:
         names = [one.strip() for one in str(found[1]).split("|")]
-        return " or ".join(KINDS.get(name, name) for name in names)
+        return " or ".join(TYPE_NAMES.get(name, name) for name in names)
 
     plain = re.sub(r"`(.*?)`", kinds, words)
     return plain.replace("Expected ", "give ").replace(", got ", ", and not ")
@@ -201,7 +201,7 @@ class EpisodePlan:
 
 def list_shipped() -> list[str]:
     """Names of the plans that ship."""
-    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+    return sorted(path.stem for path in SHIPPED_PLANS.glob("*.toml"))
 
 
 def load_plan(name: str) -> EpisodePlan:
@@ -213,17 +213,17 @@ def load_plan(name: str) -> EpisodePlan:
         An unknown plan; invalid TOML or unknown keys; an impossible range; a missing custom
         anatomy.
     """
-    path = Path(name) if name.endswith(".toml") else SHIPPED / f"{name}.toml"
+    path = Path(name) if name.endswith(".toml") else SHIPPED_PLANS / f"{name}.toml"
     if not os.path.isfile(path):  # accepts any name
         raise InputError(
             f"there is no plan {name!r}: choose {', '.join(list_shipped())}, or give the path of a .toml file."
         )
     with read_as(path, "a plan", "A plan is text in UTF-8."):
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"is longer than a plan may be, {MOST_BYTES:,} bytes. Leave out what is no plan.")
+        if path.stat().st_size > MAX_PLAN_BYTES:
+            raise InputError(f"is longer than a plan may be, {MAX_PLAN_BYTES:,} bytes. Leave out what is no plan.")
         text = path.read_text(encoding="utf-8-sig")
     plan = plan_from(text, path.stem, path.parent)
-    return replace(plan, own={each: compute_anatomy_digest(plan, each) for each in _own_anatomies(plan.contents)})
+    return replace(plan, own={each: compute_anatomy_digest(plan, each) for each in _list_own_anatomies(plan.contents)})
 
 
 def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
@@ -265,7 +265,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
 def list_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
     """List every field that may be sampled: name, value, limits of a number, and known words."""
     found = []
-    for name, (kind, about) in _kinds_of(type(table)).items():
+    for name, (kind, about) in _list_field_types(type(table)).items():
         if kind in (Number, Word):
             limits, words = (about, ()) if isinstance(about, ValueLimits) else (None, about or ())
             found.append((name, getattr(table, name), limits, words))
@@ -275,14 +275,14 @@ def list_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | 
 def list_fixed(table: msgspec.Struct) -> list[tuple[str, float, ValueLimits]]:
     """List every fixed number: name, value and limits; one entry for each number of a pair."""
     found = []
-    for name, (kind, about) in _kinds_of(type(table)).items():
+    for name, (kind, about) in _list_field_types(type(table)).items():
         if kind != Number and isinstance(about, ValueLimits):
             value = getattr(table, name)
             found += [(name, each, about) for each in (value if isinstance(value, tuple) else (value,))]
     return found
 
 
-def _kinds_of(table: type[msgspec.Struct]) -> dict[str, tuple[object, ValueLimits | tuple[str, ...] | None]]:
+def _list_field_types(table: type[msgspec.Struct]) -> dict[str, tuple[object, ValueLimits | tuple[str, ...] | None]]:
     """List every field: its types, and its limits or known words."""
     hints = get_type_hints(table, include_extras=True)
     return {name: get_args(kind)[:2] if get_origin(kind) is Annotated else (kind, None) for name, kind in hints.items()}
@@ -307,18 +307,18 @@ def _check(contents: PlanContents) -> None:
         check_learners([contents.bodies.learner.name], False, "bodies.learner.name")
     if not any(each.weight > 0.0 for each in contents.motion.named.values()):
         raise InputError("motion: give one family or more, with a weight above 0.")
-    if contents.bodies.tumour != TumourPlan() and "drawn" not in _anatomies(contents):
+    if contents.bodies.tumour != TumourPlan() and "drawn" not in _list_anatomies(contents):
         raise InputError(
             'bodies.tumour: only drawn anatomies have such a tumour. Say anatomies = "drawn", or leave it out.'
         )
     for name in PART_LABELS:
         key = to_ratio_key(name)
-        if getattr(contents.bodies.tissue, key) != 1.0 and not _own_anatomies(contents):
+        if getattr(contents.bodies.tissue, key) != 1.0 and not _list_own_anatomies(contents):
             raise InputError(
                 f"bodies.tissue.{key}: only an own anatomy may have {name}. Name one in bodies.anatomies, or leave "
                 "it out."
             )
-    for each in _own_anatomies(contents):
+    for each in _list_own_anatomies(contents):
         path = PurePath(each)
         if path.suffix != ".vtu":
             raise InputError(f"bodies.anatomies: {each!r} is invalid: give drawn, template or a .vtu next to the plan.")
@@ -331,12 +331,12 @@ def to_ratio_key(region: str) -> str:
     return f"{region}_ratio"
 
 
-def _own_anatomies(contents: PlanContents) -> list[str]:
+def _list_own_anatomies(contents: PlanContents) -> list[str]:
     """List the named anatomies of bodies, except the built-in ones."""
-    return sorted(_anatomies(contents) - {"drawn", "template"})
+    return sorted(_list_anatomies(contents) - {"drawn", "template"})
 
 
-def _anatomies(contents: PlanContents) -> set[str]:
+def _list_anatomies(contents: PlanContents) -> set[str]:
     """List the named anatomies of bodies."""
     choices = contents.bodies.anatomies
     named = choices.choice if isinstance(choices, Distribution) else [choices] if isinstance(choices, str) else choices

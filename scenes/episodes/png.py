@@ -25,12 +25,12 @@ def encode_png(picture: np.ndarray) -> np.ndarray:
     height, width = picture.shape
     bits = 8 * picture.itemsize
     header = struct.pack(">IIBBBBB", width, height, bits, GREY, 0, 0, 0)
-    packed = isal_zlib.compress(_differences(picture), LEVEL)
-    code = SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", packed) + _chunk(b"IEND", b"")
+    packed = isal_zlib.compress(_filter_rows(picture), LEVEL)
+    code = SIGNATURE + _encode_chunk(b"IHDR", header) + _encode_chunk(b"IDAT", packed) + _encode_chunk(b"IEND", b"")
     return np.frombuffer(code, np.uint8)
 
 
-def _differences(picture: np.ndarray) -> np.ndarray:
+def _filter_rows(picture: np.ndarray) -> np.ndarray:
     """Return the rows' bytes, each less that of the sample to its left, and before them the filter's number."""
     height, width = picture.shape
     size = picture.itemsize
@@ -42,5 +42,5 @@ def _differences(picture: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _chunk(name: bytes, data: bytes) -> bytes:
+def _encode_chunk(name: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", isal_zlib.crc32(data, isal_zlib.crc32(name)))

@@ -24,7 +24,7 @@ FORMAT = "sulcus run 1"  # Name and version of the folder format.
 PLAN, RUN, FAILED, BODIES, RATES = "plan.toml", "run.json", "failed", "bodies", "rates"
 """Names of files and folders other than the episodes."""
 EPISODE = re.compile(r"episode_(\d{6,})\.(?:h5|json)")  # Pattern of an episode's file name.
-PARTS = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
+PACKAGES = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
 """Packages whose version is part of an episode's bytes."""
 
 
@@ -61,7 +61,7 @@ class Failure:
 @cache
 def get_versions() -> Mapping[str, str]:
     """Return the versions of this process's packages."""
-    return {name: get_version(name) for name in PARTS}
+    return {name: get_version(name) for name in PACKAGES}
 
 
 def to_episode_name(number: int) -> str:
@@ -91,9 +91,9 @@ def begin(folder: Path, run: RunSettings, text: str, force: bool = False) -> boo
     remove_left_overs(folder / BODIES, kept=lambda name: not (folder / BODIES / name).exists())
     found = read_run(folder)
     if found is None:
-        _demand_empty(folder, force)
+        _check_empty(folder, force)
     else:
-        _demand_same(folder, found, run, force)
+        _check_same_run(folder, found, run, force)
     if found is None or found.versions != run.versions:
         _write_json(folder / RUN, {"format": FORMAT, **asdict(run)})
     if not (folder / PLAN).exists():
@@ -132,7 +132,7 @@ def read_run(folder: Path) -> RunSettings | None:
 
 def list_finished(folder: Path) -> set[int]:
     """Numbers of the episodes that are there."""
-    return {number for number, ending in _numbered(folder) if ending == ".h5"}
+    return {number for number, ending in _find_episodes(folder) if ending == ".h5"}
 
 
 def list_failures(folder: Path) -> dict[int, Failure]:
@@ -142,31 +142,31 @@ def list_failures(folder: Path) -> dict[int, Failure]:
 
 def list_failed(folder: Path) -> set[int]:
     """Numbers of the episodes that could not be made; no file is read."""
-    return {number for number, _ in _numbered(folder / FAILED)}
+    return {number for number, _ in _find_episodes(folder / FAILED)}
 
 
 def read_failure(folder: Path, number: int) -> Failure | None:
     """Read the reason why an episode failed; None if it exists by now, or if the reason cannot be read."""
     with suppress(OSError, ValueError, TypeError):  # another client is removing it
-        return Failure(**json.loads(_failed_path(folder, number).read_text()))
+        return Failure(**json.loads(_to_failed_path(folder, number).read_text()))
     return None
 
 
 def mark_failed(folder: Path, failure: Failure) -> None:
     """Note that an episode could not be made."""
-    _write_json(_failed_path(folder, failure.number), asdict(failure))
+    _write_json(_to_failed_path(folder, failure.number), asdict(failure))
 
 
 def unmark(folder: Path, number: int) -> None:
     """Remove the failure of an episode that was completed later."""
-    _failed_path(folder, number).unlink(missing_ok=True)
+    _to_failed_path(folder, number).unlink(missing_ok=True)
 
 
-def _failed_path(folder: Path, number: int) -> Path:
+def _to_failed_path(folder: Path, number: int) -> Path:
     return (folder / FAILED / to_episode_name(number)).with_suffix(".json")
 
 
-def _numbered(folder: Path) -> Iterator[tuple[int, str]]:
+def _find_episodes(folder: Path) -> Iterator[tuple[int, str]]:
     """Numbers and endings of a folder's episodes: by name alone, as there may be a million."""
     with suppress(FileNotFoundError), os.scandir(folder) as entries:
         for entry in entries:
@@ -180,7 +180,7 @@ def _write_json(path: Path, value: Mapping) -> None:
         partial.write_text(json.dumps(value) + "\n")
 
 
-def _demand_empty(folder: Path, force: bool) -> None:
+def _check_empty(folder: Path, force: bool) -> None:
     other = next((path.name for path in sorted(folder.glob("*")) if not path.name.startswith(".")), None)
     if other and not force:
         raise InputError(
@@ -189,7 +189,7 @@ def _demand_empty(folder: Path, force: bool) -> None:
         )
 
 
-def _demand_same(folder: Path, found: RunSettings, run: RunSettings, force: bool) -> None:
+def _check_same_run(folder: Path, found: RunSettings, run: RunSettings, force: bool) -> None:
     if found.digest != run.digest:
         changed = f"of another text or other anatomies of the plan {run.plan}"
         other = changed if found.plan == run.plan else f"of the plan {found.plan}"

@@ -23,8 +23,8 @@ from .families import FAMILIES, PRONY, ScenarioInputs, add_tremor
 from .plan import FIXED, EpisodePlan, PlanContents, list_fields, list_tables
 
 # Largest deviation of the cortex's red, green and blue from the default, in units of the tint.
-TINTS = np.array([0.3, 1.0, 1.0])
-SECOND = -0.3  # Ratio of the second to the first radial coefficient: lenses bend less towards their edge.
+MAX_TINTS = np.array([0.3, 1.0, 1.0])
+SECOND_RADIAL_RATIO = -0.3  # Ratio of the second to the first radial coefficient: lenses bend less towards their edge.
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def build_scene(
     title = f"{FAMILIES[asked.family].__doc__ or ''} Episode {number} of the plan {plan.name}, seed {seed}."
     return Scene(
         asked.family, title, path, seconds, effects, act.tool, act.lying, act.surgery,
-        viewpoint=_viewpoint(contents, asked.group("look"), seed, number),
+        viewpoint=_build_viewpoint(contents, asked.group("look"), seed, number),
         look=_look(asked.group("look"), site, seed, number), frames_per_second=contents.frames_per_second,
     )  # fmt: skip
 
@@ -112,7 +112,7 @@ def make_relaxing(tissue: Elasticity) -> Elasticity:
     return Elasticity(None if tissue.default is None else relaxed(tissue.default), regions)
 
 
-def _viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
+def _build_viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
     """Return the camera of an episode."""
     random = build_generator(seed, number, "look.camera")
     width, height = contents.size
@@ -129,7 +129,7 @@ def _viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, numbe
     bent = look["bent"] / corner
     middle = 0.5 * (width - 1), 0.5 * (height - 1)
     try:
-        lens = Lens(k1=0.3 * bent, k2=0.3 * SECOND * bent / corner)
+        lens = Lens(k1=0.3 * bent, k2=0.3 * SECOND_RADIAL_RATIO * bent / corner)
         return view.calibrate(Calibration((focal, focal), middle, width, height, lens))
     except ValueError as error:
         raise InputError(f"look.bent {look['bent']:g}: {error}") from error
@@ -139,7 +139,7 @@ def _look(look: Mapping[str, Any], site: CraniotomyFrame, seed: int, number: int
     """Light, colour and covers of an episode."""
     random = build_generator(seed, number, "look.covers")
     vessels = int(random.integers(2**31)) if random.random() < look["vessels"] else None
-    tint = 1.0 - look["tint"] * TINTS * random.random(3)
+    tint = 1.0 - look["tint"] * MAX_TINTS * random.random(3)
     finger = float(random.uniform(0.0, 2.0 * np.pi)) if random.random() < look["glove"] else None
     lain = []
     for _ in range(round(look["cottonoids"])):

@@ -16,9 +16,9 @@ from sim.runtime.threads import limit_to_one_thread
 
 from .run_folder import RunSettings, describe_versions, get_versions, read_run
 
-FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 """Errors that every other episode would meet too."""
-FIRST = OF_PROCESS, OF_BODY, LATER = "process", "body", "no"
+FIRST = FIRST_OF_PROCESS, FIRST_OF_BODY, NOT_FIRST = "process", "body", "no"
 """The first of its kind by a process; the first on its body by that process; neither."""
 
 
@@ -96,7 +96,7 @@ class TaskOutcome:
     skipped: bool = False
     halt: str = ""
     resumed: bool = False
-    first: str = LATER
+    first: str = NOT_FIRST
 
 
 class _Process:
@@ -119,7 +119,7 @@ def try_task(
     """
     if _Process.spoilt:
         os._exit(1)
-    halt = _unfit(folder, run)
+    halt = _explain_unfit_worker(folder, run)
     if halt:
         return TaskOutcome(number, halt=halt)
     if body is not None and (body.failed or body.halt):
@@ -135,7 +135,7 @@ def try_task(
         raise
     seconds, kind = time.perf_counter() - begun, getattr(make, "func", make)
     on_body = kind, None if body is None else body.number
-    first = OF_PROCESS if kind not in _Process.made else LATER if on_body in _Process.made else OF_BODY
+    first = FIRST_OF_PROCESS if kind not in _Process.made else NOT_FIRST if on_body in _Process.made else FIRST_OF_BODY
     if not (made.failed or made.skipped):
         _Process.made |= {kind, on_body}
     return TaskOutcome(
@@ -143,7 +143,7 @@ def try_task(
     )
 
 
-def _unfit(folder: Path, run: RunSettings) -> str:
+def _explain_unfit_worker(folder: Path, run: RunSettings) -> str:
     """Return the reason why this worker cannot take part in the run; empty if it can."""
     here = platform.node()
     other = describe_versions(get_versions(), run.versions)
@@ -159,7 +159,7 @@ def _unfit(folder: Path, run: RunSettings) -> str:
 
 def _is_full(error: BaseException | None) -> bool:
     while error is not None:
-        if isinstance(error, OSError) and error.errno in FULL:
+        if isinstance(error, OSError) and error.errno in DISK_FULL_ERRORS:
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -22,20 +22,20 @@ from distributed import Client, Scheduler, Security, SpecCluster, Worker
 from sim.errors import InputError
 from sim.runtime.processes import start_process, to_gpu_variables
 
-HERE = "127.0.0.1"
+LOCAL_HOST = "127.0.0.1"
 """Address of the scheduler and workers: not reachable from outside this machine."""
-CARD = "GPU"
+GPU_RESOURCE = "GPU"
 """Resource of a worker with its own GPU, by Dask's convention."""
-ALONE = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+ONE_THREAD_VARIABLES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """One thread per process: as many processes as cores, and reproducible sums."""
-MOST_DEATHS = 20
+MAX_WORKER_DEATHS = 20
 """Number of lost workers after which a task is given up: machines may be taken back at any time."""
 SETTINGS = {  # Settings of Dask.
-    "distributed.scheduler.allowed-failures": MOST_DEATHS,
+    "distributed.scheduler.allowed-failures": MAX_WORKER_DEATHS,
     "distributed.scheduler.worker-ttl": None,  # clocks jump, as after sleep; who ends is seen by its process
     "distributed.scheduler.http.routes": [],  # their services need no keys
 }
-PATIENCE = 10.0
+SCHEDULER_TIMEOUT = 10.0
 """Time-out of a scheduler [s]."""
 
 
@@ -93,8 +93,10 @@ def silence_dask() -> None:
 def _start(address: str, security: Security, device: str, times: int) -> _Started:
     ours, theirs = Pipe(duplex=False)
     card = to_gpu_variables(device)
-    resources = {CARD: 1.0} if card else None
-    process = start_process(_serve, address, security, resources, theirs, name="worker", variables={**ALONE, **card})
+    resources = {GPU_RESOURCE: 1.0} if card else None
+    process = start_process(
+        _serve, address, security, resources, theirs, name="worker", variables={**ONE_THREAD_VARIABLES, **card}
+    )
     theirs.close()
     return _Started(process, ours, times)
 
@@ -120,7 +122,7 @@ def _serve(address: str, security: Security, resources: dict[str, float] | None,
 
 async def _work(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
     # Without a limit: a worker that is paused near its share of memory never resumes, as its memory is not Dask's.
-    settings = {"nthreads": 1, "host": HERE, "memory_limit": 0, "resources": resources, "dashboard": False}
+    settings = {"nthreads": 1, "host": LOCAL_HOST, "memory_limit": 0, "resources": resources, "dashboard": False}
     async with Worker(address, security=security, **settings) as worker:
         connected.send_bytes(b"yes")
         await worker.finished()
@@ -150,7 +152,7 @@ class Workers:
     @property
     def needs(self) -> Mapping[str, int] | None:
         """Resources that a task requires of a worker."""
-        return {CARD: 1} if self.device == "cuda" else None
+        return {GPU_RESOURCE: 1} if self.device == "cuda" else None
 
     def count(self) -> int:
         """Return the current number of workers.
@@ -167,7 +169,7 @@ class Workers:
             known = self.client.scheduler_info(n_workers=-1)["workers"].values()
         except (OSError, TimeoutError) as error:
             raise describe_scheduler_end(self.where) from error
-        return sum(self.needs is None or CARD in one["resources"] for one in known)
+        return sum(self.needs is None or GPU_RESOURCE in one["resources"] for one in known)
 
 
 @contextmanager
@@ -190,11 +192,11 @@ def start_own_workers(
         Maximum number of consecutive crashes of a process before its first task is done.
     """
     device = devices[0].split(":")[0]
-    with _environment(), config.set({**SETTINGS, **(settings or {})}):
+    with _restore_environment(), config.set({**SETTINGS, **(settings or {})}):
         silence_dask()
         security = Security.temporary()
-        options = {"host": HERE, "port": 0, "protocol": "tls://", "security": security}
-        options |= {"dashboard": False, "dashboard_address": f"{HERE}:0"}
+        options = {"host": LOCAL_HOST, "port": 0, "protocol": "tls://", "security": security}
+        options |= {"dashboard": False, "dashboard_address": f"{LOCAL_HOST}:0"}
         scheduler = {"cls": Scheduler, "options": options}
         with (
             closing(SpecCluster({}, scheduler, security=security, name=f"sulcus-{os.getpid()}")) as cluster,
@@ -205,7 +207,7 @@ def start_own_workers(
 
 
 @contextmanager
-def connect_workers(address: str, device: str, patience: float = PATIENCE) -> Iterator[Workers]:
+def connect_workers(address: str, device: str, patience: float = SCHEDULER_TIMEOUT) -> Iterator[Workers]:
     """Yield the workers of a running scheduler; their number may change.
 
     Parameters
@@ -236,7 +238,7 @@ def connect_workers(address: str, device: str, patience: float = PATIENCE) -> It
 
 
 @contextmanager
-def _environment() -> Iterator[None]:
+def _restore_environment() -> Iterator[None]:
     """Restore the environment variables that Dask sets, at the end of the block."""
     before = dict(os.environ)
     try:

@@ -19,13 +19,13 @@ from sim.errors import InputError
 from .episode import Episode, EpisodeStep
 from .observation import KINDS, build_action_space, build_space
 from .pictures import ObservationCamera
-from .registration import NAMESPACE, STEPS
+from .registration import MAX_STEPS, NAMESPACE
 from .setting import TaskSetting, check_arguments, open_setting
-from .tasks import SECONDS, find_task
+from .tasks import STEP_SECONDS, find_task
 from .touched import TissueRequest
 
-RENDERED = ("rgb_array",)  # Supported render modes.
-METADATA: dict[str, Any] = {"render_modes": list(RENDERED), "render_fps": round(1.0 / SECONDS)}
+RENDER_MODES = ("rgb_array",)  # Supported render modes.
+METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1.0 / STEP_SECONDS)}
 """Render modes, as Gymnasium requires."""
 
 
@@ -41,8 +41,8 @@ def open_environment_setting(
     """
     if observation not in KINDS:
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
-    if render_mode is not None and render_mode not in RENDERED:
-        raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDERED)}, or None.")
+    if render_mode is not None and render_mode not in RENDER_MODES:
+        raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDER_MODES)}, or None.")
     return open_setting(find_task(task), *check_arguments(given), together)
 
 
@@ -99,7 +99,7 @@ class Operation(gymnasium.Env):
             raise InputError(f"options are {options!r:.80}: there are none; give them to gymnasium.make.")
         (touched,) = self.setting.answers.compute_responses([self.episode.begin(self.np_random)])
         step = self.episode.take(touched)
-        return self._observed(step), step.info
+        return self._build_observation(step), step.info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move the tool: return observation, reward, True if the goal or a limit was reached, False, and ground truth.
@@ -111,7 +111,7 @@ class Operation(gymnasium.Env):
         """
         (touched,) = self.setting.answers.compute_responses([self.episode.ask(action)])
         step = self.episode.take(touched)
-        return self._observed(step), step.reward, step.terminated, False, step.info
+        return self._build_observation(step), step.reward, step.terminated, False, step.info
 
     def render(self) -> np.ndarray | None:
         """Return the camera image (H, W, 3) uint8; None without a render mode.
@@ -123,7 +123,7 @@ class Operation(gymnasium.Env):
         """
         return None if self.render_mode is None else self.pictures.render([self.episode.seen])[0][0]
 
-    def _observed(self, step: EpisodeStep) -> Any:
+    def _build_observation(self, step: EpisodeStep) -> Any:
         if self.observation == "states":
             return step.states
         colour, depth = self.pictures.render([self.episode.seen])
@@ -157,7 +157,7 @@ class Operations(VectorEnv):
     def __init__(
         self,
         num_envs: int = 1,
-        max_episode_steps: int = STEPS,
+        max_episode_steps: int = MAX_STEPS,
         task: str = "palpate",
         anatomy: str | Path = "template",
         observation: str = "states",
@@ -200,8 +200,8 @@ class Operations(VectorEnv):
         for row, each in enumerate(seeds):
             if each is not None or self.episodes[row].drawn is None:
                 self.randoms[row] = seeding.np_random(each)[0]
-        steps = self._taken([episode.begin(self.randoms[row]) for row, episode in enumerate(self.episodes)])
-        return self._observed(steps), self._infos(steps)
+        steps = self._take_steps([episode.begin(self.randoms[row]) for row, episode in enumerate(self.episodes)])
+        return self._build_observation(steps), self._stack_infos(steps)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Move all tools: as `Operation.step`, a row for each environment.
@@ -215,7 +215,7 @@ class Operations(VectorEnv):
         if twists.shape != (self.num_envs, 6):
             raise InputError(f"the actions have the shape {twists.shape}: give ({self.num_envs}, 6).")
         begins = [episode.over and episode.drawn is not None for episode in self.episodes]
-        steps = self._taken(
+        steps = self._take_steps(
             [
                 episode.begin(self.randoms[row]) if begins[row] else episode.ask(twists[row])
                 for row, episode in enumerate(self.episodes)
@@ -226,7 +226,7 @@ class Operations(VectorEnv):
         for episode, late in zip(self.episodes, truncated.tolist(), strict=True):
             episode.over = episode.over or late
         rewards = np.array([step.reward for step in steps])
-        return self._observed(steps), rewards, terminated, truncated, self._infos(steps)
+        return self._build_observation(steps), rewards, terminated, truncated, self._stack_infos(steps)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return the image (H, W, 3) uint8 of each camera; None without a render mode."""
@@ -234,18 +234,18 @@ class Operations(VectorEnv):
             return None
         return tuple(self.pictures.render([episode.seen for episode in self.episodes])[0])
 
-    def _taken(self, asked: list[TissueRequest]) -> list[EpisodeStep]:
+    def _take_steps(self, asked: list[TissueRequest]) -> list[EpisodeStep]:
         answers = self.setting.answers.compute_responses(asked)
         return [episode.take(touched) for episode, touched in zip(self.episodes, answers, strict=True)]
 
-    def _observed(self, steps: Sequence[EpisodeStep]) -> Any:
+    def _build_observation(self, steps: Sequence[EpisodeStep]) -> Any:
         states = np.stack([step.states for step in steps])
         if self.observation == "states":
             return states
         colour, depth = self.pictures.render([episode.seen for episode in self.episodes])
         return {"rgb": colour, "depth": depth, "states": states}
 
-    def _infos(self, steps: Sequence[EpisodeStep]) -> dict[str, Any]:
+    def _stack_infos(self, steps: Sequence[EpisodeStep]) -> dict[str, Any]:
         """Return the truth as arrays with a row for each environment, and Gymnasium's masks of who has it: all."""
         infos = {name: np.stack([step.info[name] for step in steps]) for name in steps[0].info}
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}

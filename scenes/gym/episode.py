@@ -11,25 +11,25 @@ from sim.errors import InputError
 
 from ..script.camera_paths import sample_wandering
 from ..script.tool_paths import smooth
-from .observation import FELT, SEEN, TRACKED, compute_states
+from .observation import FORCE_NOISE, MOTION_NOISE, POSITION_NOISE, compute_states
 from .pictures import Seen
 from .setting import TaskSetting
-from .tasks import OVER, SECONDS, Goal
+from .tasks import MAX_LOAD_RATIO, STEP_SECONDS, Goal
 from .tool_motion import RobotTool, build_tool_frame, compute_lever, lay_tool, move_tool, shift_pose
 from .touched import TissueRequest, Touched
 
-STEP = 0.01  # Penalty of a step.
-OVER_LIMIT = 0.5  # Penalty of a step with a load over its limit.
-DONE = 10.0  # Reward of success.
-ENDED = -10.0  # Reward of the end of an episode at a limit.
-SHARE = 3.0
+STEP_PENALTY = 0.01  # Penalty of a step.
+LIMIT_PENALTY = 0.5  # Penalty of a step with a load over its limit.
+SUCCESS_REWARD = 10.0  # Reward of success.
+ABORT_REWARD = -10.0  # Reward of the end of an episode at a limit.
+SHARE_REWARD = 3.0
 """Reward of each share of the tumour that is resected."""
-FAR = 0.03  # Distance beyond which the potential no longer falls [m].
-NEAR = 0.01  # Distance that lowers the potential by 1 [m].
-TREMOR = 1e-4  # Largest standard deviation of the tremor [m].
-ABOVE = (5e-3, 8e-3)  # Range of the initial height of a tool above the cortex [m].
-ASIDE = (3e-3, 8e-3)  # Range of the initial lateral distance of a tool from its goal [m].
-DRAINS = 60  # Number of steps in which the fluid level falls.
+MAX_POTENTIAL_DISTANCE = 0.03  # Distance beyond which the potential no longer falls [m].
+POTENTIAL_LENGTH = 0.01  # Distance that lowers the potential by 1 [m].
+MAX_TREMOR = 1e-4  # Largest standard deviation of the tremor [m].
+START_HEIGHTS = (5e-3, 8e-3)  # Range of the initial height of a tool above the cortex [m].
+START_OFFSETS = (3e-3, 8e-3)  # Range of the initial lateral distance of a tool from its goal [m].
+DRAIN_STEPS = 60  # Number of steps in which the fluid level falls.
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,15 @@ class EpisodeScore:
     @property
     def potential(self) -> float:
         """Potential whose differences are rewarded."""
-        return SHARE * self.cut - min(self.away, FAR) / NEAR - min(self.off, 1.0)
+        return SHARE_REWARD * self.cut - min(self.away, MAX_POTENTIAL_DISTANCE) / POTENTIAL_LENGTH - min(self.off, 1.0)
 
 
 def compute_reward(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
     """Return the reward of a step from one state to the next; `ended`: at a limit, without success."""
-    reward = now.potential - before.potential - STEP
+    reward = now.potential - before.potential - STEP_PENALTY
     if now.load > 1.0:
-        reward -= OVER_LIMIT
-    return float(reward + (DONE if success else ENDED if ended else 0.0))
+        reward -= LIMIT_PENALTY
+    return float(reward + (SUCCESS_REWARD if success else ABORT_REWARD if ended else 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +91,12 @@ def draw(setting: TaskSetting, random: np.random.Generator) -> ResetSample:
     """Draw an episode."""
     goal, site, tool = setting.sample_goal(random), setting.site, setting.task.tool
     high, far, angle, size = random.random(4)
-    aside = ASIDE[0] + far * (ASIDE[1] - ASIDE[0])
+    aside = START_OFFSETS[0] + far * (START_OFFSETS[1] - START_OFFSETS[0])
     x, y = ((goal.place - site.origin) @ axis for axis in (site.right, site.up))
     x, y = x + aside * np.cos(2.0 * np.pi * angle), y + aside * np.sin(2.0 * np.pi * angle)
     under = site.find_contact(float(x), float(y), tool.radius).point
-    tip = under - (ABOVE[0] + high * (ABOVE[1] - ABOVE[0])) * site.axis
-    return ResetSample(goal, lay_tool(site, tool, tip), int(random.integers(2**31)), TREMOR * float(size))
+    tip = under - (START_HEIGHTS[0] + high * (START_HEIGHTS[1] - START_HEIGHTS[0])) * site.axis
+    return ResetSample(goal, lay_tool(site, tool, tip), int(random.integers(2**31)), MAX_TREMOR * float(size))
 
 
 class Episode:
@@ -120,7 +120,7 @@ class Episode:
         self.hand, self.touched, self.judged = self.drawn.hand, None, None
         self.step, self.held, self.violations, self.cut, self.over = 0, 0, 0, 0, False
         self.patch = self.setting.find_near(self.drawn.goal.place)
-        return self._asked(self.drawn)
+        return self._build_request(self.drawn)
 
     def ask(self, action: np.ndarray) -> TissueRequest:
         """Move the tool; what is asked of the tissue then.
@@ -139,13 +139,13 @@ class Episode:
         twist = np.clip(twist, -1.0, 1.0) * np.repeat([task.step, task.turn], 3)
         self.hand = move_tool(self.hand, self.setting.site, task.tool, twist, task.tilt, task.deepest)
         self.step += 1
-        return self._asked(self.drawn)
+        return self._build_request(self.drawn)
 
-    def _asked(self, drawn: ResetSample) -> TissueRequest:
+    def _build_request(self, drawn: ResetSample) -> TissueRequest:
         task = self.setting.task
-        offset = drawn.tremor * self.frame @ sample_wandering(drawn.seed, SECONDS * self.step)[:3]
+        offset = drawn.tremor * self.frame @ sample_wandering(drawn.seed, STEP_SECONDS * self.step)[:3]
         self.actual = shift_pose(self.hand, offset)
-        fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth(self.step / DRAINS)
+        fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth(self.step / DRAIN_STEPS)
         return TissueRequest(self.actual.compute_pose(task.tool), self.touched, fluid, self.done)
 
     @property
@@ -170,24 +170,26 @@ class Episode:
         """Return the result of a step from the tissue's response."""
         assert self.drawn is not None
         task, goal, self.shown = self.setting.task, self.drawn.goal, self.done
-        target = self._target(touched)
-        judged = self._judge(touched, target)
+        target = self._compute_target(touched)
+        judged = self._compute_score(touched, target)
         kept = touched.good and judged.away <= task.aside and judged.off <= task.tolerance and judged.load <= 1.0
         self.held = self.held + 1 if kept else 0
         success = self.held >= task.held
         if success and task.cuts:
             self.cut, self.held = self.cut + 1, 0
             success = self.cut >= goal.amount
-            judged = self._judge(touched, target)
-        ended = judged.load > OVER or not touched.good
+            judged = self._compute_score(touched, target)
+        ended = judged.load > MAX_LOAD_RATIO or not touched.good
         reward = 0.0 if self.judged is None else compute_reward(self.judged, judged, success, ended)
         self.violations += int(judged.load > 1.0)
         self.touched, self.judged, self.over = touched, judged, success or ended
-        return EpisodeStep(self._states(touched), reward, success or ended, self._truth(touched, target, success))
+        return EpisodeStep(
+            self._build_states(touched), reward, success or ended, self._collect_truth(touched, target, success)
+        )
 
-    def _target(self, touched: Touched) -> np.ndarray:
+    def _compute_target(self, touched: Touched) -> np.ndarray:
         """Target position of the tool (3,) [m]: above the goal, or at the next share where it is now."""
-        planned = self._planned()
+        planned = self._compute_planned_target()
         return planned if self.share is None else planned + touched.motion[self.share].mean(axis=0)
 
     @property
@@ -196,13 +198,13 @@ class Episode:
         shares = self.setting.shares
         return shares[min(self.cut, len(shares) - 1)] if shares else None
 
-    def _planned(self) -> np.ndarray:
+    def _compute_planned_target(self) -> np.ndarray:
         """Target position of the tool in the scan (3,) [m]."""
         assert self.drawn is not None
         nodes = self.setting.site.anatomy.mesh.nodes
         return self.drawn.goal.place if self.share is None else nodes[self.share].mean(axis=0)
 
-    def _judge(self, touched: Touched, target: np.ndarray) -> EpisodeScore:
+    def _compute_score(self, touched: Touched, target: np.ndarray) -> EpisodeScore:
         assert self.drawn is not None
         task, goal, axis = self.setting.task, self.drawn.goal, self.setting.site.axis
         size = float(np.linalg.norm(touched.force))
@@ -213,9 +215,9 @@ class Episode:
         along = float((target - tip) @ axis)
         aside = float(np.linalg.norm(target - tip - along * axis))
         away = float(np.hypot(aside, max(along, 0.0) if size == 0.0 else 0.0))
-        return EpisodeScore(away, abs(self._reached(touched) - goal.amount) / goal.amount, 0, load)
+        return EpisodeScore(away, abs(self._compute_reached(touched) - goal.amount) / goal.amount, 0, load)
 
-    def _reached(self, touched: Touched) -> float:
+    def _compute_reached(self, touched: Touched) -> float:
         """Return the force [N], the shift [m], or the shares cut, which are compared with the goal's amount."""
         assert self.drawn is not None
         if self.setting.task.cuts:
@@ -225,19 +227,19 @@ class Episode:
         row = np.searchsorted(touched.nodes, self.patch)
         return float(touched.motion[row].mean(axis=0) @ self.drawn.goal.direction)
 
-    def _states(self, touched: Touched) -> np.ndarray:
+    def _build_states(self, touched: Touched) -> np.ndarray:
         assert self.drawn is not None
         task, goal = self.setting.task, self.drawn.goal
         cortex = touched.motion[np.searchsorted(touched.nodes, self.setting.cortex)].mean(axis=0)
         noise = self.random.standard_normal((3, 3))
-        tracked = shift_pose(self.actual, TRACKED * noise[0])
-        sensed = np.stack([touched.force, cortex]) + np.array([[FELT], [SEEN]]) * noise[1:]
+        tracked = shift_pose(self.actual, POSITION_NOISE * noise[0])
+        sensed = np.stack([touched.force, cortex]) + np.array([[FORCE_NOISE], [MOTION_NOISE]]) * noise[1:]
         done = self.cut / goal.amount if task.cuts else self.held / task.held
-        time = SECONDS * self.step
-        planned = replace(goal, place=self._planned())
+        time = STEP_SECONDS * self.step
+        planned = replace(goal, place=self._compute_planned_target())
         return compute_states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
-    def _truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
+    def _collect_truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
         """Return ground truth that no robot has (see the docs). Arrays are new in each step."""
         assert self.judged is not None and self.drawn is not None
         setting = self.setting
@@ -249,6 +251,6 @@ class Episode:
             "force": touched.force.copy(), "pressure": touched.pressure,
             "tumour_nodes": now, "tumour_middle": now[left].mean(axis=0), "model_error": touched.error,
             "target": target.copy(), "away": self.judged.away, "asked": float(self.drawn.goal.amount),
-            "reached": self._reached(touched), "load": self.judged.load, "violations": self.violations,
+            "reached": self._compute_reached(touched), "load": self.judged.load, "violations": self.violations,
             "success": success, "reliable": touched.good, "steps_done": self.shown,
         }  # fmt: skip

@@ -50,13 +50,13 @@ class PosedElements:
         going = [row for row, each in enumerate(asked) if each.last is not None]
         for rows in (begin, going):
             for some in [rows] if self.together and rows else [[row] for row in rows]:
-                found |= dict(zip(some, self._answered([asked[row] for row in some]), strict=True))
+                found |= dict(zip(some, self._solve_poses([asked[row] for row in some]), strict=True))
         return [found[row] for row in range(len(asked))]
 
-    def _answered(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def _solve_poses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         loads = Loads((Touching(np.stack([each.pose for each in asked])[:, None]),))
         starts = [each.last.memory for each in asked if each.last is not None and each.last.memory is not None]
-        answer = self.fem.deform(loads, _stacked(starts) if starts else None)
+        answer = self.fem.deform(loads, _join_starts(starts) if starts else None)
         force = answer.reaction[:, 0, :3]
         size = np.linalg.norm(force, axis=1)
         if self.ball is not None:
@@ -72,12 +72,14 @@ class PosedElements:
         ]
 
 
-def _stacked(starts: Sequence[Deformation]) -> Deformation:
+def _join_starts(starts: Sequence[Deformation]) -> Deformation:
     return starts[0] if len(starts) == 1 else join_deformations(starts)
 
 
-APART = 0.1  # Spacing of the solved fluid levels, relative to the height; solutions in between are interpolated.
-AROUND = 0.03  # Distance from the corridor and the tumour within which healthy tissue is considered [m].
+LEVEL_SPACING = (
+    0.1  # Spacing of the solved fluid levels, relative to the height; solutions in between are interpolated.
+)
+MAX_SURFACE_DISTANCE = 0.03  # Distance from the corridor and the tumour within which healthy tissue is considered [m].
 
 
 class HealthySurface(NamedTuple):
@@ -111,21 +113,21 @@ class CutElements:
 
     def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         """Solve as `TissueModel.compute_responses`; independent of earlier requests, as levels have one order."""
-        return [self._touched(each) for each in asked]
+        return [self._solve_touch(each) for each in asked]
 
-    def _touched(self, asked: TissueRequest) -> Touched:
-        level = (1.0 - asked.fluid) / APART
+    def _solve_touch(self, asked: TissueRequest) -> Touched:
+        level = (1.0 - asked.fluid) / LEVEL_SPACING
         low = int(level)
         share = level - low
-        motion = self._at(low, asked.done).displacement[0]
+        motion = self._solve_level(low, asked.done).displacement[0]
         if share > 0.0:
-            motion = (1.0 - share) * motion + share * self._at(low + 1, asked.done).displacement[0]
-        force = self._force(asked.pose, asked.done, motion)
+            motion = (1.0 - share) * motion + share * self._solve_level(low + 1, asked.done).displacement[0]
+        force = self._compute_force(asked.pose, asked.done, motion)
         size = float(np.linalg.norm(force))
-        good = all(self._at(low + more, asked.done).outcome[0].good for more in range(2 if share > 0.0 else 1))
+        good = all(self._solve_level(low + more, asked.done).outcome[0].good for more in range(2 if share > 0.0 else 1))
         return Touched(motion, np.arange(len(motion)), force, self.ball.compute_pressure(size), good)
 
-    def _at(self, level: int, done: int) -> Deformation:
+    def _solve_level(self, level: int, done: int) -> Deformation:
         """Return the solution at a fluid level, started from the level above.
 
         After more steps, from that after fewer.
@@ -134,16 +136,16 @@ class CutElements:
         if key not in self._solved:
             start = None
             if done > 1:
-                start = self._at(level, done - 1)
+                start = self._solve_level(level, done - 1)
             elif level > 0:
-                start = self._at(level - 1, done)
-            posture = HeadPose(fluid=1.0 - APART * level).build_posture(self.site.anatomy.mesh.nodes)
+                start = self._solve_level(level - 1, done)
+            posture = HeadPose(fluid=1.0 - LEVEL_SPACING * level).build_posture(self.site.anatomy.mesh.nodes)
             self._solved[key] = self.fem.deform(Loads((posture, Resected(np.array([float(done)])))), start)
         return self._solved[key]
 
-    def _force(self, pose: np.ndarray, done: int, motion: np.ndarray) -> np.ndarray:
+    def _compute_force(self, pose: np.ndarray, done: int, motion: np.ndarray) -> np.ndarray:
         """Force (3,) [N] of the ball on healthy tissue."""
-        healthy, nodes = self._healthy(done), self.site.anatomy.mesh.nodes
+        healthy, nodes = self._get_healthy(done), self.site.anatomy.mesh.nodes
         radius = self.ball.radius
         middle = pose[:3, 3] + radius * pose[:3, 2]
         near = find_closest_points(middle[None], (nodes + motion)[healthy.triangles])
@@ -154,13 +156,13 @@ class CutElements:
         distance = float(np.copysign(np.linalg.norm(away), away @ outward))
         return -float(self.ball.compute_force(np.array(radius - distance))) * outward
 
-    def _healthy(self, done: int) -> HealthySurface:
+    def _get_healthy(self, done: int) -> HealthySurface:
         """Return the remaining body after a number of steps."""
         if done not in self._surfaces:
-            self._surfaces[done] = self._near(done)
+            self._surfaces[done] = self._build_healthy(done)
         return self._surfaces[done]
 
-    def _near(self, done: int) -> HealthySurface:
+    def _build_healthy(self, done: int) -> HealthySurface:
         body = self.fem.get_remains(done).anatomy
         left, brain = body.mesh, ~body.in_tumour
         surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
@@ -168,5 +170,5 @@ class CutElements:
         way = np.linspace(self.site.origin, left.nodes[tumour].mean(axis=0), 8)
         middle = left.nodes[surface].mean(axis=1)
         around = np.concatenate([way, left.nodes[tumour]])
-        near = np.linalg.norm(middle[:, None] - around, axis=2).min(axis=1) < AROUND
+        near = np.linalg.norm(middle[:, None] - around, axis=2).min(axis=1) < MAX_SURFACE_DISTANCE
         return HealthySurface(surface[near], compute_vertex_normals(left.nodes, surface))

@@ -21,9 +21,9 @@ from surrogate.model.learned import Learned
 from ..script.site import CraniotomyFrame
 from .touched import TissueRequest, Touched
 
-NEAR = 1e-5  # Tolerance of the ball's depth [m].
-TRIES = 12  # Maximum number of iterations for the ball's depth.
-STRONGEST = 1.5  # Largest force in the search, relative to the strongest of the training.
+DEPTH_TOLERANCE = 1e-5  # Tolerance of the ball's depth [m].
+MAX_ITERATIONS = 12  # Maximum number of iterations for the ball's depth.
+MAX_FORCE_RATIO = 1.5  # Largest force in the search, relative to the strongest of the training.
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,9 @@ class PressedModel:
         """Predict as `TissueModel.compute_responses`."""
         poses = np.stack([each.pose for each in asked])
         parts = [poses] if self.together else np.split(poses, len(poses))
-        return [touched for part in parts for touched in self._answered(part)]
+        return [touched for part in parts for touched in self._predict_poses(part)]
 
-    def _answered(self, poses: np.ndarray) -> list[Touched]:
+    def _predict_poses(self, poses: np.ndarray) -> list[Touched]:
         """Predict tools at poses (B, 4, 4) together."""
         near = to_indentation(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
         depth = np.linalg.norm(near.force, axis=1)
@@ -113,8 +113,8 @@ class PressedModel:
         if not len(rows):
             return answers
         point, inward = near.point[rows], inward[rows]
-        size, found = self._forces(point, inward, depth[rows])
-        answer = self.model.deform(self._loads(point, inward, size))
+        size, found = self._find_forces(point, inward, depth[rows])
+        answer = self.model.deform(self._build_loads(point, inward, size))
         stated = np.where(np.isfinite(answer.bound[0]), answer.bound[0], self.model.bound)
         for number, row in enumerate(rows.tolist()):
             answers[row] = Touched(
@@ -123,36 +123,36 @@ class PressedModel:
             )  # fmt: skip
         return answers
 
-    def _loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
+    def _build_loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
         """Pushes of sizes (k,) [N], each on a footprint of its contact radius, clipped to the training range."""
-        return Loads((Pushed(point, size[:, None] * inward, self._footprint(size)),))
+        return Loads((Pushed(point, size[:, None] * inward, self._compute_footprint(size)),))
 
-    def _footprint(self, size: np.ndarray) -> np.ndarray:
+    def _compute_footprint(self, size: np.ndarray) -> np.ndarray:
         return np.clip(self.ball.compute_contact_radius(size), *self.model.envelope.footprint)
 
-    def _forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _find_forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find forces (k,) [N] at points (k, 3) by the secant method, and whether each reaches its depth (k,) [m]."""
         patch, rows = self._patch, np.arange(len(depth))
         place = find_closest_points(point, patch.points[patch.triangles])
-        corners, most = patch.triangles[place.triangle], STRONGEST * self.model.envelope.force[1]
+        corners, most = patch.triangles[place.triangle], MAX_FORCE_RATIO * self.model.envelope.force[1]
 
         def off(size: np.ndarray) -> np.ndarray:
             """Return the signed depth error (k,) [m] of the ball under each trial force."""
-            moved = self.model.deform(self._loads(point, inward, size), at=patch.nodes).displacement
+            moved = self.model.deform(self._build_loads(point, inward, size), at=patch.nodes).displacement
             there = np.einsum("kc,kci,ki->k", place.weights, moved[rows[:, None], corners], inward)
-            return there + self.ball.compute_extra_depth(size, self._footprint(size)) - depth
+            return there + self.ball.compute_extra_depth(size, self._compute_footprint(size)) - depth
 
         before, short = np.zeros(len(depth)), -depth
         size = np.minimum(self.ball.compute_force(depth), most)
-        for _ in range(TRIES):
+        for _ in range(MAX_ITERATIONS):
             now = off(size)
-            near = np.abs(now) < NEAR
+            near = np.abs(now) < DEPTH_TOLERANCE
             if near.all():
                 break
             slope = np.where(near, np.inf, now - short) / np.where(near | (size == before), 1.0, size - before)
             # Converged entries stay: others in the batch have no influence.
             before, short, size = size, now, np.where(near, size, np.clip(size - now / slope, 0.0, most))
-        return size, np.abs(off(size)) < NEAR
+        return size, np.abs(off(size)) < DEPTH_TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +178,9 @@ class PosedModel:
 
         If the model rejects a pose, the tissue stays and is marked unreliable.
         """
-        return [self._answered(each.pose, each.last) for each in asked]
+        return [self._predict_pose(each.pose, each.last) for each in asked]
 
-    def _answered(self, pose: np.ndarray, last: Touched | None) -> Touched:
+    def _predict_pose(self, pose: np.ndarray, last: Touched | None) -> Touched:
         loads = Loads((Touching(pose[None, None]),))
         try:
             answer = self.model.deform(loads, None if last is None else last.memory)

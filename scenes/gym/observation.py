@@ -10,18 +10,18 @@ from .tool_motion import RobotTool
 
 KINDS = ("states", "rgbd")
 """Kinds of observations."""
-LENGTH = 0.01
+LENGTH_UNIT = 0.01
 """Unit of lengths in an observation [m]."""
-LONG = 10.0
+TIME_UNIT = 10.0
 """Unit of times in an observation [s]: the longest episode."""
-TRACKED = 1e-4  # Standard deviation of a tracked position [m].
-FELT = 2e-3  # Standard deviation of a component of the measured force [N].
-SEEN = 2e-4  # Standard deviation of an observed motion of the cortex [m].
-BOUND = 10.0
+POSITION_NOISE = 1e-4  # Standard deviation of a tracked position [m].
+FORCE_NOISE = 2e-3  # Standard deviation of a component of the measured force [N].
+MOTION_NOISE = 2e-4  # Standard deviation of an observed motion of the cortex [m].
+STATE_BOUND = 10.0
 """Bound of all numbers of an observation, which are clipped to it."""
-COUNT = 24
+STATE_SIZE = 24
 """Number of components of a state."""
-FARTHEST = 2.0
+MAX_DEPTH = 2.0
 """Upper limit of depths in images [m]."""
 
 
@@ -32,14 +32,14 @@ def build_action_space() -> spaces.Box:
 
 def build_space(kind: str, size: tuple[int, int]) -> spaces.Space:
     """Return the observation space of one of `KINDS`, with images of a width and height [pixel]."""
-    states = spaces.Box(-BOUND, BOUND, (COUNT,), np.float32)
+    states = spaces.Box(-STATE_BOUND, STATE_BOUND, (STATE_SIZE,), np.float32)
     if kind == "states":
         return states
     width, height = size
     return spaces.Dict(
         {
             "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
-            "depth": spaces.Box(0.0, FARTHEST, (height, width), np.float32),
+            "depth": spaces.Box(0.0, MAX_DEPTH, (height, width), np.float32),
             "states": states,
         }
     )
@@ -63,14 +63,14 @@ def compute_states(
         Completed share of the steps to hold, or of the tissue to cut.
     """
     parts = (
-        (hand.place - origin) @ frame / LENGTH,
+        (hand.place - origin) @ frame / LENGTH_UNIT,
         (frame.T @ hand.turned)[:, :2].T.ravel(),
         sensed[0] @ frame / task.force,
-        [time / LONG],
-        (goal.place - origin) @ frame / LENGTH,
+        [time / TIME_UNIT],
+        (goal.place - origin) @ frame / LENGTH_UNIT,
         goal.direction @ frame,
         [goal.amount / task.unit],
         [done],
-        sensed[1] @ frame / LENGTH,
+        sensed[1] @ frame / LENGTH_UNIT,
     )
-    return np.clip(np.concatenate(parts), -BOUND, BOUND).astype(np.float32)
+    return np.clip(np.concatenate(parts), -STATE_BOUND, STATE_BOUND).astype(np.float32)

@@ -37,7 +37,8 @@ class ObservationCamera:
             rows = [row for row, each in enumerate(seen) if each[2] == done]
             stage = self.setting.get_stage(done)
             scenes = [
-                stage.build_layers(self._positions(touched), pose) for touched, pose, _ in (seen[row] for row in rows)
+                stage.build_layers(self._compute_positions(touched), pose)
+                for touched, pose, _ in (seen[row] for row in rows)
             ]
             if done not in self._renderers:
                 self._renderers[done] = Renderer(scenes[0], stage.lamp, stage.device)
@@ -46,7 +47,7 @@ class ObservationCamera:
             colour[rows], depth[rows] = pictures.colour.numpy(), pictures.depth.numpy()
         return colour, depth
 
-    def _positions(self, touched: Touched) -> np.ndarray:
+    def _compute_positions(self, touched: Touched) -> np.ndarray:
         positions = self.setting.site.anatomy.mesh.nodes.copy()
         positions[touched.nodes] += touched.motion
         return positions

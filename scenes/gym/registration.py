@@ -6,7 +6,7 @@ from sim.runtime.optional_packages import require_extra
 
 NAMESPACE = "sulcus"  # Prefix of the environments' names.
 NAMES = ("Palpate", "Retract", "Debulk")  # Names of the environments.
-STEPS = 200
+MAX_STEPS = 200
 """Number of steps after which an episode is truncated."""
 
 
@@ -26,7 +26,7 @@ def register_environments() -> None:
             register(
                 known,
                 "scenes.gym.environment:Operation",
-                max_episode_steps=STEPS,
+                max_episode_steps=MAX_STEPS,
                 kwargs={"task": name.lower()},
                 vector_entry_point="scenes.gym.environment:Operations",
             )

@@ -37,11 +37,11 @@ from .touched import TissueModel
 PHYSICS = ("auto", "model", "fem")  # Kinds of deformation models.
 TEMPLATE = "template"  # Name of the shipped anatomy.
 ARGUMENTS = ("anatomy", "physics", "device", "size", "model")  # Arguments that determine a setting.
-TIGHTEST = attrgetter("bound")  # Key for selecting the model with the smallest error bound.
-SPREAD = 6e-3  # Largest distance of a goal from the point above the tumour's centre [m].
-LOWEST = 0.6  # Lowest final fluid level, as a share of the height.
-HIGHEST = 0.9  # Highest final fluid level, as a share of the height.
-PATCH = 8e-3  # Radius of the patch of cortex whose shift is rewarded [m].
+BOUND_KEY = attrgetter("bound")  # Key for selecting the model with the smallest error bound.
+MAX_GOAL_DISTANCE = 6e-3  # Largest distance of a goal from the point above the tumour's centre [m].
+MIN_FLUID_LEVEL = 0.6  # Lowest final fluid level, as a share of the height.
+MAX_FLUID_LEVEL = 0.9  # Highest final fluid level, as a share of the height.
+PATCH_RADIUS = 8e-3  # Radius of the patch of cortex whose shift is rewarded [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,20 +97,20 @@ class TaskSetting:
     def find_near(self, place: np.ndarray) -> np.ndarray:
         """Vertices (n,) of the open cortex within `PATCH` of a place (3,) [m], or the nearest one."""
         away = np.linalg.norm(self.site.anatomy.mesh.nodes[self.cortex] - place, axis=1)
-        return self.cortex[away <= max(PATCH, away.min())]
+        return self.cortex[away <= max(PATCH_RADIUS, away.min())]
 
     def sample_goal(self, random: np.random.Generator) -> Goal:
         """Draw a goal; every task takes as many numbers."""
         far, angle, turn, amount, more = random.random(5)
         task, site = self.task, self.site
         arm = self.middle - site.origin
-        offset = SPREAD * np.sqrt(far) * np.array([np.cos(2.0 * np.pi * angle), np.sin(2.0 * np.pi * angle)])
+        offset = MAX_GOAL_DISTANCE * np.sqrt(far) * np.array([np.cos(2.0 * np.pi * angle), np.sin(2.0 * np.pi * angle)])
         place = site.find_contact(
             float(arm @ site.right + offset[0]), float(arm @ site.up + offset[1]), task.tool.radius
         )
         size = task.amount[0] + amount * (task.amount[1] - task.amount[0])
         if task.cuts:
-            return Goal(self.middle, site.axis, size, LOWEST + more * (HIGHEST - LOWEST))
+            return Goal(self.middle, site.axis, size, MIN_FLUID_LEVEL + more * (MAX_FLUID_LEVEL - MIN_FLUID_LEVEL))
         lean, turn = task.forward * more, 2.0 * np.pi * turn
         sideways = np.cos(turn) * site.right + np.sin(turn) * site.up
         return Goal(place.point, np.cos(lean) * site.axis + np.sin(lean) * sideways, size)
@@ -153,24 +153,24 @@ def open_setting(
         Unreadable files; an anatomy without tumour or open cortex; an unavailable device; a missing model, or a given
         model that is not applicable.
     """
-    theatre = _theatre(anatomy, _shipped(task) if model is None and anatomy == TEMPLATE else model, device)
+    theatre = _open_setup(anatomy, _get_shipped_model(task) if model is None and anatomy == TEMPLATE else model, device)
     if not theatre.anatomy.in_tumour.any():
         raise InputError(f"{anatomy}: has no tumour, which these tasks aim at: mesh one with region {TUMOUR_LABEL}.")
     scene, tool = task.build_scene(size), task.tool
     scene = scene.replace_regions(find_learned_regions(scene.elasticity, theatre.learned_tissue))
     card = find_device(device, LIVE.precision).name != "cpu"
     at_once = card if together is None else together
-    ball = Hertz(tool.radius, _touched(task, scene, theatre.site)) if isinstance(tool, Probe) else None
+    ball = Hertz(tool.radius, _find_touched_tissue(task, scene, theatre.site)) if isinstance(tool, Probe) else None
     if physics != "fem":
-        refused = _refusals(task, scene, theatre)
+        refused = _list_rejections(task, scene, theatre)
         known = [each for name, each in theatre.models.items() if refused[name] is None]
         if posed := [each for each in known if each.tool is not None]:
-            return TaskSetting(task, scene, theatre, PosedModel(min(posed, key=TIGHTEST), ball))
+            return TaskSetting(task, scene, theatre, PosedModel(min(posed, key=BOUND_KEY), ball))
         if ball is not None and known:
             return TaskSetting(
-                task, scene, theatre, PressedModel(theatre.site, min(known, key=TIGHTEST), ball, at_once)
+                task, scene, theatre, PressedModel(theatre.site, min(known, key=BOUND_KEY), ball, at_once)
             )
-        _say_none(task, anatomy, physics, model, next(iter(refused.values()), None))
+        _report_no_model(task, anatomy, physics, model, next(iter(refused.values()), None))
     fem = theatre.build_fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
     if isinstance(fem, Fem):
         return TaskSetting(task, scene, theatre, PosedElements(fem, ball, at_once))
@@ -178,7 +178,7 @@ def open_setting(
     return TaskSetting(task, scene, theatre, CutElements(theatre.site, fem, ball))
 
 
-def _touched(task: GymTask, scene: Scene, site: CraniotomyFrame) -> Tissue:
+def _find_touched_tissue(task: GymTask, scene: Scene, site: CraniotomyFrame) -> Tissue:
     """Return the tissue that a ball presses: the one with the largest volume within its radius of the goals' centre.
 
     Where tissue is cut away, it is the brain's.
@@ -194,7 +194,7 @@ def _touched(task: GymTask, scene: Scene, site: CraniotomyFrame) -> Tissue:
     return tissue
 
 
-def _refusals(task: GymTask, scene: Scene, theatre: PatientSetup) -> dict[str, str | None]:
+def _list_rejections(task: GymTask, scene: Scene, theatre: PatientSetup) -> dict[str, str | None]:
     """Return, by name, why a trained model is not applicable; None if it is. For a ball, models of pushes apply too."""
     if task.cuts:
         return dict.fromkeys(theatre.models, "tissue is resected, which no model supports")
@@ -213,7 +213,7 @@ def _refusals(task: GymTask, scene: Scene, theatre: PatientSetup) -> dict[str, s
     return found
 
 
-def _say_none(task: GymTask, anatomy: str, physics: str, model: str | None, why: str | None) -> None:
+def _report_no_model(task: GymTask, anatomy: str, physics: str, model: str | None, why: str | None) -> None:
     """Report that no trained model is applicable, and why.
 
     Raises
@@ -235,12 +235,12 @@ def _say_none(task: GymTask, anatomy: str, physics: str, model: str | None, why:
 
 
 @lru_cache(maxsize=4)
-def _theatre(anatomy: str, model: str | None, device: str) -> PatientSetup:
+def _open_setup(anatomy: str, model: str | None, device: str) -> PatientSetup:
     body = None if anatomy == TEMPLATE else Path(anatomy)
     return open_theatre(body, None if model is None else Path(model), device)
 
 
-def _shipped(task: GymTask) -> str | None:
+def _get_shipped_model(task: GymTask) -> str | None:
     return str(get_spatula_model_path()) if isinstance(task.tool, Blade) else None
 
 

@@ -15,9 +15,9 @@ from ..script.scene import Scene
 from ..script.tool import Blade, Instrument, Probe
 from ..script.viewpoint import Viewpoint
 
-SECONDS = 0.05
+STEP_SECONDS = 0.05
 """Duration of a step [s]."""
-OVER = 1.25
+MAX_LOAD_RATIO = 1.25
 """Ratio of a load to its limit at which an episode ends."""
 
 

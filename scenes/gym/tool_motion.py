@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..script.site import CraniotomyFrame
 from ..script.tool import Instrument, Probe
 
-HIGHEST = 0.02  # Largest height of a tool above the centre of the open cortex [m].
+MAX_HEIGHT = 0.02  # Largest height of a tool above the centre of the open cortex [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ def move_tool(
     frame = build_tool_frame(site)
     place = site.clip_to_opening(hand.place + frame @ twist[:3], tool.radius)
     along = float((place - site.origin) @ site.axis) + compute_lever(tool)
-    place = place + (np.clip(along, -HIGHEST, deepest) - along) * site.axis
+    place = place + (np.clip(along, -MAX_HEIGHT, deepest) - along) * site.axis
     turned = Rotation.from_rotvec(frame @ twist[3:]).as_matrix() @ hand.turned
     first = tool.pose(site.origin, site.axis, site.right)[:3, 2]
     if turned[:, 2] @ first < np.cos(tilt):

@@ -11,14 +11,14 @@ from scipy.stats import chi2
 
 from ar.overlay.gauge import Gauge
 from ar.tracking.pose import Pose, TrackedTargets
-from ar.tracking.pose_stream import LONGEST, PoseStream
+from ar.tracking.pose_stream import MAX_GAP, PoseStream
 from ar.tracking.registration import Registration
 
 from ..script.uncertainty import LEVEL
 from ..tracked.follower import (
-    LIMIT,
-    UNCHECKED,
-    UNKNOWN,
+    MAX_OVERLAY_ERROR,
+    UNCHECKED_WARNING,
+    UNKNOWN_WARNING,
     TrackingResult,
     TumourState,
     compute_tip_covariance,
@@ -31,10 +31,10 @@ from ..tracked.tracked_tool import TrackedTool
 from .frame import to_stamp, to_time
 from .heard import ReceivedTransforms, Sent
 
-EVEN = 3  # Minimum number of poses to estimate the camera's acceleration between them.
-THEIRS = "are these its poses and registration?"  # Question in the warning about a misplaced tool.
-NOT_SEEN = TrackedTargets(0, {}, {}, {})  # Tracking result without targets.
-PRESSED = 2e-3  # Depth of the tool whose solution is timed at the start [m].
+MIN_POSES = 3  # Minimum number of poses to estimate the camera's acceleration between them.
+OWNER_QUESTION = "are these its poses and registration?"  # Question in the warning about a misplaced tool.
+NO_TARGETS = TrackedTargets(0, {}, {}, {})  # Tracking result without targets.
+TIMED_DEPTH = 2e-3  # Depth of the tool whose solution is timed at the start [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ def place_camera(
     times = np.array([to_time(sent.stamp) if stamped else sent.arrived for sent in course])
     time = to_time(stamp) if stamped else now
     poses = np.stack([sent.T for sent in course])
-    if stamped and len(course) >= EVEN and np.ptp(times[-EVEN:]) <= LONGEST * EVEN:
+    if stamped and len(course) >= MIN_POSES and np.ptp(times[-MIN_POSES:]) <= MAX_GAP * MIN_POSES:
         between = PoseStream(times, poses, np.zeros((len(course), 6, 6))).interpolate(time)
         if between is not None:
             arm = float(np.linalg.norm(place - between.T_camera_target[:3, 3]))
@@ -132,12 +132,12 @@ class PoseResponder:
         self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
     ) -> PoseResult:
         """Compute the result at a time `now` [s], from the result `before`; `moment` is now, in seconds since 1970."""
-        registration = self._registration(heard)
+        registration = self._find_registration(heard)
         if isinstance(registration, str):
-            return self._nothing(registration, moment, before)
+            return self._build_unknown(registration, moment, before)
         body = heard.find_relative(heard.names.tool, now)
         if isinstance(body, str):
-            return self._nothing(body, moment, before)
+            return self._build_unknown(body, moment, before)
         stamp = body.stamp or to_stamp(moment)
         beside = Pose(body.T, np.diag(np.repeat([self.tracking**2, 0.0], 3)), 0.0, 0)
         pose = np.linalg.inv(registration.T_patient_scan) @ body.T @ self.tool.T_cube_tool
@@ -145,14 +145,14 @@ class PoseResponder:
         motion = self.motion.compute_motion(pose, spread, None if before is None else before.motion)
         known = TrackingResult(
             to_time(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "",
-            NOT_SEEN, motion, None, pose, spread,
+            NO_TARGETS, motion, None, pose, spread,
         )  # fmt: skip
-        known = replace(known, seen=known.time, felt=moment, **self._doubts(known, before))
+        known = replace(known, seen=known.time, felt=moment, **self._describe_doubts(known, before))
         if known.state is TumourState.UNKNOWN:
             return PoseResult(stamp, known)
-        known = self._with_band(known, registration)
+        known = self._add_band(known, registration)
         if known.relied and registration.scanned is None:
-            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED)
+            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED_WARNING)
         stage = self.motion.stage
         gauge = Painter(stage, self.tool).measure_tip(known, stage.build_tumour(motion.positions))
         return PoseResult(stamp, known, gauge)
@@ -160,7 +160,7 @@ class PoseResponder:
     def measure(self) -> float:
         """Measure the time of one solution [s]: the tool 2 mm deep at the craniotomy, with kernels loaded before."""
         site, pose = self.motion.stage.site, np.eye(4)
-        pose[:3] = np.column_stack([site.right, site.up, -site.axis, site.origin + PRESSED * site.axis])
+        pose[:3] = np.column_stack([site.right, site.up, -site.axis, site.origin + TIMED_DEPTH * site.axis])
         self.motion.compute_motion(pose, self.tracking**2 * np.eye(3))
         begun = clock.perf_counter()
         self.motion.compute_motion(pose, self.tracking**2 * np.eye(3))
@@ -169,7 +169,7 @@ class PoseResponder:
     def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
         """Return the scan's pose in the camera's frame for an image's time stamp, or why it is unknown at `now` [s]."""
         name = heard.names.camera
-        registration, body = self._registration(heard), heard.find_relative(name, now)
+        registration, body = self._find_registration(heard), heard.find_relative(name, now)
         if isinstance(registration, str) or isinstance(body, str):
             return registration if isinstance(registration, str) else str(body)
         middle = registration.T_patient_scan @ np.append(self.motion.stage.tumour_at_rest.vertices.mean(axis=0), 1.0)
@@ -178,7 +178,7 @@ class PoseResponder:
             return placed.format(name=name)
         return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)
 
-    def _registration(self, heard: ReceivedTransforms) -> Registration | str:
+    def _find_registration(self, heard: ReceivedTransforms) -> Registration | str:
         """Return the registration from the file or the last message, or the reason why there is none."""
         if self.registration is not None:
             return self.registration
@@ -187,19 +187,19 @@ class PoseResponder:
             return f"no {heard.names.registration} yet"
         return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
 
-    def _doubts(self, known: TrackingResult, before: TrackingResult | None) -> dict[str, object]:
+    def _describe_doubts(self, known: TrackingResult, before: TrackingResult | None) -> dict[str, object]:
         """Return state, text and `near` of an unreliable result; only `near` of a reliable one."""
         near = before is not None and before.near
         assert known.T_scan_tool is not None
-        doubt, near = describe_misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, THEIRS)
+        doubt, near = describe_misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, OWNER_QUESTION)
         doubt = doubt or known.motion.doubt
         if doubt:
             return {"state": TumourState.UNSURE, "words": doubt, "near": near}
         if not known.motion.known:
-            return {"state": TumourState.UNKNOWN, "words": UNKNOWN, "near": near}
+            return {"state": TumourState.UNKNOWN, "words": UNKNOWN_WARNING, "near": near}
         return {"near": near}
 
-    def _with_band(self, known: TrackingResult, registration: Registration) -> TrackingResult:
+    def _add_band(self, known: TrackingResult, registration: Registration) -> TrackingResult:
         """Add the bound on the tumour's error [m], and its parts by source, to a reliable result."""
         if not known.relied:
             return known
@@ -210,20 +210,20 @@ class PoseResponder:
         band = float(np.hypot(registered, known.motion.error))
         return add_bound(known, band, parts)
 
-    def _nothing(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
+    def _build_unknown(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
         """Nothing is known now, and why."""
         felt = None if before is None else before.felt
         near = before is not None and before.near
         state = TumourState.NO_TOOL if felt is None else TumourState.STALE
         motion = self.motion.rest if before is None else before.motion
         return PoseResult(
-            to_stamp(moment), TrackingResult(moment, state, why, NOT_SEEN, motion, felt=felt, near=near)
+            to_stamp(moment), TrackingResult(moment, state, why, NO_TARGETS, motion, felt=felt, near=near)
         )  # fmt: skip
 
 
 def add_bound(known: TrackingResult, band: float, parts: dict[str, float]) -> TrackingResult:
     """Add a bound [m] on the position, and its parts, to a result; beyond 5 mm it is unreliable."""
-    if band <= LIMIT:
+    if band <= MAX_OVERLAY_ERROR:
         return replace(known, band=band, parts=parts)
     return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band), band=None, parts={})
 

@@ -21,17 +21,19 @@ from .frame import (
 )
 from .messages import Code, encode_status
 
-REFUSED = "SulcusRefused"
+REJECTED_DEVICE = "SulcusRefused"
 """Device name of each STATUS that is sent to one client."""
-LONGEST = 1 << 28  # Maximum size of a message body [bytes]; a longer one ends the connection.
-PATIENCE = 10.0  # Time limit for an announced body to arrive, and for a client to read its messages [s].
-GREETING = 0.2  # Time in which a new client may send a request before everything is sent to it [s].
-FAREWELL = 1.0  # Time for sending the reason of a rejection, and for ending a connection [s].
-PARTING = 0.1  # Time to read the last message when a server ends [s].
-HELD = 1 << 18  # Size of a slow client's system buffer [bytes]: its content is not replaced by newer messages.
-AHEAD = 1 << 16  # Size of the chunks in which a body is skipped [bytes].
+MAX_BODY_BYTES = 1 << 28  # Maximum size of a message body [bytes]; a longer one ends the connection.
+CLIENT_TIMEOUT = 10.0  # Time limit for an announced body to arrive, and for a client to read its messages [s].
+GREETING_TIME = 0.2  # Time in which a new client may send a request before everything is sent to it [s].
+FAREWELL_TIME = 1.0  # Time for sending the reason of a rejection, and for ending a connection [s].
+LAST_MESSAGE_TIME = 0.1  # Time to read the last message when a server ends [s].
+CLIENT_BUFFER_BYTES = (
+    1 << 18
+)  # Size of a slow client's system buffer [bytes]: its content is not replaced by newer messages.
+CHUNK_BYTES = 1 << 16  # Size of the chunks in which a body is skipped [bytes].
 # First letters of the message types that are requests, and of those that ask for selected messages.
-REQUESTS, ASKING = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
+REQUESTS, QUERIES = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
 
 Receive = Callable[[int, Header, bytes], None]
 """Takes a client's number, a message's header and its content; raises `BadMessageError`."""
@@ -106,7 +108,7 @@ class LinkClients:
         self._count(why, text)
         client = self._clients.get(number)
         if client is not None and not client.asks:
-            client.offer(REFUSED, (pack_message("STATUS", REFUSED, encode_status(code, text), 0),))
+            client.offer(REJECTED_DEVICE, (pack_message("STATUS", REJECTED_DEVICE, encode_status(code, text), 0),))
 
     async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection until it ends."""
@@ -120,14 +122,14 @@ class LinkClients:
             return
         self._count("too many clients")
         text = f"{self._most} clients are connected, and no more are taken: end one of them"
-        writer.write(pack_message("STATUS", REFUSED, encode_status(Code.BUSY, text), 0))
+        writer.write(pack_message("STATUS", REJECTED_DEVICE, encode_status(Code.BUSY, text), 0))
         await _close(writer)
 
     async def close(self) -> None:
         """Send what waits, for a moment, and end all connections."""
         for client in self._clients.values():
             client.leave()
-        for patience in (PARTING, FAREWELL):
+        for patience in (LAST_MESSAGE_TIME, FAREWELL_TIME):
             if self._attending:
                 await asyncio.wait(self._attending, timeout=patience)
             for client in self._clients.values():
@@ -154,7 +156,7 @@ class LinkClients:
             await asyncio.wait((sending, reading), return_when=asyncio.FIRST_COMPLETED)
             if reading.done() and not sending.done():
                 client.leave()
-                await asyncio.wait((sending,), timeout=FAREWELL)
+                await asyncio.wait((sending,), timeout=FAREWELL_TIME)
         finally:
             del self._clients[client.number]
             for task in (sending, reading):
@@ -165,7 +167,7 @@ class LinkClients:
     async def _send(self, client: Client) -> None:
         """Send what waits, as fast as the client reads it."""
         try:
-            async with asyncio.timeout(GREETING):
+            async with asyncio.timeout(GREETING_TIME):
                 await client.spoke.wait()
         except TimeoutError:
             pass
@@ -179,7 +181,7 @@ class LinkClients:
                 while client.waiting:
                     messages = client.waiting.pop(next(iter(client.waiting)))
                     client.writer.writelines(messages)
-                    async with asyncio.timeout(PATIENCE):
+                    async with asyncio.timeout(CLIENT_TIMEOUT):
                         await client.writer.drain()
         except TimeoutError:
             self._count("client that does not read")
@@ -193,9 +195,11 @@ class LinkClients:
             while True:
                 raw = await reader.readexactly(HEADER.size)
                 header = read_header(raw)
-                if header.size > LONGEST:
-                    raise BadMessageError(f"{_named(header)} announces {header.size} bytes; {LONGEST} are the most")
-                async with asyncio.timeout(PATIENCE):
+                if header.size > MAX_BODY_BYTES:
+                    raise BadMessageError(
+                        f"{_format_name(header)} announces {header.size} bytes; {MAX_BODY_BYTES} are the most"
+                    )
+                async with asyncio.timeout(CLIENT_TIMEOUT):
                     await self._hear(client, reader, header)
                 await asyncio.sleep(0)  # a client that sends without pause blocks no other
         except TimeoutError:
@@ -219,7 +223,7 @@ class LinkClients:
         if header.size > longest:
             await _pass_over(reader, header.size)
             why, code = ("too long", Code.OVERFLOW) if longest else ("type not used", Code.UNKNOWN_INSTRUCTION)
-            self.reject(client.number, code, why, f"{_named(header)} is passed over: {why}")
+            self.reject(client.number, code, why, f"{_format_name(header)} is passed over: {why}")
             return
         body = await reader.readexactly(header.size)
         try:
@@ -228,18 +232,20 @@ class LinkClients:
         except BadMessageError as error:
             code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
             # # The text after a colon differs from message to message.
-            self.reject(client.number, code, str(error).partition(":")[0], f"{_named(header)} is rejected: {error}")
+            self.reject(
+                client.number, code, str(error).partition(":")[0], f"{_format_name(header)} is rejected: {error}"
+            )
 
     def _ask(self, client: Client, header: Header) -> None:
         """Send a client without stream its requested messages only."""
-        client.asks = header.kind.startswith(ASKING)
+        client.asks = header.kind.startswith(QUERIES)
         client.spoke.set()
         if header.kind.startswith("STP_"):
             client.waiting.clear()
         elif client.asks:
-            found = _found(self._newest, header.kind.removeprefix("GET_"), header.name)
+            found = _find_message(self._newest, header.kind.removeprefix("GET_"), header.name)
             text = f"there is no {header.kind.removeprefix('GET_')} yet"
-            none = pack_message("STATUS", REFUSED, encode_status(Code.NOT_FOUND, text), 0)
+            none = pack_message("STATUS", REJECTED_DEVICE, encode_status(Code.NOT_FOUND, text), 0)
             client.waiting.clear()
             client.offer("asked", (found or none,))
         else:
@@ -253,7 +259,7 @@ class LinkClients:
             self._note(f"rejected: {text or why}")
 
 
-def _found(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
+def _find_message(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
     """Return a message of a type: that of a name if there is one, else the first of those with the last time stamp."""
     every = [(read_header(each[: HEADER.size]), each) for messages in newest.values() for each in messages]
     alike = [(header, each) for header, each in every if header.kind == kind]
@@ -261,28 +267,28 @@ def _found(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> byt
     return next(named, max(alike, key=lambda pair: pair[0].stamp)[1] if alike else None)
 
 
-def _named(header: Header) -> str:
+def _format_name(header: Header) -> str:
     return f"{header.kind} {header.name}".strip()
 
 
 async def _pass_over(reader: asyncio.StreamReader, size: int) -> None:
     """Read `size` bytes, and discard them."""
     while size:
-        size -= len(await reader.readexactly(min(size, AHEAD)))
+        size -= len(await reader.readexactly(min(size, CHUNK_BYTES)))
 
 
 def _hold_little(writer: asyncio.StreamWriter) -> None:
     """Limit the system's send buffer for unread bytes, and enable keep-alive to detect lost clients."""
     writer.transport.set_write_buffer_limits(high=0)
     own = writer.get_extra_info("socket")
-    own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD)
+    own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_BUFFER_BYTES)
     own.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
 
 async def _close(writer: asyncio.StreamWriter) -> None:
     try:
         writer.close()
-        async with asyncio.timeout(FAREWELL):
+        async with asyncio.timeout(FAREWELL_TIME):
             await writer.wait_closed()
     except (OSError, TimeoutError):
         writer.transport.abort()

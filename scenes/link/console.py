@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-MOST = 10  # Maximum number of printed lines in an interval.
-WHILE = 5.0  # Interval in which at most MOST lines are printed [s].
+MAX_LINES = 10  # Maximum number of printed lines in an interval.
+LINE_INTERVAL = 5.0  # Interval in which at most MOST lines are printed [s].
 PREFIX = "sulcus link: "  # Start of each line.
 
 
@@ -21,13 +21,13 @@ def print_safely(line: str) -> None:
 
 def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
     """Return a function that writes lines, no more than 10 in 5 s; the next line reports how many were suppressed."""
-    begun, count, left_out = -WHILE, 0, 0
+    begun, count, left_out = -LINE_INTERVAL, 0, 0
 
     def note(line: str) -> None:
         nonlocal begun, count, left_out
-        if clock() - begun >= WHILE:
+        if clock() - begun >= LINE_INTERVAL:
             begun, count = clock(), 0
-        if count == MOST:
+        if count == MAX_LINES:
             left_out += 1
             return
         count += 1

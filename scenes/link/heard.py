@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from .frame import NAME_BYTES, TICKS, BadMessageError
 
-SQUARE = 2e-3  # Tolerance of axes from length 1 and right angles: matrices have single precision.
-FARTHEST = 10.0  # Largest coordinate of a tracked body [m].
-SET_BACK = 5.0  # Difference from the last time stamp above which an earlier one means that the clock was set back [s].
+ROTATION_TOLERANCE = 2e-3  # Tolerance of axes from length 1 and right angles: matrices have single precision.
+MAX_COORDINATE = 10.0  # Largest coordinate of a tracked body [m].
+MAX_CLOCK_STEP = (
+    5.0  # Difference from the last time stamp above which an earlier one means that the clock was set back [s].
+)
 # Number of earlier transforms of one name that are kept, for images that arrive later than the poses around them.
-KEPT = 32
+MAX_KEPT_TRANSFORMS = 32
 
 
 @dataclass(frozen=True)
@@ -91,9 +93,13 @@ class ReceivedTransforms:
         if last is not None and last.sender == sender and stamp and name != self.names.registration:
             if stamp == last.stamp:
                 raise BadMessageError("the same time stamp again")
-            if 0 < last.stamp - stamp < SET_BACK * TICKS:
+            if 0 < last.stamp - stamp < MAX_CLOCK_STEP * TICKS:
                 raise BadMessageError("a time stamp before the last one")
-        kept = () if last is None or (stamp and stamp < last.stamp) else (*self.earlier[name][1 - KEPT :], last)
+        kept = (
+            ()
+            if last is None or (stamp and stamp < last.stamp)
+            else (*self.earlier[name][1 - MAX_KEPT_TRANSFORMS :], last)
+        )
         newest = {**self.sent, name: Sent(T, stamp, now, sender)}
         return replace(self, sent=newest, earlier={**self.earlier, name: kept})
 
@@ -106,15 +112,15 @@ class ReceivedTransforms:
                 return f"no {each} yet"
             if (age := now - sent.arrived) > self.stale:
                 return f"no new {each} for {age:.1f} s"
-        return self._in_reference(name, self.sent[name])
+        return self._transform_to_reference(name, self.sent[name])
 
     def list_transforms(self, name: str) -> tuple[Sent, ...]:
         """Return a body's transforms by one sender, oldest first, relative to the current reference."""
         newest = self.sent[name]
         every = (*self.earlier.get(name, ()), newest)
-        return tuple(self._in_reference(name, sent) for sent in every if sent.sender == newest.sender)
+        return tuple(self._transform_to_reference(name, sent) for sent in every if sent.sender == newest.sender)
 
-    def _in_reference(self, name: str, body: Sent) -> Sent:
+    def _transform_to_reference(self, name: str, body: Sent) -> Sent:
         if not self.names.is_tracker_transform(name):
             return body
         reference = self.sent[self.names.reference]
@@ -148,9 +154,9 @@ def to_rigid(matrix: np.ndarray) -> np.ndarray:
     axes, shift = matrix[:3, :3], 1e-3 * matrix[:3, 3]
     if np.linalg.det(axes) < 0.0:
         raise BadMessageError("a matrix that mirrors: one frame is left-handed")
-    if np.abs(axes.T @ axes - np.eye(3)).max() > SQUARE:
+    if np.abs(axes.T @ axes - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise BadMessageError("a matrix that scales or shears: give a rotation and a shift in mm")
-    if np.abs(shift).max() > FARTHEST:
+    if np.abs(shift).max() > MAX_COORDINATE:
         raise BadMessageError("a shift of more than 10 m: give mm")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_matrix(axes).as_matrix(), shift

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from .frame import BadMessageError
 
-FLOATS = np.dtype(">f4")  # Type of numbers in a message.
-WHOLES = np.dtype(">u4")  # Type of integers in a message.
+FLOAT_TYPE = np.dtype(">f4")  # Type of numbers in a message.
+INTEGER_TYPE = np.dtype(">u4")  # Type of integers in a message.
 # Image header: version, components, scalar type, endianness, space, sizes, axes and centre, start and sizes of the
 # part.
 IMAGE = struct.Struct(">HBBBB3H12f6H")
@@ -23,7 +23,7 @@ POINT = struct.Struct(">64s32s4B3ff20s")  # Point: name, group, colour, position
 STATUS = struct.Struct(">Hq20s")  # Status: code, subcode, name of the error.
 BYTES, BIG, RAS = 3, 1, 1  # OpenIGTLink's numbers: unsigned bytes; big-endian; coordinates in RAS.
 ASCII = 3  # Number of the encoding US-ASCII.
-LONGEST_TEXT = (1 << 16) - 1  # Maximum length of a text [bytes].
+MAX_TEXT_BYTES = (1 << 16) - 1  # Maximum length of a text [bytes].
 
 
 class Code(IntEnum):
@@ -54,24 +54,24 @@ class SentMesh:
     @staticmethod
     def from_triangles(triangles: np.ndarray) -> SentMesh:
         """From vertex numbers (m, 3)."""
-        rows = np.full((len(triangles), 4), 3, WHOLES)
+        rows = np.full((len(triangles), 4), 3, INTEGER_TYPE)
         rows[:, 1:] = triangles
         return SentMesh(len(triangles), rows.tobytes())
 
 
-NOTHING = SentMesh(0, b"")
+EMPTY_MESH = SentMesh(0, b"")
 """Surface that is not available."""
 
 
 def encode_polydata(points: np.ndarray, mesh: SentMesh) -> bytes:
     """POLYDATA: points (n, 3) [mm] and the triangles between them."""
     head = struct.pack(">10I", len(points), 0, 0, 0, 0, mesh.count, len(mesh.cells), 0, 0, 0)
-    return head + np.ascontiguousarray(points, FLOATS).tobytes() + mesh.cells
+    return head + np.ascontiguousarray(points, FLOAT_TYPE).tobytes() + mesh.cells
 
 
 def transform(T: np.ndarray) -> bytes:
     """TRANSFORM: a rigid motion (4, 4) [mm], column by column."""
-    return np.ascontiguousarray(T[:3].T, FLOATS).tobytes()
+    return np.ascontiguousarray(T[:3].T, FLOAT_TYPE).tobytes()
 
 
 def read_transform(content: bytes) -> np.ndarray:
@@ -83,7 +83,7 @@ def read_transform(content: bytes) -> np.ndarray:
         A content of another size.
     """
     T = np.eye(4)
-    T[:3] = _floats(content, 12).reshape(4, 3).T
+    T[:3] = _read_floats(content, 12).reshape(4, 3).T
     return T
 
 
@@ -95,7 +95,7 @@ def read_position(content: bytes) -> np.ndarray:
     BadMessageError
         A content of another size, such as a position without orientation; an invalid quaternion.
     """
-    numbers = _floats(content, 7)
+    numbers = _read_floats(content, 7)
     if not abs(np.linalg.norm(numbers[3:]) - 1.0) < 1e-2:
         raise BadMessageError("its quaternion is not of length 1")
     T = np.eye(4)
@@ -103,10 +103,10 @@ def read_position(content: bytes) -> np.ndarray:
     return T
 
 
-def _floats(content: bytes, count: int) -> np.ndarray:
-    if len(content) != FLOATS.itemsize * count:
-        raise BadMessageError(f"wrong size: {len(content)} bytes in place of {FLOATS.itemsize * count}")
-    return np.frombuffer(content, FLOATS).astype(float)
+def _read_floats(content: bytes, count: int) -> np.ndarray:
+    if len(content) != FLOAT_TYPE.itemsize * count:
+        raise BadMessageError(f"wrong size: {len(content)} bytes in place of {FLOAT_TYPE.itemsize * count}")
+    return np.frombuffer(content, FLOAT_TYPE).astype(float)
 
 
 def encode_points(names: list[str], places: np.ndarray) -> bytes:
@@ -166,7 +166,7 @@ def read_image(content: bytes) -> np.ndarray:
 
 def encode_string(text: str) -> bytes:
     """Return STRING: a text of ASCII characters."""
-    raw = text.encode("ascii", "replace")[:LONGEST_TEXT]
+    raw = text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
     return struct.pack(">HH", ASCII, len(raw)) + raw
 
 

@@ -16,16 +16,27 @@ from ..play.stage import Stage
 from ..tracked.follower import TrackingResult, TumourState
 from .answer import PoseResult
 from .frame import BadMessageError, pack_message
-from .messages import NOTHING, Code, SentMesh, encode_points, encode_polydata, encode_status, encode_string, transform
+from .messages import (
+    EMPTY_MESH,
+    Code,
+    SentMesh,
+    encode_points,
+    encode_polydata,
+    encode_status,
+    encode_string,
+    transform,
+)
 
 # Largest distance of a requested point from the tumour or open cortex in the scan to which it is assigned [m].
-BESIDE = 2e-3
-MOST_NAMED = 5  # Maximum number of points outside the tracked surfaces that are named.
-MOST_PLACES = 1000
+MAX_POINT_DISTANCE = 2e-3
+MAX_NAMED_POINTS = 5  # Maximum number of points outside the tracked surfaces that are named.
+MAX_PLACES = 1000
 """Maximum number of points in one request."""
-STRANGE = "places that are not in or on the tumour, nor on open cortex, so that their motion is not known"
+UNTRACKED_POINTS = "places that are not in or on the tumour, nor on open cortex, so that their motion is not known"
 """Reason why points are not tracked."""
-ON = 1e-6  # Largest distance of a point from its position by barycentric coordinates, to be inside the tetrahedron [m].
+INSIDE_TOLERANCE = (
+    1e-6  # Largest distance of a point from its position by barycentric coordinates, to be inside the tetrahedron [m].
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,20 +92,20 @@ class Outgoing:
     def build_messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """Build all messages of a result, with its stamp: unknown surfaces are sent without points."""
         known, stamp = answer.known, answer.stamp
-        none = encode_polydata(np.empty((0, 3)), NOTHING)
+        none = encode_polydata(np.empty((0, 3)), EMPTY_MESH)
         out = []
         for name, vertices, mesh in self._surfaces:
-            here = _follows(known, vertices)
+            here = _is_motion_known(known, vertices)
             body = encode_polydata(1e3 * known.motion.positions[vertices], mesh) if here else none
             for word, shown in (("Now", known.relied), ("Doubtful", known.state is TumourState.UNSURE)):
                 out.append(pack_message("POLYDATA", f"{name}{word}", body if shown else none, stamp))
         if known.relied:
             rest, now = (each[self.stage.tumour_vertices] for each in (self._rest, known.motion.positions))
             out.append(pack_message("TRANSFORM", "TumourToRas", transform(fit_rigid(1e3 * rest, 1e3 * now)), stamp))
-        out.append(pack_message("STRING", "TipToTumour", encode_string(self._distance_words(answer)), stamp))
-        out.append(pack_message("STRING", "TumourMotion", encode_string(self._motion_words(known)), stamp))
+        out.append(pack_message("STRING", "TipToTumour", encode_string(self._format_distance(answer)), stamp))
+        out.append(pack_message("STRING", "TumourMotion", encode_string(self._format_motion(known)), stamp))
         if places is not None:
-            body = self._points(known, places)
+            body = self._build_point_message(known, places)
             for word, shown in (("Now", known.relied), ("Doubtful", known.state is TumourState.UNSURE)):
                 out.append(pack_message("POINT", f"Points{word}", body if shown else b"", stamp))
         return tuple(out)
@@ -114,8 +125,8 @@ class Outgoing:
         BadMessageError
             No point or too many; none in or on the tumour or on open cortex, so that their motion is unknown.
         """
-        if not 0 < len(at) <= MOST_PLACES:
-            raise BadMessageError(f"no place, or more than are followed: 1 to {MOST_PLACES}")
+        if not 0 < len(at) <= MAX_PLACES:
+            raise BadMessageError(f"no place, or more than are followed: 1 to {MAX_PLACES}")
         anatomy = self.stage.anatomy
         triangles = np.concatenate([anatomy.tumour_surface, anatomy.open_surface])
         found = find_closest_points(at, self._rest[triangles])
@@ -124,26 +135,28 @@ class Outgoing:
         vertices = np.concatenate([corners, corners[:, :1]], axis=1)
         weights = np.concatenate([found.weights, np.zeros((len(at), 1))], axis=1)
         held = locate(anatomy.mesh, at)
-        inside = self._in_tumour(held, at)
+        inside = self._is_in_tumour(held, at)
         vertices[inside], weights[inside], away[inside] = held.vertices[inside], held.weights[inside], 0.0
         labels = [name or f"number {row}" for row, name in enumerate(names, 1)]
-        strange = _listed([f"{labels[row]} {1e3 * away[row]:.0f} mm away" for row in np.flatnonzero(away > BESIDE)])
-        good = np.flatnonzero(away <= BESIDE)
+        strange = _format_names(
+            [f"{labels[row]} {1e3 * away[row]:.0f} mm away" for row in np.flatnonzero(away > MAX_POINT_DISTANCE)]
+        )
+        good = np.flatnonzero(away <= MAX_POINT_DISTANCE)
         if not len(good):
-            raise BadMessageError(f"{STRANGE}: {strange}")
+            raise BadMessageError(f"{UNTRACKED_POINTS}: {strange}")
         return SentPlaces(tuple(names[row] for row in good), at[good], vertices[good], weights[good], strange)
 
-    def _in_tumour(self, held: Located, at: np.ndarray) -> np.ndarray:
+    def _is_in_tumour(self, held: Located, at: np.ndarray) -> np.ndarray:
         """Return True for each point (n, 3) [m] in tetrahedra of the tumour."""
         there = np.linalg.norm(np.einsum("nk,nkd->nd", held.weights, self._rest[held.vertices]) - at, axis=1)
         known = np.isin(held.vertices, self.stage.anatomy.tumour_nodes) | (held.weights <= 0.0)
-        return known.all(axis=1) & (there <= ON)
+        return known.all(axis=1) & (there <= INSIDE_TOLERANCE)
 
     @property
     def _rest(self) -> np.ndarray:
         return self.stage.anatomy.mesh.nodes
 
-    def _points(self, known: TrackingResult, places: SentPlaces) -> bytes:
+    def _build_point_message(self, known: TrackingResult, places: SentPlaces) -> bytes:
         """Build the POINT message of the positions of those points that the result covers."""
         moved = (known.motion.positions - self._rest)[places.vertices]
         at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
@@ -151,20 +164,20 @@ class Outgoing:
         here = np.flatnonzero((np.isin(places.vertices, nodes) | (places.weights <= 0.0)).all(axis=1))
         return encode_points([places.names[row] for row in here], at[here])
 
-    def _distance_words(self, answer: PoseResult) -> str:
+    def _format_distance(self, answer: PoseResult) -> str:
         """Describe the distance from tip to tumour with its error and source, or the reason why it is not available."""
         known, gauge = answer.known, answer.gauge
         if gauge is None:
             return f"not known: {known.words}"
         inside = "inside the tumour, its edge " if gauge.inside else ""
-        return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_but(known)}"
+        return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_format_doubt(known)}"
 
-    def _motion_words(self, known: TrackingResult) -> str:
+    def _format_motion(self, known: TrackingResult) -> str:
         """Describe the tumour's displacement, with its error and sources; or why it is unknown."""
         if known.band is None:
             return f"not known: {known.words}"
         moved = format_millimetres(known.motion.moved, known.motion.error)
-        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._of}){_but(known)}"
+        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._of}){_format_doubt(known)}"
 
     @property
     def _of(self) -> str:
@@ -174,18 +187,18 @@ class Outgoing:
         return "of tracking and model; not known of registration, tissue and segmentation"
 
 
-def _but(known: TrackingResult) -> str:
+def _format_doubt(known: TrackingResult) -> str:
     """Describe why numbers are unreliable; empty if they are reliable."""
     return "" if known.relied else f"; doubtful: {known.words}"
 
 
-def _listed(names: list[str]) -> str:
+def _format_names(names: list[str]) -> str:
     """Return some of many, and how many others there are."""
-    others = len(names) - MOST_NAMED
-    return ", ".join(names[:MOST_NAMED]) + (f" and {others} others" if others > 0 else "")
+    others = len(names) - MAX_NAMED_POINTS
+    return ", ".join(names[:MAX_NAMED_POINTS]) + (f" and {others} others" if others > 0 else "")
 
 
-def _follows(known: TrackingResult, vertices: np.ndarray) -> bool:
+def _is_motion_known(known: TrackingResult, vertices: np.ndarray) -> bool:
     """Return True if the motion of these vertices is known."""
     answer = known.motion.answer
     return answer is not None and bool(np.isin(vertices, answer.nodes).all())

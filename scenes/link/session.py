@@ -33,16 +33,16 @@ from .messages import (
     read_position,
     read_transform,
 )
-from .outgoing import MOST_PLACES, STRANGE, SentPlaces
+from .outgoing import MAX_PLACES, UNTRACKED_POINTS, SentPlaces
 
-TICK = 0.1  # Interval of checks for missing input [s].
-BEAT = 1.0  # Interval of unchanged STATUS messages [s].
-AGAIN = 1.0  # Interval of attempts to connect to a server [s].
-MOST_OTHERS = 6  # Maximum number of other received transforms that are named when the required one does not arrive.
+CHECK_INTERVAL = 0.1  # Interval of checks for missing input [s].
+STATUS_INTERVAL = 1.0  # Interval of unchanged STATUS messages [s].
+RECONNECT_INTERVAL = 1.0  # Interval of attempts to connect to a server [s].
+MAX_OTHERS = 6  # Maximum number of other received transforms that are named when the required one does not arrive.
 # Types that are received without a reply: a STATUS in reply to a STATUS would loop forever.
 UNANSWERED = ("STATUS", "STRING", "CAPABILITY")
-SHORT = 1 << 16  # Maximum size of a message without an image or points [bytes], and allowance for headers.
-AHEAD = 1 << 18  # Read-ahead size of a client [bytes].
+MAX_SHORT_BYTES = 1 << 16  # Maximum size of a message without an image or points [bytes], and allowance for headers.
+READ_AHEAD_BYTES = 1 << 18  # Read-ahead size of a client [bytes].
 
 Picture = tuple[np.ndarray, int]
 """Colours (H, W, 3) uint8, and a time stamp."""
@@ -135,7 +135,7 @@ class LinkSession:
         most: int = 16,
         note: Callable[[str], None] = lambda line: None,
     ) -> None:
-        self.clients = LinkClients(self._receive, self._longest, most, note)
+        self.clients = LinkClients(self._receive, self._get_max_size, most, note)
         self._note = note
         self._answers, self._speaks, self._heard, self._eye = answers, speaks, heard, eye
         self._others: dict[str, None] = {}
@@ -166,7 +166,7 @@ class LinkSession:
         OSError
             An address that cannot be served on.
         """
-        server = await asyncio.start_server(self.clients.converse, host, port, limit=AHEAD)
+        server = await asyncio.start_server(self.clients.converse, host, port, limit=READ_AHEAD_BYTES)
         ready.set_result(server.sockets[0].getsockname()[1])
         work = [] if source is None else [asyncio.create_task(self._connected(*source))]
         try:
@@ -180,7 +180,7 @@ class LinkSession:
         reached, at = True, f"the server {format_address(host, port)}"
         while True:
             try:
-                streams = await asyncio.open_connection(host, port, limit=AHEAD)
+                streams = await asyncio.open_connection(host, port, limit=READ_AHEAD_BYTES)
             except OSError as error:
                 if reached:
                     self._note(f"{at} cannot be reached ({error}): start it, or mend --client. It is tried again")
@@ -191,7 +191,7 @@ class LinkSession:
                 with suppress(OSError):
                     await self.clients.listen(*streams)
                 self._note(f"{at} has ended the connection")
-            await asyncio.sleep(AGAIN)
+            await asyncio.sleep(RECONNECT_INTERVAL)
 
     async def _work(self, seconds: float) -> None:
         self.clients.publish("scan", (self._speaks.build_scan(0),))
@@ -220,10 +220,12 @@ class LinkSession:
             self._posed.clear()
             heard, places, self._begun = self._heard, self._places, self._loop.time()
             body = heard.find_relative(heard.names.tool, self._begun)
-            answer, messages = await self._loop.run_in_executor(thread, self._computed, heard, places, self._begun)
+            answer, messages = await self._loop.run_in_executor(
+                thread, self._compute_messages, heard, places, self._begun
+            )
             self._solved, self._begun = answer, np.inf
             self._arrived = np.inf if isinstance(body, str) else body.arrived
-            current = self._current(self._loop.time())
+            current = self._get_current_result(self._loop.time())
             # A pose may have grown old while its solution was computed.
             self._show(current, messages if current is answer else self._speaks.build_messages(current, places))
 
@@ -233,26 +235,30 @@ class LinkSession:
         beat = 0.0
         while True:
             now, kinds = self._loop.time(), frozenset(self.clients.refused)
-            if (answer := self._current(now)) is not self._shown:
+            if (answer := self._get_current_result(now)) is not self._shown:
                 self._show(answer, self._speaks.build_messages(answer, self._places))
             known = answer.known
             # A number that grows is no news.
             saying = known.state, re.sub(r"[\d.]+", "", known.words), kinds, tuple(self._others)
-            if saying != said or now - beat >= BEAT:
+            if saying != said or now - beat >= STATUS_INTERVAL:
                 said, beat = saying, now
-                self.clients.publish("status", (self._speaks.build_status(answer, self._refused_words(known)),))
-            await asyncio.sleep(TICK)
+                self.clients.publish("status", (self._speaks.build_status(answer, self._format_rejected(known)),))
+            await asyncio.sleep(CHECK_INTERVAL)
 
-    def _current(self, now: float) -> PoseResult:
+    def _get_current_result(self, now: float) -> PoseResult:
         """Return the last solution, or the reason why none holds at a time [s]; the solver is not called."""
         if isinstance(self._heard.find_relative(self._heard.names.tool, now), str):
             return self._answers.compute_result(self._heard, now, clock.time(), self._shown.known)
         answer, waited = add_lateness(self._solved, now - self._arrived, self._heard.stale), now - self._begun
-        if answer is self._solved and answer.known.state in (TumourState.NO_TOOL, TumourState.STALE) and waited > BEAT:
+        if (
+            answer is self._solved
+            and answer.known.state in (TumourState.NO_TOOL, TumourState.STALE)
+            and waited > STATUS_INTERVAL
+        ):
             return replace(answer, known=replace(answer.known, words=f"no solution yet, computing for {waited:.0f} s"))
         return answer
 
-    def _computed(
+    def _compute_messages(
         self, heard: ReceivedTransforms, places: SentPlaces | None, now: float
     ) -> tuple[PoseResult, tuple[bytes, ...]]:
         """Compute a result and its messages, in the solver's thread."""
@@ -263,12 +269,12 @@ class LinkSession:
         self._shown = answer
         if answer.known.state not in self._states:
             self._states.add(answer.known.state)
-            self._note(f"the tumour is {_found(answer.known)}")
+            self._note(f"the tumour is {_describe_state(answer.known)}")
         self.clients.publish("answer", messages)
 
-    def _refused_words(self, known: TrackingResult) -> str:
+    def _format_rejected(self, known: TrackingResult) -> str:
         """Describe rejected messages, and other received transforms if the wanted one does not arrive."""
-        parts = [f"{number} {why}" for why, number in self.clients.refused.most_common(MOST_OTHERS)]
+        parts = [f"{number} {why}" for why, number in self.clients.refused.most_common(MAX_OTHERS)]
         words = f"; rejected: {', '.join(parts)}" if parts else ""
         if self._others and known.state in (TumourState.NO_TOOL, TumourState.STALE):
             words += f"; other transforms received: {', '.join(self._others)}"
@@ -286,19 +292,19 @@ class LinkSession:
             drawn = await self._loop.run_in_executor(thread, eye.draw, colour, self._shown.known, camera)
             self.clients.publish("picture", (pack_message("IMAGE", "Overlay", encode_image(drawn), stamp),))
 
-    def _longest(self, kind: str) -> int:
+    def _get_max_size(self, kind: str) -> int:
         """Return the maximum size [bytes] of a wanted message of a type; 0: not wanted."""
         if kind == "IMAGE" and self._eye is not None:
-            return IMAGE.size + 4 * self._eye.calibration.width * self._eye.calibration.height + SHORT
+            return IMAGE.size + 4 * self._eye.calibration.width * self._eye.calibration.height + MAX_SHORT_BYTES
         if kind == "POINT":
-            return MOST_PLACES * POINT.size + SHORT
-        return SHORT if kind in ("TRANSFORM", "POSITION", *UNANSWERED) else 0
+            return MAX_PLACES * POINT.size + MAX_SHORT_BYTES
+        return MAX_SHORT_BYTES if kind in ("TRANSFORM", "POSITION", *UNANSWERED) else 0
 
     def _receive(self, number: int, header: Header, content: bytes) -> None:
         """Hear a message; raises `BadMessageError`."""
         match header.kind:
             case "TRANSFORM" | "POSITION":
-                self._hear_transform(number, header, content)
+                self._receive_transform(number, header, content)
             case "IMAGE" if self._eye is not None:
                 colour, wanted = read_image(content), self._eye.calibration
                 if colour.shape[:2] != (wanted.height, wanted.width):
@@ -313,14 +319,14 @@ class LinkSession:
                 self._places = self._speaks.attach_points(names, 1e-3 * places)
                 self._posed.set()
                 if self._places.strange:
-                    words = f"{STRANGE}: {self._places.strange}; the others are followed"
-                    self.clients.reject(number, Code.CONFIGURATION, STRANGE, words)
+                    words = f"{UNTRACKED_POINTS}: {self._places.strange}; the others are followed"
+                    self.clients.reject(number, Code.CONFIGURATION, UNTRACKED_POINTS, words)
 
-    def _hear_transform(self, number: int, header: Header, content: bytes) -> None:
+    def _receive_transform(self, number: int, header: Header, content: bytes) -> None:
         names = self._heard.names
         name = names.by_wire.get(header.name)
         if name is None:
-            if header.name and len(self._others) < MOST_OTHERS:
+            if header.name and len(self._others) < MAX_OTHERS:
                 self._others[header.name] = None
             return
         check_status(header.metadata)
@@ -330,7 +336,7 @@ class LinkSession:
             self._posed.set()
 
 
-def _found(known: TrackingResult) -> str:
+def _describe_state(known: TrackingResult) -> str:
     """Describe the state of the tumour, for a console."""
     if known.relied:
         return f"known, {known.state.value}"

@@ -17,7 +17,7 @@ from sim.runtime.atomic_files import check_output, remove_empty_parents
 from sim.runtime.journal import run_of
 from sim.runtime.partial_files import to_unfinished_path
 
-FRAME = re.compile(r"frame_\d{4,}\.png")  # Pattern of a frame's file name.
+FRAME_PATTERN = re.compile(r"frame_\d{4,}\.png")  # Pattern of a frame's file name.
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:
@@ -78,7 +78,7 @@ def check_output_frames(folder: Path, force: bool) -> list[Path]:
     InputError
         Existing frames, without `force`.
     """
-    frames = sorted(path for path in folder.glob("frame_*.png") if FRAME.fullmatch(path.name))
+    frames = sorted(path for path in folder.glob("frame_*.png") if FRAME_PATTERN.fullmatch(path.name))
     if frames and not force:
         raise InputError(
             f"{folder}: holds {len(frames)} frames. Give --force to remove them, or choose another folder."
@@ -87,7 +87,7 @@ def check_output_frames(folder: Path, force: bool) -> list[Path]:
 
 
 # Attributes of a data set that must be unchanged for a run to resume it.
-KEPT = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
+UNCHANGED_ATTRIBUTES = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
 
 
 def read_statements(path: Path) -> dict[str, str]:
@@ -138,7 +138,7 @@ def remove_data(path: Path, wanted: Mapping[str, str]) -> None:
     """Remove a data set, and an unfinished one of its name, that cannot go on as what is `wanted`; keep others."""
     for each in (path, to_unfinished_path(path)):
         found = read_statements(each)
-        if any(found.get(name) != wanted.get(name) for name in KEPT):
+        if any(found.get(name) != wanted.get(name) for name in UNCHANGED_ATTRIBUTES):
             each.unlink(missing_ok=True)
 
 

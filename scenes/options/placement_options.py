@@ -14,7 +14,7 @@ from sim.bodies.subject import Subject
 from sim.errors import InputError
 
 Point = tuple[float, float, float]
-ON_LINE = 2000  # Number of points of a trajectory that are compared with the brain.
+LINE_POINTS = 2000  # Number of points of a trajectory that are compared with the brain.
 
 
 def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +90,7 @@ def place_craniotomy(subject: Subject, args: argparse.Namespace) -> Subject:
         or whose markup is of another kind.
     """
     if isinstance(args.opening_at, Path):
-        return _marked(subject, read_markup(args.opening_at))
+        return _place_opening(subject, read_markup(args.opening_at))
     if args.opening_at is not None:
         return replace(subject, site=find_opening_at(subject.cortex, 1e-3 * np.array(args.opening_at)))
     over, pieces = args.opening_over, subject.pieces
@@ -103,45 +103,45 @@ def place_craniotomy(subject: Subject, args: argparse.Namespace) -> Subject:
         place = pieces[over - 1].centre
     elif isinstance(over, Path):
         markup = read_markup(over)
-        _demand_kind(markup, "--opening-over", Fiducial=1, Line=2)
-        place = max(markup.points, key=lambda end: _depth(subject, end))
+        _check_kind(markup, "--opening-over", Fiducial=1, Line=2)
+        place = max(markup.points, key=lambda end: _compute_depth(subject, end))
     else:
         place = 1e-3 * np.array(over)
-    return replace(subject, site=find_opening_over(subject.cortex, place, _depth(subject, place)))
+    return replace(subject, site=find_opening_over(subject.cortex, place, _compute_depth(subject, place)))
 
 
-def _depth(subject: Subject, place: np.ndarray) -> float:
+def _compute_depth(subject: Subject, place: np.ndarray) -> float:
     """Return the depth [m] of a point (3,) below the brain surface; negative outside."""
     # Beyond a few voxels from the surface, the field of a volume gives only the side.
     apart = float(np.linalg.norm(subject.cortex - place, axis=1).min())
     return -apart if subject.brain(place[None])[0] > 0.0 else apart
 
 
-def _marked(subject: Subject, markup: Markup) -> Subject:
+def _place_opening(subject: Subject, markup: Markup) -> Subject:
     """Return the subject opened at a point, where a trajectory enters the brain, or within an outline."""
-    _demand_kind(markup, "--opening-at", Fiducial=1, Line=2, ClosedCurve=None)
+    _check_kind(markup, "--opening-at", Fiducial=1, Line=2, ClosedCurve=None)
     if markup.kind == "ClosedCurve":
         outline = markup.fit_curve()
         return replace(subject, outline=outline, site=find_opening_within(subject.cortex, outline))
-    ends = sorted(markup.points, key=lambda end: _depth(subject, end))
-    along = ends[0] + np.linspace(0.0, 1.0, ON_LINE)[:, None] * (ends[-1] - ends[0])
+    ends = sorted(markup.points, key=lambda end: _compute_depth(subject, end))
+    along = ends[0] + np.linspace(0.0, 1.0, LINE_POINTS)[:, None] * (ends[-1] - ends[0])
     inside = np.flatnonzero(subject.brain(along) < 0.0)
     entry = along[inside[0]] if len(inside) else ends[-1]
     return replace(subject, site=find_opening_at(subject.cortex, entry))
 
 
-def _demand_kind(markup: Markup, option: str, **kinds: int | None) -> None:
+def _check_kind(markup: Markup, option: str, **kinds: int | None) -> None:
     """Reject markups of other kinds, or with another number of points than they declare."""
     if markup.kind in kinds and kinds[markup.kind] in (None, len(markup.points)):
         return
     words = {"Fiducial": "one point", "Line": "a line of two points", "ClosedCurve": "a closed curve"}
     raise InputError(
-        f"{markup.path}: holds {_held(markup)}; {option} takes {' or '.join(words[kind] for kind in kinds)}. "
+        f"{markup.path}: holds {_describe_markup(markup)}; {option} takes {' or '.join(words[kind] for kind in kinds)}. "
         "Save that from 3D Slicer."
     )
 
 
-def _held(markup: Markup) -> str:
+def _describe_markup(markup: Markup) -> str:
     """Describe the content of a file."""
     count = "1 point" if len(markup.points) == 1 else f"{len(markup.points)} points"
     known = {

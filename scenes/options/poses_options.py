@@ -60,10 +60,10 @@ def check_pose_options(args: argparse.Namespace) -> None:
     if args.camera_poses is not None and args.hand_eye is None:
         raise InputError("--camera-poses has a body that the camera is fixed to: give --hand-eye H.json, too.")
     if args.clock != [AUTO]:
-        _clock(args.clock)
+        _parse_clock(args.clock)
 
 
-def _clock(words: list[str]) -> tuple[float, float]:
+def _parse_clock(words: list[str]) -> tuple[float, float]:
     """Return an offset, and by how much it is off [s]."""
     try:
         offset, error = float(words[0]), float(words[1]) if len(words) > 1 else 0.0
@@ -93,12 +93,12 @@ def open_external_tracker(args: argparse.Namespace, calibration: Calibration) ->
     if args.hand_eye is not None:
         body = None if args.camera_poses is None else read_stream(args.camera_poses)
         eye = CameraMount(*read_hand_eye(args.hand_eye), body)
-    elsewhere = ExternalTracker(tool, patient, _clock_of(args, calibration, tool, patient), eye)
-    _say_apart(args, elsewhere)
+    elsewhere = ExternalTracker(tool, patient, _choose_clock(args, calibration, tool, patient), eye)
+    _report_mismatch(args, elsewhere)
     return elsewhere
 
 
-def _say_apart(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
+def _report_mismatch(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
     """Report the times of poses and images, if the video begins outside the poses."""
     from ar.tracking.pictures import read_video
 
@@ -117,7 +117,7 @@ def _say_apart(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
     print(f"sulcus overlay: {said}", file=sys.stderr)
 
 
-def _clock_of(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
+def _choose_clock(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
     """Return the given clock offset, or the one estimated from the video's own markers."""
     from ar.tracking.pictures import read_video
     from ar.tracking.pose_stream import Clock
@@ -126,7 +126,7 @@ def _clock_of(args: argparse.Namespace, calibration: Calibration, tool: PoseStre
     from ..tracked.run import read_timed
 
     if args.clock != [AUTO]:
-        return Clock(*_clock(args.clock))
+        return Clock(*_parse_clock(args.clock))
     try:
         film = (each.picture for each in read_timed(read_video(Path(args.pictures), args.rate)))
         found = estimate_video_clock(film, calibration, tool, patient)

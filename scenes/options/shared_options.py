@@ -54,14 +54,14 @@ def add_json(parser: argparse.ArgumentParser, meaning: str = "print one JSON lin
 
 def to_json_line(value: Any) -> str:
     """One line of JSON: null stands for numbers that are not finite, which JSON does not have."""
-    return json.dumps(_finite(value), allow_nan=False)
+    return json.dumps(_replace_non_finite(value), allow_nan=False)
 
 
-def _finite(value: Any) -> Any:
+def _replace_non_finite(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _replace_non_finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_replace_non_finite(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

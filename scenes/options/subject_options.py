@@ -81,17 +81,17 @@ def parse_sources(args: argparse.Namespace) -> Sources:
         args.convention,
         args.mask,
         args.tumour_in,
-        _parts(args),
+        _get_parts(args),
         args.axes,
     )
 
 
 def parse_regions(args: argparse.Namespace) -> tuple[str, ...]:
     """Return the parts of brain and tumour that become regions of their own."""
-    return tuple(dict.fromkeys((*(name for name in _parts(args) if name in PART_LABELS), *args.regions)))
+    return tuple(dict.fromkeys((*(name for name in _get_parts(args) if name in PART_LABELS), *args.regions)))
 
 
-def _parts(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
+def _get_parts(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
     return {name: getattr(args, name) for name in (*PART_LABELS, *SEPTA) if getattr(args, name) is not None}
 
 
@@ -104,7 +104,7 @@ def label_words(args: argparse.Namespace) -> list[str]:
         "--convention": args.convention,
         "--mask": args.mask,
         "--tumour-in": args.tumour_in,
-        **{f"--{name}": ",".join(map(str, found)) for name, found in _parts(args).items()},
+        **{f"--{name}": ",".join(map(str, found)) for name, found in _get_parts(args).items()},
         "--regions": ",".join(args.regions) or None,
         "--axes": args.axes or None,
     }
@@ -112,9 +112,9 @@ def label_words(args: argparse.Namespace) -> list[str]:
 
 
 # Options that place a tumour in the template.
-PLACED = ("radius", "cover", "tumour_shape", "site", "tumour_at", "head", "brain_ml", "falx_depth")
-SMALLEST_ML = 20.0  # Smallest accepted volume of a brain [ml].
-LARGEST_ML = 5000.0  # Largest accepted volume of a brain [ml].
+PLACING_OPTIONS = ("radius", "cover", "tumour_shape", "site", "tumour_at", "head", "brain_ml", "falx_depth")
+MIN_BRAIN_ML = 20.0  # Smallest accepted volume of a brain [ml].
+MAX_BRAIN_ML = 5000.0  # Largest accepted volume of a brain [ml].
 
 
 def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
@@ -162,7 +162,7 @@ def describe_source(args: argparse.Namespace) -> str:
 
 def check_no_drawn_options(args: argparse.Namespace) -> None:
     """Reject options of a synthetic tumour together with a label map, by an `InputError`."""
-    for name in PLACED:
+    for name in PLACING_OPTIONS:
         if getattr(args, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} draws in a healthy head: leave it out with --labels.")
 
@@ -181,21 +181,21 @@ def build_drawn_subject(args: argparse.Namespace, chosen: dict[str, Any]) -> Sub
         raise InputError("--t1 colours your own brain: give --labels or --mask too, or leave it out.")
     if args.mask is not None and args.head is not None:
         raise InputError(f"--mask says whose brain it is, and --head {args.head} does: leave one of them out.")
-    if args.brain_volume is not None and not SMALLEST_ML <= args.brain_volume <= LARGEST_ML:
+    if args.brain_volume is not None and not MIN_BRAIN_ML <= args.brain_volume <= MAX_BRAIN_ML:
         raise InputError(
-            f"--brain-volume {args.brain_volume:g} is outside {SMALLEST_ML:g} to {LARGEST_ML:g}: choose between."
+            f"--brain-volume {args.brain_volume:g} is outside {MIN_BRAIN_ML:g} to {MAX_BRAIN_ML:g}: choose between."
         )
     if args.tumour_at is not None and (args.site is not None or args.cover is not None):
         raise InputError("--tumour-at says where the tumour lies: leave out --site and --cover, or --tumour-at.")
     middle = None if args.tumour_at is None else tuple(1e-3 * value for value in args.tumour_at)
     lengths = 1e-3 * chosen["radius"], 1e-3 * chosen["cover"]
-    subject = _in_head(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle), args)
+    subject = _place_in_head(Tumour(*lengths, chosen["tumour_shape"], chosen["site"], args.seed, middle), args)
     if args.falx_depth is None:
         return subject
     return replace(subject, septa=(synthesise_falx(subject.cortex, 1e-3 * args.falx_depth),))
 
 
-def _in_head(tumour: Tumour, args: argparse.Namespace) -> Subject:
+def _place_in_head(tumour: Tumour, args: argparse.Namespace) -> Subject:
     volume = None if args.brain_volume is None else 1e-6 * args.brain_volume
     if args.mask is not None:
         return build_synthetic_subject(tumour, build_masked_head(args.mask, args.t1, volume))

@@ -104,10 +104,10 @@ def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientS
     from ..script.scene import find_scene
 
     scene = apply_tissue_options(args, find_scene(name), theatre)
-    return scene if args.trajectory is None else _approached(args, scene, theatre.site)
+    return scene if args.trajectory is None else _follow_trajectory(args, scene, theatre.site)
 
 
-def _approached(args: argparse.Namespace, scene: Scene, site: CraniotomyFrame) -> Scene:
+def _follow_trajectory(args: argparse.Namespace, scene: Scene, site: CraniotomyFrame) -> Scene:
     """Let the scene's tool follow the trajectory; a notice names what keeps it from that."""
     from sim.bodies.markups import read_markup
 
@@ -145,9 +145,11 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
     budget = args.within_error, args.within_time
     if args.deformer != "auto" and budget == (None, None):
         if args.deformer is None and not theatre.select_models(scene):
-            from ..play.deformers import TRUTH
+            from ..play.deformers import TRUTH_TEXT
 
-            none = "no model exists next to this anatomy; `sulcus train` trains one" if scene.sight is None else TRUTH
+            none = (
+                "no model exists next to this anatomy; `sulcus train` trains one" if scene.sight is None else TRUTH_TEXT
+            )
             why = next(iter(theatre.list_rejections(scene).values()), none)
             print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {why}", file=sys.stderr)
         best = theatre.select_best(scene)

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
     from ..script.scene import Scene
 
-OWN = tuple(name for name in REGION_NAMES if name != "brain")
+NON_BRAIN_REGIONS = tuple(name for name in REGION_NAMES if name != "brain")
 """Names of regions that may have a stiffness of their own."""
-DOUBTED = 100.0, 1e6
+PLAUSIBLE_YOUNG = 100.0, 1e6
 """Young's moduli [Pa] below and above which no tissue in a skull was measured, by far.
 
 Operated brains have 7.3 kPa, and their tumours 11.4 to 33.1 kPa in the mean of each kind: Chauvet et al. 2016,
@@ -78,7 +78,7 @@ def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN
         default=[],
         metavar="REGION:YOUNG[,POISSON]",
         help=f"Young's modulus [Pa] and, optionally, Poisson's ratio of a region, by number or name "
-        f"({', '.join(OWN)}), such as oedema:2000 or 3:2000,0.45; for Ogden's law REGION:C1,M1;C2,M2;K; repeatable "
+        f"({', '.join(NON_BRAIN_REGIONS)}), such as oedema:2000 or 3:2000,0.45; for Ogden's law REGION:C1,M1;C2,M2;K; repeatable "
         f"(default: {default}; necrosis as the tumour)",
     )
 
@@ -117,7 +117,7 @@ def parse_tissue(args: argparse.Namespace) -> Tissue:
     InputError
         Missing or unknown constants of the law, text with another format, or invalid constants.
     """
-    tissue = _elastic(args)
+    tissue = _parse_tissue(args)
     if args.young is not None:
         _warn(f"--young {args.young:g}", tissue)
     if args.prony is None:
@@ -131,7 +131,7 @@ def parse_tissue(args: argparse.Namespace) -> Tissue:
     return replace(tissue, prony=tuple(series))
 
 
-def _elastic(args: argparse.Namespace) -> Material | Ogden:
+def _parse_tissue(args: argparse.Namespace) -> Material | Ogden:
     """Return the requested elastic tissue, with the Prony series of its preset."""
     known = MATERIALS[args.material].tissue if args.material in MATERIALS else None
     ours = {"--ogden": args.ogden, "--bulk": args.bulk}
@@ -234,7 +234,7 @@ def parse_region_tissues(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | N
 def check_stiffness(tissue: Tissue) -> str:
     """Return the reason why a tissue's small-strain stiffness is implausible, as a predicate; empty if plausible."""
     mu, lame = tissue.lame
-    young, (least, most) = mu * (3.0 * lame + 2.0 * mu) / (lame + mu), DOUBTED
+    young, (least, most) = mu * (3.0 * lame + 2.0 * mu) / (lame + mu), PLAUSIBLE_YOUNG
     if least <= young <= most:
         return ""
     if young > most:
@@ -261,7 +261,7 @@ def parse_region_label(text: str) -> int:
     ValueError
         Neither.
     """
-    return REGION_NAMES[text] if text in OWN else int(text)
+    return REGION_NAMES[text] if text in NON_BRAIN_REGIONS else int(text)
 
 
 def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
@@ -287,7 +287,9 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
         raise InputError(f"--region {text}: {error}") from error
     except ValueError as error:
         form = "REGION:C1,M1;C2,M2;K, as in 2:1340,-19;148000" if ogden else "REGION:YOUNG, as in oedema:2000"
-        raise InputError(f"--region {text}: write {form}. REGION is a number, or one of {', '.join(OWN)}.") from error
+        raise InputError(
+            f"--region {text}: write {form}. REGION is a number, or one of {', '.join(NON_BRAIN_REGIONS)}."
+        ) from error
 
 
 def parse_terms(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:

@@ -21,16 +21,16 @@ TUMOUR_MIDDLE, TIP = "the tumour's middle", "the tool's tip"
 # Chart of the distance from tip to tumour.
 DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of the model (95 %); dotted: error unknown")
 FORCE = Line("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: error unknown")  # Chart of the force.
-SET = Line("force", "N", "#ffa94d", "as it is set")  # Chart of the prescribed force.
+SET_FORCE = Line("force", "N", "#ffa94d", "as it is set")  # Chart of the prescribed force.
 # Chart of the tumour's motion.
-MOVED = Line("tumour moved", "mm", "#4cf28c", "band: error of the tumour (95 %); dotted: not known")
+TUMOUR_MOTION = Line("tumour moved", "mm", "#4cf28c", "band: error of the tumour (95 %); dotted: not known")
 
 
 def list_lines(scene: Scene) -> tuple[Line, ...]:
     """Return the plotted quantities of a scene: without a tool, the displacement of the tumour."""
     if scene.tool is None:
-        return (MOVED,)
-    return DISTANCE, FORCE if scene.posed else SET
+        return (TUMOUR_MOTION,)
+    return DISTANCE, FORCE if scene.posed else SET_FORCE
 
 
 def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
@@ -38,9 +38,9 @@ def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
     if scene.tool is None:
         known = frame.estimate.location if frame.estimate is not None else None
         error = frame.tumour_error.bound if known is None else known.p95
-        return Sample(now, (1e3 * frame.moved,), (_scaled(error, 1e3),))
+        return Sample(now, (1e3 * frame.moved,), (_scale_value(error, 1e3),))
     force, force_error = get_tool_force(frame.loads, frame.deformation)
-    distance = _scaled(frame.distance, 1e3), _scaled(frame.distance_error, 1e3)
+    distance = _scale_value(frame.distance, 1e3), _scale_value(frame.distance_error, 1e3)
     return Sample(now, (distance[0], force), (distance[1], force_error))
 
 
@@ -77,5 +77,5 @@ def draw_slices_through(stage: Stage, cut: Cut, through: str) -> np.ndarray:
     return draw_slices(stage.scan, cut.tip if through == TIP and cut.tip is not None else middle, cut)
 
 
-def _scaled(value: float | None, by: float) -> float | None:
+def _scale_value(value: float | None, by: float) -> float | None:
     return None if value is None or not np.isfinite(value) else by * value

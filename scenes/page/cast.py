@@ -18,7 +18,7 @@ from ..script.camera_paths import PATHS
 from ..script.scene import Scene
 from .referee import FemResult, FemWorker, Question
 
-ALL: frozenset[str] = frozenset()
+ALL_ACTIVE: frozenset[str] = frozenset()
 """Disabled effects when all effects are active."""
 
 
@@ -38,7 +38,7 @@ class SceneSolvers:
         """
         self.theatre, self.turn = theatre, turn
         # Not on a GPU: rendering while a solver's thread records a CUDA graph would be recorded, too.
-        self.stages = {ALL: replace(theatre.build_stage(scene), device="cpu")}
+        self.stages = {ALL_ACTIVE: replace(theatre.build_stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
         self.filmed: dict[tuple[frozenset[str], str], Stage] = {}
         self.last: dict[str, Deformation] = {}
@@ -50,22 +50,22 @@ class SceneSolvers:
         if self.playable:
             self.get_player(deformer)
 
-    def get_stage(self, off: frozenset[str] = ALL) -> Stage:
+    def get_stage(self, off: frozenset[str] = ALL_ACTIVE) -> Stage:
         """Return the stage of the scene without some effects, of the tissue that it has with them."""
         if off not in self.stages:
-            scene = self.stages[ALL].scene
+            scene = self.stages[ALL_ACTIVE].scene
             for effect in scene.get_effects_on(self.theatre.anatomy):
                 scene = remove_effect(scene, effect) if type(effect).__name__ in off else scene
-            self.stages[off] = replace(self.stages[ALL], scene=scene)
+            self.stages[off] = replace(self.stages[ALL_ACTIVE], scene=scene)
         return self.stages[off]
 
-    def get_worker(self, off: frozenset[str] = ALL) -> FemWorker:
+    def get_worker(self, off: frozenset[str] = ALL_ACTIVE) -> FemWorker:
         """Return the finite elements of the scene without some effects."""
         if off not in self.solvers:
             self.solvers[off] = FemWorker(self.theatre, self.get_stage(off).scene, self.turn)
         return self.solvers[off]
 
-    def get_player(self, name: str, off: frozenset[str] = ALL) -> Player:
+    def get_player(self, name: str, off: frozenset[str] = ALL_ACTIVE) -> Player:
         """Return the player of the scene without some effects: a trained model, or FEM with a solution."""
         if (name, off) not in self.players:
             stage = self.get_stage(off)
@@ -74,7 +74,7 @@ class SceneSolvers:
                 assert solved is not None
                 deformer = solved.deformer
             else:
-                deformer = self._trained(name, stage.scene)
+                deformer = self._build_trained(name, stage.scene)
             uncertainty = self.theatre.estimate_uncertainty(stage.scene)
             self.players[name, off] = Player(stage, deformer, uncertainty=uncertainty)
         return self.players[name, off]
@@ -89,7 +89,7 @@ class SceneSolvers:
             self.filmed[off, path] = replace(player.stage, scene=replace(player.scene, viewpoint=view))
         return replace(player, stage=self.filmed[off, path])
 
-    def _trained(self, name: str, scene: Scene) -> Deformer:
+    def _build_trained(self, name: str, scene: Scene) -> Deformer:
         """Return a trained model. Its FEM fallback is built under `turn`, on the CPU like the stages."""
         with self.turn if name == GUARDED else nullcontext():
             return replace(self.theatre, device="cpu").build_deformer(name, scene)

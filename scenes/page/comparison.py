@@ -21,7 +21,7 @@ from ..script.tool_paths import compute_lift
 from .referee import FemResult
 
 # Texts: the displayed result is FEM's; FEM's result is the reference.
-OWN, TRUTH = "this is the result of the FEM solver", "the truth is the result of the FEM solver"
+FEM_SHOWN, FEM_REFERENCE = "this is the result of the FEM solver", "the truth is the result of the FEM solver"
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def compare_with_fem(truth: FemResult, player: Player, own: bool, shown: Deforma
     )
 
 
-def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: str = OWN) -> str:
+def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: str = FEM_SHOWN) -> str:
     """Format the comparison; that of a previous load is greyed and marked, with the state of the FEM solver.
 
     `own` is the text for a solution by FEM itself.
@@ -115,7 +115,7 @@ class PageState:
     plan: tuple[str, ...] | None = None
 
 
-RECENT = 120  # Number of last loads that are kept for each deformer.
+MAX_RECENT_LOADS = 120  # Number of last loads that are kept for each deformer.
 
 
 @dataclass(frozen=True)
@@ -170,5 +170,5 @@ def _keep(numbers: dict[str, float], load: str, value: float) -> None:
     """Note the newest value of a load, and forget the load that was noted longest ago."""
     numbers.pop(load, None)
     numbers[load] = value
-    if len(numbers) > RECENT:
+    if len(numbers) > MAX_RECENT_LOADS:
         del numbers[next(iter(numbers))]

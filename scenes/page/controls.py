@@ -9,35 +9,35 @@ import numpy as np
 
 from ar.overlay.hud import name_bearings
 from ar.overlay.styles import STYLES, Style
-from ar.page.elements import STYLE
+from ar.page.elements import STYLE_KEY
 from ar.page.parts import Dropdown, Fold, Note, Slider, Toggle
 from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
 
 from ..script.camera_paths import PATHS
 from ..script.scene import SCENES, Scene
 from ..script.site import CraniotomyFrame
-from ..script.tool_paths import AIR, Touch
+from ..script.tool_paths import IDLE_HEIGHT, Touch
 from .beside import TIP, TUMOUR_MIDDLE
 from .requests import HAND, SCRIPT, Requests
 from .text import describe_effect
 
-MOST_FORCE = 0.4  # End of the force slider [N].
-MOST_DEPTH = 8.0  # End of the depth slider [mm].
-MOST_TILT = 40.0  # End of the direction sliders [deg].
-STAYS = "stays"
+MAX_FORCE = 0.4  # End of the force slider [N].
+MAX_DEPTH = 8.0  # End of the depth slider [mm].
+MAX_TILT = 40.0  # End of the direction sliders [deg].
+STATIC_CAMERA = "stays"
 """Label of a static camera."""
 PLAN = "solver details (advanced)"
 """Label of the note on the solvers."""
 OWN_FILM = "your own video or camera"
 """Label of the note on own videos."""
 # Text of the note on own videos.
-ASKED = (  # Text of that note.
+OWN_VIDEO_NOTE = (  # Text of that note.
     "<p>The same page can show your own video, or a camera of this machine, with the tumour overlay:</p>"
     "<p><code>sulcus overlay VIDEO --page --camera K.yaml --registration R.json --tool T.json</code></p>"
     "<p>A camera's number instead of the video selects that camera. <code>sulcus film palpate --out film</code> makes "
     "a test video. <code>sulcus overlay --help</code> lists the command that makes each file.</p>"
 )
-HANDS = "A slider takes the tool in your hand; 'script' gives it back."  # Hint on manual control.
+MANUAL_HINT = "A slider takes the tool in your hand; 'script' gives it back."  # Hint on manual control.
 
 
 def build_controls(
@@ -52,7 +52,7 @@ def build_controls(
 
     `give` receives who gets the tool, `take` numbers of its touch, as `Requests.take_over` does.
     """
-    cameras = "scene default", STAYS, *PATHS
+    cameras = "scene default", STATIC_CAMERA, *PATHS
 
     def film(name: str) -> None:
         wish.set(path="" if name == cameras[0] else name)
@@ -78,7 +78,7 @@ def build_controls(
         *([] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]),
         *([Fold("physics effects (on/off)", switches)] if switches else []),
         Note(PLAN),
-        Note(OWN_FILM, ASKED),
+        Note(OWN_FILM, OWN_VIDEO_NOTE),
     ]
 
 
@@ -86,7 +86,12 @@ def add_overlay_controls(now: Style, choose: Callable[[Style], None]) -> Dropdow
     """Build the choice of overlay styles."""
     styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
     return Dropdown(
-        "overlay", tuple(styles), STYLES[now], lambda words: choose(styles[words]), hint="how it is drawn", key=STYLE
+        "overlay",
+        tuple(styles),
+        STYLES[now],
+        lambda words: choose(styles[words]),
+        hint="how it is drawn",
+        key=STYLE_KEY,
     )
 
 
@@ -129,13 +134,13 @@ def build_tool_controls(
     )  # fmt: skip
     tilts = (
         Slider(
-            f"direction {way} [deg]", -MOST_TILT, MOST_TILT, 1.0, 0.0,
+            f"direction {way} [deg]", -MAX_TILT, MAX_TILT, 1.0, 0.0,
             lambda value, way=way: take(**{way: np.radians(value)}), f"tilt {way}, to {side} [deg]", against,
         )
         for way, _, side in ways
     )  # fmt: skip
     return [
-        Dropdown("tool", (SCRIPT, HAND), SCRIPT, give, hint=HANDS),
+        Dropdown("tool", (SCRIPT, HAND), SCRIPT, give, hint=MANUAL_HINT),
         build_strength_slider(scene, wish, take),
         *places,
         *tilts,
@@ -154,16 +159,16 @@ def build_strength_slider(scene: Scene, wish: Requests, take: Callable[..., None
     """Build the slider of the force, or of the depth of a posed tool."""
     touch = wish.touch
     if scene.posed:
-        low = -1e3 * AIR
-        now = min(max(1e3 * touch.depth, low), MOST_DEPTH)
+        low = -1e3 * IDLE_HEIGHT
+        now = min(max(1e3 * touch.depth, low), MAX_DEPTH)
         hint = "how far the tool is beyond where it just touches; negative: in the air"
-        return Slider("depth [mm]", low, MOST_DEPTH, 0.1, now, lambda value: take(depth=1e-3 * value), hint=hint)
+        return Slider("depth [mm]", low, MAX_DEPTH, 0.1, now, lambda value: take(depth=1e-3 * value), hint=hint)
     return Slider(
         "force [N]",
         0.0,
-        MOST_FORCE,
+        MAX_FORCE,
         0.01,
-        min(touch.force, MOST_FORCE),
+        min(touch.force, MAX_FORCE),
         lambda value: take(force=value),
         hint="how hard it pushes",
     )

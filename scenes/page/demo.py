@@ -26,7 +26,15 @@ from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
 from .beside import list_lines, render_slices, sample_of
 from .cast import SceneSolvers
-from .comparison import OWN, TRUTH, AccuracyTimeTable, PageState, compare_with_fem, describe_change, format_comparison
+from .comparison import (
+    FEM_REFERENCE,
+    FEM_SHOWN,
+    AccuracyTimeTable,
+    PageState,
+    compare_with_fem,
+    describe_change,
+    format_comparison,
+)
 from .controls import PLAN, build_controls, is_animated, to_slider_values
 from .referee import FemResult, FemWorker
 from .requests import HAND, SCRIPT, Requests, describe_holder
@@ -42,10 +50,10 @@ from .view import (
     render_page_image,
 )
 
-WAITS = "The finite elements are working on this load."  # Text while FEM solves.
+WAITING_TEXT = "The finite elements are working on this load."  # Text while FEM solves.
 # Text before the first result.
-RESTS = '<p class="stale">The undeformed body, as in the scan. The first result is being computed.</p>'
-READING = 2.0  # Time for which a playing page shows why a frame is skipped [s].
+UNDEFORMED_TEXT = '<p class="stale">The undeformed body, as in the scan. The first result is being computed.</p>'
+MESSAGE_TIME = 2.0  # Time for which a playing page shows why a frame is skipped [s].
 
 
 class Demo:
@@ -69,7 +77,7 @@ class Demo:
         self._cast(scene, deformer)
         self.wish.set(style=style)
         size, site = (scene.viewpoint.width, scene.viewpoint.height), theatre.site
-        parts = self._parts(deformer)
+        parts = self._build_contents(deformer)
         self.browser = Browser(
             parts[0],
             choose_viewpoint(site),
@@ -112,7 +120,7 @@ class Demo:
             print(f"sulcus demo: {said} (line {place.lineno} of {place.filename})", file=sys.stderr)
         self.browser.report(f'<p class="warn">error: this frame is left out ({escape(said)})</p>')
         self._tell()
-        until = min(end, clock.perf_counter() + READING)
+        until = min(end, clock.perf_counter() + MESSAGE_TIME)
         while self.wish.read_current() == self.asked and self.wish.scene == self.stage.scene.name:
             if clock.perf_counter() >= (until if self.wish.plays else end):
                 break
@@ -175,7 +183,7 @@ class Demo:
             deformer = self.theatre.select_default(scene)
             self._cast(scene, deformer)
             self.wish.set(style=old[2].style, path=old[2].path, through=old[2].through)
-            parts = self._parts(deformer)
+            parts = self._build_contents(deformer)
         except InputError as error:
             self.cast, self.tally, self.wish, self.history = old
             self.wish.set(scene=self.stage.scene.name)
@@ -191,21 +199,21 @@ class Demo:
         """Update the page towards the requested state; return the number of rendered frames, 0 or 1."""
         self.asked = self.wish.read_current()
         if self.asked == now.asked:
-            self._arrive()
-        elif (found := self._found(now)) is not None:
+            self._mark_shown()
+        elif (found := self._find_result(now)) is not None:
             self._draw(now, found)
             return 1
         if now.frame is not None and self.wish.look != now.look:
-            self._restyle(now)
+            self._draw_in_style(now)
         return 0
 
-    def _arrive(self) -> None:
+    def _mark_shown(self) -> None:
         """Mark the request as shown: nothing is pending, and playback continues."""
         self.busy.end_work()
         self.cast.stop_all()
         self.wish.go_on(self.asked[0], len(self.stage.scene.times))
 
-    def _found(self, now: PageState) -> FemResult | None:
+    def _find_result(self, now: PageState) -> FemResult | None:
         """Return the solution of the request, or of a frame on the way to it; None until there is one."""
         number, name, touch, off = self.asked
         question, scene = (number, touch), self.stage.scene
@@ -218,22 +226,22 @@ class Demo:
         if self.cast.get_worker(off).player is None:
             self.busy.begin_work("preparing the finite elements")
             if now.frame is None and not now.rests:
-                self._rest(now)
+                self._show_undeformed(now)
         elif now.goal == self.asked and now.frame is not None:
             self.busy.begin_work(f"on the way to frame {number}: frame {now.frame.number} is solved")
         else:
             self.busy.begin_work(describe_work(scene, "fem", *question))
         return self.cast.solve(off, question, now.shown, 1.0 / scene.frames_per_second)
 
-    def _rest(self, now: PageState) -> None:
+    def _show_undeformed(self, now: PageState) -> None:
         """Show the body at rest while nothing else can be shown."""
         number, _, touch, _ = self.asked
         stage = replace(self.stage, observer=None)  # there is no truth yet to be seen
         player = Player(stage, AtRest(stage.site.anatomy), self.wish.style)
         frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.get_touch(number))
         move_bodies(self.browser, frame, player)
-        self.browser.show(number, render_page_image(frame), RESTS)
-        self._beside(frame, player)
+        self.browser.show(number, render_page_image(frame), UNDEFORMED_TEXT)
+        self._show_side_panels(frame, player)
         now.rests = True
 
     def _draw(self, now: PageState, found: FemResult) -> None:
@@ -241,15 +249,15 @@ class Demo:
         number, name, touch, off = self.asked
         fem = name == "fem" or bool(off)
         look = self.wish.look
-        player = self._seen(self.asked, look)
+        player = self._get_player(self.asked, look)
         hand = touch or player.get_touch(found.number)
         self.reached, now.goal, now.asked = found.number, self.asked, (found.number, name, touch, off)
         now.look, now.shown, now.own = look, found, None
-        now.load = compute_loads_digest(self._whole(found.number, touch) if off else found.loads)
+        now.load = compute_loads_digest(self._build_loads(found.number, touch) if off else found.loads)
         now.frame = frame = player.draw_frame(found.number, hand, found.loads, found.deformation, found.seconds)
         self.history.add(sample_of(frame, self.stage.scene, clock.monotonic()))
         if found.number == number:
-            self._arrive()
+            self._mark_shown()
         if fem and not off:
             now.own = found
         elif found.number == number:
@@ -258,7 +266,7 @@ class Demo:
             self.tally.record_time(name, now.load, found.deformation.cost.total)
         now.picture = render_page_image(frame)
         move_bodies(self.browser, frame, player)
-        self._beside(frame, player)
+        self._show_side_panels(frame, player)
         if touch is None:
             self._show_touch(hand, lambda: self.wish.tool == SCRIPT)
 
@@ -268,22 +276,22 @@ class Demo:
             for label, value in to_slider_values(self.stage.scene, touch).items():
                 self.browser.put(label, value, wanted)
 
-    def _restyle(self, now: PageState) -> None:
+    def _draw_in_style(self, now: PageState) -> None:
         """Render the same solution in another style."""
         assert now.frame is not None and now.asked is not None
         frame, now.look = now.frame, self.wish.look
-        player, seconds = self._seen(now.asked, now.look), frame.seconds["deform"]
+        player, seconds = self._get_player(now.asked, now.look), frame.seconds["deform"]
         now.frame = player.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
         now.picture = render_page_image(now.frame)
-        self._beside(now.frame, player)
+        self._show_side_panels(now.frame, player)
 
-    def _seen(self, asked: tuple, look: tuple[Style, str, str]) -> Player:
+    def _get_player(self, asked: tuple, look: tuple[Style, str, str]) -> Player:
         """Return the player of a request, in the given style."""
         _, name, _, off = asked
         style, path, _ = look
         return replace(self.cast.get_player_on_path("fem" if off else name, off, path), style=style)
 
-    def _beside(self, frame: Frame, player: Player) -> None:
+    def _show_side_panels(self, frame: Frame, player: Player) -> None:
         """Show slices of a frame, and the chart of recent values, when there is time for it."""
         through, history = self.wish.through, self.history
         self.browser.show_beside(lambda: (render_slices(frame, player, through), history.draw_chart()))
@@ -316,10 +324,12 @@ class Demo:
             verdict = f'<p class="warn">error: the finite elements do not solve {what} ({why})</p>'
         elif off and truth is not None:
             shown, whole = now.frame.deformation, self.cast.get_player(name)
-            verdict = describe_change(truth, whole, shown, gone) if fresh else format_comparison(None, True, WAITS)
+            verdict = (
+                describe_change(truth, whole, shown, gone) if fresh else format_comparison(None, True, WAITING_TEXT)
+            )
         else:
-            own = OWN if now.frame.estimate is None else TRUTH
-            verdict = format_comparison(now.judged if truth is not None else None, not fresh, WAITS, own)
+            own = FEM_SHOWN if now.frame.estimate is None else FEM_REFERENCE
+            verdict = format_comparison(now.judged if truth is not None else None, not fresh, WAITING_TEXT, own)
         plan = self.cast.get_worker(off).plan or self.referee.plan
         if plan != now.plan:
             now.plan = plan
@@ -331,12 +341,12 @@ class Demo:
         assert now.picture is not None
         self.browser.show(now.frame.number, now.picture, said, self.asked[0])
 
-    def _whole(self, number: int, touch: Touch | None) -> Loads:
+    def _build_loads(self, number: int, touch: Touch | None) -> Loads:
         """Return the loads of a frame under all effects of the scene."""
         scene, time = self.stage.scene, float(self.stage.scene.times[number])
         return scene.build_loads(self.stage.site, touch or scene.path(time), time)
 
-    def _parts(self, deformer: str) -> tuple:
+    def _build_contents(self, deformer: str) -> tuple:
         """Build the contents of the page: bodies, playback, controls, title, text."""
         scene, site = self.stage.scene, self.stage.site
         wish, names = self.wish, self.theatre.list_deformers(scene)
@@ -364,14 +374,14 @@ class Demo:
         """Change the tool control by the menu or the frame slider; the menu is updated after pending messages."""
         if tool == HAND:
             self._start_hand()
-        self.wish.set(tool=tool, holder=self._visitor() if tool == HAND else None, **wishes)
+        self.wish.set(tool=tool, holder=self._get_user() if tool == HAND else None, **wishes)
         if self.stage.scene.tool is not None:
             self.browser.put("tool", tool)
 
     def _take(self, **values: float) -> None:
         """Switch to manual control after a slider was moved."""
         self._start_hand()
-        self.wish.set(holder=self._visitor())
+        self.wish.set(holder=self._get_user())
         self.wish.take_over(**values)
         self._show_touch(self.wish.touch, lambda: True)
         self.browser.put("tool", HAND)
@@ -383,6 +393,6 @@ class Demo:
             scene = self.stage.scene
             self.wish.set(touch=scene.path(float(scene.times[number])))
 
-    def _visitor(self) -> int | None:
+    def _get_user(self) -> int | None:
         """Return the user whose change is processed now."""
         return None if self.browser.deed is None else self.browser.deed.visitor

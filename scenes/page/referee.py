@@ -97,17 +97,17 @@ class FemWorker:
 
     def _serve(self, theatre: PatientSetup, scene: Scene) -> None:
         try:
-            self._judge(theatre, scene)
+            self._solve_questions(theatre, scene)
         except Exception as error:  # the page says it; the thread's own report goes to the terminal
             self.failure = error
             if not isinstance(error, InputError):
                 raise
 
-    def _judge(self, theatre: PatientSetup, scene: Scene) -> None:
+    def _solve_questions(self, theatre: PatientSetup, scene: Scene) -> None:
         session = None
-        while (question := self._next()) is not None:
+        while (question := self._wait_for_question()) is not None:
             if session is None:
-                session = self._prepared(theatre, scene)
+                session = self._prepare_session(theatre, scene)
                 continue
             begun, (asked, touch) = clock.perf_counter(), question
             try:
@@ -122,13 +122,13 @@ class FemWorker:
                     self.newest = None
                 self.wake.notify_all()
 
-    def _next(self) -> Question | None:
+    def _wait_for_question(self) -> Question | None:
         """Return the newest question, once there is one; None at the end."""
         with self.wake:
             self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)
             return None if self.closed.is_set() else self.newest
 
-    def _prepared(self, theatre: PatientSetup, scene: Scene) -> ReplaySession | None:
+    def _prepare_session(self, theatre: PatientSetup, scene: Scene) -> ReplaySession | None:
         """Return the finite elements; None where they are not wanted any more when it is their turn."""
         with self.turn:
             if self.closed.is_set() or self.newest is None:

@@ -22,16 +22,16 @@ from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
 from .comparison import ComparisonRow
 
-SEEN = (  # Explanation of the image.
+IMAGE_EXPLANATION = (  # Explanation of the image.
     "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "
     "the green outline shows where it is computed to be now, while the tissue moves."
 )
-ESTIMATED = (  # Explanation of the image where the motion is estimated from the cortex.
+ESTIMATE_EXPLANATION = (  # Explanation of the image where the motion is estimated from the cortex.
     "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; the green "
     "outline shows where it is estimated to be, from the dots on the cortex alone. No force and no stiffness is known."
 )
-RESEARCH = "Research only. Not a medical device."  # Restriction of use.
-MIDLINE = 5e-3  # Distance from the midline below which a tumour has no side [m].
+RESEARCH_ONLY = "Research only. Not a medical device."  # Restriction of use.
+MIDLINE_DISTANCE = 5e-3  # Distance from the midline below which a tumour has no side [m].
 # Names of finite elements for users.
 ELEMENTS = {"p1": "linear tetrahedra", "p2": "quadratic tetrahedra", "smoothed": "smoothed linear tetrahedra"}
 EFFECTS = {
@@ -55,9 +55,9 @@ def describe_effect(name: str) -> str:
 def format_caption(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
     """Describe the image: visible parts, meaning of the lines, and anatomy."""
     title = " ".join(scene.title.split())
-    seen = SEEN if scene.sight is None else ESTIMATED
+    seen = IMAGE_EXPLANATION if scene.sight is None else ESTIMATE_EXPLANATION
     return (
-        f"<p>{seen} <b>{RESEARCH}</b></p><p>Scene: {escape(title)}</p>{format_page_legend(scene)}"
+        f"<p>{seen} <b>{RESEARCH_ONLY}</b></p><p>Scene: {escape(title)}</p>{format_page_legend(scene)}"
         f'<p class="dim">{escape(describe_scene(theatre, scene, anatomy))}</p>'
     )
 
@@ -115,7 +115,7 @@ def describe_side_of_brain(site: CraniotomyFrame) -> str:
     """Describe the side of the opening, relative to the middle of the brain's width."""
     nodes = site.anatomy.mesh.nodes[:, 0]
     off = float(site.origin[0] - 0.5 * (nodes.min() + nodes.max()))
-    return "near the midline" if abs(off) < MIDLINE else f"on the patient's {'right' if off > 0.0 else 'left'}"
+    return "near the midline" if abs(off) < MIDLINE_DISTANCE else f"on the patient's {'right' if off > 0.0 else 'left'}"
 
 
 def describe_fem(theatre: PatientSetup, scene: Scene) -> str:
@@ -167,7 +167,7 @@ def plan_words(lines: Sequence[str]) -> str:
 def format_trust(answer: Deformation, name: str) -> str:
     """Describe the source of a solution and its error; as a warning with the reason, if it is unreliable."""
     outcome = answer.outcome[0]
-    who = f"<b>{escape(_guarded_words(outcome) if name == GUARDED else describe_deformer(name))}</b>"
+    who = f"<b>{escape(_describe_guarded(outcome) if name == GUARDED else describe_deformer(name))}</b>"
     if outcome is Outcome.EXTRAPOLATED:
         return (
             f'<p>{who}</p><p class="warn">Do not rely on this result: the load lies outside the range that the model '
@@ -187,7 +187,7 @@ def format_trust(answer: Deformation, name: str) -> str:
     )
 
 
-def _guarded_words(outcome: Outcome) -> str:
+def _describe_guarded(outcome: Outcome) -> str:
     """Describe which of the two computed the solution of a guarded model."""
     by_model = outcome in (Outcome.PREDICTED, Outcome.EXTRAPOLATED)
     return "trained model (guarded)" if by_model else "finite elements, as the error bound of the model is too large"
@@ -302,14 +302,14 @@ def format_cost_table(rows: Sequence[ComparisonRow]) -> str:
         what = "Medians over different loads: not comparable."
     lines = (
         f"<tr{' class=best' if row.best else ''}><td>{escape(row.name)}</td>"
-        f"<td>{row.milliseconds:.1f} ms</td><td>error {_off(row.millimetres)} mm</td>"
+        f"<td>{row.milliseconds:.1f} ms</td><td>error {_format_error(row.millimetres)} mm</td>"
         f"<td>{format_load_count(row.loads)}</td></tr>"
         for row in rows
     )
     return f'<p class="dim">{what}</p><table>{"".join(lines)}</table>'
 
 
-def _off(millimetres: float) -> str:
+def _format_error(millimetres: float) -> str:
     """Return the error in millimetres; a small one is not rounded to none."""
     return f"{millimetres:.3f}" if millimetres >= 1e-3 else "under 0.001"
 

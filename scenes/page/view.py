@@ -8,7 +8,7 @@ from ar.overlay.hud import draw_orientation_labels
 from ar.page.browser import Browser
 from ar.page.parts import SceneSurface, SceneViewpoint, Sign
 
-from ..play.observer import BALL, BALL_FACES, ELLIPSOID_COLOUR
+from ..play.observer import ELLIPSOID_COLOUR, SPHERE, SPHERE_FACES
 from ..play.player import Frame, Player
 from ..play.stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 from ..script.site import CraniotomyFrame
@@ -17,8 +17,8 @@ from .referee import FemResult
 FEM_COLOUR = TRUTH_COLOUR  # Colour of the FEM tumour.
 STALE_COLOUR = (0.45, 0.45, 0.45)
 """Colour of the FEM tumour while it belongs to another load than the one shown."""
-SMALL = 1e-4  # Radius of the ellipsoid before there is one [m].
-BESIDE = 12e-3  # Distance of the orientation letters from the brain [m].
+INITIAL_RADIUS = 1e-4  # Radius of the ellipsoid before there is one [m].
+LETTER_DISTANCE = 12e-3  # Distance of the orientation letters from the brain [m].
 
 
 def build_page_bodies(stage: Stage) -> list[SceneSurface]:
@@ -28,7 +28,9 @@ def build_page_bodies(stage: Stage) -> list[SceneSurface]:
     bodies = [*build_brain(stage), wire]
     if stage.observer is not None:
         middle = tumour.vertices.mean(axis=0)
-        bodies.append(SceneSurface("ellipsoid", middle + SMALL * BALL, BALL_FACES, ELLIPSOID_COLOUR, wireframe=True))
+        bodies.append(
+            SceneSurface("ellipsoid", middle + INITIAL_RADIUS * SPHERE, SPHERE_FACES, ELLIPSOID_COLOUR, wireframe=True)
+        )
     if tool is not None:
         pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
         at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -50,7 +52,7 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
 def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
     """Return the patient's sides round the brain."""
     nodes = site.anatomy.mesh.nodes
-    middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + BESIDE
+    middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + LETTER_DISTANCE
     ways = zip(("RL", "AP", "SI"), np.diag(half), strict=True)
     return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
 

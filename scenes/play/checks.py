@@ -24,8 +24,8 @@ from .picture_checks import (
 )
 from .player import Frame, Player
 
-STILL = 0.25  # Share of its largest motion below which the tumour counts as still.
-NOWHERE = 0.0, np.inf, np.inf, np.inf, False
+STILL_SHARE = 0.25  # Share of its largest motion below which the tumour counts as still.
+WORST_MISS = 0.0, np.inf, np.inf, np.inf, False
 """Metrics of a tumour at an invalid position: overlap, distance [m], two image distances [pixel], occlusion drawn."""
 
 
@@ -119,16 +119,16 @@ def measure(
 
     `camera_at` gives the reference camera at a time [s].
     """
-    doubts = _doubts(frames, truth)
+    doubts = _list_unreliable(frames, truth)
     moved = [
         np.linalg.norm(
             truth.restrict(player.stage.select_stage(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1
         ).mean()
         for row, frame in enumerate(frames)
     ]
-    finite = [_finite(frame) for frame in frames]
+    finite = [_is_finite(frame) for frame in frames]
     misses = [
-        _miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else NOWHERE
+        _measure_miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else WORST_MISS
         for row, frame in enumerate(frames)
     ]
     overlap, error, pixels, drawn, honestly = zip(*misses, strict=True)
@@ -149,13 +149,13 @@ def measure(
         ),
         leaked=float(truth.leaked.max()),
         bond=float(truth.bond.max()),
-        covered=_covered(player, frames, truth),
-        removed=_removed(player, frames, truth) if all(finite) else np.nan,
+        covered=_compute_coverage(player, frames, truth),
+        removed=_compute_removed_share(player, frames, truth) if all(finite) else np.nan,
         doubt="" if not doubts else doubts[0] + (f" ({len(doubts) - 1} more)" if doubts[1:] else ""),
     )
 
 
-def _covered(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
+def _compute_coverage(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
     """Compute the share of frames whose displayed ellipsoid contains the tumour's centre by FEM."""
     if not any(frame.estimate for frame in frames):
         return np.nan
@@ -173,7 +173,7 @@ def is_within_surface(closed: Layer, point: np.ndarray) -> bool:
     return bool((np.einsum("fi,fi->f", np.cross(b - a, c - a), point - a) <= 0.0).all())
 
 
-def _removed(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
+def _compute_removed_share(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
     """Share of the tumour's motion, summed over its vertices and the frames, that estimates remove."""
     if not any(frame.estimate for frame in frames):
         return np.nan
@@ -184,7 +184,7 @@ def _removed(player: Player, frames: Sequence[Frame], truth: Deformation) -> flo
     return float(1.0 - left / moved) if moved > 0.0 else np.nan
 
 
-def _doubts(frames: Sequence[Frame], truth: Deformation) -> list[str]:
+def _list_unreliable(frames: Sequence[Frame], truth: Deformation) -> list[str]:
     """List frames whose displayed or FEM solution is unreliable, with the outcome."""
     found = []
     for frame, true in zip(frames, truth.outcome, strict=True):
@@ -208,7 +208,7 @@ def list_objections(frames: Sequence[Frame]) -> list[str]:
         if why
     ]
     motion = np.linalg.norm([estimate.true for estimate in estimates], axis=1) if estimates else np.zeros(0)
-    moving = np.count_nonzero(motion > STILL * motion.max(initial=0.0))
+    moving = np.count_nonzero(motion > STILL_SHARE * motion.max(initial=0.0))
     if moving < 0.5 * len(motion):
         found.append(
             f"the tumour moves in {moving} of {len(motion)} frames, and elsewhere the rigid error alone is estimated: "
@@ -217,11 +217,11 @@ def list_objections(frames: Sequence[Frame]) -> list[str]:
     return found
 
 
-def _finite(frame: Frame) -> bool:
+def _is_finite(frame: Frame) -> bool:
     return bool(np.isfinite(frame.picture.depth).all() and np.isfinite(frame.deformation.displacement).all())
 
 
-def _miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
+def _measure_miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
     """Compute overlap, mean distance [m], largest image distance [pixel] and outline distance of a frame to the truth.
 
     The last value is true if parts that are not seen through cortex are drawn as occluded.

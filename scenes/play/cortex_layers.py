@@ -18,22 +18,22 @@ from ..script.site import CraniotomyFrame
 from ..script.tool import build_capsule
 from ..script.viewpoint import Cottonoid
 
-FINE = 0.2e-3  # Edge of a voxel across the axis of the craniotomy [m].
-ALONG = 1e-3  # Edge of a voxel along the axis of the craniotomy [m].
-BEYOND = 10e-3  # Margin of the voxels round the craniotomy [m].
-ABOVE = 5e-3  # Height of the voxels above the centre of the craniotomy [m].
-BELOW = 14e-3  # Depth of the voxels below the centre of the craniotomy [m].
-TRUNKS = 14  # Number of vessels that enter at the border.
-WIDEST = 0.8e-3  # Largest width of a vessel [m].
-NARROWEST = 0.2e-3  # Width at which a vessel ends [m].
-STEP = 0.2e-3  # Step of a vessel's path [m].
-BRANCHES = 0.05  # Probability of a branch in each step.
-TURNS = 0.12  # Standard deviation of the turn in each step [rad].
-LEFT = 0.998  # Factor on the width in each step.
-BRANCH = 0.72  # Width of a branch relative to its parent.
-DARK = 0.75  # Largest share of the light that a vessel absorbs.
-MOTTLE = 0.12  # Contrast of the mottle: vessels too fine to be drawn.
-MOTTLED = 0.35e-3  # Length scale of the mottle [m].
+VOXEL_ACROSS = 0.2e-3  # Edge of a voxel across the axis of the craniotomy [m].
+VOXEL_ALONG = 1e-3  # Edge of a voxel along the axis of the craniotomy [m].
+VOXEL_MARGIN = 10e-3  # Margin of the voxels round the craniotomy [m].
+HEIGHT_ABOVE = 5e-3  # Height of the voxels above the centre of the craniotomy [m].
+DEPTH_BELOW = 14e-3  # Depth of the voxels below the centre of the craniotomy [m].
+TRUNK_COUNT = 14  # Number of vessels that enter at the border.
+MAX_VESSEL_WIDTH = 0.8e-3  # Largest width of a vessel [m].
+MIN_VESSEL_WIDTH = 0.2e-3  # Width at which a vessel ends [m].
+VESSEL_STEP = 0.2e-3  # Step of a vessel's path [m].
+BRANCH_PROBABILITY = 0.05  # Probability of a branch in each step.
+TURN_DEVIATION = 0.12  # Standard deviation of the turn in each step [rad].
+WIDTH_FACTOR = 0.998  # Factor on the width in each step.
+BRANCH_WIDTH_RATIO = 0.72  # Width of a branch relative to its parent.
+MAX_ABSORPTION = 0.75  # Largest share of the light that a vessel absorbs.
+MOTTLE_CONTRAST = 0.12  # Contrast of the mottle: vessels too fine to be drawn.
+MOTTLE_LENGTH = 0.35e-3  # Length scale of the mottle [m].
 
 
 @lru_cache(maxsize=2)
@@ -45,10 +45,10 @@ def add_vessels(
     They go with the tissue, and have no height. Without a scan, tissue is evenly bright. `dark` and `relief` as of
     `Solid`.
     """
-    half = site.radius + BEYOND
-    across, along = np.arange(-half, half, FINE), np.arange(-ABOVE, BELOW, ALONG)
+    half = site.radius + VOXEL_MARGIN
+    across, along = np.arange(-half, half, VOXEL_ACROSS), np.arange(-HEIGHT_ABOVE, DEPTH_BELOW, VOXEL_ALONG)
     T = np.eye(4)
-    T[:3, :3] = np.column_stack([FINE * site.right, FINE * site.up, ALONG * site.axis])
+    T[:3, :3] = np.column_stack([VOXEL_ACROSS * site.right, VOXEL_ACROSS * site.up, VOXEL_ALONG * site.axis])
     T[:3, 3] = site.origin + across[0] * (site.right + site.up) + along[0] * site.axis
     scan = np.ones((len(across), len(across), len(along)), np.float32)
     if intensity is not None:
@@ -62,29 +62,29 @@ def compute_vessel_absorption(across: np.ndarray, random: np.random.Generator) -
     """Share of the light that vessels take, (n, n), at places `across` (n,) [m] from the middle, both ways."""
     points, widths = sample_vessel_paths(float(np.abs(across).max()), random)
     here = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1)
-    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * WIDEST)
-    width = np.append(widths, WIDEST)[nearest]
-    vessels = DARK * np.exp(-2.0 * (away / width) ** 2)
-    mottle = gaussian_filter(random.standard_normal(away.shape), MOTTLED / FINE)
-    return np.clip(vessels + (1.0 - vessels) * MOTTLE * mottle / mottle.std(), 0.0, 0.95)
+    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * MAX_VESSEL_WIDTH)
+    width = np.append(widths, MAX_VESSEL_WIDTH)[nearest]
+    vessels = MAX_ABSORPTION * np.exp(-2.0 * (away / width) ** 2)
+    mottle = gaussian_filter(random.standard_normal(away.shape), MOTTLE_LENGTH / VOXEL_ACROSS)
+    return np.clip(vessels + (1.0 - vessels) * MOTTLE_CONTRAST * mottle / mottle.std(), 0.0, 0.95)
 
 
 def sample_vessel_paths(half: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points (k, 2) [m] of vessels that come in at the border of a square, wander and branch; their widths (k,) [m]."""
-    angles = 2.0 * np.pi * (np.arange(TRUNKS) + random.uniform(0.0, 0.7, TRUNKS)) / TRUNKS
+    angles = 2.0 * np.pi * (np.arange(TRUNK_COUNT) + random.uniform(0.0, 0.7, TRUNK_COUNT)) / TRUNK_COUNT
     rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
-    ends = list(zip(rim, angles + np.pi, WIDEST * random.uniform(0.5, 1.0, TRUNKS), strict=True))
+    ends = list(zip(rim, angles + np.pi, MAX_VESSEL_WIDTH * random.uniform(0.5, 1.0, TRUNK_COUNT), strict=True))
     points, widths = [], []
     while ends:
         at, way, width = ends.pop()
-        while width > NARROWEST and np.abs(at).max() <= half:
+        while width > MIN_VESSEL_WIDTH and np.abs(at).max() <= half:
             points.append(at)
             widths.append(width)
-            way = way + TURNS * random.standard_normal()
-            at, width = at + STEP * np.array([np.cos(way), np.sin(way)]), LEFT * width
-            if random.uniform() < BRANCHES:
+            way = way + TURN_DEVIATION * random.standard_normal()
+            at, width = at + VESSEL_STEP * np.array([np.cos(way), np.sin(way)]), WIDTH_FACTOR * width
+            if random.uniform() < BRANCH_PROBABILITY:
                 side = random.choice([-1.0, 1.0])
-                ends.append((at, way + side * random.uniform(0.5, 1.2), BRANCH * width))
+                ends.append((at, way + side * random.uniform(0.5, 1.2), BRANCH_WIDTH_RATIO * width))
                 way, width = way - 0.2 * side, 0.95 * width
     return np.array(points), np.array(widths)
 
@@ -92,12 +92,12 @@ def sample_vessel_paths(half: float, random: np.random.Generator) -> tuple[np.nd
 COTTON, GLOVE = 5, 6
 """Segmentation ids."""
 COTTON_COLOUR, GLOVE_COLOUR = (0.93, 0.92, 0.88), (0.86, 0.80, 0.66)  # Colours (RGB, 0 to 1).
-PLACES = 9  # Number of vertices along a side of a cotton square.
-THICK = 0.7e-3  # Height of a cotton square above the cortex [m].
-FINGER = 7e-3  # Radius of a finger [m].
-LENGTH = 70e-3  # Length of a finger [m].
-OVER = 4e-3  # Length of a finger beyond the edge of the craniotomy [m].
-HIGH = 7e-3  # Height of a finger above the cortex [m].
+SQUARE_VERTICES = 9  # Number of vertices along a side of a cotton square.
+SQUARE_HEIGHT = 0.7e-3  # Height of a cotton square above the cortex [m].
+FINGER_RADIUS = 7e-3  # Radius of a finger [m].
+FINGER_LENGTH = 70e-3  # Length of a finger [m].
+FINGER_OVERHANG = 4e-3  # Length of a finger beyond the edge of the craniotomy [m].
+FINGER_HEIGHT = 7e-3  # Height of a finger above the cortex [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +117,10 @@ class Squares:
 
 def build_squares(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> Squares:
     """Lay squares of cotton on an open cortex."""
-    steps = np.linspace(-0.5, 0.5, PLACES)
+    steps = np.linspace(-0.5, 0.5, SQUARE_VERTICES)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-    i, j = (each.ravel() for each in np.meshgrid(*[np.arange(PLACES - 1)] * 2, indexing="ij"))
-    a, b, c, d = (PLACES * (i + p) + j + q for p, q in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    i, j = (each.ravel() for each in np.meshgrid(*[np.arange(SQUARE_VERTICES - 1)] * 2, indexing="ij"))
+    a, b, c, d = (SQUARE_VERTICES * (i + p) + j + q for p, q in ((0, 0), (1, 0), (1, 1), (0, 1)))
     faces = np.concatenate([np.stack(each, axis=1) for each in ((a, b, c), (a, c, d))])
     places, triangles = [], []
     for each in cottonoids:
@@ -130,16 +130,16 @@ def build_squares(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> Squ
         places += [site.find_nearest(site.origin + x * site.right + y * site.up) for x, y in at]
     return Squares(
         np.array([place.vertices for place in places]), np.array([place.weights for place in places]),
-        np.concatenate(triangles), -THICK * np.array([place.inward for place in places]),
+        np.concatenate(triangles), -SQUARE_HEIGHT * np.array([place.inward for place in places]),
     )  # fmt: skip
 
 
 def build_finger(site: CraniotomyFrame, angle: float) -> Layer:
     """Build a motionless gloved finger over the craniotomy edge, from a direction in the tangent plane [rad]."""
     out = np.cos(angle) * site.right + np.sin(angle) * site.up
-    tip = site.origin + (site.clearance - OVER) * out - HIGH * site.axis
+    tip = site.origin + (site.clearance - FINGER_OVERHANG) * out - FINGER_HEIGHT * site.axis
     way = normalise_vectors((out - 0.35 * site.axis)[None])[0]
     side = normalise_vectors(np.cross(way, site.axis)[None])[0]
-    vertices, triangles = build_capsule(FINGER, LENGTH)
+    vertices, triangles = build_capsule(FINGER_RADIUS, FINGER_LENGTH)
     turned = vertices @ np.stack([side, np.cross(way, side), way])
     return Layer("glove", GLOVE, turned + tip, triangles, GLOVE_COLOUR, gloss=0.3, still=True)

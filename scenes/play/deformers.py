@@ -28,7 +28,7 @@ from surrogate.locating.regions import find_differing_regions
 from surrogate.model.applicability import find_rejection
 from surrogate.model.guarded import Guarded, get_held_out_error
 from surrogate.model.learned import Learned
-from surrogate.model.left_out import LIMIT
+from surrogate.model.left_out import MAX_VERTEX_ERROR
 from surrogate.model.store import load
 
 from ..script.scene import Scene, check_scene_exists
@@ -44,7 +44,7 @@ from .stereo_observer import StereoObserver
 GUARDED = "guarded"
 """Name of the best model with FEM fallback."""
 # Text: FEM's result is the reference of an estimate.
-TRUTH = "what an estimate is held against is the truth, as finite elements have it"
+TRUTH_TEXT = "what an estimate is held against is the truth, as finite elements have it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ class PatientSetup:
         an estimate is compared.
         """
         if scene.sight is not None:
-            return dict.fromkeys(self.models, TRUTH)
+            return dict.fromkeys(self.models, TRUTH_TEXT)
         effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
         return {name: find_rejection(model, effects, element) for name, model in self.models.items()}
 
@@ -144,7 +144,7 @@ class PatientSetup:
     def list_deformers(self, scene: Scene) -> tuple[str, ...]:
         """List all deformers available for a scene: trained models that support it, the best one guarded, FEM."""
         knowing = tuple(self.select_models(scene))
-        return (*knowing, *([GUARDED] if self._guardable(scene) else []), "fem")
+        return (*knowing, *([GUARDED] if self._can_guard(scene) else []), "fem")
 
     def select_best(self, scene: Scene) -> str:
         """Select the trained model with the smallest error bound; FEM if none supports the scene."""
@@ -156,7 +156,7 @@ class PatientSetup:
         stated = self.models[self.select_best(scene)].left_out
         if self.limit is not None:
             return self.limit
-        return LIMIT if stated is None else stated.limit
+        return MAX_VERTEX_ERROR if stated is None else stated.limit
 
     def select_default(self, scene: Scene) -> str:
         """Select the default deformer of a scene: the best model, guarded if its bound is weak.
@@ -164,9 +164,9 @@ class PatientSetup:
         A model of tissue that relaxes is used without guard, with its bound: see `_guardable`.
         """
         name = self.select_best(scene)
-        return GUARDED if self._guardable(scene) and get_held_out_error(self.models[name]).weak else name
+        return GUARDED if self._can_guard(scene) and get_held_out_error(self.models[name]).weak else name
 
-    def _guardable(self, scene: Scene) -> bool:
+    def _can_guard(self, scene: Scene) -> bool:
         """Return True if FEM can serve as fallback of the best model.
 
         With relaxing tissue it cannot: an FEM frame depends on all previous frames, which the model computed.
@@ -202,12 +202,12 @@ class PatientSetup:
         if name == "fem":
             return self.build_fem(scene, scene.accuracy, live=True)
         allowed = ", ".join(self.list_deformers(scene))
-        if name == GUARDED and self.select_models(scene) and not self._guardable(scene):
+        if name == GUARDED and self.select_models(scene) and not self._can_guard(scene):
             raise InputError(
                 f"{self.select_best(scene)} cannot be {GUARDED} in the scene {scene.name}: its tissue relaxes, so that "
                 f"finite elements would have to solve from the first frame on. Choose one of {allowed}."
             )
-        if name == GUARDED and self._guardable(scene):
+        if name == GUARDED and self._can_guard(scene):
             model, limit = self.models[self.select_best(scene)], self.limit_of(scene)
             return Guarded(model, self.build_fem(scene, scene.accuracy, live=True), limit)
         if name == GUARDED and self.models:

@@ -69,7 +69,7 @@ def measure_effects(theatre: PatientSetup, scene: Scene, every: int) -> Iterator
     """
     whole = run(theatre, scene, every)
     nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, held=0)
-    yield _row(theatre, ALL, whole, nowhere)
+    yield _build_row(theatre, ALL, whole, nowhere)
     for effect in scene.get_effects_on(theatre.anatomy):
         name = type(effect).__name__
         if isinstance(effect, Elasticity):
@@ -80,7 +80,7 @@ def measure_effects(theatre: PatientSetup, scene: Scene, every: int) -> Iterator
         except InputError as error:
             yield AblationRow(name, refused=str(error))
             continue
-        yield _row(theatre, name, whole, less)
+        yield _build_row(theatre, name, whole, less)
 
 
 def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
@@ -94,14 +94,14 @@ def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
     before = list_device_arrays()  # freed meanwhile or not, they are not the scene's
     fem = theatre.build_fem(scene, scene.accuracy, live=True)
     times = scene.times[::every].tolist()
-    found, seconds = _solved(fem, scene, theatre.site, times)
+    found, seconds = _solve_frames(fem, scene, theatre.site, times)
     wp.synchronize()
     known = {id(array) for array in before}
     held = sum(array.capacity for array in list_device_arrays() if id(array) not in known)
     return AblationRun(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
 
 
-def _solved(
+def _solve_frames(
     fem: Deformer, scene: Scene, site: CraniotomyFrame, times: list[float]
 ) -> tuple[list[np.ndarray], list[float]]:
     """Displacements (V, 3) [m], NaN of what was cut out, and seconds of each frame."""
@@ -124,7 +124,7 @@ def list_device_arrays() -> list[wp.array]:
     return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
 
 
-def _row(theatre: PatientSetup, name: str, whole: AblationRun, less: AblationRun) -> AblationRow:
+def _build_row(theatre: PatientSetup, name: str, whole: AblationRun, less: AblationRun) -> AblationRow:
     anatomy = theatre.anatomy
 
     def apart(nodes: np.ndarray) -> float:

@@ -15,13 +15,13 @@ from ..script.uncertainty import REGISTRATION, TumourError
 
 # Parts of the head in the positive and negative direction of each RAS axis.
 SIDES = (("right", "left"), ("front", "back"), ("crown", "feet"))
-NAMED = 0.05  # Smallest component of a unit vector that is named.
+MIN_NAMED_COMPONENT = 0.05  # Smallest component of a unit vector that is named.
 # Pattern of the regions with own tissues, in the description by `Elasticity`.
-OWN_TISSUES = re.compile(r"; region \d.*?(?=\)(?:;|$))")
-OWN = re.compile(r"(?:(?<=; )|\()([\w ]+)\)?: ")  # Pattern of the name of one region.
+OWN_TISSUES_PATTERN = re.compile(r"; region \d.*?(?=\)(?:;|$))")
+REGION_PATTERN = re.compile(r"(?:(?<=; )|\()([\w ]+)\)?: ")  # Pattern of the name of one region.
 
 
-DOUBTS = {  # Warnings written into an image whose solution is unreliable.
+OUTCOME_WARNINGS = {  # Warnings written into an image whose solution is unreliable.
     Outcome.EXTRAPOLATED: "outside what the model learned: do not rely on it",
     Outcome.PIERCED: "the tool penetrates the tissue: do not rely on it",
     Outcome.ON_BONE: "the tool stands on bone: do not rely on it",
@@ -33,7 +33,7 @@ DOUBTS = {  # Warnings written into an image whose solution is unreliable.
 
 def describe_outcome(outcome: Outcome) -> str:
     """Return the reason why a solution is unreliable, in a few words for the image; empty if it is reliable."""
-    return "" if outcome.good else DOUBTS.get(outcome, "not solved to the end: do not rely on it")
+    return "" if outcome.good else OUTCOME_WARNINGS.get(outcome, "not solved to the end: do not rely on it")
 
 
 def format_acting(loads: Loads, answer: Deformation, nodes: np.ndarray) -> str:
@@ -41,15 +41,15 @@ def format_acting(loads: Loads, answer: Deformation, nodes: np.ndarray) -> str:
 
     `nodes` (V, 3) [m] are the undeformed vertices of the brain: the fluid level is given as a share of its height.
     """
-    return ", ".join(words for words in (_words(cause, answer, nodes) for cause in loads.causes) if words)
+    return ", ".join(words for words in (_describe_cause(cause, answer, nodes) for cause in loads.causes) if words)
 
 
-def _words(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
+def _describe_cause(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
     match cause:
         case Pushed():
             return f"force {np.linalg.norm(cause.force[0]):.2f} N" if cause.force[0].any() else "the tool does not push"
         case Posture():
-            return f"gravity pulls to the {_way(cause.direction[0])}, {_fluid(cause, nodes)}"
+            return f"gravity pulls to the {_name_direction(cause.direction[0])}, {_describe_fluid(cause, nodes)}"
         case Resected():
             steps = round(float(cause.done[0]))
             return f"resection: {steps} step{'' if steps == 1 else 's'} done"
@@ -62,17 +62,17 @@ def _words(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
             return ""
 
 
-def _way(direction: np.ndarray) -> str:
+def _name_direction(direction: np.ndarray) -> str:
     """Name the RAS directions of a vector (3,), largest component first, with the components if there are several."""
     down = direction / np.linalg.norm(direction)
-    axes = [axis for axis in np.argsort(-np.abs(down), kind="stable") if abs(down[axis]) > NAMED]
+    axes = [axis for axis in np.argsort(-np.abs(down), kind="stable") if abs(down[axis]) > MIN_NAMED_COMPONENT]
     names = [SIDES[axis][int(down[axis] < 0.0)] for axis in axes]
     if len(axes) == 1:
         return names[0]
     return " and the ".join(f"{name} ({abs(down[axis]):.2f})" for name, axis in zip(names, axes, strict=True))
 
 
-def _fluid(cause: Posture, nodes: np.ndarray) -> str:
+def _describe_fluid(cause: Posture, nodes: np.ndarray) -> str:
     """Describe the fluid level as a share of the brain's height."""
     height = -nodes @ (cause.direction[0] / np.linalg.norm(cause.direction[0]))
     share = float(np.clip((cause.csf_level[0] - height.min()) / np.ptp(height), 0.0, 1.0))
@@ -81,7 +81,7 @@ def _fluid(cause: Posture, nodes: np.ndarray) -> str:
 
 def shorten_source(source: str) -> str:
     """Shorten `Deformation.source`: regions with a tissue of their own are given by name only."""
-    return OWN_TISSUES.sub(lambda found: f"; own tissue: {', '.join(OWN.findall(found[0]))}", source)
+    return OWN_TISSUES_PATTERN.sub(lambda found: f"; own tissue: {', '.join(REGION_PATTERN.findall(found[0]))}", source)
 
 
 NOT_KNOWN_WORDS = "tumour position error: not known"

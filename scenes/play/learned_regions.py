@@ -21,12 +21,12 @@ def find_learned_regions(
     if learned is None or brain is None or learned.default is None:
         return {}
     others = {label: one for label, one in learned.regions.items() if label not in {*here.regions, *named}}
-    return {label: _beside(brain, one, learned.default) for label, one in others.items()}
+    return {label: _scale_tissue(brain, one, learned.default) for label, one in others.items()}
 
 
-def _beside(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
+def _scale_tissue(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
     """Return a region's tissue in a scene of this brain, scaled from the trained one; other laws: the brain's."""
-    if isinstance(region, Material | Ogden) and _at_once(brain) == _at_once(learned):
+    if isinstance(region, Material | Ogden) and _remove_relaxation(brain) == _remove_relaxation(learned):
         return replace(region, prony=brain.prony)
     if not isinstance(brain, Material) or not isinstance(region, Material) or not isinstance(learned, Material):
         return brain
@@ -34,6 +34,6 @@ def _beside(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
     return replace(brain, young=brain.young * region.young / learned.young, poisson=poisson)
 
 
-def _at_once(tissue: Tissue) -> Tissue:
+def _remove_relaxation(tissue: Tissue) -> Tissue:
     """Return a tissue as if it did not relax."""
     return replace(tissue, prony=()) if isinstance(tissue, Material | Ogden) else tissue

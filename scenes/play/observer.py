@@ -24,17 +24,19 @@ from surrogate.locating.observation import Observation
 from surrogate.locating.prior import compute_middle
 
 from ..script.sight import PointObservation, StereoObservation
-from ..script.site import HOLE, CraniotomyFrame
+from ..script.site import HOLE_RATIO, CraniotomyFrame
 from ..script.tool import build_sphere
 
-TOUCHES = 1e-3  # Distance from the cortex within which a tool touches it [m].
-HIDES = 4e-3  # Distance from a tool within which points are hidden [m].
-CORNERS = 32  # Number of tool corners, nearest to those of the cortex, that are searched for the contact point.
+TOUCH_DISTANCE = 1e-3  # Distance from the cortex within which a tool touches it [m].
+HIDING_DISTANCE = 4e-3  # Distance from a tool within which points are hidden [m].
+SEARCHED_CORNERS = (
+    32  # Number of tool corners, nearest to those of the cortex, that are searched for the contact point.
+)
 ELLIPSOID_COLOUR = (0.21, 0.30, 0.90)  # Colour of the ellipsoid (RGB, 0 to 1).
 ELLIPSOID = 5
 """Segmentation id of the ellipsoid's layer, which no image contains."""
-BALL, BALL_FACES = build_sphere()  # Unit sphere: vertices and triangles.
-NOTHING = Observation(np.zeros((0, 3)))
+SPHERE, SPHERE_FACES = build_sphere()  # Unit sphere: vertices and triangles.
+NO_POINTS = Observation(np.zeros((0, 3)))
 """Empty observation."""
 
 
@@ -139,8 +141,8 @@ class TumourEstimate:
         if self.location is None:
             return None
         root = np.linalg.cholesky(self.location.centroid_covariance)
-        at = np.sqrt(RADIUS_SQUARED) * BALL @ root.T
-        return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, BALL_FACES, ELLIPSOID_COLOUR)
+        at = np.sqrt(RADIUS_SQUARED) * SPHERE @ root.T
+        return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, SPHERE_FACES, ELLIPSOID_COLOUR)
 
 
 class Sees(Protocol):
@@ -175,28 +177,28 @@ class Observer:
     def observe(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
         """Sample the observation of a frame; arguments as of `estimate`."""
         sight, random = self.sight, np.random.default_rng([self.sight.seed, 1 + number])
-        now = self._at(positions)
+        now = self._interpolate_points(positions)
         off = self._smooth + sight.white * random.standard_normal(now.shape)
         shown, tips = np.ones(len(now), bool), np.zeros((0, 3))
         if tool is not None:
-            shown = KDTree(tool).query(now)[0] > HIDES
+            shown = KDTree(tool).query(now)[0] > HIDING_DISTANCE
             tips = find_touched(self.site.anatomy, positions, tool)
             tips = self._as_a_whole(tips + sight.white * random.standard_normal(tips.shape))
         sigma = np.full(shown.sum(), np.hypot(sight.white, sight.smooth))
-        return Observation(self._as_a_whole(now + off)[shown], self._at(self._rest)[shown], sigma, tips)
+        return Observation(self._as_a_whole(now + off)[shown], self._interpolate_points(self._rest)[shown], sigma, tips)
 
     @property
     def _rest(self) -> np.ndarray:
         return self.site.anatomy.mesh.nodes
 
-    def _at(self, positions: np.ndarray) -> np.ndarray:
+    def _interpolate_points(self, positions: np.ndarray) -> np.ndarray:
         """Interpolate the observed points (n, 3) [m]."""
         vertices, weights = self._places
         return np.einsum("nc,nci->ni", weights, positions[vertices])
 
     def _as_a_whole(self, points: np.ndarray) -> np.ndarray:
         """Points (n, 3) [m] with the rigid error."""
-        return self._rigid.apply(points, self._at(self._rest).mean(axis=0))
+        return self._rigid.apply(points, self._interpolate_points(self._rest).mean(axis=0))
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
@@ -205,14 +207,16 @@ class Observer:
         triangles = site.anatomy.open_surface
         corners = self._rest[triangles]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        area *= (site.compute_axis_distance(corners.reshape(-1, 3)).reshape(-1, 3) < HOLE * site.clearance).all(axis=1)
+        area *= (site.compute_axis_distance(corners.reshape(-1, 3)).reshape(-1, 3) < HOLE_RATIO * site.clearance).all(
+            axis=1
+        )
         some = random.choice(len(area), self.sight.points, p=area / area.sum())
         return triangles[some], random.dirichlet(np.ones(3), len(some))
 
     @cached_property
     def _smooth(self) -> np.ndarray:
         """(n, 3) [m]: the error that neighbours share."""
-        at, random = self._at(self._rest), np.random.default_rng([self.sight.seed, 0, 1])
+        at, random = self._interpolate_points(self._rest), np.random.default_rng([self.sight.seed, 0, 1])
         return self.sight.smooth * smooth_root(at) @ random.standard_normal(at.shape)
 
     @cached_property
@@ -244,10 +248,10 @@ def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> n
     (0, 3) where it is in the air.
     """
     triangles = anatomy.open_surface
-    near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:CORNERS]]
+    near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:SEARCHED_CORNERS]]
     place = find_closest_points(near, positions[triangles]).point
     away = np.linalg.norm(place - near, axis=1)
-    return place[[away.argmin()]] if away.min() < TOUCHES else NOTHING.now
+    return place[[away.argmin()]] if away.min() < TOUCH_DISTANCE else NO_POINTS.now
 
 
 def locate_tumour(
@@ -257,7 +261,7 @@ def locate_tumour(
 
     `begun` is the start time of the measurement, by `time.perf_counter`.
     """
-    observation, location, refusal = NOTHING, None, ""
+    observation, location, refusal = NO_POINTS, None, ""
     try:
         observation = see()
         location = locator.locate(observation)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.composite import BROKEN, DOUBTFUL, HIDDEN, format_ground
-from ar.overlay.gauge import GAUGE, format_gauge
-from ar.overlay.hud import FINE, NARROW, WHITE, format_millimetres, wrap_line
+from ar.overlay.composite import BROKEN_STROKES, DOUBTFUL_COLOUR, HIDDEN_STROKES, format_ground
+from ar.overlay.gauge import NUMBER_SCALE, format_gauge
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, WHITE, format_millimetres, wrap_line
 from ar.overlay.outlines import (
     compute_changed_share,
     compute_ink,
@@ -17,7 +17,7 @@ from ar.overlay.outlines import (
     has_text,
     measure_outline_gap,
 )
-from ar.overlay.styles import NOTICED, WHOLE
+from ar.overlay.styles import MIN_REPORTED_SHARE, WHOLE_SHARE
 from ar.rendering.layer import Layer
 from ar.rendering.raycast import raycast
 from sim.geometry.surface import is_enclosing
@@ -27,15 +27,18 @@ from surrogate.model.guarded import find_first_model
 from .player import TRUE_STROKES, Frame, Player
 from .stage import ESTIMATED_LINES, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 
-STEPS = 24  # Number of sampling steps along an edge of a triangle of the tumour.
+EDGE_STEPS = 24  # Number of sampling steps along an edge of a triangle of the tumour.
 # Barycentric weights (q, 3) at which the tumour's triangles are sampled: corners, edges and interior.
-SAMPLES = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
+SAMPLES = (
+    np.array([(i, j, EDGE_STEPS - i - j) for i in range(EDGE_STEPS + 1) for j in range(EDGE_STEPS + 1 - i)])
+    / EDGE_STEPS
+)
 
-SLACK = 0.02  # Share of the silhouette's pixels that may deviate.
+MASK_TOLERANCE = 0.02  # Share of the silhouette's pixels that may deviate.
 BROKEN_SHARES = (0.35, 0.88)  # Range of the share of a broken outline that is drawn.
-CHANGED = 0.5  # Largest share of occluded ground whose colour may change.
-SOFT = 2  # Total length of the soft ends of two strokes [pixel]: their colour is not the outline's.
-FAR = 0.3  # Largest distance of the number from the tip, as a share of the image width.
+MAX_CHANGED_SHARE = 0.5  # Largest share of occluded ground whose colour may change.
+SOFT_LENGTH = 2  # Total length of the soft ends of two strokes [pixel]: their colour is not the outline's.
+MAX_NUMBER_DISTANCE = 0.3  # Largest distance of the number from the tip, as a share of the image width.
 
 
 def render_silhouette(camera: Camera, layer: Layer) -> np.ndarray:
@@ -48,22 +51,24 @@ def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
 
     Outlines drawn broken, because they are occluded or unreliable, may have gaps.
     """
-    ink, shut = compute_ink(DOUBTFUL if frame.doubt else TUMOUR_COLOUR), find_closed_ground(frame)
-    above = _above(frame)
-    gap = BROKEN[1] + SOFT if frame.doubt else 0
+    ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), find_closed_ground(frame)
+    above = _mask_foreground(frame)
+    gap = BROKEN_STROKES[1] + SOFT_LENGTH if frame.doubt else 0
     return max(
         measure_outline_gap(frame.shown, ink, mask, above | shut, gap=gap),
-        measure_outline_gap(frame.shown, ink, mask, above | ~shut, sum(HIDDEN), HIDDEN[1] + SOFT),
+        measure_outline_gap(
+            frame.shown, ink, mask, above | ~shut, sum(HIDDEN_STROKES), HIDDEN_STROKES[1] + SOFT_LENGTH
+        ),
     )
 
 
 def measure_truth_error(frame: Frame, mask: np.ndarray) -> float:
     """Compute the distance of the truth's outline [pixel]; the estimate's outline, drawn over it, is masked out."""
-    above = _above(frame) | find_ink(frame.shown, compute_ink(TUMOUR_COLOUR))
+    above = _mask_foreground(frame) | find_ink(frame.shown, compute_ink(TUMOUR_COLOUR))
     return measure_outline_gap(frame.shown, compute_ink(TRUTH_COLOUR), mask, above, 2 * sum(TRUE_STROKES))
 
 
-def _above(frame: Frame) -> np.ndarray:
+def _mask_foreground(frame: Frame) -> np.ndarray:
     """(H, W) bool: words and tools."""
     return find_ink(frame.shown, WHITE, 0) | (frame.picture.segmentation == TOOL)
 
@@ -78,29 +83,33 @@ def is_hidden_part_marked(frame: Frame, mask: np.ndarray) -> bool:
 
     There the outline must be broken, without shading, and the image must name the occluder.
     """
-    ink, shut = compute_ink(DOUBTFUL if frame.doubt else TUMOUR_COLOUR), find_closed_ground(frame)
+    ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), find_closed_ground(frame)
     least, most = BROKEN_SHARES
-    inked = compute_inked_share(frame.shown, ink, mask, _above(frame) | ~shut)
+    inked = compute_inked_share(frame.shown, ink, mask, _mask_foreground(frame) | ~shut)
     changed = compute_changed_share(frame.picture.colour, frame.shown, mask & shut & (frame.taken == 0))
-    return _said(frame, mask) and not (inked < least or inked > most or changed > CHANGED)  # NaN: none is there
+    return _is_ground_labelled(frame, mask) and not (
+        inked < least or inked > most or changed > MAX_CHANGED_SHARE
+    )  # NaN: none is there
 
 
-def _said(frame: Frame, mask: np.ndarray) -> bool:
+def _is_ground_labelled(frame: Frame, mask: np.ndarray) -> bool:
     seen = frame.picture.segmentation[mask & (frame.picture.segmentation != TOOL)]
     layers, counts = (each.tolist() for each in np.unique(seen, return_counts=True))
     share = float(np.isin(seen, OPENING.ids, invert=True).mean()) if len(seen) else 0.0
-    if share < NOTICED + SLACK:
+    if share < MIN_REPORTED_SHARE + MASK_TOLERANCE:
         return True
     words = OPENING.describe(dict(zip(layers, counts, strict=True))).removeprefix("partly ")
-    allowed = [words] * (share > WHOLE - SLACK) + [f"partly {words}"] * (share < WHOLE + SLACK)
-    return any(all(has_text(frame.shown, line, FINE) for line in format_ground(said)) for said in allowed)
+    allowed = [words] * (share > WHOLE_SHARE - MASK_TOLERANCE) + [f"partly {words}"] * (
+        share < WHOLE_SHARE + MASK_TOLERANCE
+    )
+    return any(all(has_text(frame.shown, line, TEXT_SCALE) for line in format_ground(said)) for said in allowed)
 
 
 def has_printed_numbers(player: Player, frame: Frame) -> bool:
     """Return True if the image shows the frame number, the distance from tip to tumour, and the estimate."""
-    if not has_text(frame.shown, f"frame {frame.number}", FINE) or not _estimate_printed(player, frame):
+    if not has_text(frame.shown, f"frame {frame.number}", TEXT_SCALE) or not _estimate_printed(player, frame):
         return False
-    return frame.tip is None or _number(player, frame, frame.tip) is not None
+    return frame.tip is None or _find_number(player, frame, frame.tip) is not None
 
 
 def has_distance_at_tip(player: Player, frame: Frame) -> bool:
@@ -108,23 +117,23 @@ def has_distance_at_tip(player: Player, frame: Frame) -> bool:
     if frame.tip is None:
         return True
     (tip,), _ = frame.camera.project(frame.tip[None])
-    found = _number(player, frame, frame.tip)
+    found = _find_number(player, frame, frame.tip)
     if found is None or not np.isfinite(tip).all():
         return found is not None
     height, width = frame.shown.shape[:2]
     tip = np.clip(tip, 0, (width - 1, height - 1))
     away = tip - np.clip(tip, found[:2], found[2:])
-    return bool(np.linalg.norm(away) <= FAR * width)
+    return bool(np.linalg.norm(away) <= MAX_NUMBER_DISTANCE * width)
 
 
-def _number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, int, int, int] | None:
+def _find_number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, int, int, int] | None:
     """Find the box of the distance text in an image; None if it is not found."""
-    corners = _corners(player, frame)
-    distance, inside = _distance(player, frame, corners, tip), is_enclosing(corners, tip)
+    corners = _get_corners(player, frame)
+    distance, inside = _compute_distance(player, frame, corners, tip), is_enclosing(corners, tip)
     error = None if frame.doubt else frame.tumour_error.bound
     for off in (0.0, 0.5e-4, 1e-4):  # samples are never nearer than the surface: by less than what is printed
         text = format_gauge(distance - off, error, inside)
-        at = find_text(frame.shown, text, GAUGE)
+        at = find_text(frame.shown, text, NUMBER_SCALE)
         if at is not None:
             return at
     return None
@@ -143,19 +152,19 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
     said = [
         line
         for text in (f"{ESTIMATED_LINES.motion} {format_millimetres(length, found.location.p95)}", frame.remark)
-        for line in wrap_line(text, NARROW * frame.shown.shape[1])
+        for line in wrap_line(text, MAX_BOTTOM_WIDTH * frame.shown.shape[1])
     ]
     return frame.remark.endswith(f"error {1e3 * off:.1f} mm") and all(
-        has_text(frame.shown, text, FINE) for text in said
+        has_text(frame.shown, text, TEXT_SCALE) for text in said
     )
 
 
-def _corners(player: Player, frame: Frame) -> np.ndarray:
+def _get_corners(player: Player, frame: Frame) -> np.ndarray:
     """Corners (S, 3, 3) [m] of the tumour's triangles as they are drawn."""
     return player.estimate_positions(frame)[player.stage.select_stage(frame.loads).anatomy.tumour_surface]
 
 
-def _distance(player: Player, frame: Frame, corners: np.ndarray, tip: np.ndarray) -> float:
+def _compute_distance(player: Player, frame: Frame, corners: np.ndarray, tip: np.ndarray) -> float:
     """Compute the distance from tip to tumour [m] by sampling the drawn surfaces, corrected by the model."""
     apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
     model = find_first_model(player.deformer, frame.deformation)

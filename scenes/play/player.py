@@ -12,7 +12,7 @@ import numpy as np
 from ar.optics.camera import Camera
 from ar.overlay.composite import Overlaid, composite, draw_points, format_head_lines
 from ar.overlay.gauge import Gauge
-from ar.overlay.hud import NARROW, lay, wrap_line
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, lay, wrap_line
 from ar.overlay.legend import LegendNames
 from ar.overlay.marks import Cover, Marks, Trace, Words
 from ar.overlay.styles import Style
@@ -39,17 +39,17 @@ from .observer import TumourEstimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
 from .tip_reading import read_tip_distance
 
-REFUSED = "observation rejected, and the scan is shown: do not rely on it"  # Warning in the image.
+REJECTED_WARNING = "observation rejected, and the scan is shown: do not rely on it"  # Warning in the image.
 TRUE_STROKES = (12, 4)  # Stroke and gap lengths of the reference's outline [pixel].
 ELLIPSOID_STROKES = (8, 5)  # Stroke and gap lengths of the ellipsoid's outline [pixel].
-COVERS = (TOOL, COTTON, GLOVE)
+OCCLUDER_LABELS = (TOOL, COTTON, GLOVE)
 """Layers drawn in front of the overlay."""
-IN_BONE = "blocked by bone at the craniotomy edge: do not rely on it"  # Warning in the image.
+BONE_WARNING = "blocked by bone at the craniotomy edge: do not rely on it"  # Warning in the image.
 # Largest penetration into the craniotomy edge that tissue carries [m]: beyond, the tool is drawn elsewhere.
-CARRIED = 0.5e-3
-BLOCKED = 2e-3  # Penetration into the craniotomy edge above which a load counts as infeasible [m].
-FEW = 480  # Image width below which the error lines are short [pixel].
-STILL = 1e-6  # Largest displacement of a brain that counts as undeformed [m].
+CARRIED_DEPTH = 0.5e-3
+BLOCKED_DEPTH = 2e-3  # Penetration into the craniotomy edge above which a load counts as infeasible [m].
+NARROW_IMAGE_WIDTH = 480  # Image width below which the error lines are short [pixel].
+MOTION_TOLERANCE = 1e-6  # Largest displacement of a brain that counts as undeformed [m].
 STAGES = ("deform", "render", "overlay")
 """Stages of a frame that are timed."""
 
@@ -222,14 +222,14 @@ class Player:
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
         # # The observer's rendering time is not part of the estimate.
         seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds
-        tumour, rest = stage.build_tumour(_believed(positions, estimate)), stage.tumour_at_rest
+        tumour, rest = stage.build_tumour(_estimate_positions(positions, estimate)), stage.tumour_at_rest
         doubt = describe_outcome(deformation.outcome[0]) or (
-            IN_BONE if held is not None and held.beyond > BLOCKED else ""
+            BONE_WARNING if held is not None and held.beyond > BLOCKED_DEPTH else ""
         )
-        doubt = doubt or (REFUSED if estimate is not None and estimate.location is None else "")
-        gauge = None if held is None else self._gauge(held, loads, deformation, tumour)
-        promised = None if doubt else self._promised(deformation)
-        error = NOT_KNOWN if doubt else self._tumour_error(touch, loads, promised or 0.0, estimate)
+        doubt = doubt or (REJECTED_WARNING if estimate is not None and estimate.location is None else "")
+        gauge = None if held is None else self._measure_tip_gauge(held, loads, deformation, tumour)
+        promised = None if doubt else self._get_model_error(deformation)
+        error = NOT_KNOWN if doubt else self._compute_tumour_error(touch, loads, promised or 0.0, estimate)
         shown = None if gauge is None else replace(gauge, error=error.bound)
         traces = () if estimate is None else list_traces(estimate, stage.build_reference(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
@@ -238,14 +238,14 @@ class Player:
             moved = motion, error.moved
         band = 0.0 if estimate is not None else error.bound or 0.0
         trained = find_first_model(self.deformer, deformation) is not None
-        lines = format_errors(promised, error, trained, doubt, camera.width < FEW)
+        lines = format_errors(promised, error, trained, doubt, camera.width < NARROW_IMAGE_WIDTH)
         head = format_head_lines(lines, picture.segmentation == TOOL)
         remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
             marks = Marks(band, shown, rest, traces)
             words = Words(doubt, head, get_legend_names(estimate), moved, error.bound)
-            over = composite(picture, camera, tumour, self.style, Cover(COVERS, OPENING), marks, words)
+            over = composite(picture, camera, tumour, self.style, Cover(OCCLUDER_LABELS, OPENING), marks, words)
             if estimate is not None and self.style != "none":
                 draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
             annotate(over, number, remark)
@@ -265,17 +265,17 @@ class Player:
             seconds=took, estimate=estimate,
         )  # fmt: skip
 
-    def _gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
+    def _measure_tip_gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
         """Measure from the tip to the tumour, with the error bound of the deformer, if known."""
         gauge = measure_gauge(held.tip, tumour)
         read = (
             None
-            if held.beyond > CARRIED
+            if held.beyond > CARRIED_DEPTH
             else read_tip_distance(self.deformer, loads, answer, self.scene.tool, gauge.distance)
         )
         return gauge if read is None else replace(gauge, read=read.distance, error=read.bound)
 
-    def _promised(self, answer: Deformation) -> float | None:
+    def _get_model_error(self, answer: Deformation) -> float | None:
         """Return a model's guaranteed error relative to FEM [m], of this load if available; None if unknown."""
         model = find_first_model(self.deformer, answer)
         if model is None:
@@ -284,7 +284,7 @@ class Player:
         bound = of_load if np.isfinite(of_load) else model.bound
         return bound if np.isfinite(bound) else None
 
-    def _tumour_error(
+    def _compute_tumour_error(
         self, touch: Touch, loads: Loads, promised: float, estimate: TumourEstimate | None
     ) -> TumourError:
         """Return the error of the tumour position: known on the script's tool path; an estimate replaces its bound."""
@@ -328,7 +328,7 @@ class Player:
 
     def estimate_positions(self, frame: Frame) -> np.ndarray:
         """Return the drawn positions (V, 3) [m] of all mesh vertices: the tumour's by the estimate, if there is one."""
-        return _believed(self.compute_positions(frame.deformation), frame.estimate)
+        return _estimate_positions(self.compute_positions(frame.deformation), frame.estimate)
 
     def place_tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> HeldTool:
         """Compute the tool position: a pushing tool rests on the deformed cortex from outside.
@@ -341,7 +341,7 @@ class Player:
         carried = self.scene.find_contact(self.site, touch).locate(positions)
         inside = self.site.clip_to_opening(carried, tool.radius)
         beyond = float(np.linalg.norm(inside - carried))
-        tip = through = inside if beyond > CARRIED else carried
+        tip = through = inside if beyond > CARRIED_DEPTH else carried
         if isinstance(tool, Probe):
             tip = find_resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
         tip = tip - compute_lift(touch.force) * inward
@@ -356,10 +356,10 @@ class Player:
 
 def is_undeformed(deformation: Deformation) -> bool:
     """Return True if nothing moves by more than a micrometre: there is no motion whose error could be given."""
-    return bool(np.abs(deformation.displacement).max(initial=0.0) < STILL)
+    return bool(np.abs(deformation.displacement).max(initial=0.0) < MOTION_TOLERANCE)
 
 
-def _believed(positions: np.ndarray, estimate: TumourEstimate | None) -> np.ndarray:
+def _estimate_positions(positions: np.ndarray, estimate: TumourEstimate | None) -> np.ndarray:
     return positions if estimate is None else estimate.place_tumour(positions)
 
 
@@ -387,5 +387,5 @@ def measure_gauge(tip: np.ndarray, hidden: Layer) -> Gauge:
 def annotate(over: Overlaid, number: int, remark: str) -> None:
     """Write a remark at the bottom of a composite image and a frame's number, in place."""
     height, width = over.taken.shape
-    lay(over.colour, over.taken, wrap_line(remark, NARROW * width), (0, height))
+    lay(over.colour, over.taken, wrap_line(remark, MAX_BOTTOM_WIDTH * width), (0, height))
     lay(over.colour, over.taken, [f"frame {number}"], (width, height))

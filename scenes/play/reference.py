@@ -15,7 +15,7 @@ from sim.runtime.device import find_device
 from ..script.scene import Scene
 from .deformers import PatientSetup
 
-TOGETHER = 16  # Number of frames that are solved together: small enough for regular progress reports.
+BATCH_FRAMES = 16  # Number of frames that are solved together: small enough for regular progress reports.
 
 
 def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | OperatedFem:
@@ -24,7 +24,7 @@ def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | OperatedFe
     A frame that starts from the last one takes a quarter of the time of a frame solved alone.
     """
     if find_device(theatre.device, TRAIN.precision).name != "cpu":
-        return theatre.build_fem(scene, TRAIN, TOGETHER)
+        return theatre.build_fem(scene, TRAIN, BATCH_FRAMES)
     return theatre.build_fem(scene, TRAIN, 1, live=True)
 
 
@@ -48,9 +48,9 @@ def solve_reference_frames(
     `progress` hears how many more frames are solved, whenever some are. `fem` are finite elements that are at hand, as
     `build_reference_fem` makes them.
     """
-    fem = fem or theatre.build_fem(scene, TRAIN, TOGETHER)
+    fem = fem or theatre.build_fem(scene, TRAIN, BATCH_FRAMES)
     apart = not is_history_dependent(fem) and not (isinstance(fem, Fem) and fem.batch == 1)
-    size = TOGETHER if apart else 1
+    size = BATCH_FRAMES if apart else 1
     answers: list[Deformation] = []
     for first in range(0, len(loads), size):
         some = stack(loads[first : first + size])

@@ -15,7 +15,7 @@ from .player import Player
 T = TypeVar("T")  # Type of a frame.
 # Largest time step of one solve where the brain separates from the skull [s]. One long solve costs half as much as the
 # steps that show its course, but takes a quarter of a minute without an image.
-LEAP = 0.2
+MAX_TIME_STEP = 0.2
 
 
 @dataclass(frozen=True)
@@ -125,4 +125,4 @@ def plan_replay_order(player: Player) -> ReplayOrder | None:
     if not any(isinstance(effect, SkullContact) for effect in scene.get_effects_on(player.site.anatomy)):
         return None
     # # Only displacements of such a state are stored, a third of a megabyte each.
-    return ReplayOrder(max(1, round(LEAP * scene.frames_per_second)), back=True, kept=64)
+    return ReplayOrder(max(1, round(MAX_TIME_STEP * scene.frames_per_second)), back=True, kept=64)

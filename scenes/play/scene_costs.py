@@ -6,16 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ar.overlay.hud import HEAD, ROW, bound_words, draw_text_panel
+from ar.overlay.hud import HEAD_ROW, LINE_SPACING, bound_words, draw_text_panel
 from ar.screen import shrink_image
 
 from .frame_text import shorten_source
 from .player import Frame, Player
 from .stage import DRAPE, TOOL
 
-DRAWN = 8  # Number of frames rendered of each scene, evenly spaced; the first loads kernels and is not timed.
-SIZE = (480, 360)  # Width and height of an image of the sheet [pixel].
-LINES = "green estimate, pink truth, blue 95 % of its middle"
+RENDERED_FRAMES = 8  # Number of frames rendered of each scene, evenly spaced; the first loads kernels and is not timed.
+IMAGE_SIZE = (480, 360)  # Width and height of an image of the sheet [pixel].
+LINE_LEGEND = "green estimate, pink truth, blue 95 % of its middle"
 """Legend of the lines drawn with an estimate."""
 
 
@@ -27,14 +27,16 @@ def label_lines(frame: Frame, name: str) -> list[str]:
     moment = f"t {frame.time:.2f} s{', ' if frame.acts else ''}{frame.acts}"
     rest = [*doubt, moment, "ms: " + ", ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in spent)]
     if found is None:
-        return [f"{name}: tumour moved {_within(frame.moved, frame.moved_error)}", *rest, source]
+        return [f"{name}: tumour moved {_format_length(frame.moved, frame.moved_error)}", *rest, source]
     moved = [f"truth: tumour moved {1e3 * found.truly:.2f} mm"]
-    moved += [] if found.location is None else [f"estimate: tumour moved {_within(found.moved, frame.moved_error)}"]
-    lines = [] if frame.named else [f"lines: {LINES}"]
+    moved += (
+        [] if found.location is None else [f"estimate: tumour moved {_format_length(found.moved, frame.moved_error)}"]
+    )
+    lines = [] if frame.named else [f"lines: {LINE_LEGEND}"]
     return [*moved, *rest, f"truth: {source}", f"estimate: {found.source}", *lines]
 
 
-def _within(length: float, error: float | None) -> str:
+def _format_length(length: float, error: float | None) -> str:
     """Format a length and the tumour's error of it [m] in millimetres; an unknown error is given at the image's top."""
     return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {bound_words(error, 1)}'}"
 
@@ -45,7 +47,9 @@ def add_cost_label(frame: Frame, name: str) -> np.ndarray:
     # It hides cortex where it must, but no tool, no line and no word.
     hides = (frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)
     sights = [each.view(np.uint8) for each in hides]
-    return draw_text_panel(frame.shown, label_lines(frame, name), below=HEAD + ROW * len(frame.head), sights=sights)
+    return draw_text_panel(
+        frame.shown, label_lines(frame, name), below=HEAD_ROW + LINE_SPACING * len(frame.head), sights=sights
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,23 +68,25 @@ class Thumbnail:
 
 def render_thumbnail(player: Player, name: str) -> Thumbnail:
     """Return the frame of a deformer `name` in which the tumour has moved most, of those after the last cut, small."""
-    every = max(1, (len(player.scene.times) - 1) // (DRAWN - 1))
+    every = max(1, (len(player.scene.times) - 1) // (RENDERED_FRAMES - 1))
     frames = list(player.play_frames(every))
-    best = max(frames, key=lambda frame: (_cuts(player, frame), frame.moved))
+    best = max(frames, key=lambda frame: (_count_cuts(player, frame), frame.moved))
     said = add_cost_label(best, name)
     taken = best.taken | (said != best.shown).any(axis=2).view(np.uint8)
     picture = draw_text_panel(said, [player.scene.name], "top right", 0.9, sights=[taken])
     return Thumbnail(
-        shrink_image(picture, *SIZE), _medians(frames[1:] or frames), 1e3 * max(frame.moved for frame in frames)
+        shrink_image(picture, *IMAGE_SIZE),
+        _compute_medians(frames[1:] or frames),
+        1e3 * max(frame.moved for frame in frames),
     )
 
 
-def _cuts(player: Player, frame: Frame) -> int:
+def _count_cuts(player: Player, frame: Frame) -> int:
     left = player.stage.select_stage(frame.loads).left
     return 0 if left is None else left.done
 
 
-def _medians(frames: list[Frame]) -> dict[str, float]:
+def _compute_medians(frames: list[Frame]) -> dict[str, float]:
     return {stage: 1e3 * float(np.median([frame.seconds[stage] for frame in frames])) for stage in frames[0].seconds}
 
 

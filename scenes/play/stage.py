@@ -21,7 +21,7 @@ from sim.loads import Loads, Resected
 
 from ..script.scene import Scene
 from ..script.sight import StereoObservation
-from ..script.site import HOLE, CraniotomyFrame
+from ..script.site import HOLE_RATIO, CraniotomyFrame
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
 from .observer import Sees
 
@@ -37,19 +37,23 @@ TOOL_COLOUR = (0.78, 0.80, 0.83)  # Colour of the tool (RGB, 0 to 1).
 TUMOUR_COLOUR = (0.20, 0.94, 0.42)
 TRUTH_COLOUR = (0.90, 0.35, 0.78)
 """Colour of the tumour surface computed by FEM."""
-DARK = (0.33, 0.16, 0.17)  # Share of the cortex colour (RGB) that the scan's black keeps.
-RELIEF = 1.5e-3  # Depth of black below white [m].
+DARK_SHARES = (0.33, 0.16, 0.17)  # Share of the cortex colour (RGB) that the scan's black keeps.
+RELIEF_DEPTH = 1.5e-3  # Depth of black below white [m].
 OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
 """Layer through which the tumour is seen, and text for the occluders."""
 # Names of the lines in an image of a prediction.
 PREDICTED_LINES = LegendNames("predicted tumour", "its error, 95 %", "in the scan")
 ESTIMATED_LINES = LegendNames("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"), "estimate moved")
 """Names of the lines in an image of a prediction, and in one of an estimate."""
-READ_BELOW = 2.0e-3  # Depth under the surface at which the scan is read [m]: the edge of grey matter mixes with fluid.
-RIM = 10e-3  # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
+READING_DEPTH = (
+    2.0e-3  # Depth under the surface at which the scan is read [m]: the edge of grey matter mixes with fluid.
+)
+RIM_DISTANCE = (
+    10e-3  # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
+)
 DRAPE_HEIGHT = 3.0e-3  # Height of the drape above the brain [m].
 DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
-DIP = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
+DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +133,8 @@ class Stage:
         layer = self._visible.build_layer(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
             return layer
-        beyond = self.site.compute_axis_distance(layer.vertices) - HOLE * self.site.clearance
-        below = np.minimum(DIP * beyond.clip(0.0), DRAPE_DEPTH)
+        beyond = self.site.compute_axis_distance(layer.vertices) - HOLE_RATIO * self.site.clearance
+        below = np.minimum(DRAPE_SLOPE * beyond.clip(0.0), DRAPE_DEPTH)
         return replace(layer, vertices=layer.vertices + below[:, None] * self.site.axis)
 
     @cached_property
@@ -142,7 +146,7 @@ class Stage:
 
     def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
-        return self._layers(positions, self.compute_corners(pose))
+        return self._list_layers(positions, self.compute_corners(pose))
 
     def compute_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
         """Corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
@@ -150,7 +154,7 @@ class Stage:
             return None
         return np.asarray(self.scene.tool.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
 
-    def _layers(self, positions: np.ndarray, corners: np.ndarray | None) -> list[Layer]:
+    def _list_layers(self, positions: np.ndarray, corners: np.ndarray | None) -> list[Layer]:
         look = self.scene.look
         seen = [self.build_visible(positions), self._drape]
         seen += [] if look.finger is None else [self._finger]
@@ -166,7 +170,7 @@ class Stage:
 
     def render_tool_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
         """Return the same, of a tool by its corners (t, 3) [m]."""
-        layers = self._layers(positions, corners)
+        layers = self._list_layers(positions, corners)
         count = len(layers)
         if count not in self._renderers:
             self._renderers[count] = Renderer(layers, self.lamp, self.device)
@@ -210,20 +214,22 @@ class Stage:
 
     @cached_property
     def _cortex(self) -> Cortex:
-        return self._dressed(self.anatomy.open_surface)
+        return self._build_cortex(self.anatomy.open_surface)
 
     @cached_property
     def _visible(self) -> Cortex:
         mesh = self.anatomy.mesh
         away = np.linalg.norm(mesh.nodes[mesh.surface] - self.site.origin, axis=2).min(axis=1)
-        return self._dressed(mesh.surface[away < self.site.radius + RIM])
+        return self._build_cortex(mesh.surface[away < self.site.radius + RIM_DISTANCE])
 
-    def _dressed(self, surface: np.ndarray) -> Cortex:
+    def _build_cortex(self, surface: np.ndarray) -> Cortex:
         """Triangles (S, 3) of the mesh's surface that wear the scan."""
         vertices, triangles = np.unique(surface, return_inverse=True)
         at = self.anatomy.mesh.nodes[vertices]
         colour = np.array(CORTEX_COLOUR) * self.scene.look.tint
-        return Cortex(vertices, triangles, at - READ_BELOW * compute_vertex_normals(at, triangles), self.scan, colour)
+        return Cortex(
+            vertices, triangles, at - READING_DEPTH * compute_vertex_normals(at, triangles), self.scan, colour
+        )
 
     @cached_property
     def scan(self) -> Solid | None:
@@ -232,11 +238,11 @@ class Stage:
         if isinstance(sight, StereoObservation) and sight.vessels:
             seed = sight.seed
         if seed is not None:
-            return add_vessels(self.intensity, self.site, seed, DARK, RELIEF)
+            return add_vessels(self.intensity, self.site, seed, DARK_SHARES, RELIEF_DEPTH)
         if self.intensity is None:
             return None
         values = self.intensity.apply_window(self.site.anatomy.mesh)
-        return Solid(values, np.linalg.inv(self.intensity.affine), DARK, RELIEF)
+        return Solid(values, np.linalg.inv(self.intensity.affine), DARK_SHARES, RELIEF_DEPTH)
 
     @cached_property
     def _drape(self) -> Layer:
@@ -246,7 +252,7 @@ class Stage:
         lifted = mesh.nodes + DRAPE_HEIGHT * normals
         # # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
         far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
-        outside = np.where(far, site.radius, site.compute_axis_distance(mesh.nodes) - HOLE * site.clearance)
+        outside = np.where(far, site.radius, site.compute_axis_distance(mesh.nodes) - HOLE_RATIO * site.clearance)
         points, triangles, rim = clip_surface(lifted, mesh.surface, outside)
         # The wall has its own vertices: normals shared with the drape would round its edge off.
         low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis

@@ -12,7 +12,7 @@ from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
 
 from ..script.sight import StereoObservation
-from .observer import NOTHING, RigidError, TumourEstimate, find_touched, locate_tumour, sample_rigid_error
+from .observer import NO_POINTS, RigidError, TumourEstimate, find_touched, locate_tumour, sample_rigid_error
 from .stage import Stage
 from .stereo_update import First, StereoPair, observe_first, observe_point_cloud, observe_points
 
@@ -31,7 +31,7 @@ class StereoObserver:
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
         shot, anatomy = self.render_pair(number, positions, tool), self.stage.site.anatomy
-        tips = NOTHING.now if tool is None else find_touched(anatomy, positions, tool)
+        tips = NO_POINTS.now if tool is None else find_touched(anatomy, positions, tool)
         _ = self._first_shot  # to draw it takes long
         begun = clock.perf_counter()
         return locate_tumour(anatomy, self.locator, lambda: self.observe(shot, tips), positions, begun)
@@ -46,8 +46,8 @@ class StereoObserver:
         """
         site, sight = self.stage.site, self.sight
         if not sight.named:
-            return observe_point_cloud(site, shot, sight.points, self._tracked(0), tips)
-        return observe_points(site, self.first, shot, self._tracked(1), tips)
+            return observe_point_cloud(site, shot, sight.points, self._build_microscope(0), tips)
+        return observe_points(site, self.first, shot, self._build_microscope(1), tips)
 
     def render_pair(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> StereoPair:
         """Render both eyes' images of a frame, for positions (V, 3) [m] and a tool's corners (t, 3) [m].
@@ -60,7 +60,7 @@ class StereoObserver:
             replace(scene.viewpoint, eye=eye).build_camera(self.stage.site, time) for eye in ("left", "right")
         )
         pictures = [
-            self._noisy(stage.render_tool_corners(camera, positions, tool).colour, number, eye)
+            self._add_noise(stage.render_tool_corners(camera, positions, tool).colour, number, eye)
             for eye, (stage, camera) in enumerate(zip(self._stages, (left, right), strict=True))
         ]
         seen = None if tool is None or scene.tool is None else (tool, np.asarray(scene.tool.mesh.faces))
@@ -75,7 +75,7 @@ class StereoObserver:
         InputError
             See `observe_first`.
         """
-        return observe_first(self.stage.site, self._first_shot, self.sight.points, self._tracked(0))
+        return observe_first(self.stage.site, self._first_shot, self.sight.points, self._build_microscope(0))
 
     @cached_property
     def _first_shot(self) -> StereoPair:
@@ -86,14 +86,14 @@ class StereoObserver:
         """Stages of the two cameras: a stage caches the image of its last camera."""
         return replace(self.stage), replace(self.stage)
 
-    def _noisy(self, picture: np.ndarray, number: int, eye: int) -> np.ndarray:
+    def _add_noise(self, picture: np.ndarray, number: int, eye: int) -> np.ndarray:
         """Add camera noise to an image (H, W, 3) uint8; the image of the right camera (1) is darker."""
         random = np.random.default_rng([self.sight.seed, 2 + number, eye])
         noise = self.sight.noise * random.standard_normal(picture.shape, np.float32)
         lit = np.float32(1.0 - eye * self.sight.darker) * picture + noise
         return np.clip(np.rint(lit), 0.0, 255.0).astype(np.uint8)
 
-    def _tracked(self, number: int) -> TrackedMicroscope:
+    def _build_microscope(self, number: int) -> TrackedMicroscope:
         return TrackedMicroscope(sample_rigid_error(self.sight, 2 + number), self.stage.site.origin)
 
 

@@ -47,7 +47,7 @@ def read_tip_distance(
     apart
         Distance [m] between the drawn tip and the drawn tumour.
     """
-    if _ball(loads, tool) is None:
+    if _get_ball(loads, tool) is None:
         return None
     model = find_first_model(deformer, answer)
     if model is None:
@@ -75,14 +75,14 @@ def measure_tip_distance(
     InputError
         A solution without open cortex or tumour.
     """
-    ball = _ball(loads, tool)
+    ball = _get_ball(loads, tool)
     if ball is None:
         return None
     found = build_tip_gauge(anatomy).compute_distances(loads, answer.displacement, answer.nodes, ball.shape, lift)
     return TipDistance(float(found[0]), None)
 
 
-def _ball(loads: Loads, tool: Instrument | None) -> Probe | None:
+def _get_ball(loads: Loads, tool: Instrument | None) -> Probe | None:
     """Return the tool where it is the only thing that pushes or is moved, and a ball; else None."""
     alone = len(loads.get_all(Pushed)) + len(loads.get_all(Touching)) == 1
     return tool if alone and isinstance(tool, Probe) else None

@@ -6,8 +6,8 @@ import threading
 import time as clock
 from collections.abc import Callable
 
-NOTICED = 0.3  # Waiting time that is reported [s].
-LOOK = 0.1  # Polling interval [s].
+MIN_REPORTED_TIME = 0.3  # Waiting time that is reported [s].
+POLL_INTERVAL = 0.1  # Polling interval [s].
 
 
 class Busy:
@@ -44,9 +44,9 @@ class Busy:
         self._thread.join()
 
     def _watch(self) -> None:
-        while not self._closed.wait(LOOK):
+        while not self._closed.wait(POLL_INTERVAL):
             with self._lock:
                 waited = 0.0 if self._since is None else clock.perf_counter() - self._since
-                if waited >= NOTICED:
+                if waited >= MIN_REPORTED_TIME:
                     self._say(f"{self._what} ... {waited:.0f} s")
                     self.noticed = True

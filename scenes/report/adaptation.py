@@ -19,7 +19,7 @@ from surrogate.data.simulate import simulate
 
 from .study import ReportStudy, note_seconds, read_noted_seconds
 
-SHARE = 0.2  # Removed share of the tumour's volume.
+REMOVED_SHARE = 0.2  # Removed share of the tumour's volume.
 
 
 def debulk_tumour(anatomy: Anatomy) -> Anatomy:
@@ -32,7 +32,7 @@ def debulk_tumour(anatomy: Anatomy) -> Anatomy:
     middle, volume = mesh.nodes[mesh.tets[tumour]].mean(axis=1), mesh.volumes[tumour]
     far = np.linalg.norm(middle - np.average(middle, axis=0, weights=volume), axis=1)
     inside = np.argsort(far, kind="stable")
-    inside = inside[np.cumsum(volume[inside]) <= SHARE * volume.sum()]
+    inside = inside[np.cumsum(volume[inside]) <= REMOVED_SHARE * volume.sum()]
     left = np.setdiff1d(np.arange(len(mesh.tets)), tumour[inside])
     used, table = np.unique(mesh.table[left], return_inverse=True)
     middles = None if mesh.middles is None else table[:, 4:]
@@ -42,12 +42,12 @@ def debulk_tumour(anatomy: Anatomy) -> Anatomy:
 
 def build_debulked_study(study: ReportStudy) -> ReportStudy:
     """Return the same study of the debulked body, once `simulate_debulked` has made its data."""
-    return replace(study, data=_path(study))
+    return replace(study, data=_to_answers_path(study))
 
 
 def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> None:
     """Solve the data's own loads on the debulked body; `progress` receives the number of newly solved rows."""
-    path = _path(study)
+    path = _to_answers_path(study)
     if path.exists():
         progress(len(study.dataset.loads) + len(study.dataset.unit_good))
         return
@@ -69,8 +69,8 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
 
 def read_simulation_seconds(study: ReportStudy) -> float | None:
     """Read the seconds of `simulate_debulked`; None if it was not run, or not in one run."""
-    return read_noted_seconds(_path(study))
+    return read_noted_seconds(_to_answers_path(study))
 
 
-def _path(study: ReportStudy) -> Path:
+def _to_answers_path(study: ReportStudy) -> Path:
     return study.folder / "answers" / f"debulked-{study.digest}.h5"

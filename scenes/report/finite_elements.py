@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.accuracy import FLOOR, Accuracy, Precision
+from sim.accuracy import MIN_TOLERANCE, Accuracy, Precision
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.refine import refine
@@ -26,8 +26,8 @@ from .adaptation import debulk_tumour
 from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow, compare_with_reference, summarise_times
 from .study import ReportStudy
 
-OWN, HALVED = "own", "halved"  # Meshes: that of the data; with every edge halved.
-STANDARD = 1e-4  # Solver tolerance of data sets.
+OWN_MESH, HALVED_MESH = "own", "halved"  # Meshes: that of the data; with every edge halved.
+STANDARD_TOLERANCE = 1e-4  # Solver tolerance of data sets.
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class FemVariant:
     name: str
     law: str | None = None
     element: str | None = None
-    mesh: str = OWN
-    tolerance: float = STANDARD
+    mesh: str = OWN_MESH
+    tolerance: float = STANDARD_TOLERANCE
     precision: Precision | None = None
 
     @property
     def accuracy(self) -> Accuracy:
         """Accuracy settings of the solver."""
-        precision: Precision = "float32" if self.tolerance >= FLOOR["float32"] else "float64"
+        precision: Precision = "float32" if self.tolerance >= MIN_TOLERANCE["float32"] else "float64"
         return Accuracy(tolerance=self.tolerance, precision=self.precision or precision)
 
 
@@ -61,8 +61,8 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
         Input that `Fem` rejects; a law that the data's tissue has no constants for.
     """
     body, own = find_body(study, spec.mesh), study.anatomy
-    fem, set_up = time_work(_fem, study, spec, body)
-    loads = study.played if spec.mesh == OWN else move_pushes_onto(body, study.played)
+    fem, set_up = time_work(_build_fem, study, spec, body)
+    loads = study.played if spec.mesh == OWN_MESH else move_pushes_onto(body, study.played)
     located = locate(body.mesh, own.mesh.nodes[own.tumour_nodes])
     fem.deform(loads.select(np.array([0])))  # kernels are compiled or loaded at their first launch
     fields, good, seconds = [], [], []
@@ -80,19 +80,19 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
         failed=good.count(False),
         set_up=set_up,
         plan=fem.plan.explain(),
-        adapt=_adapt(study, spec, loads.select(np.array([0]))),
+        adapt=_measure_adaptation(study, spec, loads.select(np.array([0]))),
         **summarise_times(seconds),
     )
     return row, field
 
 
-def _adapt(study: ReportStudy, spec: FemVariant, load: Loads) -> float:
+def _measure_adaptation(study: ReportStudy, spec: FemVariant, load: Loads) -> float:
     """Return the seconds from the debulked body to its first solution, with compiled kernels."""
     body = debulk_tumour(find_body(study, spec.mesh))
-    return time_work(lambda: _fem(study, spec, body).deform(load))[1]
+    return time_work(lambda: _build_fem(study, spec, body).deform(load))[1]
 
 
-def _fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
+def _build_fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
     """Set up for single loads."""
     effects = build_push_effects(body, change_law(study.get_tissue_on(body), spec.law))
     return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
@@ -102,15 +102,15 @@ def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
     """Describe the kind of difference from the reference."""
     if change_law(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE
-    same = (spec.element or study.element) == "p2" and spec.mesh == (HALVED if study.fine else OWN)
+    same = (spec.element or study.element) == "p2" and spec.mesh == (HALVED_MESH if study.fine else OWN_MESH)
     return TOLERANCE_ALONE if same else ERROR
 
 
 def find_body(study: ReportStudy, mesh: str) -> Anatomy:
     """Return the body on a mesh by name; meshes of the template are made once and kept."""
-    if mesh == OWN:
+    if mesh == OWN_MESH:
         return study.anatomy
-    if mesh == HALVED:
+    if mesh == HALVED_MESH:
         return refine(study.anatomy)
     return read_anatomy(build_template_mesh(study.folder / "meshes", int(mesh)))
 

@@ -9,7 +9,7 @@ import numpy as np
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
 from surrogate.data.splits import DiscSplit, leave_sectors_out
-from surrogate.evaluation.coverage import TENTHS, compute_coverage
+from surrogate.evaluation.coverage import FORCE_CLASSES, compute_coverage
 from surrogate.evaluation.score import SolveCounts, time_model_alone, time_single_loads
 from surrogate.training.train import train
 
@@ -19,7 +19,7 @@ from .reference import get_solutions_beyond
 from .row import ErrorFigures, ReportRow, compare_with_reference, compute_figures, summarise_times
 from .study import ReportStudy, measure_series_seconds
 
-FEWEST_LOADS = 64  # Smallest number of training loads of a learning curve.
+MIN_LOADS = 64  # Smallest number of training loads of a learning curve.
 
 
 @dataclass(frozen=True)
@@ -42,27 +42,27 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
     def judged(model: Deformer, split: DiscSplit) -> tuple[ErrorFigures | None, float]:
         """Return the errors relative to the data's own solutions of held-out loads."""
         rows = np.flatnonzero(split.test)
-        return _held(model, study.converged.select(rows), truth[rows], nodes)
+        return _compute_errors(model, study.converged.select(rows), truth[rows], nodes)
 
     discs, sectors = study.discs, leave_sectors_out(study.pushed, study.patch)
-    (model, solves), learning = time_work(_trained, study, spec, discs)
+    (model, solves), learning = time_work(_train_model, study, spec, discs)
     order = np.flatnonzero(discs.train)
     curve = []
     for count in list_counts(len(order)):
         left_aside = np.isin(np.arange(len(discs.disc)), order[count:])
         fewer = replace(discs, disc=np.where(left_aside, -2, discs.disc))
-        curve.append((count, judged(_trained(study, spec, fewer)[0], discs)[0]))
-    of_discs, of_sectors = judged(model, discs), judged(_trained(study, spec, sectors)[0], sectors)
+        curve.append((count, judged(_train_model(study, spec, fewer)[0], discs)[0]))
+    of_discs, of_sectors = judged(model, discs), judged(_train_model(study, spec, sectors)[0], sectors)
     beyond = get_solutions_beyond(study)
     outside = study.outside.select(np.flatnonzero(beyond.good))
     sets = {
         "discs": of_discs,
         "sectors": of_sectors,
-        "beyond": _held(model, outside, beyond.displacement[beyond.good], nodes),
+        "beyond": _compute_errors(model, outside, beyond.displacement[beyond.good], nodes),
     }
     field = model.deform(study.played, at=nodes).displacement
     covered = compute_coverage_beyond(study, spec, outside, beyond.displacement[beyond.good])
-    adapt, adapted = _adapted(study, spec)
+    adapt, adapted = _measure_adaptation(study, spec)
     held_out = study.converged.select(np.flatnonzero(discs.test))
     bare = time_model_alone(model, held_out)
     row = ReportRow(
@@ -89,7 +89,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
 
 def list_counts(most: int) -> list[int]:
     """64, 128, 256, ... below `most`."""
-    return [FEWEST_LOADS << k for k in range(20) if FEWEST_LOADS << k < most]
+    return [MIN_LOADS << k for k in range(20) if MIN_LOADS << k < most]
 
 
 def compute_coverage_beyond(
@@ -99,24 +99,26 @@ def compute_coverage_beyond(
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.left_out.get(spec.name)
     held = {} if found is None else {"discs": found.held[0]}
-    if model.bounds is not None and len(outside) >= TENTHS:
+    if model.bounds is not None and len(outside) >= FORCE_CLASSES:
         held["beyond"] = compute_coverage(model, outside, truth).held[0]
     return {name: share for name, share in held.items() if share is not None}
 
 
-def _adapted(study: ReportStudy, spec: LearnerSpec) -> tuple[float | None, ErrorFigures | None]:
+def _measure_adaptation(study: ReportStudy, spec: LearnerSpec) -> tuple[float | None, ErrorFigures | None]:
     """Seconds of simulating and learning the debulked body, and figures there; nothing where it was not simulated."""
     seconds = read_simulation_seconds(study)
     if seconds is None:
         return None, None
     after = build_debulked_study(study)
-    (model, _), learning = time_work(_trained, after, spec, after.discs)
+    (model, _), learning = time_work(_train_model, after, spec, after.discs)
     rows = np.flatnonzero(after.discs.test)
     seconds += learning + measure_series_seconds(after, spec.name)
-    return seconds, _held(model, after.converged.select(rows), after.answers[rows], after.anatomy.tumour_nodes)[0]
+    return seconds, _compute_errors(
+        model, after.converged.select(rows), after.answers[rows], after.anatomy.tumour_nodes
+    )[0]
 
 
-def _trained(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tuple[Deformer, SolveCounts]:
+def _train_model(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tuple[Deformer, SolveCounts]:
     """Train a model on the training loads of a split; with the solves that it took."""
     trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
     solves = trained.scores[0].solves
@@ -124,7 +126,9 @@ def _trained(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tuple[D
     return trained.models[spec.name], solves
 
 
-def _held(model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> tuple[ErrorFigures | None, float]:
+def _compute_errors(
+    model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray
+) -> tuple[ErrorFigures | None, float]:
     """Figures against `truth` (B, k, 3) [m], and the share of the loads that the model calls extrapolated."""
     answer = model.deform(loads, at=nodes)
     flagged = [outcome is Outcome.EXTRAPOLATED for outcome in answer.outcome]

@@ -15,15 +15,15 @@ import numpy as np
 from ar.screen import write_png
 from sim.runtime.atomic_files import write_atomically
 from surrogate.evaluation.choose import find_pareto_front
-from surrogate.model.left_out import FEWEST_FOR_P999
+from surrogate.model.left_out import MIN_LOADS_FOR_P999
 
 from ..analysis.loglog_chart import ChartPanel, Curve, Dot, draw_panels
 from ..analysis.measurement import write_table
 from .row import ERROR, TOLERANCE_ALONE, ErrorFigures, ReportRow
 
 SIZE = (880, 560)  # Width and height of a chart [pixel].
-DIFFERENT = "another law: model difference"  # Name of the group of rows with another material law.
-TIME = "milliseconds a load, one at a time"  # Label of the time axis.
+DIFFERENT_LAW = "another law: model difference"  # Name of the group of rows with another material law.
+TIME_LABEL = "milliseconds a load, one at a time"  # Label of the time axis.
 Place = tuple[float, float]
 
 
@@ -32,7 +32,7 @@ def find_front(rows: Sequence[ReportRow]) -> frozenset[str]:
 
     Only errors count: another law is none, and the reference's own elements have none of their mesh.
     """
-    return find_pareto_front(_places((row, row.reference) for row in rows if row.against == ERROR))
+    return find_pareto_front(_collect_points((row, row.reference) for row in rows if row.against == ERROR))
 
 
 def plot_error_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
@@ -40,15 +40,15 @@ def plot_error_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
 
     Rows that show only their tolerance would be far below all others, and are omitted.
     """
-    places = _places((row, row.reference) for row in rows if row.against != TOLERANCE_ALONE)
-    group = {row.name: row.family if row.against == ERROR else DIFFERENT for row in rows}
+    places = _collect_points((row, row.reference) for row in rows if row.against != TOLERANCE_ALONE)
+    group = {row.name: row.family if row.against == ERROR else DIFFERENT_LAW for row in rows}
     title = "Error against time: full colour where no other row is both faster and nearer"
     return _scatter(title, "mean distance from the reference at the tumour [mm]", places, group, find_front(rows))
 
 
 def plot_learners_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
     """Plot the learning error against time, (H, W, 3) uint8; None without learners."""
-    places = _places((row, row.own_fem.get("discs")) for row in rows)
+    places = _collect_points((row, row.own_fem.get("discs")) for row in rows)
     title = "What learning lost, against time: distance from its own finite elements, left-out discs"
     group = {row.name: row.family for row in rows}
     return _scatter(
@@ -65,7 +65,7 @@ def plot_error_against_solves(rows: Sequence[ReportRow]) -> np.ndarray | None:
     return draw_panels([ChartPanel("Error against solves", "training loads", y, curves, size=SIZE)]) if curves else None
 
 
-def _places(found: Iterable[tuple[ReportRow, ErrorFigures | None]]) -> dict[str, Place]:
+def _collect_points(found: Iterable[tuple[ReportRow, ErrorFigures | None]]) -> dict[str, Place]:
     """Milliseconds a load and mean distance [mm] by name, where both are there and can stand on logarithmic axes."""
     return {
         row.name: (row.median, figures.mm.mean)
@@ -78,7 +78,7 @@ def _scatter(
     title: str, y: str, places: Mapping[str, Place], group: Mapping[str, str], best: frozenset[str]
 ) -> np.ndarray | None:
     dots = tuple(Dot(name, group[name], *place, pale=name not in best) for name, place in places.items())
-    return draw_panels([ChartPanel(title, TIME, y, dots=dots, size=SIZE)]) if dots else None
+    return draw_panels([ChartPanel(title, TIME_LABEL, y, dots=dots, size=SIZE)]) if dots else None
 
 
 # Functions that draw the charts, by name.
@@ -110,7 +110,7 @@ NOTES = (  # Paragraphs below the tables.
     "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
     "of those vertices. A row in bold, or full colour, is Pareto-optimal in time and mean error.",
     "Worst vertex: of each load the vertex with the largest distance; mean, p95 and p99.9 are over the loads. "
-    f"No p99.9 is given for fewer than {FEWEST_FOR_P999:,} loads.",
+    f"No p99.9 is given for fewer than {MIN_LOADS_FOR_P999:,} loads.",
     "Solves: all FEM solutions used by a row: loads, linear responses to unit forces at nodes of the "
     "cortex, and terms of the power series. In discs: those of the tumour under loads inside the held-out discs. "
     "The linear responses of the cortex are included in all; the cortex is not compared. Minutes: duration of "
@@ -147,8 +147,8 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
             if picture is not None:
                 write_png(folder / f"{section.name}-{kind}.png", picture)
                 plots.append(folder / f"{section.name}-{kind}.png")
-        write_table(folder / f"{section.name}.csv", [dict(_flat(asdict(row))) for row in section.rows])
-        bodies.append(_section(section, folder, plots))
+        write_table(folder / f"{section.name}.csv", [dict(_flatten(asdict(row))) for row in section.rows])
+        bodies.append(_format_section(section, folder, plots))
     with write_atomically(folder / "report.json", ".json") as partial:
         partial.write_text(json.dumps({"machine": machine, "sections": [asdict(section) for section in sections]}))
     notes = "".join(f"<p>{escape(note)}</p>" for note in NOTES)
@@ -160,29 +160,33 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
         )
 
 
-def _section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
+def _format_section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
     measured = [row for row in section.rows if row.reference is not None]
     learnt = [row for row in section.rows if row.own_fem]
     about = "".join(f"<p>{escape(sentence)}</p>" for sentence in section.about)
-    first, *others = [_picture(plot, plot.stem) for plot in plots] or [""]
+    first, *others = [_embed_image(plot, plot.stem) for plot in plots] or [""]
     pictures = [
-        f"<figure>{_picture(folder / 'pictures' / row.picture, row.name)}"
+        f"<figure>{_embed_image(folder / 'pictures' / row.picture, row.name)}"
         f"<figcaption>{escape(row.name)}</figcaption></figure>"
         for row in measured
         if row.picture
     ]
     return (
         f"<h2>{escape(section.name)}</h2>{first}{about}"
-        f"<h3>Against the reference</h3>{_against_reference(section)}"
-        + (f"<h3>Against its own finite elements</h3>{_against_own_fem(learnt)}{''.join(others)}" if learnt else "")
-        + f"<h3>By tenths of the force</h3>{_by_force(measured, learnt)}"
+        f"<h3>Against the reference</h3>{_format_reference_table(section)}"
+        + (
+            f"<h3>Against its own finite elements</h3>{_format_own_fem_table(learnt)}{''.join(others)}"
+            if learnt
+            else ""
+        )
+        + f"<h3>By tenths of the force</h3>{_format_force_table(measured, learnt)}"
         "<h3>Worst cases</h3><p>The tumour as the row has it, and dashed in yellow where the reference has it; a pixel "
         "is about 0.1 mm.</p>"
-        f"{''.join(pictures)}{_plans(measured)}"
+        f"{''.join(pictures)}{_format_plans(measured)}"
     )
 
 
-def _plans(rows: Sequence[ReportRow]) -> str:
+def _format_plans(rows: Sequence[ReportRow]) -> str:
     """Describe how the FEM rows solve a load."""
     plans = []
     for row in rows:
@@ -192,7 +196,7 @@ def _plans(rows: Sequence[ReportRow]) -> str:
     return f"<h3>Which solvers finite elements try</h3>{''.join(plans)}" if plans else ""
 
 
-def _against_reference(section: Section) -> str:
+def _format_reference_table(section: Section) -> str:
     best = find_front(section.rows)
     heads = (
         "row", "distance", "loads", *SPREAD_HEADS, "median ms", "p99", "model in NumPy ms", "set-up s", "memory GiB",
@@ -207,20 +211,24 @@ def _against_reference(section: Section) -> str:
         short = "" if row.solving is not None or row.loads is None else " of fitting"
         cost = (row.median, row.p99, row.bare, row.set_up, row.memory, row.card)
         cells = (
-            row.name, row.against, _count(row), *_spread(row.reference), *map(_text, cost), _solves(row),
-            "" if row.inside is None else str(row.inside), _text(minutes) + short, _adapting(row),
+            row.name, row.against, _count(row), *_spread(row.reference), *map(_format_number, cost), _format_solves(row),
+            "" if row.inside is None else str(row.inside), _format_number(minutes) + short, _format_adaptation(row),
         )  # fmt: skip
         lines.append(("front" if row.name in best else "", cells))
-    return _table(heads, lines)
+    return _format_table(heads, lines)
 
 
-def _adapting(row: ReportRow) -> str:
+def _format_adaptation(row: ReportRow) -> str:
     if row.adapt is None:
         return "not measured"
-    return _text(row.adapt) if row.adapted is None else f"{_text(row.adapt)} ({_text(row.adapted.mm.mean)})"
+    return (
+        _format_number(row.adapt)
+        if row.adapted is None
+        else f"{_format_number(row.adapt)} ({_format_number(row.adapted.mm.mean)})"
+    )
 
 
-def _solves(row: ReportRow) -> str:
+def _format_solves(row: ReportRow) -> str:
     """Format the number of FEM solves that a row used, by kind."""
     kinds = ((row.loads, ""), (row.units, " unit"), (row.series, " series"))
     return " + ".join(f"{count}{kind}" for count, kind in kinds if count)
@@ -231,11 +239,11 @@ def _count(row: ReportRow) -> str:
     return f"{loads}, {row.failed} failed" if row.failed else str(loads)
 
 
-def _against_own_fem(rows: Sequence[ReportRow]) -> str:
+def _format_own_fem_table(rows: Sequence[ReportRow]) -> str:
     heads = (
         "row", "loads of", "loads", *SPREAD_HEADS, "called extrapolated", "within 95 % bound",
     )  # fmt: skip
-    return _table(
+    return _format_table(
         heads,
         (
             (
@@ -256,18 +264,18 @@ def _share(share: float | None) -> str:
     return "" if share is None else f"{100.0 * share:.0f} %"
 
 
-def _by_force(measured: Sequence[ReportRow], learnt: Sequence[ReportRow]) -> str:
+def _format_force_table(measured: Sequence[ReportRow], learnt: Sequence[ReportRow]) -> str:
     """Return the errors of learners relative to their own FEM, over more loads."""
     lines = [(row.name, "reference", row.reference) for row in measured]
     lines += [(row.name, "own FEM", row.own_fem["discs"]) for row in learnt if "discs" in row.own_fem]
     most = max((len(figures.tenths) for *_, figures in lines if figures), default=0)
     heads = ("mean mm (largest)", "from", *(f"{k + 1}" for k in range(most)))
     table = [
-        ("", (name, against, *(f"{_text(t.mean)} ({_text(t.largest)})" for t in figures.tenths)))
+        ("", (name, against, *(f"{_format_number(t.mean)} ({_format_number(t.largest)})" for t in figures.tenths)))
         for name, against, figures in lines
         if figures
     ]
-    return _table(heads, table)
+    return _format_table(heads, table)
 
 
 def _spread(figures: ErrorFigures | None) -> tuple[str, ...]:
@@ -275,17 +283,17 @@ def _spread(figures: ErrorFigures | None) -> tuple[str, ...]:
         return ("",) * len(SPREAD_HEADS)
     worst = figures.worst
     values = (*asdict(figures.mm).values(), worst.mean, worst.p95, worst.p999, *asdict(figures.percent).values())
-    return tuple("\N{EN DASH}" if value is None else _text(value) for value in values)
+    return tuple("\N{EN DASH}" if value is None else _format_number(value) for value in values)
 
 
-def _text(value: float | None) -> str:
+def _format_number(value: float | None) -> str:
     """Three digits, as people write them."""
     if value is None:
         return ""
     return "< 0.0001" if 0.0 < value < 1e-4 else f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
-def _table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
+def _format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
     """Lines of a class and cells."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(
@@ -294,17 +302,17 @@ def _table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> 
     return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
 
 
-def _picture(path: Path, words: str) -> str:
+def _embed_image(path: Path, words: str) -> str:
     """Embed an image in the page."""
     data = b64encode(path.read_bytes()).decode()
     return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
 
 
-def _flat(value: Any, name: str = "") -> Iterable[tuple[str, Any]]:
+def _flatten(value: Any, name: str = "") -> Iterable[tuple[str, Any]]:
     """Numbers and texts; one inside others is named by the way to it, as in reference.mm.mean."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else None
     if inside is None:
         yield name, value
         return
     for key, each in inside:
-        yield from _flat(each, f"{name}.{key}" if name else str(key))
+        yield from _flatten(each, f"{name}.{key}" if name else str(key))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ar.optics.camera import look_at
-from ar.overlay.composite import DASHED, composite
+from ar.overlay.composite import MARGIN_STROKES, composite
 from ar.overlay.hud import draw_text_panel
 from ar.overlay.marks import Cover
 from ar.overlay.outlines import compute_silhouette, draw_dashes, find_outlines
@@ -54,7 +54,11 @@ def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     shown = composite(picture, camera, stage.build_tumour(predicted), style="window", cover=Cover((TOOL,))).colour
     reference = stage.build_tumour(there)
     draw_dashes(
-        shown, find_outlines(compute_silhouette(camera, reference.vertices, reference.triangles)), YELLOW, DASHED, 1
+        shown,
+        find_outlines(compute_silhouette(camera, reference.vertices, reference.triangles)),
+        YELLOW,
+        MARGIN_STROKES,
+        1,
     )
     force = float(np.linalg.norm(pushed.force[worst]))
     lines = [f"{force:.2f} N on {1e3 * radius:.1f} mm", f"maximum error {1e3 * distance[worst]:.3f} mm"]

@@ -16,12 +16,12 @@ from sim.geometry.locate import Located, locate
 from sim.loads import Loads
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
-from surrogate.model.kept_arrays import REMADE
+from surrogate.model.kept_arrays import REMEDY
 from surrogate.model.npz_archive import Archive
 
 from .study import ReportStudy
 
-TOGETHER = 16  # Number of loads solved together where a batch is faster: an interruption loses no more than these.
+BATCH_LOADS = 16  # Number of loads solved together where a batch is faster: an interruption loses no more than these.
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +78,15 @@ def _solve(
     made: Callable[[], tuple[Fem, Located]],
     progress: Callable[[int], object],
 ) -> None:
-    missing = np.array([row for row in range(len(loads)) if not _path(study, kind, row).exists()], int)
+    missing = np.array([row for row in range(len(loads)) if not _to_answers_path(study, kind, row).exists()], int)
     progress(len(loads) - len(missing))
     if not len(missing):
         return
     fem, located = made()
-    for rows in np.array_split(missing, -(-len(missing) // min(fem.batch, TOGETHER))):
+    for rows in np.array_split(missing, -(-len(missing) // min(fem.batch, BATCH_LOADS))):
         answer = fem.deform(loads.select(rows))
         for row, field, outcome in zip(rows, located.read(answer.displacement), answer.outcome, strict=True):
-            with write_atomically(_path(study, kind, row), ".npz") as partial:
+            with write_atomically(_to_answers_path(study, kind, row), ".npz") as partial:
                 np.savez(partial, displacement=field, good=outcome.good, seconds=answer.cost.total / len(rows))
         progress(len(rows))
 
@@ -94,16 +94,16 @@ def _solve(
 def _read(study: ReportStudy, kind: str, count: int) -> ReferenceSolutions:
     kept = []
     for row in range(count):
-        path = _path(study, kind, row)
+        path = _to_answers_path(study, kind, row)
         with (
-            read_as(path, "a solution of the reference", REMADE),
+            read_as(path, "a solution of the reference", REMEDY),
             path.open("rb") as raw,
         ):
             names = "displacement", "good", "seconds"
-            arrays = Archive(raw, REMADE).read_arrays(names)
+            arrays = Archive(raw, REMEDY).read_arrays(names)
             kept.append([arrays[name] for name in names])
     return ReferenceSolutions(*(np.stack(part) for part in zip(*kept, strict=True)))
 
 
-def _path(study: ReportStudy, kind: str, row: int) -> Path:
+def _to_answers_path(study: ReportStudy, kind: str, row: int) -> Path:
     return study.folder / "answers" / f"{kind}-{study.digest}-{row:04d}.npz"

@@ -17,8 +17,8 @@ from .study import ReportStudy
 
 # Differences from the reference: same law, another law, the reference's own elements.
 ERROR, DIFFERENCE, TOLERANCE_ALONE = "error", "model difference", "its tolerance alone"
-TENTHS = 10  # Number of classes of force.
-FEWEST_FOR_P99 = 1000  # Minimum number of loads for a 99th percentile.
+FORCE_CLASSES = 10  # Number of classes of force.
+MIN_LOADS_FOR_P99 = 1000  # Minimum number of loads for a 99th percentile.
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.
         return None
     motion = np.linalg.norm(truth, axis=2).mean(axis=1)
     mm, percent = 1e3 * distance, 100.0 * distance / motion[:, None]
-    parts = [rows for rows in np.array_split(np.argsort(force, kind="stable"), TENTHS) if len(rows)]
+    parts = [rows for rows in np.array_split(np.argsort(force, kind="stable"), FORCE_CLASSES) if len(rows)]
     tenths = (
         Tenth(*(float(v) for v in (force[r].min(), force[r].max(), mm[r].mean(), mm[r].max(), percent[r].mean())))
         for r in parts
@@ -102,7 +102,7 @@ def compare_with_reference(
 def summarise_times(seconds: Sequence[float]) -> dict[str, Any]:
     """Summarise the wall times of single loads [s]."""
     ms = 1e3 * np.array(seconds)
-    p99 = float(np.percentile(ms, 99.0)) if len(ms) >= FEWEST_FOR_P99 else None
+    p99 = float(np.percentile(ms, 99.0)) if len(ms) >= MIN_LOADS_FOR_P99 else None
     return {"median": float(np.median(ms)), "p99": p99, "timed": len(ms)}
 
 

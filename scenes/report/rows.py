@@ -18,7 +18,7 @@ from threading import BoundedSemaphore, Event
 import msgspec
 import numpy as np
 
-from sim.accuracy import FLOOR, Precision
+from sim.accuracy import MIN_TOLERANCE, Precision
 from sim.errors import InputError
 from sim.geometry.tetmesh import compute_digest
 from sim.material import LAWS
@@ -29,13 +29,13 @@ from sim.runtime.threads import limit_to_one_thread
 from surrogate.training.train import LEARNERS
 
 from ..analysis.measurement import measure_peak_memory, watch_gpu_memory
-from .finite_elements import HALVED, OWN, STANDARD, FemVariant, get_law_name, measure_elements
+from .finite_elements import HALVED_MESH, OWN_MESH, STANDARD_TOLERANCE, FemVariant, get_law_name, measure_elements
 from .learner import LearnerSpec, measure_learner
 from .row import ReportRow
 from .study import ReportStudy
 
 Spec = FemVariant | LearnerSpec
-FAMILY = {FemVariant: "finite elements", LearnerSpec: "learnt"}  # Names of families by type.
+FAMILY_NAMES = {FemVariant: "finite elements", LearnerSpec: "learnt"}  # Names of families by type.
 
 
 def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
@@ -58,9 +58,9 @@ def measure_row(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
                 row, field = measure_elements(study, spec)
             row = replace(row, card=max(taken) / 2**30 or None)
         else:
-            row, field = _on_one_core(study, spec)
+            row, field = _measure_on_one_core(study, spec)
     except InputError as error:
-        return ReportRow(spec.name, FAMILY[type(spec)], state=str(error))
+        return ReportRow(spec.name, FAMILY_NAMES[type(spec)], state=str(error))
     row = replace(row, memory=measure_peak_memory())
     # The time for images does not belong to the row.
     from ar.screen import write_png
@@ -72,7 +72,7 @@ def measure_row(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
     return replace(row, picture=picture.name)
 
 
-def _on_one_core(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.ndarray]:
+def _measure_on_one_core(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.ndarray]:
     """Products this small take longer on several, and say less."""
     with limit_to_one_thread():
         return measure_learner(study, spec)
@@ -80,19 +80,23 @@ def _on_one_core(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.n
 
 ELEMENTS = ("p1", "smoothed", "p2")  # Compared finite elements.
 MESHES = {"2.5k": "2500", "17k": "17000"}  # Numbers of nodes of the compared meshes, by name.
-TOLERANCES = (1e-2, 1e-3, STANDARD, 1e-5, 1e-6)  # Compared solver tolerances.
+TOLERANCES = (1e-2, 1e-3, STANDARD_TOLERANCE, 1e-5, 1e-6)  # Compared solver tolerances.
 Run = Callable[[ReportStudy, Spec, Path], ReportRow]
 CORES = 4  # Number of CPU cores per measured learner, which uses one; the others prepare the next process.
 
 
 def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
     """Return the data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
-    meshes = {} if not remesh else MESHES if study.of_template else {"halved edges": HALVED}
+    meshes = {} if not remesh else MESHES if study.of_template else {"halved edges": HALVED_MESH}
     return (
         FemVariant("FEM"),
         *(FemVariant(f"FEM {name}", element=name) for name in ELEMENTS if name != study.element),
         *(FemVariant(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
-        *(FemVariant(f"FEM {_power(size)}", tolerance=size) for size in TOLERANCES if size != STANDARD),
+        *(
+            FemVariant(f"FEM {_format_power(size)}", tolerance=size)
+            for size in TOLERANCES
+            if size != STANDARD_TOLERANCE
+        ),
         FemVariant("FEM float64", precision="float64"),
         *(FemVariant(f"FEM {law} law", law=law) for law in LAWS if law != get_law_name(study.tissue)),
     )
@@ -100,14 +104,14 @@ def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[F
 
 def list_all_combinations(study: ReportStudy) -> tuple[FemVariant, ...]:
     """All of the star's laws, elements, meshes, tolerances and precisions with each other."""
-    meshes = {OWN: OWN, **(MESHES if study.of_template else {"halved edges": HALVED})}
+    meshes = {OWN_MESH: OWN_MESH, **(MESHES if study.of_template else {"halved edges": HALVED_MESH})}
     precisions: tuple[Precision, ...] = ("float32", "float64")
     return tuple(
-        FemVariant(f"FEM {law} {element} {name} {_power(size)} {precision}", law, element, mesh, size, precision)
+        FemVariant(f"FEM {law} {element} {name} {_format_power(size)} {precision}", law, element, mesh, size, precision)
         for law, element, (name, mesh), size, precision in product(
             LAWS, ELEMENTS, meshes.items(), TOLERANCES, precisions
         )
-        if size >= FLOOR[precision]
+        if size >= MIN_TOLERANCE[precision]
     )
 
 
@@ -125,7 +129,7 @@ def measure_in_process(
         with process_pool(["cpu"], prepare_rows, replace(study)) as children, turn:
             return run_on_each(children, _measure, [(spec, picture)])[0]
     except LostError:
-        return ReportRow(spec.name, FAMILY[type(spec)], state="its process was killed, probably out of memory")
+        return ReportRow(spec.name, FAMILY_NAMES[type(spec)], state="its process was killed, probably out of memory")
 
 
 def _measure(study: ReportStudy, task: tuple[Spec, Path]) -> ReportRow:
@@ -153,7 +157,7 @@ def measure_rows(
         together = 1 if kind is FemVariant else max(1, cores // CORES - beside)
         measuring = run or partial(measure_in_process, BoundedSemaphore(together))
         ahead = together if cores >= CORES else 0
-        groups.append(_ahead(partial(_row, study, measuring), list(alike), ahead))
+        groups.append(_run_ahead(partial(_get_row, study, measuring), list(alike), ahead))
     if not beside or len(groups) < 2:
         yield from chain.from_iterable(groups)
         return
@@ -167,7 +171,7 @@ def measure_rows(
             stopped.set()
 
 
-def _ahead(work: Callable[[Spec], ReportRow], specs: Sequence[Spec], ahead: int) -> Iterator[ReportRow]:
+def _run_ahead(work: Callable[[Spec], ReportRow], specs: Sequence[Spec], ahead: int) -> Iterator[ReportRow]:
     """Yield the rows in order, while further ones run ahead. After a stop, no other row begins."""
     waiting: deque[Future[ReportRow]] = deque()
     with ThreadPoolExecutor(ahead + 1) as threads:
@@ -183,11 +187,11 @@ def _ahead(work: Callable[[Spec], ReportRow], specs: Sequence[Spec], ahead: int)
                 future.cancel()
 
 
-def _row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
+def _get_row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
     stem = f"{study.data.stem} {spec.name}".replace(" ", "-")
     path = study.folder / "rows" / f"{stem}.json"
-    digest = _digest(study, spec)
-    kept = _kept(path, digest)
+    digest = _compute_row_digest(study, spec)
+    kept = _read_kept_row(path, digest)
     if kept is None:
         kept = run(study, spec, study.folder / "pictures" / f"{stem}.png")
         if kept.state == "measured":
@@ -196,12 +200,12 @@ def _row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
     return kept
 
 
-def _power(tolerance: float) -> str:
+def _format_power(tolerance: float) -> str:
     """0.01 as 1e-2."""
     return f"{tolerance:.0e}".replace("e-0", "e-")
 
 
-def _digest(study: ReportStudy, spec: Spec) -> str:
+def _compute_row_digest(study: ReportStudy, spec: Spec) -> str:
     stated = f"{study.digest} {study.timed} {study.device} {type(spec).__name__} {sorted(asdict(spec).items())}"
     return compute_digest(np.frombuffer(stated.encode(), np.uint8))
 
@@ -210,7 +214,7 @@ FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}
 """Former names of fields in files of rows."""
 
 
-def _kept(path: Path, digest: str) -> ReportRow | None:
+def _read_kept_row(path: Path, digest: str) -> ReportRow | None:
     """Return the row in a file, if it is there, whole, and of the same inputs."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8-sig"))

@@ -20,12 +20,12 @@ from sim.loads import Loads, Pushed
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
 from sim.runtime.versions import get_version
-from surrogate.data.answer_rows import BRAIN, read_tissue_statement
+from surrogate.data.answer_rows import TISSUE_KEY, read_tissue_statement
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import split_forces
 from surrogate.data.splits import DiscSplit, leave_discs_out
-from surrogate.training.expansion import EXPANDED, Expansion
+from surrogate.training.expansion import SERIES_MODELS, Expansion
 
 from ..script.shipped_files import get_template_path
 
@@ -86,7 +86,7 @@ class ReportStudy:
     def tissue(self) -> Elasticity:
         """The tissue that the data was made with, and that of regions."""
         stated = self.dataset.provenance
-        return read_tissue_statement(stated) if BRAIN in stated else Elasticity()
+        return read_tissue_statement(stated) if TISSUE_KEY in stated else Elasticity()
 
     def get_tissue_on(self, body: Anatomy) -> Elasticity:
         """Return the same for a body that may lack some of the regions."""
@@ -161,9 +161,9 @@ class ReportStudy:
         return compute_digest(np.frombuffer(stated.encode(), np.uint8), data.good, *vars(self.pushed).values())
 
 
-STRONGER = (1.2, 1.6)  # Range of forces beyond the training, relative to its largest force.
-MORE_OBLIQUE = (5.0, 15.0)  # Range of angles beyond the training's largest angle [deg].
-NEARER = (0.5, 0.9)  # Range of distances of a centre from the edge, relative to the radius.
+FORCE_RATIOS = (1.2, 1.6)  # Range of forces beyond the training, relative to its largest force.
+EXTRA_ANGLES = (5.0, 15.0)  # Range of angles beyond the training's largest angle [deg].
+EDGE_DISTANCES = (0.5, 0.9)  # Range of distances of a centre from the edge, relative to the radius.
 KINDS = ("stronger", "more oblique", "nearer to the rim")  # Kinds of loads beyond the training range.
 
 
@@ -174,22 +174,22 @@ def draw_loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) 
     kind = np.arange(count) % len(KINDS)
     size, direction = split_forces(replace(like, force=like.force[rows]))
     point, footprint = like.point[rows], like.footprint[rows]
-    size = np.where(kind == 0, split_forces(training)[0].max() * random.uniform(*STRONGER, count), size)
-    oblique = _tilted(
-        direction, patch.find_normals(point), _angle(patch, training), random.uniform(*MORE_OBLIQUE, count)
+    size = np.where(kind == 0, split_forces(training)[0].max() * random.uniform(*FORCE_RATIOS, count), size)
+    oblique = _turn_from_normal(
+        direction, patch.find_normals(point), _compute_max_angle(patch, training), random.uniform(*EXTRA_ANGLES, count)
     )
     direction = np.where((kind == 1)[:, None], oblique, direction)
-    point = np.where((kind == 2)[:, None], _near_rim(patch, footprint, random), point)
+    point = np.where((kind == 2)[:, None], _sample_near_rim(patch, footprint, random), point)
     return Loads((Pushed(point, size[:, None] * direction, footprint),))
 
 
-def _angle(patch: Patch, pushed: Pushed) -> float:
+def _compute_max_angle(patch: Patch, pushed: Pushed) -> float:
     """Greatest angle between force and inward normal [rad]."""
     cosine = np.einsum("bi,bi->b", split_forces(pushed)[1], patch.find_normals(pushed.point))
     return float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
 
 
-def _tilted(direction: np.ndarray, normal: np.ndarray, angle: float, more: np.ndarray) -> np.ndarray:
+def _turn_from_normal(direction: np.ndarray, normal: np.ndarray, angle: float, more: np.ndarray) -> np.ndarray:
     """Tilt `normal` (B, 3) by `angle` [rad] and `more` (B,) [degrees], at most 85; return unit directions (B, 3)."""
     along = direction - np.einsum("bi,bi->b", direction, normal)[:, None] * normal
     length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -199,29 +199,29 @@ def _tilted(direction: np.ndarray, normal: np.ndarray, angle: float, more: np.nd
     return np.cos(turn) * normal + np.sin(turn) * along
 
 
-def _near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def _sample_near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Points (B, 3) [m] whose footprints (B,) [m] hang over the rim by a tenth to half of their radius."""
     points = patch.place(random.random((4096, 3)))[0]
     ratio = patch.compute_edge_distance(points)[None] / footprint[:, None]
-    wanted = random.uniform(*NEARER, len(footprint))[:, None]
+    wanted = random.uniform(*EDGE_DISTANCES, len(footprint))[:, None]
     return points[np.abs(ratio - wanted).argmin(axis=1)]
 
 
 def note_seconds(made: Path, seconds: float) -> None:
     """Keep the seconds that a file took to make, in a JSON file of its name."""
-    with write_atomically(_beside(made), ".json") as partial:
+    with write_atomically(_to_json_path(made), ".json") as partial:
         partial.write_text(json.dumps({"seconds": seconds}))
 
 
 def read_noted_seconds(made: Path) -> float | None:
     """Read the stored value; None if missing or incomplete."""
     try:
-        return float(json.loads(_beside(made).read_text())["seconds"])
+        return float(json.loads(_to_json_path(made).read_text())["seconds"])
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
 
 
-def _beside(made: Path) -> Path:
+def _to_json_path(made: Path) -> Path:
     return made.with_suffix(".json")
 
 
@@ -233,4 +233,4 @@ def tabulate_series(study: ReportStudy, progress: Callable[[int, int], object]) 
 
 def measure_series_seconds(study: ReportStudy, learner: str) -> float:
     """Return the seconds spent on the table, if this learner uses it."""
-    return study.expansion.tabulated.seconds if learner in EXPANDED else 0.0
+    return study.expansion.tabulated.seconds if learner in SERIES_MODELS else 0.0

@@ -14,10 +14,10 @@ from .tool import Instrument, Probe
 from .tool_paths import Path, Touch
 
 # Largest angle to the craniotomy's axis [rad]: a tool that enters more obliquely slides along the cortex.
-STEEPEST = np.radians(60.0)
+MAX_ENTRY_ANGLE = np.radians(60.0)
 # Largest distance of a point from the open cortex, and largest extension of a line that is to reach it [m].
-NEAR = 10e-3
-CORRECTIONS = 6  # Number of iterations from a point in the tangent plane to one of the curved cortex.
+MAX_CORTEX_DISTANCE = 10e-3
+ITERATIONS = 6  # Number of iterations from a point in the tangent plane to one of the curved cortex.
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
     if markup.kind == "Fiducial" and len(points) == 1:
         entry = site.find_nearest(points[0]).point
         apart = float(np.linalg.norm(entry - points[0]))
-        if apart > NEAR:
+        if apart > MAX_CORTEX_DISTANCE:
             raise InputError(
-                f"{path}: its point lies {1e3 * apart:.0f} mm from the open cortex, and {1e3 * NEAR:g} mm is the most. "
+                f"{path}: its point lies {1e3 * apart:.0f} mm from the open cortex, and {1e3 * MAX_CORTEX_DISTANCE:g} mm is the most. "
                 "Open the skull there (--opening-at), or mark another entry."
             )
         return _approach(site, entry, site.axis)
@@ -77,12 +77,12 @@ def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
     outer, deep = sorted(points, key=lambda point: float((point - site.origin) @ site.axis))
     way = (deep - outer) / np.linalg.norm(deep - outer)
     angle = float(np.arccos(np.clip(way @ site.axis, -1.0, 1.0)))
-    if angle > STEEPEST:
+    if angle > MAX_ENTRY_ANGLE:
         raise InputError(
-            f"{path}: runs at {np.degrees(angle):.0f} degrees to the opening's axis, and {np.degrees(STEEPEST):.0f} is "
+            f"{path}: runs at {np.degrees(angle):.0f} degrees to the opening's axis, and {np.degrees(MAX_ENTRY_ANGLE):.0f} is "
             "the most. Open the skull where it enters: --opening-at with this file."
         )
-    entry = _entry(site.corners, outer, way)
+    entry = _find_entry(site.corners, outer, way)
     if entry is None:
         arm = site.corners.reshape(-1, 3) - outer
         beside = float(np.linalg.norm(arm - np.outer(arm @ way, way), axis=1).min())
@@ -92,9 +92,9 @@ def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
         )
     before, beyond = float((outer - entry) @ way), float((entry - deep) @ way)
     apart = max(before, beyond)
-    if apart > NEAR:
+    if apart > MAX_CORTEX_DISTANCE:
         raise InputError(
-            f"{path}: ends {1e3 * apart:.0f} mm from where it would enter the open cortex, and {1e3 * NEAR:g} mm is "
+            f"{path}: ends {1e3 * apart:.0f} mm from where it would enter the open cortex, and {1e3 * MAX_CORTEX_DISTANCE:g} mm is "
             "the most that a line is drawn out by. See that it is of this opening, and draw it through the cortex."
         )
     return replace(_approach(site, entry, way), line=True)
@@ -104,13 +104,13 @@ def _approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray) -> Appr
     """Return the approach at a point (3,) [m] of the cortex, in a direction (3,)."""
     axes = np.stack([site.right, site.up])
     place = axes @ (entry - site.origin)
-    for _ in range(CORRECTIONS):
+    for _ in range(ITERATIONS):
         place = place + axes @ (entry - site.find_nearest(site.origin + place @ axes).point)
     right, up = np.arctan(axes @ way / (way @ site.axis)).tolist()
     return Approach(float(place[0]), float(place[1]), (right, up))
 
 
-def _entry(corners: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray | None:
+def _find_entry(corners: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray | None:
     """Compute the first intersection of a line with triangles (S, 3, 3) from outside (3,) [m]; None if it misses.
 
     Möller, Trumbore 1997, J. Graphics Tools 2:21-28.

@@ -12,11 +12,11 @@ import numpy as np
 from ar.optics.camera import Camera
 from sim.errors import InputError
 
-BREATH = 0.25  # Breathing frequency [Hz]: fifteen breaths a minute.
-SLOW = (0.2, 2.5)  # Frequencies of the slow drift of a hand that holds a camera [Hz].
-TREMOR = (8.0, 12.0)  # Frequencies of a hand's tremor [Hz] (Elble and Koller 1990, "Tremor").
-WAVES = 8  # Number of waves of drift, and of tremor.
-SHARE = 0.1  # Size of the tremor relative to the drift.
+BREATHING_FREQUENCY = 0.25  # Breathing frequency [Hz]: fifteen breaths a minute.
+DRIFT_FREQUENCIES = (0.2, 2.5)  # Frequencies of the slow drift of a hand that holds a camera [Hz].
+TREMOR_FREQUENCIES = (8.0, 12.0)  # Frequencies of a hand's tremor [Hz] (Elble and Koller 1990, "Tremor").
+WAVE_COUNT = 8  # Number of waves of drift, and of tremor.
+TREMOR_SHARE = 0.1  # Size of the tremor relative to the drift.
 
 
 class CameraPath(Protocol):
@@ -56,7 +56,7 @@ class HandHeld:
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
         """Return the camera at a time [s]."""
         way = sample_wandering(self.seed, time)
-        lifted = np.array([0.0, self.breath * np.sin(2.0 * np.pi * BREATH * time), 0.0])
+        lifted = np.array([0.0, self.breath * np.sin(2.0 * np.pi * BREATHING_FREQUENCY * time), 0.0])
         turn = self.turn * way[3:]
         moved = camera.move(self.shift * way[:3] + lifted)
         angle = float(np.linalg.norm(turn))
@@ -147,9 +147,9 @@ class Microscope:
 def sample_waves(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frequencies [Hz], phases [rad] and amplitudes of a hand's motion, each (6, n), for 3 shifts and 3 turns."""
     random = np.random.default_rng(seed)
-    bands = [random.uniform(*band, (6, WAVES)) for band in (SLOW, TREMOR)]
-    sizes = [np.full((6, WAVES), size * np.sqrt(2.0 / WAVES)) for size in (1.0, SHARE)]
-    return np.hstack(bands), random.uniform(0.0, 2.0 * np.pi, (6, 2 * WAVES)), np.hstack(sizes)
+    bands = [random.uniform(*band, (6, WAVE_COUNT)) for band in (DRIFT_FREQUENCIES, TREMOR_FREQUENCIES)]
+    sizes = [np.full((6, WAVE_COUNT), size * np.sqrt(2.0 / WAVE_COUNT)) for size in (1.0, TREMOR_SHARE)]
+    return np.hstack(bands), random.uniform(0.0, 2.0 * np.pi, (6, 2 * WAVE_COUNT)), np.hstack(sizes)
 
 
 def sample_wandering(seed: int, time: float) -> np.ndarray:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 Law = Literal["uniform", "log-uniform", "normal"]
 MESH, REGISTRATION, SEGMENTATION = "mesh", "registration", "segmentation"  # Names of contributors.
 TOOL, SKULL = "tool's place", "skull"  # Names of contributors.
-LEAST_POSSIBLE = 0.01  # Smallest total probability of a scene's skull models.
-TOGETHER = "several together"
+MIN_SKULL_PROBABILITY = 0.01  # Smallest total probability of a scene's skull models.
+COMBINED = "several together"
 """Interaction: difference from the sum of the single contributions."""
 
 
@@ -77,35 +77,35 @@ TIP = ParameterPrior(
     TOOL, "normal", (1.06e-3, 1.06e-3), "place of the tool's tip, along each axis [m]",
     "mean error of a tracked probe 1.69 mm: Perwoeg et al. 2018, Int. J. Comput. Assist. Radiol. Surg. 13",
 )  # fmt: skip
-SKULL_HOLDS = ParameterPrior(
+SKULL_PRIOR = ParameterPrior(
     SKULL, "uniform", (0.0, 1.0), "bonded, sliding or letting go, each as probable",
     "contested: Ji, Roberts, Hartov, Paulsen 2009, Med. Image Anal. 13:659; its bond tears at some kPa, "
     "arXiv 2512.08425",
 )  # fmt: skip
-OF_MESH = ParameterPrior(
+MESH_PRIOR = ParameterPrior(
     MESH, "normal", (0.05, 0.05), "share of the tumour's motion, where the skull holds the brain",
     "smoothed elements are 5.2 % off quadratic ones: docs/notes/surrogate_experiments.md",
 )  # fmt: skip
-OF_MESH_SLIDING = ParameterPrior(
+SLIDING_MESH_PRIOR = ParameterPrior(
     "mesh of a sliding brain", "normal", (0.12, 0.12), "share of the tumour's motion, where the brain slides",
     "smoothed elements are 8 to 17 % off quadratic ones under tools: docs/notes/uncertainty_experiments.md",
 )  # fmt: skip
-OF_MESH_SINKING = ParameterPrior(
+SINKING_MESH_PRIOR = ParameterPrior(
     "mesh of a sinking brain", "normal", (0.25, 0.25), "share of the tumour's motion, where it slides under weight",
     "smoothed elements are 16 to 22 % off quadratic ones, and these go down on finer meshes: "
     "docs/notes/uncertainty_experiments.md",
 )  # fmt: skip
-OF_REGISTRATION = ParameterPrior(
+REGISTRATION_PRIOR = ParameterPrior(
     REGISTRATION, "normal", (1.56e-3, 1.56e-3), "shift of the whole scan, along each axis [m]",
     "2.49 mm in the mean by point pairs in 11 patients: Mongen, Willems 2019, Acta Neurochir. 161",
 )  # fmt: skip
-OF_SEGMENTATION = ParameterPrior(
+SEGMENTATION_PRIOR = ParameterPrior(
     SEGMENTATION, "normal", (1e-3, 1e-3), "how far the tumour's outline is too wide, all round [m]",
     "raters agree with a Dice score of 74 - 85 %, which is 1.3 - 2.3 mm between two of them on 7 ml: Menze et al. "
     "2015, IEEE Trans. Med. Imaging 34:1993-2024",
 )  # fmt: skip
-OF_MESHES = OF_MESH, OF_MESH_SLIDING, OF_MESH_SINKING  # Priors of the mesh error.
-PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, *OF_MESHES, OF_REGISTRATION, OF_SEGMENTATION)
+MESH_PRIORS = MESH_PRIOR, SLIDING_MESH_PRIOR, SINKING_MESH_PRIOR  # Priors of the mesh error.
+PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_PRIOR, TIP, *MESH_PRIORS, REGISTRATION_PRIOR, SEGMENTATION_PRIOR)
 """All priors; the error of a trained model is added if one is used."""
 
 
@@ -142,7 +142,7 @@ def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
         return (random.permutation(count) + random.uniform(size=count)) / count
 
     columns = [
-        prior.compute_quantiles(shares()).tolist() for prior in (STIFFNESS, POISSON, RATIO, SKULL_HOLDS, TIP, TIP, TIP)
+        prior.compute_quantiles(shares()).tolist() for prior in (STIFFNESS, POISSON, RATIO, SKULL_PRIOR, TIP, TIP, TIP)
     ]
     columns.append(ndtri(shares()).tolist())
     rows = zip(*columns, strict=True)
@@ -162,7 +162,7 @@ def sample_from_fit(
     InputError
         The fitted skull is not allowed by the scene.
     """
-    if sum(tissue.skulls[name] for name in skulls) < LEAST_POSSIBLE:
+    if sum(tissue.skulls[name] for name in skulls) < MIN_SKULL_PROBABILITY:
         raise InputError(
             f"the fitted tissue has a skull that this scene cannot have ({' or '.join(skulls)}): choose another scene, "
             "or another tissue by --tissue."
@@ -181,8 +181,8 @@ def sample_from_fit(
 def sample_rigid_errors(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Errors of registration (count, 3) and of segmentation (count,) [m]."""
     random = np.random.default_rng([seed, 1])
-    shift = OF_REGISTRATION.range[1] * random.standard_normal((count, 3))
-    return shift, OF_SEGMENTATION.range[1] * random.standard_normal(count)
+    shift = REGISTRATION_PRIOR.range[1] * random.standard_normal((count, 3))
+    return shift, SEGMENTATION_PRIOR.range[1] * random.standard_normal(count)
 
 
 def choose_name(share: float, names: Sequence[str]) -> str:

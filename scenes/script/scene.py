@@ -37,10 +37,10 @@ from .head_posture import Lie, get_supine_pose
 from .sight import PointObservation, StereoObservation
 from .site import CraniotomyFrame
 from .tool import Instrument, Probe
-from .tool_paths import AIR, Path, Touch, keep_idle
-from .viewpoint import PLAIN, USUAL, Appearance, Viewpoint
+from .tool_paths import IDLE_HEIGHT, Path, Touch, keep_idle
+from .viewpoint import PLAIN_APPEARANCE, USUAL_VIEWPOINT, Appearance, Viewpoint
 
-MOST_FRAMES = 108_000  # Maximum number of frames of a scene: one hour at 30 frames/s.
+MAX_FRAMES = 108_000  # Maximum number of frames of a scene: one hour at 30 frames/s.
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,10 @@ class Bounds:
 
 
 PALPATION = Probe()  # Default tool.
-SHORT = 0.1e-3  # Largest distance by which the bone's edge may stop a tool before its target without a notice [m].
-HANDLED = (ToolForce, ToolContact, Retraction)
+STOP_TOLERANCE = (
+    0.1e-3  # Largest distance by which the bone's edge may stop a tool before its target without a notice [m].
+)
+TOOL_EFFECTS = (ToolForce, ToolContact, Retraction)
 """Effects that need a tool."""
 
 
@@ -111,8 +113,8 @@ class Scene:
     lying: Lie = get_supine_pose
     surgery: Debulking | None = None
     sight: PointObservation | StereoObservation | None = None
-    viewpoint: Viewpoint = USUAL
-    look: Appearance = PLAIN
+    viewpoint: Viewpoint = USUAL_VIEWPOINT
+    look: Appearance = PLAIN_APPEARANCE
     element: str | None = None
     accuracy: Accuracy = LIVE
     bounds: Bounds = Bounds()
@@ -123,12 +125,12 @@ class Scene:
             number = getattr(self, what)
             if not isinstance(number, Real) or not 0.0 < float(number) < np.inf:
                 raise InputError(f"the scene {self.name} has {what} {number!r}: give a number above 0.")
-        if float(self.duration) * float(self.frames_per_second) > MOST_FRAMES:
+        if float(self.duration) * float(self.frames_per_second) > MAX_FRAMES:
             raise InputError(
                 f"the scene {self.name} lasts {self.duration:g} s at {self.frames_per_second:g} frames a second: "
-                f"that is more than {MOST_FRAMES:,} frames. Give a shorter duration, or fewer a second."
+                f"that is more than {MAX_FRAMES:,} frames. Give a shorter duration, or fewer a second."
             )
-        needs = [type(effect).__name__ for effect in self.effects if isinstance(effect, HANDLED)]
+        needs = [type(effect).__name__ for effect in self.effects if isinstance(effect, TOOL_EFFECTS)]
         if self.tool is None and needs:
             raise InputError(
                 f"the scene {self.name} asks for {needs[0]}, but has no tool: give it one, or leave it out."
@@ -177,7 +179,7 @@ class Scene:
         """Return the effects on an anatomy: without skull contact if there is no skull, and with the resection."""
         gone = () if anatomy.slide_normal.any() else (SkullContact,)
         kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
-        return kept if self.surgery is None else (*kept, _resection(self.surgery, anatomy))
+        return kept if self.surgery is None else (*kept, _build_resection(self.surgery, anatomy))
 
     def find_contact(self, site: CraniotomyFrame, touch: Touch) -> Place:
         """Return the material point that the tool touches."""
@@ -203,7 +205,7 @@ class Scene:
         if self.posed:
             asked = asked + touch.depth * site.compute_direction(touch)
         beyond = float(site.compute_axis_distance(asked[None])[0]) - site.compute_reach(self.tool.radius)
-        return f"the bone's edge stops the tool {1e3 * beyond:.1f} mm short" if beyond > SHORT else ""
+        return f"the bone's edge stops the tool {1e3 * beyond:.1f} mm short" if beyond > STOP_TOLERANCE else ""
 
     def compute_pose(self, site: CraniotomyFrame, touch: Touch) -> np.ndarray:
         """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""
@@ -212,28 +214,28 @@ class Scene:
 
     def build_loads(self, site: CraniotomyFrame, touch: Touch, time: float) -> Loads:
         """Build one load case: the cause of every effect that has one; without causes, only time advances."""
-        causes = (self._cause(effect, site, touch, time) for effect in self.get_effects_on(site.anatomy))
+        causes = (self._build_cause(effect, site, touch, time) for effect in self.get_effects_on(site.anatomy))
         return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
 
-    def _cause(self, effect: Effect, site: CraniotomyFrame, touch: Touch, time: float) -> Cause | None:
+    def _build_cause(self, effect: Effect, site: CraniotomyFrame, touch: Touch, time: float) -> Cause | None:
         """Build the cause of an effect of the scene at a time."""
         match effect:
             case ToolForce():
-                return self._pushed(site, touch)
+                return self._build_pushed(site, touch)
             case Resection():
                 assert self.surgery is not None
                 return Resected(np.array([self.surgery.count_done(time)]))
             case ToolContact():
                 return Touching(self.compute_pose(site, touch)[None, None])
             case Retraction():
-                laid = self.compute_pose(site, replace(touch, depth=-AIR))
+                laid = self.compute_pose(site, replace(touch, depth=-IDLE_HEIGHT))
                 return Retracted(laid[None], (self.compute_pose(site, touch) - laid)[None, :3, 3])
             case Gravity():
                 return self.lying(time).build_posture(site.anatomy.mesh.nodes)
             case _:
                 return None
 
-    def _pushed(self, site: CraniotomyFrame, touch: Touch) -> Pushed:
+    def _build_pushed(self, site: CraniotomyFrame, touch: Touch) -> Pushed:
         assert self.tool is not None
         force = touch.force * site.compute_direction(touch)
         return Pushed(self.find_contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
@@ -244,7 +246,7 @@ class Scene:
 
 
 @lru_cache(8)
-def _resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
+def _build_resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
     """Each frame asks for it."""
     return surgery.build_resection(anatomy)
 
@@ -269,7 +271,7 @@ def find_scene(name: str) -> Scene:
     """
     check_scene_exists(name)
     if name.endswith(".py"):
-        return _own_scene(name)
+        return _read_own_scene(name)
     return importlib.import_module(f"scenes.builtin.{name}").SCENE
 
 
@@ -281,7 +283,7 @@ def check_scene_exists(name: str) -> None:
         )
 
 
-def _own_scene(path: str) -> Scene:
+def _read_own_scene(path: str) -> Scene:
     from sim.terms.laws.conformance import check_tissue
 
     found = getattr(run_script(path), "SCENE", None)

@@ -12,7 +12,7 @@ from sim.bodies.open_cortex import OpenCortex, Place, open_cortex
 from .tool_paths import Touch
 
 # Radius of the drape's hole over that of the largest circle of open cortex: its rim hides the mesh's ragged border.
-HOLE = 0.98
+HOLE_RATIO = 0.98
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class CraniotomyFrame(OpenCortex):
 
     def compute_reach(self, radius: float) -> float:
         """Return the maximum distance [m] of a tool of this `radius` from the axis, as limited by the bone."""
-        return max(0.0, HOLE * self.clearance - radius)
+        return max(0.0, HOLE_RATIO * self.clearance - radius)
 
     def clip_to_opening(self, point: np.ndarray, radius: float) -> np.ndarray:
         """Move a point (3,) [m] towards the axis, to where the bone stops a tool of this `radius` [m]."""

@@ -11,7 +11,7 @@ import trimesh
 
 from sim.tools import Ball, BuiltIn, Spatula, Tool, get_core
 
-SHAFT = 1.8e-3  # Default radius of a tool's shaft [m].
+SHAFT_RADIUS = 1.8e-3  # Default radius of a tool's shaft [m].
 
 
 def build_sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +35,7 @@ def add_shaft(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     core = get_core(shape)
     ball = core.radius * build_sphere(3)[0]
     head = trimesh.convex.convex_hull((core.corners[:, None] + ball).reshape(-1, 3))
-    shaft = trimesh.creation.cylinder(SHAFT, segment=[core.centre, top], sections=24)
+    shaft = trimesh.creation.cylinder(SHAFT_RADIUS, segment=[core.centre, top], sections=24)
     both = head + shaft
     return np.asarray(both.vertices), np.asarray(both.faces)
 

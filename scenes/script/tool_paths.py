@@ -35,16 +35,16 @@ class Touch:
 Path = Callable[[float], Touch]
 """Time [s] -> Touch."""
 
-AIR = 4e-3  # Height of an idle tool above the tissue [m].
+IDLE_HEIGHT = 4e-3  # Height of an idle tool above the tissue [m].
 
 
 # Force below which a tool is drawn above the tissue [N]: so small that no visible tool acts through the air.
-FAINT = 2e-3
+MIN_VISIBLE_FORCE = 2e-3
 
 
 def compute_lift(force: float) -> float:
     """Return the height [m] above the tissue at which a tool that pushes with a force [N] is drawn: `AIR` when idle."""
-    return AIR * max(0.0, 1.0 - force / FAINT)
+    return IDLE_HEIGHT * max(0.0, 1.0 - force / MIN_VISIBLE_FORCE)
 
 
 def smooth(t: float) -> float:
@@ -102,7 +102,7 @@ def palpate(
 
     def path(time: float) -> Touch:
         touch = stroke(time)
-        return Touch(touch.x, touch.y, depth=_lowered(touch.force, depth))
+        return Touch(touch.x, touch.y, depth=_interpolate_depth(touch.force, depth))
 
     return path
 
@@ -111,14 +111,14 @@ def lay(depth: float, tilt: float = 0.0, rise: float = 1.5, at: tuple[float, flo
     """Come down by `AIR` [m] and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x, and stay there."""
 
     def path(time: float) -> Touch:
-        return Touch(*at, tilt=(tilt, 0.0), depth=_lowered(smooth(time / rise), depth))
+        return Touch(*at, tilt=(tilt, 0.0), depth=_interpolate_depth(smooth(time / rise), depth))
 
     return path
 
 
-def _lowered(share: float, depth: float) -> float:
+def _interpolate_depth(share: float, depth: float) -> float:
     """Return the depth [m] of a tool after a share of its way from the air to `depth` [m]."""
-    return share * (AIR + depth) - AIR
+    return share * (IDLE_HEIGHT + depth) - IDLE_HEIGHT
 
 
 def stroke_cortex(force: float, radius: float, speed: float) -> Path:

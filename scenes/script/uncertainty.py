@@ -14,7 +14,7 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
 
-from .priors import OF_REGISTRATION, PRIORS, REGISTRATION, SEGMENTATION
+from .priors import PRIORS, REGISTRATION, REGISTRATION_PRIOR, SEGMENTATION
 from .scene import Scene
 from .site import CraniotomyFrame
 
@@ -23,9 +23,9 @@ LEVEL = 0.95
 """Probability level of every printed bound."""
 SUFFIX = ".uncertainty.json"  # Ending of the file, next to the anatomy.
 SURROGATE = "surrogate"  # Name of a contributor.
-AT_REST = (REGISTRATION, SEGMENTATION)
+REST_CONTRIBUTORS = (REGISTRATION, SEGMENTATION)
 """Contributors that displace a tumour in the scan, and by the same amount after it has moved."""
-DEVIATIONS = 1.96  # Bound at 95 % of a Gaussian [standard deviations].
+BOUND_DEVIATIONS = 1.96  # Bound at 95 % of a Gaussian [standard deviations].
 
 
 @dataclass(frozen=True)
@@ -132,11 +132,13 @@ class Uncertainty:
     def evaluate(self, time: float, surrogate: float = 0.0) -> TumourError:
         """Return the error at a time [s], where a trained model adds its own bound [m]."""
         parts = {name: self.read(values, time) for name, values in self.parts.items()}
-        parts[SURROGATE] = surrogate / DEVIATIONS
+        parts[SURROGATE] = surrogate / BOUND_DEVIATIONS
         worst = float(np.hypot(self.read(self.worst, time), surrogate))
-        moved = DEVIATIONS * float(np.linalg.norm([size for name, size in parts.items() if name not in AT_REST]))
+        moved = BOUND_DEVIATIONS * float(
+            np.linalg.norm([size for name, size in parts.items() if name not in REST_CONTRIBUTORS])
+        )
         largest = max(parts, key=lambda name: parts[name])
-        registration = OF_REGISTRATION.range[1]
+        registration = REGISTRATION_PRIOR.range[1]
         return TumourError(worst, largest, moved=min(moved, worst), guess=self.guess, registration=registration)
 
     def read(self, values: tuple[float, ...], time: float) -> float:
@@ -148,13 +150,13 @@ def mark_of(scene: Scene, site: CraniotomyFrame, element: str) -> str:
     """Compute the fingerprint of a scene: 16 hexadecimal digits of its loads, its anatomy and the priors."""
     times = np.linspace(0.0, scene.duration, 25).tolist()
     # Rounded, for sines differ from machine to machine in the last digit.
-    acts = [np.round(_numbers(scene, time), 6).tolist() for time in times]
+    acts = [np.round(_list_parameters(scene, time), 6).tolist() for time in times]
     priors = [(prior.law, prior.range) for prior in PRIORS]
     whole = (scene.effects, scene.surgery, scene.tool, scene.duration, element, acts, priors, site.anatomy.digest)
     return sha256(repr(whole).encode()).hexdigest()[:16]
 
 
-def _numbers(scene: Scene, time: float) -> list[float]:
+def _list_parameters(scene: Scene, time: float) -> list[float]:
     """Return the parameters of tool and head at a time [s]."""
     touch, lying = scene.path(time), scene.lying(time)
     return [touch.x, touch.y, touch.force, *touch.tilt, touch.depth, *lying.direction, lying.fluid]
@@ -206,16 +208,16 @@ def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
     rows = {name: asdict(scenes[name]) for name in sorted(scenes)}
     stored = {"format": FORMAT, "unit": "m", "level": LEVEL, "scenes": rows}
     with write_atomically(path, ".json") as unfinished:
-        unfinished.write_text(json.dumps(_rounded(stored), indent=1) + "\n")
+        unfinished.write_text(json.dumps(_round_numbers(stored), indent=1) + "\n")
 
 
-def _rounded(value: object) -> object:
+def _round_numbers(value: object) -> object:
     """Numbers to a micrometre: more digits promise more than an ensemble knows."""
     match value:
         case dict():
-            return {name: _rounded(one) for name, one in value.items()}
+            return {name: _round_numbers(one) for name, one in value.items()}
         case list() | tuple():
-            return [_rounded(one) for one in value]
+            return [_round_numbers(one) for one in value]
         case float():
             return round(value, 6)
         case _:

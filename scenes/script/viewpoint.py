@@ -64,11 +64,11 @@ class Appearance:
     finger: float | None = None
 
 
-PLAIN = Appearance()
+PLAIN_APPEARANCE = Appearance()
 """Default look of scenes."""
 
 
-UNDER = 10e-3  # Depth under the cortex of the camera's target [m]: between the tool and the tumour.
+TARGET_DEPTH = 10e-3  # Depth under the cortex of the camera's target [m]: between the tool and the tumour.
 Eye = Literal["left", "right"]
 
 
@@ -124,7 +124,7 @@ class Viewpoint:
 
     def find_target(self, site: CraniotomyFrame) -> np.ndarray:
         """Return the target point of the camera (3,) [m]."""
-        return site.origin + UNDER * site.axis
+        return site.origin + TARGET_DEPTH * site.axis
 
     def build_camera(self, site: CraniotomyFrame, time: float = 0.0) -> Camera:
         """Return the camera that looks at a site at a time [s]."""
@@ -143,5 +143,5 @@ class Viewpoint:
     calibrated, target, camera = calibrate, find_target, build_camera  # Former names, for one release.
 
 
-USUAL = Viewpoint()
+USUAL_VIEWPOINT = Viewpoint()
 """Default viewpoint of scenes."""

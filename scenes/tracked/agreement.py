@@ -9,14 +9,14 @@ import numpy as np
 
 from ar.tracking.pose import Pose
 
-FARTHEST = 0.2  # Largest distance of a printed target from the body that carries it [m].
-LOOSE = 5e-3  # Largest motion of a printed target on the body that carries it [m].
-KNOWN = 2e-3  # Largest standard deviation of a usable target pose [m].
-KEPT = 30  # Number of last images kept.
-FEWEST = 4  # Minimum number of images for a warning about a moving target.
-NEARER = 3.0  # Factor by which bodies must be closer to the target with swapped files for a warning.
-BESIDE = 0.02  # Smallest distance of a target from its body for a warning about swapped files [m].
-MOST = 90.0  # Percentile of the kept images that is used [%]: one in ten may be misread.
+MAX_TARGET_DISTANCE = 0.2  # Largest distance of a printed target from the body that carries it [m].
+MAX_TARGET_MOTION = 5e-3  # Largest motion of a printed target on the body that carries it [m].
+MAX_POSE_DEVIATION = 2e-3  # Largest standard deviation of a usable target pose [m].
+MAX_KEPT_IMAGES = 30  # Number of last images kept.
+MIN_IMAGES = 4  # Minimum number of images for a warning about a moving target.
+SWAP_RATIO = 3.0  # Factor by which bodies must be closer to the target with swapped files for a warning.
+MIN_SWAP_DISTANCE = 0.02  # Smallest distance of a target from its body for a warning about swapped files [m].
+MOTION_PERCENTILE = 90.0  # Percentile of the kept images that is used [%]: one in ten may be misread.
 REMEDY = "see --poses and --clock"  # Remedy in warnings.
 
 
@@ -45,28 +45,28 @@ class Agreement:
 
         All are in one frame. A target whose position is too uncertain is skipped.
         """
-        if np.linalg.eigvalsh(target.covariance[:3, :3])[-1] > KNOWN**2:
+        if np.linalg.eigvalsh(target.covariance[:3, :3])[-1] > MAX_POSE_DEVIATION**2:
             return self
-        place, other = (None if each is None else _beside(target, each) for each in (body, swapped))
+        place, other = (None if each is None else _compute_target_position(target, each) for each in (body, swapped))
         assert place is not None
-        places = np.vstack([self.places.get(name, np.empty((0, 3))), place])[-KEPT:]
-        doubt = _doubt(name, places, other)
+        places = np.vstack([self.places.get(name, np.empty((0, 3))), place])[-MAX_KEPT_IMAGES:]
+        doubt = _describe_doubt(name, places, other)
         return Agreement({**self.places, name: places}, {**self.doubts, name: doubt})
 
 
-def _beside(target: Pose, body: Pose) -> np.ndarray:
+def _compute_target_position(target: Pose, body: Pose) -> np.ndarray:
     """Return the position of a target in a body's frame (3,) [m]."""
     return (np.linalg.inv(body.T_camera_target) @ target.T_camera_target)[:3, 3]
 
 
-def _doubt(name: str, places: np.ndarray, swapped: np.ndarray | None) -> str:
+def _describe_doubt(name: str, places: np.ndarray, swapped: np.ndarray | None) -> str:
     """Describe the inconsistency of positions (n, 3) [m] of a target on its body; the newest is the last."""
     away = float(np.linalg.norm(places[-1]))
-    if swapped is not None and away > BESIDE and NEARER * np.linalg.norm(swapped) < away:
+    if swapped is not None and away > MIN_SWAP_DISTANCE and SWAP_RATIO * np.linalg.norm(swapped) < away:
         return f"the {name}'s target is seen {1e3 * away:.0f} mm from its poses: are the two files of --poses swapped?"
-    if away > FARTHEST:
+    if away > MAX_TARGET_DISTANCE:
         return f"the {name}'s target is seen {1e3 * away:.0f} mm from its poses: {REMEDY}"
-    moved = np.percentile(np.linalg.norm(places - np.median(places, axis=0), axis=1), MOST)
-    if len(places) >= FEWEST and moved > LOOSE:
+    moved = np.percentile(np.linalg.norm(places - np.median(places, axis=0), axis=1), MOTION_PERCENTILE)
+    if len(places) >= MIN_IMAGES and moved > MAX_TARGET_MOTION:
         return f"the {name}'s target moves by {1e3 * moved:.0f} mm on the body that its poses have: {REMEDY}"
     return ""

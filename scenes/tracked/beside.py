@@ -15,12 +15,12 @@ from .picture import Painter
 # Chart of the distance from tip to tumour.
 DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion (95 %); dotted: not to be relied on")
 # Chart of the overlay's error.
-WITHIN = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation")
+OVERLAY_ERROR = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation")
 
 
 def list_lines(tooled: bool) -> tuple[Line, ...]:
     """Return the plotted quantities of each image."""
-    return (DISTANCE, WITHIN) if tooled else (WITHIN,)
+    return (DISTANCE, OVERLAY_ERROR) if tooled else (OVERLAY_ERROR,)
 
 
 def sample_of(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: float) -> Sample:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ar.tracking.intrinsics import BoardView, find_board
-from ar.tracking.pictures import GIVE, read_images
+from ar.tracking.pictures import REMEDY, read_images
 from ar.tracking.targets import Detector, Target
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
@@ -41,7 +41,7 @@ def detect_board(path: Path, board: Target, size: tuple[int, int] | None = None)
         Unreadable input, images of different sizes or of another one than given, or no visible board.
     """
     views, count, first, detector = [], 0, "", Detector([board])
-    with read_as(path, "images of a board", GIVE):
+    with read_as(path, "images of a board", REMEDY):
         try:
             for picture in read_images(path):
                 count += 1
@@ -58,7 +58,7 @@ def detect_board(path: Path, board: Target, size: tuple[int, int] | None = None)
         except ValueError as error:
             raise InputError(str(error)) from error
     if size is None or not count:
-        raise InputError(f"{path}: holds no images. {GIVE}")
+        raise InputError(f"{path}: holds no images. {REMEDY}")
     if not views:
         raise InputError(
             f"{path}: the board is in none of {count} images: print it by `sulcus markers`, and show most of it."

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ar.optics.calibration import LONGEST_TEXT, WANTED, Calibration, parse_calibration, to_opencv_text, to_ros_text
+from ar.optics.calibration import MAX_TEXT_LENGTH, REMEDY, Calibration, parse_calibration, to_opencv_text, to_ros_text
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as, to_path
@@ -18,9 +18,9 @@ INTRINSICS = "sulcus intrinsics"
 """Format of the covariance file of a calibration."""
 FORMATS = {"opencv": to_opencv_text, "ros": to_ros_text}  # Writers of calibration files, by format.
 # Remedy in error messages.
-GIVE_HAND_EYE = "Give what `sulcus calibrate --hand-eye A.csv B.csv --json` prints, B being the camera."
-LARGEST_HAND_EYE = 1 << 16  # Maximum size of a hand-eye calibration file [bytes].
-RIGID = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles.
+HAND_EYE_REMEDY = "Give what `sulcus calibrate --hand-eye A.csv B.csv --json` prints, B being the camera."
+MAX_HAND_EYE_BYTES = 1 << 16  # Maximum size of a hand-eye calibration file [bytes].
+ROTATION_TOLERANCE = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles.
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -35,11 +35,11 @@ def read_calibration(path: str | Path) -> Calibration:
         rejects.
     """
     path = to_path(path)
-    with read_as(path, "a camera's calibration", WANTED):
+    with read_as(path, "a camera's calibration", REMEDY):
         if path.exists() and not path.is_file():
-            raise InputError(f"is no file. {WANTED}")
+            raise InputError(f"is no file. {REMEDY}")
         with path.open("rb") as file:
-            text = file.read(4 * LONGEST_TEXT + 1).decode("utf-8-sig")
+            text = file.read(4 * MAX_TEXT_LENGTH + 1).decode("utf-8-sig")
         try:
             return parse_calibration(text)
         except ValueError as error:
@@ -55,7 +55,7 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
         A file of that name and kind with an invalid covariance.
     """
     beside = to_path(path).with_suffix(".json")
-    if not beside.is_file() or beside.stat().st_size > LONGEST_TEXT:
+    if not beside.is_file() or beside.stat().st_size > MAX_TEXT_LENGTH:
         return None
     with read_as(beside, "a covariance of `sulcus calibrate`", "Remove it, or calibrate the camera again."):
         stored = json.loads(beside.read_text(encoding="utf-8-sig"))
@@ -124,14 +124,14 @@ def read_hand_eye(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     from ar.tracking.rigid import is_rigid
 
     path = to_path(path)
-    with read_as(path, "a hand-eye calibration", GIVE_HAND_EYE):
+    with read_as(path, "a hand-eye calibration", HAND_EYE_REMEDY):
         with path.open("rb") as file:
-            stored = json.loads(file.read(LARGEST_HAND_EYE))
+            stored = json.loads(file.read(MAX_HAND_EYE_BYTES))
         X = np.eye(4)
         X[:3, :3], X[:3, 3] = np.array(stored["rotation"], float), 1e-3 * np.array(stored["shift_mm"], float)
         off = np.array([1e-3 * float(stored["rms_mm"]), np.radians(float(stored["rms_degrees"]))])
-        if not is_rigid(X, RIGID):
-            raise InputError(f"its rotation is none. {GIVE_HAND_EYE}")
+        if not is_rigid(X, ROTATION_TOLERANCE):
+            raise InputError(f"its rotation is none. {HAND_EYE_REMEDY}")
         if not np.isfinite(off).all() or (off < 0.0).any():
-            raise InputError(f"its residuals are no lengths. {GIVE_HAND_EYE}")
+            raise InputError(f"its residuals are no lengths. {HAND_EYE_REMEDY}")
         return X, np.diag(np.repeat(off**2, 3))

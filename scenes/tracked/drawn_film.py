@@ -21,7 +21,7 @@ from ..script.camera_paths import HandHeld
 from ..script.scene import find_scene
 from ..script.site import CraniotomyFrame
 from .filming import (
-    USUAL,
+    USUAL_CALIBRATION,
     VIEW,
     Mounted,
     Taking,
@@ -34,14 +34,14 @@ from .filming import (
 
 SCENE = "palpate"
 """Scene of the video."""
-CAMERA = USUAL.resize_calibration(800, 600, scale=True)
+CAMERA = USUAL_CALIBRATION.resize_calibration(800, 600, scale=True)
 """Camera of the video: fewer pixels than usual, so that it takes seconds."""
-RATE = 10.0  # Frame rate [1/s].
-LENGTH = 1.7  # Length of the video [s].
-BEGIN = 0.5  # Start time in the scene [s]: the ball makes contact at 0.4 s.
+FRAME_RATE = 10.0  # Frame rate [1/s].
+DURATION = 1.7  # Length of the video [s].
+START_TIME = 0.5  # Start time in the scene [s]: the ball makes contact at 0.4 s.
 # Covered targets and gaps, with their times [s].
-TROUBLES = (Trouble("reference", 0.25, 0.55), Trouble("tool", 0.85, 1.05), Trouble("gap", 1.25, 1.55))
-ROUND = 25e-3  # Standard deviation of the tissue displacement around a tool's tip [m].
+DISTURBANCES = (Trouble("reference", 0.25, 0.55), Trouble("tool", 0.85, 1.05), Trouble("gap", 1.25, 1.55))
+TISSUE_SPREAD = 25e-3  # Standard deviation of the tissue displacement around a tool's tip [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Dent:
         for tip in cause.pose[:, 0, :3, 3]:
             place = self.site.find_nearest(tip).point
             depth = max(0.0, float((tip - place) @ self.site.axis))
-            share = np.exp(-np.square(nodes - place).sum(axis=1) / (2.0 * ROUND**2))
+            share = np.exp(-np.square(nodes - place).sum(axis=1) / (2.0 * TISSUE_SPREAD**2))
             moved.append(depth * share[:, None] * self.site.axis)
         exact = np.zeros((2, len(loads)))
         found = build_prediction(
@@ -106,11 +106,11 @@ def build_synthetic_video(theatre: PatientSetup) -> DrawnFilm:
     view = replace(VIEW.calibrate(CAMERA), path=HandHeld(0))
     whole = find_scene(SCENE)
     scene = replace(
-        whole, path=lambda time: whole.path(time + BEGIN), viewpoint=from_where_it_sees_all(view),
-        frames_per_second=RATE, duration=LENGTH,
+        whole, path=lambda time: whole.path(time + START_TIME), viewpoint=from_where_it_sees_all(view),
+        frames_per_second=FRAME_RATE, duration=DURATION,
     )  # fmt: skip
     stage = theatre.build_stage(scene)
     deformer = Dent(theatre.anatomy, stage.site)
     player = Player(stage, deformer)
-    mounts, taking = mount_targets(player), Taking(troubles=TROUBLES)
+    mounts, taking = mount_targets(player), Taking(troubles=DISTURBANCES)
     return DrawnFilm(stage, mounts, CAMERA, deformer, tuple(render_shots(player, mounts, taking)), taking)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 from ar.tracking.drawn import read_stamp
-from ar.tracking.pictures import GIVE, Named, read_video
+from ar.tracking.pictures import REMEDY, Named, read_video
 from ar.tracking.pose import Pose, TrackedTargets, Tracker, Verdict
 from ar.tracking.pose_stream import Clock, PoseStream, estimate_clock_by_motion
 from ar.tracking.rigid import build_cross_matrices, turn_vectors
@@ -22,9 +22,11 @@ from sim.runtime.outside_files import read_as
 from .agreement import Agreement
 from .pose_file import TrackedRow
 
-AT_REST = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
+REST_POSE = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 """Pose of the camera in its own coordinate system."""
-FAR = 1.0  # Time between poses and an image beyond which they belong to another clock or another recording [s].
+MAX_TIME_GAP = (
+    1.0  # Time between poses and an image beyond which they belong to another clock or another recording [s].
+)
 
 
 def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:
@@ -42,9 +44,9 @@ def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame
     for picture in film:
         begun = time.perf_counter()
         state = tracker.track(picture.grey, state)
-        verdict, pose, lacks = _known(state, wanted)
+        verdict, pose, lacks = _select_pose(state, wanted)
         if pose is not None and body == "camera":
-            pose = AT_REST.transform_to(pose)
+            pose = REST_POSE.transform_to(pose)
         yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun, lacks)
 
 
@@ -59,24 +61,24 @@ def follow_body(path: Path, calibration: Calibration, body: str, frame: str, rat
         Unreadable input, or images of another size than the camera was calibrated at.
     """
     count = 0
-    with read_as(path, "a video", GIVE):
+    with read_as(path, "a video", REMEDY):
         try:
-            for row in track_rows(map(_at_its_time, read_video(path, rate)), calibration, body, frame):
+            for row in track_rows(map(_set_stamped_time, read_video(path, rate)), calibration, body, frame):
                 count += 1
                 yield row
         except ValueError as error:
             raise InputError(str(error)) from error
     if not count:
-        raise InputError(f"{path}: holds no image. {GIVE}")
+        raise InputError(f"{path}: holds no image. {REMEDY}")
 
 
-def _at_its_time(picture: Named) -> Named:
+def _set_stamped_time(picture: Named) -> Named:
     """Return an image with the time of its stamp, if it has one."""
     stamp = read_stamp(picture.grey)
     return picture if stamp is None else replace(picture, time=stamp)
 
 
-def _known(state: TrackedTargets, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
+def _select_pose(state: TrackedTargets, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
     """Return the pose of the first target, relative to the second if given; else the verdict of the missing one."""
     for name in wanted:
         if name not in state.poses:
@@ -125,11 +127,11 @@ class ExternalTracker:
 
     def find_tool(self, time: float) -> Pose | None:
         """Return the tool relative to the reference, in the image of a time [s]; None if the poses are missing."""
-        return self._at(time, self._beside)
+        return self._interpolate_pose(time, self._interpolate_tool)
 
     def find_reference(self, time: float) -> Pose | None:
         """Return the reference in the camera's frame, in the image of a time [s]; None if it is unknown."""
-        return self._at(time, self._in_camera)
+        return self._interpolate_pose(time, self._locate_in_camera)
 
     @property
     def swapped(self) -> ExternalTracker:
@@ -165,9 +167,9 @@ class ExternalTracker:
         for name, stream in self.streams.items():
             at = stream.to_stream_day(time + self.clock.offset)
             first, last = stream.times[[0, -1]].tolist()
-            if at < first - FAR:
+            if at < first - MAX_TIME_GAP:
                 return f"the {name}'s poses begin {first - at:.1f} s after this image"
-            if at > last + FAR:
+            if at > last + MAX_TIME_GAP:
                 return f"the {name}'s poses end {at - last:.1f} s before this image"
         return ""
 
@@ -177,7 +179,7 @@ class ExternalTracker:
         missing = [each.compute_age(time) for each in self.streams.values() if each.interpolate(time) is None]
         return max(missing) if missing else None
 
-    def _at(self, time: float, pose_at: Callable[[float], Pose | None]) -> Pose | None:
+    def _interpolate_pose(self, time: float, pose_at: Callable[[float], Pose | None]) -> Pose | None:
         """Return a pose at an image's time [s]; its covariance includes the motion during the clock error."""
         time, error = time + self.clock.offset, self.clock.error
         pose = pose_at(time)
@@ -190,11 +192,11 @@ class ExternalTracker:
         step = np.concatenate([U[:3, 3] - T[:3, 3], turn_vectors(U[None, :3, :3] @ T[:3, :3].T)[0]])
         return Pose(T, pose.covariance + np.outer(step, step), pose.residual, pose.corners)
 
-    def _beside(self, time: float) -> Pose | None:
+    def _interpolate_tool(self, time: float) -> Pose | None:
         tool, patient = self.tool.interpolate(time), self.patient.interpolate(time)
         return None if tool is None or patient is None else tool.transform_to(patient)
 
-    def _in_camera(self, time: float) -> Pose | None:
+    def _locate_in_camera(self, time: float) -> Pose | None:
         assert self.eye is not None
         patient = self.patient.interpolate(time)
         body = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 0) if self.eye.body is None else self.eye.body.interpolate(time)

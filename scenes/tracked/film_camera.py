@@ -9,14 +9,14 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 from ar.tracking.focal_fit import fit_focal_length
-from ar.tracking.pictures import GIVE, read_video
+from ar.tracking.pictures import REMEDY, read_video
 from ar.tracking.pose import check_image_size
 from ar.tracking.targets import Detector, list_targets
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-LOOKED = 120  # Number of first images of a video among which some are examined.
-EACH = 10  # Stride of the examined images.
+FIRST_IMAGES = 120  # Number of first images of a video among which some are examined.
+IMAGE_STRIDE = 10  # Stride of the examined images.
 
 
 def check_video(film: Path, rate: float, calibration: Calibration, camera: str) -> None:
@@ -39,16 +39,16 @@ def check_video(film: Path, rate: float, calibration: Calibration, camera: str) 
     """
     targets = {target.name: target for target in list_targets()}
     detector, seen, count = Detector(tuple(targets.values())), [], 0
-    with read_as(film, "a video", GIVE):
+    with read_as(film, "a video", REMEDY):
         try:
-            for picture in islice(read_video(film, rate), 0, LOOKED, EACH):
+            for picture in islice(read_video(film, rate), 0, FIRST_IMAGES, IMAGE_STRIDE):
                 check_image_size(picture.grey, calibration.width, calibration.height)
                 seen += [(targets[name], corners) for name, corners in detector.detect(picture.grey).items()]
                 count += 1
         except ValueError as error:
             raise InputError(str(error)) from error
     if not count:
-        raise InputError(f"{film}: holds no image. {GIVE}")
+        raise InputError(f"{film}: holds no image. {REMEDY}")
     fit = fit_focal_length(calibration.build_camera(np.eye(4)), seen)
     if fit is not None and fit.differs:
         way = "longer" if fit.factor > 1.0 else "shorter"

@@ -29,17 +29,19 @@ from ..script.viewpoint import Viewpoint
 from .registration_file import describe_scan
 from .tracked_tool import TrackedTool
 
-USUAL = Calibration((1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film")
+USUAL_CALIBRATION = Calibration(
+    (1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film"
+)
 """Default camera of a video."""
-VIEW = Viewpoint(distance=0.32).calibrate(USUAL)
+VIEW = Viewpoint(distance=0.32).calibrate(USUAL_CALIBRATION)
 """View from arm's length: it shows the opening, the reference near it and the tool's cube."""
 # Centre of the reference relative to the craniotomy, to the right, up and outwards [m].
-BESIDE = (-0.078, 0.010, 0.022)
-TURNED = (28.0, -24.0)  # Rotation of the reference about x and y from the line of sight [deg].
-MOUNT = 0.09  # Distance from the tool's tip up its shaft to the centre of its cube [m].
-HAND = (196, 148, 128)  # Colour of a hand that covers a target (RGB).
-BRIGHT = 12.0  # Factor on the brightness of an over-exposed image.
-SMEAR = 41  # Length of a smear [pixel].
+REFERENCE_POSITION = (-0.078, 0.010, 0.022)
+REFERENCE_ROTATION = (28.0, -24.0)  # Rotation of the reference about x and y from the line of sight [deg].
+CUBE_DISTANCE = 0.09  # Distance from the tool's tip up its shaft to the centre of its cube [m].
+HAND_COLOUR = (196, 148, 128)  # Colour of a hand that covers a target (RGB).
+BRIGHT_FACTOR = 12.0  # Factor on the brightness of an over-exposed image.
+SMEAR_LENGTH = 41  # Length of a smear [pixel].
 KINDS = {
     "reference": "a hand covers the patient's reference",
     "tool": "a hand covers the tool's cube",
@@ -53,16 +55,18 @@ KINDS = {
 def from_where_it_sees_all(view: Viewpoint) -> Viewpoint:
     """Return the same camera, at a distance from which its image shows as much as that of `VIEW`."""
     assert view.calibration is not None
-    longer = (view.calibration.focal[1] / view.height) / (USUAL.focal[1] / USUAL.height)
+    longer = (view.calibration.focal[1] / view.height) / (USUAL_CALIBRATION.focal[1] / USUAL_CALIBRATION.height)
     return replace(view, distance=longer * VIEW.distance)
 
 
 def place_reference(site: CraniotomyFrame, camera: Camera) -> np.ndarray:
     """Return T_scan_patient (4, 4) of the reference near a site, facing `camera`."""
-    right, up, outwards = BESIDE
+    right, up, outwards = REFERENCE_POSITION
     middle = site.origin + right * site.right + up * site.up - outwards * site.axis
     T = np.eye(4)
-    T[:3, :3] = camera.T_camera_world[:3, :3].T @ Rotation.from_euler("xy", TURNED, degrees=True).as_matrix()
+    T[:3, :3] = (
+        camera.T_camera_world[:3, :3].T @ Rotation.from_euler("xy", REFERENCE_ROTATION, degrees=True).as_matrix()
+    )
     T[:3, 3] = middle - T[:3, :3] @ [*(0.5 * build_patient_reference().faces[0].size), 0.0]
     return T
 
@@ -150,7 +154,7 @@ def mount_targets(player: Player) -> Mounted:
     touch = player.get_touch(0)
     pose = player.place_tool(scene.tool, touch, site.anatomy.mesh.nodes).pose
     T_tool_cube = np.eye(4)
-    T_tool_cube[2, 3] = MOUNT
+    T_tool_cube[2, 3] = CUBE_DISTANCE
     towards = pose[:3, :3].T @ (camera.centre - pose[:3, :3] @ T_tool_cube[:3, 3] - pose[:3, 3])
     turn = np.arctan2(towards[1], towards[0]) - 0.25 * np.pi  # the edge between the cube's sides comes to the front
     T_tool_cube[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
@@ -198,8 +202,8 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
             (build_tool_cube(), pose @ np.linalg.inv(mounts.tool.T_cube_tool)),
             (build_patient_reference(), mounts.T_scan_patient),
         ]
-        view = partial(_seen, renderer, [layer.vertices for layer in layers if not layer.still], targets, wrong)
-        camera_at = partial(_later, player, time)
+        view = partial(_render_image, renderer, [layer.vertices for layer in layers if not layer.still], targets, wrong)
+        camera_at = partial(_get_later_camera, player, time)
         tumour = positions[stage.tumour_vertices]
         places = np.stack([tumour.mean(axis=0), site.origin, *(T[:3, 3] for _, T in targets)])
         shown = (
@@ -210,16 +214,20 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
         camera = camera_at(find_row_time(camera_at, readout, places[0]))
         moved = tumour - rest[stage.tumour_vertices]
         yield VideoFrame(
-            time, stamp_time(_taken(shown, taking, wrong, number), time), camera.T_camera_world, pose, moved
+            time,
+            stamp_time(_apply_disturbances(shown, taking, wrong, number), time),
+            camera.T_camera_world,
+            pose,
+            moved,
         )
 
 
-def _later(player: Player, time: float, after: float) -> Camera:
+def _get_later_camera(player: Player, time: float, after: float) -> Camera:
     """Return the camera `after` seconds from an image's time [s]."""
     return player.get_camera(time + after)
 
 
-def _seen(
+def _render_image(
     renderer: Renderer,
     moving: Sequence[np.ndarray],
     targets: Sequence[tuple[Target, np.ndarray]],
@@ -231,7 +239,7 @@ def _seen(
     shown = render_targets(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
     for target, T in targets:
         if NAMES[target.name] in wrong:
-            shown = _covered(shown, camera, target, T)
+            shown = _draw_hand(shown, camera, target, T)
     return shown
 
 
@@ -239,24 +247,24 @@ NAMES = {"tool": "tool", "patient": "reference"}
 """Disturbance that covers each target."""
 
 
-def _covered(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: np.ndarray) -> np.ndarray:
+def _draw_hand(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: np.ndarray) -> np.ndarray:
     """Draw a hand in front of a target."""
     T = camera.T_camera_world @ T_scan_target
     outline = target.outline
     where = find_window(replace(camera, T_camera_world=np.eye(4)), outline @ T[:3, :3].T + T[:3, 3], 0.1, 0.0)
     out = colour.copy()
     if where is not None:
-        out[where] = HAND
+        out[where] = HAND_COLOUR
     return out
 
 
-def _taken(colour: np.ndarray, taking: Taking, wrong: Sequence[str] | set[str], number: int) -> np.ndarray:
+def _apply_disturbances(colour: np.ndarray, taking: Taking, wrong: Sequence[str] | set[str], number: int) -> np.ndarray:
     """Apply blur, noise and the global disturbances to an image."""
     out = colour.astype(np.float32)
     if "bright" in wrong:
-        out *= BRIGHT
+        out *= BRIGHT_FACTOR
     if "smear" in wrong:
-        out = uniform_filter1d(out, SMEAR, axis=1)
+        out = uniform_filter1d(out, SMEAR_LENGTH, axis=1)
     if taking.blur > 0.0:
         out = gaussian_filter(out, (taking.blur, taking.blur, 0.0))
     if taking.noise > 0.0:

@@ -17,7 +17,7 @@ from ar.tracking.pose import Pose, TrackedTargets, Tracker
 from ar.tracking.registration import Registration
 from ar.tracking.targets import build_patient_reference, build_tool_cube
 
-from ..script.uncertainty import DEVIATIONS, LEVEL
+from ..script.uncertainty import BOUND_DEVIATIONS, LEVEL
 from .agreement import Agreement
 from .elsewhere import ExternalTracker
 from .plausible import describe_implausible, describe_misplaced_tool
@@ -26,21 +26,25 @@ from .tracked_tool import TrackedTool
 
 # Time for which the overlay keeps its position after the reference is lost [s]: hand-held, its error is then less than
 # LIMIT.
-HELD = 0.1
-GAP = 0.2  # Longest gap between images [s].
-MISSED = 1.5  # Longest gap of a slow video [intervals].
-SLOWEST = 1.0  # Maximum interval between images [s].
-ROUNDING = 1e-6  # Rounding of image times [s].
-LIMIT = 5e-3  # Largest position error of a reliable overlay [m].
-UNKNOWN = "scan position, tissue motion unknown: do not rely on it"  # Warning in the image.
+HOLD_TIME = 0.1
+MAX_GAP = 0.2  # Longest gap between images [s].
+MAX_GAP_INTERVALS = 1.5  # Longest gap of a slow video [intervals].
+MAX_INTERVAL = 1.0  # Maximum interval between images [s].
+TIME_ROUNDING = 1e-6  # Rounding of image times [s].
+MAX_OVERLAY_ERROR = 5e-3  # Largest position error of a reliable overlay [m].
+UNKNOWN_WARNING = "scan position, tissue motion unknown: do not rely on it"  # Warning in the image.
 # Overlay error as a share of the motion during the readout of a rolling shutter: measured in
 # docs/notes/overlay_experiments.md, "Rolling shutter".
-SKEW = 0.5
+SHUTTER_FACTOR = 0.5
 # Factor on the overlay error of a rolling shutter for a tool's tip, which is far from its cube: the same page.
-LEVER = 2.0
-CALMS = 0.1  # Factor on the estimate of a maximum hand speed after one second without faster motion.
-UNCHECKED = "not checked whose registration this is: make one by `sulcus register --anatomy`"  # Warning in the image.
-NO_PACE = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"  # Warning in the image.
+TIP_FACTOR = 2.0
+SPEED_DECAY = 0.1  # Factor on the estimate of a maximum hand speed after one second without faster motion.
+UNCHECKED_WARNING = (
+    "not checked whose registration this is: make one by `sulcus register --anatomy`"  # Warning in the image.
+)
+NO_PACE_WARNING = (
+    "a rolling shutter, and how the camera moves is not known yet: do not rely on it"  # Warning in the image.
+)
 TOOL, PATIENT = build_tool_cube().name, build_patient_reference().name  # Names of the targets.
 
 
@@ -102,7 +106,7 @@ class TrackingResult:
     parts: Mapping[str, float] = field(default_factory=dict)
     seen: float | None = None
     felt: float | None = None
-    interval: float = SLOWEST
+    interval: float = MAX_INTERVAL
     near: bool = False
     pace: float | None = None
     agreement: Agreement = field(default_factory=Agreement)
@@ -154,14 +158,14 @@ class Follower:
         ValueError
             See `Tracker.track`.
         """
-        known = self._agreeing(self._looked(grey, time, before), before)
+        known = self._compare_targets(self._compute_result(grey, time, before), before)
         if before is None:
             return known
         apart = time - before.time
         known = replace(known, near=known.near or before.near)
         return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
 
-    def _agreeing(self, known: TrackingResult, before: TrackingResult | None) -> TrackingResult:
+    def _compare_targets(self, known: TrackingResult, before: TrackingResult | None) -> TrackingResult:
         """Check external poses against printed targets; if inconsistent, the tumour position is unreliable."""
         if self.elsewhere is None:
             return known
@@ -171,31 +175,31 @@ class Follower:
             return known
         return replace(known, state=TumourState.UNSURE, words=known.agreement.doubt, band=None, parts={})
 
-    def _looked(self, grey: np.ndarray, time: float, before: TrackingResult | None) -> TrackingResult:
+    def _compute_result(self, grey: np.ndarray, time: float, before: TrackingResult | None) -> TrackingResult:
         """Compute the result of `step`, for any intervals."""
         apart = None if before is None else time - before.time
-        longest = GAP if before is None else max(GAP, MISSED * before.interval)
+        longest = MAX_GAP if before is None else max(MAX_GAP, MAX_GAP_INTERVALS * before.interval)
         stale = apart is not None and not 0.0 < apart <= longest
         forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
         tracked = self.tracker.track(grey, None if before is None or forgotten else before.tracked)
         other = self.elsewhere
         reference = tracked.poses.get(PATIENT) if other is None or other.eye is None else other.find_reference(time)
         if reference is None:
-            return self._without_reference(tracked, time, before)
+            return self._build_without_reference(tracked, time, before)
         T_patient_scan = self.registration.T_patient_scan
         camera = self.calibration.build_camera(reference.T_camera_target @ T_patient_scan)
-        pace = self._pace(reference, time, None if forgotten else before)
-        shutter = SKEW * self.calibration.readout * (pace or 0.0)
-        known = self._with_tool(tracked, reference, time, before, shutter)
+        pace = self._compute_pace(reference, time, None if forgotten else before)
+        shutter = SHUTTER_FACTOR * self.calibration.readout * (pace or 0.0)
+        known = self._compute_motion(tracked, reference, time, before, shutter)
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
-        band, parts = self._band(reference, middle, known.motion, shutter)
+        band, parts = self._compute_band(reference, middle, known.motion, shutter)
         known = replace(known, camera=camera, band=band, parts=parts, seen=time, pace=pace)
-        doubt, near = self._implausible(camera, known.T_scan_tool, before)
+        doubt, near = self._describe_implausible(camera, known.T_scan_tool, before)
         known = replace(known, near=near)
         if known.relied and pace is None and self.calibration.readout > 0.0:
-            known = replace(known, state=TumourState.UNSURE, words=NO_PACE)
+            known = replace(known, state=TumourState.UNSURE, words=NO_PACE_WARNING)
         if known.relied and self.registration.scanned is None:
-            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED)
+            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED_WARNING)
         if doubt:
             known = replace(known, state=TumourState.UNSURE, words=doubt)
         if doubt or known.state is TumourState.UNKNOWN:
@@ -203,11 +207,13 @@ class Follower:
         if stale and apart is not None:
             why = f"no image for {apart:.1f} s" if apart > 0.0 else "the camera repeats an image"
             return replace(known, state=TumourState.STALE, words=f"stale, {why}: do not rely on it")
-        if known.state in (TumourState.GOOD, TumourState.REST) and band > LIMIT:
+        if known.state in (TumourState.GOOD, TumourState.REST) and band > MAX_OVERLAY_ERROR:
             return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band))
         return known
 
-    def _implausible(self, camera: Camera, tool: np.ndarray | None, before: TrackingResult | None) -> tuple[str, bool]:
+    def _describe_implausible(
+        self, camera: Camera, tool: np.ndarray | None, before: TrackingResult | None
+    ) -> tuple[str, bool]:
         """Describe why the registration is implausible for this patient; and return the updated `near`."""
         stage, near = self.motion.stage, before is not None and before.near
         theirs = "is this its registration?" if self.elsewhere is None else "are these its poses and registration?"
@@ -215,20 +221,22 @@ class Follower:
         doubt = describe_implausible(self.registration, stage, camera) or misplaced
         return doubt, near
 
-    def _without_reference(self, tracked: TrackedTargets, time: float, before: TrackingResult | None) -> TrackingResult:
+    def _build_without_reference(
+        self, tracked: TrackedTargets, time: float, before: TrackingResult | None
+    ) -> TrackingResult:
         """Return the result without a visible reference: the overlay keeps its position for a short time."""
         seen = None if before is None else before.seen
         motion = self.motion.rest if before is None else before.motion
-        held = before is not None and seen is not None and 0.0 <= time - seen < HELD + ROUNDING
+        held = before is not None and seen is not None and 0.0 <= time - seen < HOLD_TIME + TIME_ROUNDING
         camera = before.camera if before is not None and held else None
-        why = self._late(time) or ("not seen yet" if seen is None else "lost")
+        why = self._describe_age(time) or ("not seen yet" if seen is None else "lost")
         what = "nothing is drawn" if camera is None else "drawn where it was"
         return TrackingResult(
             time, TumourState.NO_REFERENCE, f"reference {why}: {what}", tracked, motion, camera, seen=seen,
             felt=None if before is None else before.felt,
         )  # fmt: skip
 
-    def _pace(self, reference: Pose, time: float, before: TrackingResult | None) -> float | None:
+    def _compute_pace(self, reference: Pose, time: float, before: TrackingResult | None) -> float | None:
         """Return the recent maximum speed of the brain across the image [m/s]; None if unknown.
 
         A hand trembles: the speed during one image may be larger than that between two images.
@@ -239,41 +247,41 @@ class Follower:
         scan = self.registration.T_patient_scan @ np.append(self.motion.stage.site.origin, 1.0)
         now, then = ((pose.T_camera_target @ scan)[:2] for pose in (reference, last))
         speed = float(np.linalg.norm(now - then)) / (time - before.time)
-        return max(speed, CALMS ** (time - before.time) * (before.pace or 0.0))
+        return max(speed, SPEED_DECAY ** (time - before.time) * (before.pace or 0.0))
 
-    def _with_tool(
+    def _compute_motion(
         self, tracked: TrackedTargets, reference: Pose, time: float, before: TrackingResult | None, shutter: float
     ) -> TrackingResult:
         """Compute the motion under the tool, by its pose relative to the reference; a `shutter` adds an error [m]."""
         felt, last = (None, None) if before is None else (before.felt, before.motion)
-        beside = self._beside(tracked, reference, time)
+        beside = self._find_tool(tracked, reference, time)
         if self.tool is None or beside is None:
             if self.motion.deformer is None:
-                return TrackingResult(time, TumourState.UNKNOWN, UNKNOWN, tracked, self.motion.rest, felt=felt)
+                return TrackingResult(time, TumourState.UNKNOWN, UNKNOWN_WARNING, tracked, self.motion.rest, felt=felt)
             if felt is None or last is None:
-                words = f"tool {self._late(time) or 'not seen yet'}: the tumour as in the scan"
+                words = f"tool {self._describe_age(time) or 'not seen yet'}: the tumour as in the scan"
                 return TrackingResult(time, TumourState.NO_TOOL, words, tracked, self.motion.rest)
-            words = f"tool {self._late(time) or 'lost'}: the tumour as {time - felt:.1f} s ago"
+            words = f"tool {self._describe_age(time) or 'lost'}: the tumour as {time - felt:.1f} s ago"
             return TrackingResult(time, TumourState.NO_TOOL, words, tracked, last, felt=felt)
         into = np.linalg.inv(self.registration.T_patient_scan)
         pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
         spread = compute_tip_covariance(self.registration, self.tool, beside) + (
-            LEVER * shutter / DEVIATIONS
+            TIP_FACTOR * shutter / BOUND_DEVIATIONS
         ) ** 2 * np.eye(3)
         motion = self.motion.compute_motion(pose, spread, last)
         moved = TumourState.GOOD if motion.moved > 0.0 else TumourState.REST
         state = TumourState.UNSURE if motion.doubt else moved if motion.known else TumourState.UNKNOWN
-        words = UNKNOWN if state is TumourState.UNKNOWN else motion.doubt
+        words = UNKNOWN_WARNING if state is TumourState.UNKNOWN else motion.doubt
         return TrackingResult(time, state, words, tracked, motion, None, pose, spread, felt=time)
 
-    def _beside(self, tracked: TrackedTargets, reference: Pose, time: float) -> Pose | None:
+    def _find_tool(self, tracked: TrackedTargets, reference: Pose, time: float) -> Pose | None:
         """Return the tool's cube relative to the reference."""
         if self.elsewhere is not None:
             return self.elsewhere.find_tool(time)
         cube = tracked.poses.get(TOOL)
         return None if cube is None else cube.transform_to(reference)
 
-    def _late(self, time: float) -> str:
+    def _describe_age(self, time: float) -> str:
         """Describe the age of an external tracker's poses, if they are missing; else empty."""
         age = None if self.elsewhere is None else self.elsewhere.compute_age(time)
         if self.elsewhere is None or age is None:
@@ -282,7 +290,7 @@ class Follower:
             return f"not known, {outside} (see --clock)"
         return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
 
-    def _band(
+    def _compute_band(
         self, reference: Pose, middle: np.ndarray, motion: BrainMotion, shutter: float
     ) -> tuple[float, dict[str, float]]:
         """Compute the error bound of the tumour's `middle` (3,) [m] across the line of sight, and its parts."""

@@ -11,7 +11,7 @@ from html import escape
 
 import numpy as np
 
-from ar.overlay.composite import DOUBTFUL
+from ar.overlay.composite import DOUBTFUL_COLOUR
 from ar.overlay.gauge import Gauge
 from ar.overlay.styles import Style
 from ar.page.browser import Browser
@@ -24,17 +24,17 @@ from ..page.view import STALE_COLOUR, build_brain, choose_viewpoint, list_orient
 from ..play.stage import TOOL_COLOUR, TUMOUR_COLOUR
 from ..play.waiting_notice import Busy
 from .beside import list_lines, render_slices, sample_of
-from .follower import GAP, SLOWEST, Follower, TrackingResult, TumourState
-from .picture import IN_GREY, Painter
+from .follower import MAX_GAP, MAX_INTERVAL, Follower, TrackingResult, TumourState
+from .picture import GREY_STATES, Painter
 from .run import Shown, Timed, overlay_one
 from .seekable_film import SeekableFilm
 from .words import describe_overlay, report
 
-FADED = 0.35  # Brightness factor of an outdated image.
-STAYS = 2.0  # Time for which the page stays after a failure [s].
-LOOKS = 0.03  # Polling interval of an idle page [s].
-UNPLUGGED = 1.0  # Time without an image after which a camera may be unplugged [s].
-KEPT = 20_000  # Number of results kept for a table and a summary, without their colours.
+FADED_BRIGHTNESS = 0.35  # Brightness factor of an outdated image.
+FAILURE_TIME = 2.0  # Time for which the page stays after a failure [s].
+POLL_INTERVAL = 0.03  # Polling interval of an idle page [s].
+UNPLUGGED_TIME = 1.0  # Time without an image after which a camera may be unplugged [s].
+MAX_KEPT_RESULTS = 20_000  # Number of results kept for a table and a summary, without their colours.
 
 
 @dataclass(eq=False)
@@ -66,7 +66,7 @@ class OverlayPage:
     browser: Browser = field(init=False)
     busy: Busy = field(init=False)
     history: History = field(init=False)
-    shown: deque[Shown] = field(default_factory=lambda: deque(maxlen=KEPT), init=False)
+    shown: deque[Shown] = field(default_factory=lambda: deque(maxlen=MAX_KEPT_RESULTS), init=False)
     # # Requests of users, written by the page's threads.
     plays: bool = field(default=True, init=False)
     style: Style = field(init=False)
@@ -77,7 +77,7 @@ class OverlayPage:
     newest: Shown | None = field(default=None, init=False)
     number: int = field(default=-1, init=False)
     # # Shortest interval between two images up to now [s].
-    interval: float = field(default=SLOWEST, init=False)
+    interval: float = field(default=MAX_INTERVAL, init=False)
     place: str = field(default="", init=False)
     drawn: tuple[str, ...] = field(default=(), init=False)
     tints: dict[str, tuple[float, float, float]] = field(default_factory=dict, init=False)
@@ -132,13 +132,13 @@ class OverlayPage:
         """
         due = clock.perf_counter()
         end, known = due + seconds, None
-        with self._failing(end):
+        with self._show_failure(end):
             while (now := clock.perf_counter()) < end:
                 self.browser.tell(lambda visitor: "")
-                wanted = self._wanted(film.count, now >= due)
+                wanted = self._find_next_number(film.count, now >= due)
                 if wanted is None:
-                    self._restyle()
-                    clock.sleep(LOOKS)
+                    self._draw_in_style()
+                    clock.sleep(POLL_INTERVAL)
                     continue
                 self.busy.begin_work(f"processing image {wanted}")
                 taken = film.read_image(wanted)
@@ -149,16 +149,16 @@ class OverlayPage:
                         self.sought.append(film.count - 1)
                     continue
                 before = known if wanted == self.number + 1 else None
-                one = overlay_one(taken, None, before, self.follower, self._painter())
+                one = overlay_one(taken, None, before, self.follower, self._build_painter())
                 self.busy.end_work()
                 apart = 0.0 if before is None else taken.picture.time - before.time
-                due = now + min(max(apart, 0.0), SLOWEST)
+                due = now + min(max(apart, 0.0), MAX_INTERVAL)
                 self.interval = min(self.interval, one.known.interval)
                 known = replace(one.known, interval=self.interval)
                 self._show(taken, one, wanted, f"image {wanted} of {film.count - 1}, {taken.picture.time:.2f} s")
         return list(self.shown)
 
-    def _wanted(self, count: int, due: bool) -> int | None:
+    def _find_next_number(self, count: int, due: bool) -> int | None:
         """Return the number of the image to be shown, if it is not the current one."""
         wanted, first = self.number, self.number < 0
         if self.sought:
@@ -179,42 +179,42 @@ class OverlayPage:
         """
         came = clock.perf_counter()
         end, known = came + seconds, None
-        with self._failing(end):
+        with self._show_failure(end):
             for picture in pictures:
                 now = clock.perf_counter()
                 if now >= end:
                     break
                 self.browser.tell(lambda visitor: "")
                 if not self.plays:
-                    self._fade("paused")
+                    self._mark_outdated("paused")
                 elif picture is None:
-                    self._silent(now - came)
+                    self._report_silence(now - came)
                 else:
-                    one = overlay_one(Timed(picture, False), 0.0, known, self.follower, self._painter())
+                    one = overlay_one(Timed(picture, False), 0.0, known, self.follower, self._build_painter())
                     known, came = one.known, now
                     self.browser.show_status("")
                     self._show(Timed(picture, False), one, 0, f"live from {self.name}")
         return list(self.shown)
 
-    def _silent(self, seconds: float) -> None:
+    def _report_silence(self, seconds: float) -> None:
         """Report that a camera has given no image for `seconds`."""
-        if seconds < UNPLUGGED:
-            self._fade(f"no image for {GAP:g} s")
+        if seconds < UNPLUGGED_TIME:
+            self._mark_outdated(f"no image for {MAX_GAP:g} s")
         else:
-            self._fade(f"no image for {seconds:.0f} s", f"Is {self.name} plugged in? This page waits for it.")
+            self._mark_outdated(f"no image for {seconds:.0f} s", f"Is {self.name} plugged in? This page waits for it.")
 
     @contextmanager
-    def _failing(self, end: float) -> Iterator[None]:
+    def _show_failure(self, end: float) -> Iterator[None]:
         """Say on the page, for a while, why it cannot go on."""
         try:
             yield
         except ValueError as error:
             self.busy.end_work()
-            self._fade(str(error))
-            clock.sleep(min(STAYS, max(0.0, end - clock.perf_counter())))
+            self._mark_outdated(str(error))
+            clock.sleep(min(FAILURE_TIME, max(0.0, end - clock.perf_counter())))
             raise
 
-    def _painter(self) -> Painter:
+    def _build_painter(self) -> Painter:
         """Return the painter with the requested style."""
         return replace(self.painter, style=self.style)
 
@@ -226,12 +226,12 @@ class OverlayPage:
         now = clock.monotonic()
         if number not in (before, before + 1):
             self.history.break_off(now)
-        self.history.add(sample_of(one.known, self._gauge(one.known), self.tooled, now))
+        self.history.add(sample_of(one.known, self._measure_gauge(one.known), self.tooled, now))
         self._draw(one)
 
-    def _gauge(self, known: TrackingResult) -> Gauge | None:
+    def _measure_gauge(self, known: TrackingResult) -> Gauge | None:
         """From tip to tumour, where both are known."""
-        if known.state in IN_GREY:
+        if known.state in GREY_STATES:
             return None
         return self.painter.measure_tip(known, self.painter.stage.build_tumour(known.motion.positions))
 
@@ -239,33 +239,33 @@ class OverlayPage:
         """Put an image, its text, bodies, slices and chart on the page."""
         known, look, painter = one.known, self.through, self.painter
         self.drawn = self.style, self.through
-        said = report(one, self._gauge(known), self.tooled, self.place)
+        said = report(one, self._measure_gauge(known), self.tooled, self.place)
         self.browser.show(max(self.number, 0), one.colour, said)
         self.browser.move("tumour", painter.stage.build_tumour(known.motion.positions).vertices)
-        grey = known.state in IN_GREY
-        self._tint("tumour", STALE_COLOUR if grey else TUMOUR_COLOUR if known.relied else DOUBTFUL)
+        grey = known.state in GREY_STATES
+        self._set_tint("tumour", STALE_COLOUR if grey else TUMOUR_COLOUR if known.relied else DOUBTFUL_COLOUR)
         tool = painter.build_tool_layer(known, cubed=False)
         if tool is not None:
             self.browser.move("tool", tool.vertices)
         if self.tooled:
-            self._tint("tool", STALE_COLOUR if grey or tool is None else TOOL_COLOUR)
+            self._set_tint("tool", STALE_COLOUR if grey or tool is None else TOOL_COLOUR)
         self.browser.show_beside(lambda: (render_slices(known, painter, look), self.history.draw_chart()))
 
-    def _tint(self, name: str, colour: tuple[float, float, float]) -> None:
+    def _set_tint(self, name: str, colour: tuple[float, float, float]) -> None:
         if self.tints.get(name) != colour:
             self.tints[name] = colour
             self.browser.tint(name, colour)
 
-    def _restyle(self) -> None:
+    def _draw_in_style(self) -> None:
         """Draw the same image in another style, if requested."""
         if self.newest is None or self.taken is None or self.drawn == (self.style, self.through):
             return
         assert self.taken.picture.colour is not None
-        colour = self._painter().paint(self.taken.picture.colour, self.newest.known).colour
+        colour = self._build_painter().paint(self.taken.picture.colour, self.newest.known).colour
         self.newest = replace(self.newest, colour=colour)
         self._draw(self.newest)
 
-    def _fade(self, why: str, hint: str = "") -> None:
+    def _mark_outdated(self, why: str, hint: str = "") -> None:
         """Mark the last image as old, unless it is marked already."""
         said = f"{why}: what is shown is old"
         if self.drawn == (said, self.style, self.through):
@@ -276,7 +276,9 @@ class OverlayPage:
         else:
             assert self.taken.picture.colour is not None
             known = replace(self.newest.known, state=TumourState.STALE, words=said)
-            dim = (FADED * self.taken.picture.colour).astype(np.uint8)
+            dim = (FADED_BRIGHTNESS * self.taken.picture.colour).astype(np.uint8)
             self.place = f"{hint} The last image" if hint else "the last image"
-            self._draw(replace(self.newest, known=known, colour=self._painter().paint(dim, known).colour, latency=None))
+            self._draw(
+                replace(self.newest, known=known, colour=self._build_painter().paint(dim, known).colour, latency=None)
+            )
         self.drawn = said, self.style, self.through

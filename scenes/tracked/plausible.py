@@ -12,10 +12,12 @@ from sim.geometry.surface import is_enclosing
 from ..play.stage import Stage
 from .tracked_tool import TrackedTool
 
-REACH = 0.3  # Largest distance of a reference from the craniotomy [m].
-NEAR = 0.2  # Distance from the head within which a tool in use comes at some time [m].
-DEEP = 0.03  # Largest depth of a tool's tip or markers inside the brain [m]: no model includes such a cut.
-FAR = 1.0  # Largest distance of a laid-down tool from the head [m]: beyond, no tracker of this patient sees it.
+MAX_REFERENCE_DISTANCE = 0.3  # Largest distance of a reference from the craniotomy [m].
+NEAR_DISTANCE = 0.2  # Distance from the head within which a tool in use comes at some time [m].
+MAX_TOOL_DEPTH = 0.03  # Largest depth of a tool's tip or markers inside the brain [m]: no model includes such a cut.
+MAX_TOOL_DISTANCE = (
+    1.0  # Largest distance of a laid-down tool from the head [m]: beyond, no tracker of this patient sees it.
+)
 
 
 def describe_implausible(registration: Registration, stage: Stage, camera: Camera) -> str:
@@ -23,7 +25,7 @@ def describe_implausible(registration: Registration, stage: Stage, camera: Camer
     opening = stage.site.origin
     middle = 0.5 * np.array([*build_patient_reference().faces[0].size, 0.0])
     away = float(np.linalg.norm(registration.point(opening)[0] - middle))
-    if away > REACH:
+    if away > MAX_REFERENCE_DISTANCE:
         return f"the registration has the opening {1e3 * away:.0f} mm from the reference: is it another patient's?"
     if camera.to_camera_frame(opening[None])[0, 2] <= 0.0:
         return "the registration has the opening behind the camera: is it another patient's?"
@@ -43,7 +45,7 @@ def describe_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stag
     for what, place in (("tip", np.zeros(3)), ("markers", np.linalg.inv(tool.T_cube_tool)[:3, 3])):
         point = T_scan_tool[:3, :3] @ place + T_scan_tool[:3, 3]
         depth = float(np.linalg.norm(corners.reshape(-1, 3) - point, axis=1).min())
-        if depth > DEEP and is_enclosing(corners, point):
+        if depth > MAX_TOOL_DEPTH and is_enclosing(corners, point):
             return f"the tool's {what} would be {1e3 * depth:.0f} mm deep in the brain"
     return ""
 
@@ -56,11 +58,11 @@ def describe_misplaced_tool(
     `near`: True if it was near before; `theirs`: question about the possible cause.
     """
     away = from_head(T_scan_tool[:3, 3], stage)
-    near = near or away <= NEAR
+    near = near or away <= NEAR_DISTANCE
     if not near:
-        never = f"the tool is {1e3 * away:.0f} mm from the head, and was never nearer than {1e3 * NEAR:.0f}"
+        never = f"the tool is {1e3 * away:.0f} mm from the head, and was never nearer than {1e3 * NEAR_DISTANCE:.0f}"
         return f"{never}: {theirs}", near
-    if away > FAR:
+    if away > MAX_TOOL_DISTANCE:
         return f"the tool is {away:.1f} m from the head, which is not plausible: {theirs}", near
     deep = "" if tool is None else describe_penetration(tool, T_scan_tool, stage)
     return f"{deep}: {theirs}" if deep else "", near

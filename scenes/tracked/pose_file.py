@@ -25,17 +25,17 @@ TIP, TIP_DEVIATION = ("tip_x_mm", "tip_y_mm", "tip_z_mm"), "tip_off_mm"  # Colum
 # Column names: upper triangle of the covariance.
 COVARIANCE = tuple(f"cov_{row}{column}" for row in range(6) for column in range(row, 6))
 # Column names: number of corners, residual, computing time, coordinate system.
-LAST = ("corners", "residual_px", "ms", "frame")
+LAST_COLUMNS = ("corners", "residual_px", "ms", "frame")
 CAMERA = "camera: x right, y down, z forward"  # Description of the camera's coordinate system.
 # Columns with the status of a body: whether the tracker saw it.
 STATUS = "state", "valid", "visible", "tracked", "seen"
 # Values of the status columns of a body that the tracker saw.
-SEEN = "ok", "good", "seen", "valid", "visible", "tracked", "tracking", "true", "yes", "1", "1.0"
-MOST_WORDS = 3  # Number of kinds of unseen rows that a warning names.
-ROUNDED = 0.01  # Tolerance of a quaternion's length from 1.
-FARTHEST = 100.0  # Largest distance of a position from the origin along an axis [m].
+SEEN_VALUES = "ok", "good", "seen", "valid", "visible", "tracked", "tracking", "true", "yes", "1", "1.0"
+MAX_NAMED_KINDS = 3  # Number of kinds of unseen rows that a warning names.
+QUATERNION_TOLERANCE = 0.01  # Tolerance of a quaternion's length from 1.
+MAX_COORDINATE = 100.0  # Largest distance of a position from the origin along an axis [m].
 UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres and radians to millimetres and radians.
-USUAL = 0.25e-3, float(np.radians(0.1))
+USUAL_DEVIATIONS = 0.25e-3, float(np.radians(0.1))
 """Standard deviations of a tracker that reports none, along and about each axis [m], [rad]."""
 
 
@@ -77,7 +77,7 @@ def read_stream(path: str | Path) -> PoseStream:
     """
     times, poses, covariances = _read(path)
     kept = ~np.isnan(poses[:, 0, 0])
-    if not _are_covariances(covariances[kept]):
+    if not _is_valid_covariance(covariances[kept]):
         raise InputError(f"{path}: has a covariance that is none: mend it, or leave its columns out.")
     try:
         return build_pose_stream(times[kept], poses[kept], covariances[kept])
@@ -98,7 +98,7 @@ def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         for name in with_errors[1:8]:
             columns[name][rows] = np.nan
     if unseen.total():
-        named = dict(unseen.most_common(MOST_WORDS))
+        named = dict(unseen.most_common(MAX_NAMED_KINDS))
         named["other"] = unseen.total() - sum(named.values())
         counted = ", ".join(f"{count} {what}" for what, count in named.items() if count)
         warnings.warn(
@@ -109,14 +109,14 @@ def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if len(odd):
         raise InputError(f"{path}: row {odd[0] + 2} has a part of a pose: fill it in, or leave all of it blank.")
     places = 1e-3 * np.column_stack([columns[name] for name in PLACE])
-    far = np.flatnonzero((np.abs(places) > FARTHEST).any(axis=1))
+    far = np.flatnonzero((np.abs(places) > MAX_COORDINATE).any(axis=1))
     if len(far):
         raise InputError(
-            f"{path}: row {far[0] + 2} is farther than {FARTHEST:.0f} m from the tracker: give millimetres."
+            f"{path}: row {far[0] + 2} is farther than {MAX_COORDINATE:.0f} m from the tracker: give millimetres."
         )
     turns, kept = np.column_stack([columns[name] for name in TURN]), ~blank.any(axis=0)
     lengths = np.linalg.norm(turns, axis=1)
-    odd = np.flatnonzero(kept & ~(np.abs(lengths - 1.0) <= ROUNDED))
+    odd = np.flatnonzero(kept & ~(np.abs(lengths - 1.0) <= QUATERNION_TOLERANCE))
     if len(odd):
         raise InputError(
             f"{path}: row {odd[0] + 2} has a quaternion of length {lengths[odd[0]]:.3g}: give qx,qy,qz,qw of length 1."
@@ -125,30 +125,30 @@ def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     poses[kept] = np.eye(4)
     poses[kept, :3, :3] = Rotation.from_quat(turns[kept]).as_matrix()
     poses[kept, :3, 3] = places[kept]
-    return columns[TIME], poses, _covariances(columns, len(turns))
+    return columns[TIME], poses, _read_covariances(columns, len(turns))
 
 
 def _is_unseen(cells: Mapping[str, str], unseen: Counter[str]) -> bool:
     """Return True if a row (cells by column) has a pose that the tracker did not see, and count it by its reason."""
     pose = {cells[name].strip().casefold() for name in (*PLACE, *TURN)}
     status = {name: cell.strip() for name, cell in cells.items() if name in STATUS or name.endswith("status")}
-    why = [f"{name} {cell[:20]!r}" for name, cell in status.items() if cell.casefold() not in SEEN]
+    why = [f"{name} {cell[:20]!r}" for name, cell in status.items() if cell.casefold() not in SEEN_VALUES]
     why += ["nan"] if pose == {"nan"} else []
     unseen.update(why[:1] if pose != {""} else [])
     return bool(why)
 
 
-def _covariances(columns: dict[str, np.ndarray], count: int) -> np.ndarray:
+def _read_covariances(columns: dict[str, np.ndarray], count: int) -> np.ndarray:
     """Covariances (n, 6, 6) [m], [rad], of `write_poses`'s columns, or the usual one."""
     if COVARIANCE[0] not in columns:
-        return np.tile(np.diag(np.repeat(np.square(USUAL), 3)), (count, 1, 1))
+        return np.tile(np.diag(np.repeat(np.square(USUAL_DEVIATIONS), 3)), (count, 1, 1))
     upper = np.zeros((count, 6, 6))
     upper[(slice(None), *np.triu_indices(6))] = np.column_stack([columns[name] for name in COVARIANCE])
     whole = upper + np.triu(upper, 1).transpose(0, 2, 1)
     return whole / np.outer(UNITS, UNITS)
 
 
-def _are_covariances(matrices: np.ndarray) -> bool:
+def _is_valid_covariance(matrices: np.ndarray) -> bool:
     """Return True if symmetric matrices (n, 6, 6) are finite and positive semi-definite, within file rounding."""
     if not np.isfinite(matrices).all():
         return False
@@ -178,16 +178,16 @@ def write_poses(path: Path, rows: Iterable[TrackedRow], tip: np.ndarray) -> None
     """
     with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
-        table.writerow((TIME, "state", *PLACE, *TURN, *TIP, TIP_DEVIATION, *COVARIANCE, *LAST))
+        table.writerow((TIME, "state", *PLACE, *TURN, *TIP, TIP_DEVIATION, *COVARIANCE, *LAST_COLUMNS))
         for row in rows:
             end = f"{1e3 * row.seconds:.2f}", CAMERA
             cells = [""] * (len(PLACE) + len(TURN) + len(TIP) + 1 + len(COVARIANCE) + 2)
             if row.pose is not None:
-                cells = [*_of_pose(row.pose, tip), str(row.pose.corners), f"{row.pose.residual:.3f}"]
+                cells = [*_format_pose(row.pose, tip), str(row.pose.corners), f"{row.pose.residual:.3f}"]
             table.writerow((f"{row.time:.6f}", row.verdict.name.lower(), *cells, *end))
 
 
-def _of_pose(pose: Pose, tip: np.ndarray) -> list[str]:
+def _format_pose(pose: Pose, tip: np.ndarray) -> list[str]:
     """Format position, rotation, tip with its root mean square error, and covariance."""
     T = pose.T_camera_target
     at, spread = pose.point(tip)

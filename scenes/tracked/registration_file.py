@@ -12,15 +12,17 @@ from ar.tracking.rigid import is_rigid
 from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.file_limits import FARTHEST
+from sim.runtime.file_limits import MAX_COORDINATE
 from sim.runtime.outside_files import read_as, to_path
 
 FORMAT = "sulcus registration 1"  # Name and version of the file format.
-WANTED = "Make one by `sulcus register`."  # Remedy in error messages.
-LARGEST = 1 << 16  # Maximum size of a valid file [bytes].
-RIGID = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles.
-ROUNDING = 1e-9  # Share of its largest eigenvalue by which a covariance's smallest may be below 0, by rounding.
-SAME = 5e-3  # Largest difference of bounds and tumour between two meshes of one scan [m].
+REMEDY = "Make one by `sulcus register`."  # Remedy in error messages.
+MAX_FILE_BYTES = 1 << 16  # Maximum size of a valid file [bytes].
+ROTATION_TOLERANCE = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles.
+EIGENVALUE_TOLERANCE = (
+    1e-9  # Share of its largest eigenvalue by which a covariance's smallest may be below 0, by rounding.
+)
+SCAN_TOLERANCE = 5e-3  # Largest difference of bounds and tumour between two meshes of one scan [m].
 _UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres and radians to millimetres and radians.
 
 
@@ -37,32 +39,32 @@ def read_registration(path: str | Path) -> Registration:
     """
     path = to_path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file. {WANTED}")
-    with read_as(path, "a registration", WANTED):
-        if path.stat().st_size > LARGEST:
-            raise InputError(f"is larger than a registration. {WANTED}")
+        raise InputError(f"{path}: no such file. {REMEDY}")
+    with read_as(path, "a registration", REMEDY):
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError(f"is larger than a registration. {REMEDY}")
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
         if stored.get("format") != FORMAT:
-            raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
+            raise InputError(f"its format is not {FORMAT!r}. {REMEDY}")
         T, covariance, centre = (
             np.array(stored[name], float) for name in ("T_patient_scan_mm", "covariance", "centre_mm")
         )
         if T.shape != (4, 4) or covariance.shape != (6, 6) or centre.shape != (3,):
             raise InputError("its numbers have other shapes than 4 x 4, 6 x 6 and 3.")
         T[:3, 3], centre, covariance = 1e-3 * T[:3, 3], 1e-3 * centre, covariance / np.outer(_UNITS, _UNITS)
-        if not is_rigid(T, RIGID):
+        if not is_rigid(T, ROTATION_TOLERANCE):
             raise InputError("T_patient_scan_mm is no rigid motion: rows of a rotation, and a shift in millimetres.")
-        _demand_covariance(covariance)
-        if not (np.abs([*T[:3, 3], *centre]) <= FARTHEST).all():
-            raise InputError(f"its shift or its centre is not within {FARTHEST:g} m: numbers are in millimetres.")
+        _check_covariance(covariance)
+        if not (np.abs([*T[:3, 3], *centre]) <= MAX_COORDINATE).all():
+            raise InputError(f"its shift or its centre is not within {MAX_COORDINATE:g} m: numbers are in millimetres.")
         counts = int(stored["pairs"]), int(stored["surface"])
-        scanned = _scanned(stored["scanned"]) if "scanned" in stored else None
+        scanned = _read_scanned(stored["scanned"]) if "scanned" in stored else None
         return Registration(T, covariance, centre, 1e-3 * float(stored["rms_mm"]), *counts, scanned)
 
 
-def _scanned(stored: dict) -> Scanned:
+def _read_scanned(stored: dict) -> Scanned:
     bounds, target = 1e-3 * np.array(stored["bounds_mm"], float), 1e-3 * np.array(stored["tumour_mm"], float)
-    if bounds.shape != (2, 3) or target.shape != (3,) or not (np.abs([*bounds, target]) <= FARTHEST).all():
+    if bounds.shape != (2, 3) or target.shape != (3,) or not (np.abs([*bounds, target]) <= MAX_COORDINATE).all():
         raise InputError("what it was made for has other numbers than bounds 2 x 3 and a tumour's middle of 3.")
     return Scanned(str(stored["anatomy"]), bounds, target)
 
@@ -93,7 +95,7 @@ def describe_other_mesh(registration: Registration, anatomy: Anatomy, path: str 
         )
     if made.digest == here.digest:
         return ""
-    if made.compute_distance(here) > SAME:
+    if made.compute_distance(here) > SCAN_TOLERANCE:
         raise InputError(
             f"{path}: was made for another anatomy: bounds or tumour are {1e3 * made.compute_distance(here):.0f} mm "
             "from those of this one. Give the --anatomy that was registered, or register this one."
@@ -101,10 +103,14 @@ def describe_other_mesh(registration: Registration, anatomy: Anatomy, path: str 
     return f"{path} was made for another mesh of what seems to be the same scan"
 
 
-def _demand_covariance(covariance: np.ndarray) -> None:
-    finite = (np.abs(covariance) <= FARTHEST**2).all()
+def _check_covariance(covariance: np.ndarray) -> None:
+    finite = (np.abs(covariance) <= MAX_COORDINATE**2).all()
     values = np.linalg.eigvalsh(covariance) if finite else np.array([-1.0])
-    if not finite or not np.allclose(covariance, covariance.T) or values[0] < -ROUNDING * max(values[-1], 0.0):
+    if (
+        not finite
+        or not np.allclose(covariance, covariance.T)
+        or values[0] < -EIGENVALUE_TOLERANCE * max(values[-1], 0.0)
+    ):
         raise InputError("covariance is no covariance: it is symmetric, finite, and nowhere negative.")
 
 

@@ -13,16 +13,18 @@ import numpy as np
 
 from ar.tracking.drawn import read_stamp
 from ar.tracking.pictures import Named
-from ar.tracking.pose_stream import DAY
+from ar.tracking.pose_stream import DAY_SECONDS
 from sim.runtime.atomic_files import write_atomically
 
 from .follower import Follower, TrackingResult, TumourState
 from .picture import Painter
 from .truth import OverlayError
 
-EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)  # Edges of the histogram of latencies [ms].
-OLD = 0.2  # Age at which an image is stale [s].
-FAINT = 32  # Smallest grey level of an occluder in a mask video, where black is not exactly 0; in a mask PNG it is 1.
+LATENCY_EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)  # Edges of the histogram of latencies [ms].
+STALE_AGE = 0.2  # Age at which an image is stale [s].
+MIN_OCCLUDER_GREY = (
+    32  # Smallest grey level of an occluder in a mask video, where black is not exactly 0; in a mask PNG it is 1.
+)
 # Column names of the table of results.
 COLUMNS = (
     "time_s", "state", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", "motion_off_mm", "within_mm",
@@ -95,8 +97,8 @@ def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> I
         covered = None if masks is None else _mask(masks, picture, number)
         stamp = read_stamp(picture.grey)
         time = days + (picture.time if stamp is None else stamp)
-        if time < before - 0.5 * DAY:
-            time, days = time + DAY, days + DAY
+        if time < before - 0.5 * DAY_SECONDS:
+            time, days = time + DAY_SECONDS, days + DAY_SECONDS
         before = time
         yield Timed(replace(picture, time=time), stamp is not None, covered)
     if masks is not None and next(masks, None) is not None:
@@ -110,7 +112,7 @@ def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
         raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each image, in order.")
     if mask.grey.shape != picture.grey.shape:
         raise ValueError(f"the mask {mask.name} is {mask.grey.shape}, its image {picture.grey.shape}.")
-    return mask.grey >= (1 if mask.name.lower().endswith(".png") else FAINT)
+    return mask.grey >= (1 if mask.name.lower().endswith(".png") else MIN_OCCLUDER_GREY)
 
 
 def pace_images(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
@@ -171,7 +173,7 @@ def overlay_one(
 
 def to_aged(known: TrackingResult, age: float) -> TrackingResult:
     """Return the result of an image of the given age [s]: it is stale beyond `OLD`."""
-    if age <= OLD or not known.relied:
+    if age <= STALE_AGE or not known.relied:
         return known
     return replace(known, state=TumourState.STALE, words=f"stale, the image is {age:.1f} s old: do not rely on it")
 
@@ -180,8 +182,8 @@ def summarise_latencies(shown: list[Shown]) -> dict[str, object]:
     """Compute median, 95th percentile and histogram [ms] of the latency of live images, or else of processing times."""
     live = [each.latency for each in shown if each.latency is not None]
     milliseconds = 1e3 * np.array(live or [each.seconds for each in shown])
-    counts = np.histogram(milliseconds, [*EDGES, np.inf])[0]
-    names = [*(f"{low}-{high}" for low, high in pairwise(EDGES)), f"over {EDGES[-1]}"]
+    counts = np.histogram(milliseconds, [*LATENCY_EDGES, np.inf])[0]
+    names = [*(f"{low}-{high}" for low, high in pairwise(LATENCY_EDGES)), f"over {LATENCY_EDGES[-1]}"]
     return {
         "what": "from the image's time to its overlay" if live else "from the image's arrival to its overlay",
         "time_from": "pixels" if all(each.stamped for each in shown) else "the source",
@@ -201,10 +203,10 @@ def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[OverlayError
     with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)
-        table.writerows(_row(each, error) for each, error in zip(shown, errors, strict=True))
+        table.writerows(_format_row(each, error) for each, error in zip(shown, errors, strict=True))
 
 
-def _row(shown: Shown, error: OverlayError | None) -> list[str]:
+def _format_row(shown: Shown, error: OverlayError | None) -> list[str]:
     known = shown.known
     placed = known.camera is not None
     lengths: list[float | None] = [*shown.middle, known.motion.moved if known.motion.known else None]
@@ -213,14 +215,14 @@ def _row(shown: Shown, error: OverlayError | None) -> list[str]:
         known.band,
         *(known.parts.get(name) for name in ("tracking", "camera", "registration", "tool", "model", "shutter")),
     ]
-    cells = [_number(None if value is None or not placed else 1e3 * value) for value in lengths]
+    cells = [_format_number(None if value is None or not placed else 1e3 * value) for value in lengths]
     late = None if shown.latency is None else 1e3 * shown.latency
     against = (None,) * 4 if error is None else (error.outline, error.overlap, 1e3 * error.middle, 1e3 * error.worst)
     return [
-        f"{known.time:.6f}", known.state.name.lower(), *cells, f"{1e3 * shown.seconds:.1f}", _number(late, 1),
-        known.words, *(_number(value, 3) for value in against), "RAS",
+        f"{known.time:.6f}", known.state.name.lower(), *cells, f"{1e3 * shown.seconds:.1f}", _format_number(late, 1),
+        known.words, *(_format_number(value, 3) for value in against), "RAS",
     ]  # fmt: skip
 
 
-def _number(value: float | None, digits: int = 4) -> str:
+def _format_number(value: float | None, digits: int = 4) -> str:
     return "" if value is None else f"{value:.{digits}f}"

@@ -14,10 +14,12 @@ from surrogate.model.learned import Learned
 
 from ..play.frame_text import describe_outcome
 from ..play.stage import Stage
-from ..script.uncertainty import DEVIATIONS
+from ..script.uncertainty import BOUND_DEVIATIONS
 
-UNBOUND = "the model states no error: do not rely on it"  # Warning in the image.
-REFUSED = "the tool is farther inside the brain than the model knows: do not rely on it"  # Warning in the image.
+NO_ERROR_WARNING = "the model states no error: do not rely on it"  # Warning in the image.
+TOO_DEEP_WARNING = (
+    "the tool is farther inside the brain than the model knows: do not rely on it"  # Warning in the image.
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +79,12 @@ class ToolMotion:
             return self.rest
         deviation = float(np.sqrt(max(np.linalg.eigvalsh(tip_covariance)[-1], 0.0)))
         deeper = T_scan_tool.copy()
-        deeper[:3, 3] += DEVIATIONS * deviation * self.stage.site.axis
+        deeper[:3, 3] += BOUND_DEVIATIONS * deviation * self.stage.site.axis
         start = None if before is None else before.answer
         try:
-            answer, further = self._answers(T_scan_tool, deeper, start)
+            answer, further = self._solve_poses(T_scan_tool, deeper, start)
         except InputError:
-            return BrainMotion(self.rest.positions, doubt=REFUSED)
+            return BrainMotion(self.rest.positions, doubt=TOO_DEEP_WARNING)
         vertices, rest = self.stage.tumour_vertices, self.rest.positions
         moved, beyond = (each.restrict(vertices).displacement[0] for each in (answer, further))
         positions, doubt = rest.copy(), describe_outcome(answer.outcome[0])
@@ -90,7 +92,7 @@ class ToolMotion:
         model = find_first_model(self.deformer, answer)
         bound = 0.0 if model is None else float(answer.bound[0, 0])
         if model is not None and not np.isfinite(bound):
-            bound, doubt = (model.bound, doubt) if np.isfinite(model.bound) else (0.0, doubt or UNBOUND)
+            bound, doubt = (model.bound, doubt) if np.isfinite(model.bound) else (0.0, doubt or NO_ERROR_WARNING)
         return BrainMotion(
             positions,
             True,
@@ -101,7 +103,7 @@ class ToolMotion:
             answer,
         )
 
-    def _answers(
+    def _solve_poses(
         self, pose: np.ndarray, deeper: np.ndarray, start: Deformation | None
     ) -> tuple[Deformation, Deformation]:
         """Compute the solutions of both poses; FEM starts from the last one."""

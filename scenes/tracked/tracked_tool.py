@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ar.tracking.rigid import is_rigid
-from ar.tracking.targets import TIP, build_tool_cube
+from ar.tracking.targets import TIP_DISTANCE, build_tool_cube
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as, to_path
@@ -20,16 +20,16 @@ from ..script.tool import add_shaft
 
 FORMAT = "sulcus tool 1"  # Name and version of the file format.
 # Remedy in error messages.
-WANTED = "Give a tool of `sulcus film`, or one with format, shape, T_cube_tool and tip_covariance_mm2."
-LONGEST = 100_000  # Maximum size of a tool's file [bytes].
-SQUARE = 1e-3  # Tolerance of a rotation's rows from orthonormality.
-FARTHEST = 1.0  # Largest distance of a tool's tip from its cube [m].
+REMEDY = "Give a tool of `sulcus film`, or one with format, shape, T_cube_tool and tip_covariance_mm2."
+MAX_FILE_BYTES = 100_000  # Maximum size of a tool's file [bytes].
+ROTATION_TOLERANCE = 1e-3  # Tolerance of a rotation's rows from orthonormality.
+MAX_TIP_DISTANCE = 1.0  # Largest distance of a tool's tip from its cube [m].
 
 
 def build_nominal_cube() -> np.ndarray:
     """Build T_cube_tool (4, 4) of a cube whose axes are the tool's, with the tip below its centre."""
     T = np.eye(4)
-    T[2, 3] = -TIP
+    T[2, 3] = -TIP_DISTANCE
     return T
 
 
@@ -63,7 +63,7 @@ class TrackedTool:
         Only the printed faces are included, with their borders.
         """
         T_tool_cube, (vertices, triangles) = np.linalg.inv(self.T_cube_tool), self.bare
-        box, sides = _cube()
+        box, sides = _build_cube()
         at = box @ T_tool_cube[:3, :3].T + T_tool_cube[:3, 3]
         return np.concatenate([vertices, at]), np.concatenate([triangles, sides + len(vertices)])
 
@@ -73,7 +73,7 @@ class TrackedTool:
         return vertices @ T_scan_tool[:3, :3].T + T_scan_tool[:3, 3], triangles
 
 
-def _cube() -> tuple[np.ndarray, np.ndarray]:
+def _build_cube() -> tuple[np.ndarray, np.ndarray]:
     """Return the printed cube as a box in its own frame: corners (8, 3) [m], and triangles (12, 3)."""
     half = float(max(abs(face.T_target_face[:3, 3]).max() for face in build_tool_cube().faces))
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -91,27 +91,31 @@ def read_tool(path: str | Path) -> TrackedTool:
         A missing or invalid file; an invalid shape, or a transform that is not rigid.
     """
     path = to_path(path)
-    with read_as(path, "a tracked tool", WANTED):
+    with read_as(path, "a tracked tool", REMEDY):
         with path.open("rb") as file:
-            stored = json.loads(file.read(LONGEST))
+            stored = json.loads(file.read(MAX_FILE_BYTES))
         if stored["format"] != FORMAT:
-            raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
+            raise InputError(f"its format is not {FORMAT!r}. {REMEDY}")
         T, covariance = np.array(stored["T_cube_tool"], float), np.array(stored["tip_covariance_mm2"], float)
         T[:3, 3] *= 1e-3
-        _demand_rigid(T)
-        if covariance.shape != (3, 3) or not np.isfinite(covariance).all() or _least(covariance) < -1e-9:
-            raise InputError(f"tip_covariance_mm2 is no covariance (3, 3). {WANTED}")
+        _check_rigid(T)
+        if (
+            covariance.shape != (3, 3)
+            or not np.isfinite(covariance).all()
+            or _compute_min_eigenvalue(covariance) < -1e-9
+        ):
+            raise InputError(f"tip_covariance_mm2 is no covariance (3, 3). {REMEDY}")
         return TrackedTool(parse_tool(str(stored["shape"])), T, 1e-6 * covariance)
 
 
-def _least(matrix: np.ndarray) -> float:
+def _compute_min_eigenvalue(matrix: np.ndarray) -> float:
     return float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0])
 
 
-def _demand_rigid(T: np.ndarray) -> None:
-    if not is_rigid(T, SQUARE):
-        raise InputError(f"T_cube_tool is no rigid transform (4, 4). {WANTED}")
-    if np.linalg.norm(T[:3, 3]) > FARTHEST:
+def _check_rigid(T: np.ndarray) -> None:
+    if not is_rigid(T, ROTATION_TOLERANCE):
+        raise InputError(f"T_cube_tool is no rigid transform (4, 4). {REMEDY}")
+    if np.linalg.norm(T[:3, 3]) > MAX_TIP_DISTANCE:
         raise InputError("T_cube_tool has the tip farther than 1 m from the cube: give millimetres.")
 
 

@@ -8,28 +8,30 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from ar.overlay.composite import HIDDEN, WARNING, format_warning
-from ar.overlay.hud import FINE, WHITE
+from ar.overlay.composite import HIDDEN_STROKES, WARNING_COLOUR, format_warning
+from ar.overlay.hud import TEXT_SCALE, WHITE
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text, measure_outline_gap
 from ar.overlay.styles import Style
 
-from ..play.picture_checks import SOFT
+from ..play.picture_checks import SOFT_LENGTH
 from ..play.stage import TUMOUR_COLOUR
 from .drawn_film import DrawnFilm
 from .filming import VideoFrame, register_with_error
 from .follower import Follower, TrackingResult
 from .picture import Painter
-from .run import OLD, Timed, overlay_one
+from .run import STALE_AGE, Timed, overlay_one
 from .tool_motion import ToolMotion
 
-BACK = 3  # Maximum number of images until a returned target is found: lost ones are searched in every third image.
-OFF = 2.0  # Maximum error of a drawn outline [pixel].
-NO_LINE = 5  # Number of pixels of an outline's colour below which there is no line.
-WORDS = {"reference": "reference lost", "tool": "tool lost"}  # Text required in an image, by covered target.
-STALE = "stale"  # Text required in a stale image.
-REPEATED = 0.1  # Time of the repeated image [s].
-DELAYED = 0.2  # Time of the delayed image [s].
-LATE = 2.5 * OLD  # Delay of the delayed image [s].
+MAX_SEARCH_IMAGES = (
+    3  # Maximum number of images until a returned target is found: lost ones are searched in every third image.
+)
+MAX_OUTLINE_ERROR = 2.0  # Maximum error of a drawn outline [pixel].
+MIN_LINE_PIXELS = 5  # Number of pixels of an outline's colour below which there is no line.
+LOST_TEXTS = {"reference": "reference lost", "tool": "tool lost"}  # Text required in an image, by covered target.
+STALE_TEXT = "stale"  # Text required in a stale image.
+REPEATED_TIME = 0.1  # Time of the repeated image [s].
+DELAYED_TIME = 0.2  # Time of the delayed image [s].
+IMAGE_DELAY = 2.5 * STALE_AGE  # Delay of the delayed image [s].
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,10 @@ class TrackingFigures:
         rules = {
             f"{self.confident} images draw a lost or old position as if it were known": self.confident == 0,
             f"{self.unsaid} images do not say that something is lost or old": self.unsaid == 0,
-            f"the tumour is back after {self.back:g} images, more than {BACK}": self.back <= BACK,
-            f"a place drawn as known is {self.off:.1f} pixels off, more than {OFF:g}": self.off <= OFF,
+            f"the tumour is back after {self.back:g} images, more than {MAX_SEARCH_IMAGES}": self.back
+            <= MAX_SEARCH_IMAGES,
+            f"a place drawn as known is {self.off:.1f} pixels off, more than {MAX_OUTLINE_ERROR:g}": self.off
+            <= MAX_OUTLINE_ERROR,
         }
         return [sentence for sentence, kept in rules.items() if not kept]
 
@@ -86,13 +90,13 @@ def replay_events(film: DrawnFilm) -> Iterator[Event]:
     before = 0.0
     for shot in film.shots:
         covered = film.taking.list_disturbances(shot.time)
-        words = next((WORDS[kind] for kind in WORDS if kind in covered), "")
-        if shot.time - before > OLD:
-            words = STALE
-        late = LATE if np.isclose(shot.time, DELAYED) else 0.0
-        yield Event(shot, late, STALE if late else words)
-        if np.isclose(shot.time, REPEATED):
-            yield Event(shot, words=STALE)
+        words = next((LOST_TEXTS[kind] for kind in LOST_TEXTS if kind in covered), "")
+        if shot.time - before > STALE_AGE:
+            words = STALE_TEXT
+        late = IMAGE_DELAY if np.isclose(shot.time, DELAYED_TIME) else 0.0
+        yield Event(shot, late, STALE_TEXT if late else words)
+        if np.isclose(shot.time, REPEATED_TIME):
+            yield Event(shot, words=STALE_TEXT)
         before = shot.time
 
 
@@ -113,10 +117,10 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
         begun = clock.perf_counter() - event.shot.time - event.late if event.late else None
         shown = overlay_one(Timed(film.get_image(event.shot), True), begun, known, follower, painter)
         known = shown.known
-        drawn = bool(np.count_nonzero(find_ink(shown.colour, compute_ink(TUMOUR_COLOUR))) >= NO_LINE)
+        drawn = bool(np.count_nonzero(find_ink(shown.colour, compute_ink(TUMOUR_COLOUR))) >= MIN_LINE_PIXELS)
         if event.words:
             confident += drawn
-            unsaid += not _says(shown.colour, known.words, event.words)
+            unsaid += not _has_warning(shown.colour, known.words, event.words)
             waits += [] if waiting else [0]
             waiting = True
             continue
@@ -124,20 +128,24 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
             waits[-1] += 1
         waiting = waiting and not drawn
         if drawn:
-            worst = max(worst, _off(film, event.shot, shown.colour))
+            worst = max(worst, _measure_outline_error(film, event.shot, shown.colour))
     return TrackingFigures(count, confident, unsaid, np.inf if waiting else max(waits), worst)
 
 
-def _says(colour: np.ndarray, words: str, wanted: str) -> bool:
+def _has_warning(colour: np.ndarray, words: str, wanted: str) -> bool:
     """Return True if text that begins as wanted is found in an image."""
     lines = format_warning(words, colour.shape[1])
-    return words.startswith(wanted) and all(has_text(colour, line, FINE, compute_ink(WARNING)) for line in lines)
+    return words.startswith(wanted) and all(
+        has_text(colour, line, TEXT_SCALE, compute_ink(WARNING_COLOUR)) for line in lines
+    )
 
 
-def _off(film: DrawnFilm, shot: VideoFrame, colour: np.ndarray) -> float:
+def _measure_outline_error(film: DrawnFilm, shot: VideoFrame, colour: np.ndarray) -> float:
     """Compute the distance between the outline in an image and the true one [pixel]."""
     camera, rest = film.calibration.build_camera(shot.T_camera_scan), film.stage.tumour_at_rest
     mask = compute_silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
     tool = compute_silhouette(camera, *film.mounts.tool.build_surface(shot.T_scan_tool))
     words = find_ink(colour, WHITE, 0)
-    return measure_outline_gap(colour, compute_ink(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN[1] + SOFT)
+    return measure_outline_gap(
+        colour, compute_ink(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN_STROKES[1] + SOFT_LENGTH
+    )

@@ -15,7 +15,7 @@ from ar.optics.calibration import Calibration
 from ar.overlay.outlines import compute_iou, compute_silhouette
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.file_limits import LARGEST_FILM
+from sim.runtime.file_limits import MAX_TRUTH_BYTES
 from sim.runtime.outside_files import read_as, to_path
 from surrogate.model.npz_archive import Archive
 
@@ -23,10 +23,10 @@ from ..play.stage import Stage
 from .follower import TrackingResult
 
 FORMAT = "sulcus film 1"  # Name and version of the file format.
-WANTED = "Give the truth.npz that `sulcus film` wrote."  # Remedy in error messages.
-COLUMNS = ("T_camera_scan", "T_scan_tool")  # Arrays of poses.
+REMEDY = "Give the truth.npz that `sulcus film` wrote."  # Remedy in error messages.
+POSE_ARRAYS = ("T_camera_scan", "T_scan_tool")  # Arrays of poses.
 SPACES = {"scan": "RAS [m]", "camera": "x right, y down, z forward [m]"}  # Axes and unit of the coordinate systems.
-WRONG = 1e-3  # Error beyond its bound above which a tumour is wrong [m].
+ERROR_TOLERANCE = 1e-3  # Error beyond its bound above which a tumour is wrong [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ def write_truth(path: Path, truth: VideoGroundTruth) -> None:
         )
 
 
-def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LARGEST_FILM) -> VideoGroundTruth:
+def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = MAX_TRUTH_BYTES) -> VideoGroundTruth:
     """Return the truth in a file, of a body with this digest and number of `vertices` on its tumour's surface.
 
     Its arrays inflate to at most `largest` bytes.
@@ -81,21 +81,21 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = LAR
         A file that is missing or no such truth, or of another body.
     """
     path = to_path(path)
-    with read_as(path, "the ground truth of a video", WANTED), path.open("rb") as raw:
-        archive = Archive(raw, WANTED, largest)
+    with read_as(path, "the ground truth of a video", REMEDY), path.open("rb") as raw:
+        archive = Archive(raw, REMEDY, largest)
         header = json.loads(archive.read_text("header"))
         if header["format"] != FORMAT:
-            raise InputError(f"its format is not {FORMAT!r}. {WANTED}")
+            raise InputError(f"its format is not {FORMAT!r}. {REMEDY}")
         if header["anatomy"] != anatomy:
             raise InputError("is of another anatomy: give the one in the video, by --anatomy.")
-        arrays = archive.read_arrays(("times", "displacement", *COLUMNS))
-        times, moved, cameras, tools = (arrays[name].astype(float) for name in ("times", "displacement", *COLUMNS))
+        arrays = archive.read_arrays(("times", "displacement", *POSE_ARRAYS))
+        times, moved, cameras, tools = (arrays[name].astype(float) for name in ("times", "displacement", *POSE_ARRAYS))
     count = len(times)
     shapes = (times.shape, cameras.shape, tools.shape, moved.shape)
     if not count or shapes != ((count,), (count, 4, 4), (count, 4, 4), (count, vertices, 3)):
-        raise InputError(f"{path}: has arrays of other shapes. {WANTED}")
+        raise InputError(f"{path}: has arrays of other shapes. {REMEDY}")
     if not all(np.isfinite(each).all() for each in (times, cameras, tools, moved)):
-        raise InputError(f"{path}: has numbers that are not finite. {WANTED}")
+        raise InputError(f"{path}: has numbers that are not finite. {REMEDY}")
     return VideoGroundTruth(str(header["anatomy"]), times, cameras, tools, moved)
 
 
@@ -104,7 +104,7 @@ def write_table(path: Path, truth: VideoGroundTruth, rest: np.ndarray) -> None:
 
     Poses are rows of 12 numbers, of the matrix from the scan to the camera, and from the tool to the scan [mm].
     """
-    names = [f"{what}_{row}{column}" for what in COLUMNS for row in range(3) for column in range(4)]
+    names = [f"{what}_{row}{column}" for what in POSE_ARRAYS for row in range(3) for column in range(4)]
     with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(("time_s", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", *names, "space"))
@@ -149,10 +149,10 @@ def compute_overlay_error(
     here = known.motion.positions[stage.tumour_vertices]
     masks = compute_silhouette(camera, true, triangles), compute_silhouette(known.camera, here, triangles)
     seen, apart = camera.to_camera_frame(true), known.camera.to_camera_frame(here) - camera.to_camera_frame(true)
-    across = _across(apart, seen)
-    middle = float(_across(apart.mean(axis=0)[None], seen.mean(axis=0)[None])[0])
+    across = _compute_lateral_lengths(apart, seen)
+    middle = float(_compute_lateral_lengths(apart.mean(axis=0)[None], seen.mean(axis=0)[None])[0])
     return OverlayError(
-        _between(*masks),
+        _compute_edge_distance(*masks),
         compute_iou(*masks),
         middle,
         float(across.max()),
@@ -160,13 +160,13 @@ def compute_overlay_error(
     )
 
 
-def _across(apart: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _compute_lateral_lengths(apart: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Lengths (n,) of vectors (n, 3) across the lines of sight to points (n, 3) of the camera's frame."""
     rays = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     return np.linalg.norm(apart - np.sum(apart * rays, axis=1, keepdims=True) * rays, axis=1)
 
 
-def _between(true: np.ndarray, drawn: np.ndarray) -> float:
+def _compute_edge_distance(true: np.ndarray, drawn: np.ndarray) -> float:
     """Mean distance [pixel] of the edge of a mask from that of the true one, and back; infinite without either."""
     edges = [mask & (np.asarray(binary_erosion(mask)) == 0) for mask in (true, drawn)]
     if not all(edge.any() for edge in edges):
@@ -181,19 +181,19 @@ def summarise_errors(known: Sequence[TrackingResult], errors: Sequence[OverlayEr
     if not relied:
         return {"pictures": 0}
     rows = [error for _, error in relied]
-    wrong = [each for each, error in relied if error.worst > (each.band or 0.0) + WRONG]
+    wrong = [each for each, error in relied if error.worst > (each.band or 0.0) + ERROR_TOLERANCE]
     return {
         "pictures": len(rows),
-        **_two("outline_px", [row.outline for row in rows]),
+        **_compute_percentiles("outline_px", [row.outline for row in rows]),
         "overlap_p50": float(np.median([row.overlap for row in rows])),
         "overlap_least": min(row.overlap for row in rows),
-        **_two("middle_mm", [1e3 * row.middle for row in rows]),
-        **_two("worst_mm", [1e3 * row.worst for row in rows]),
-        **_two("band_mm", [1e3 * (each.band or 0.0) for each, _ in relied]),
+        **_compute_percentiles("middle_mm", [1e3 * row.middle for row in rows]),
+        **_compute_percentiles("worst_mm", [1e3 * row.worst for row in rows]),
+        **_compute_percentiles("band_mm", [1e3 * (each.band or 0.0) for each, _ in relied]),
         "held_percent": 100.0 * float(np.mean([row.held for row in rows])),
         "wrong": len(wrong),
     }
 
 
-def _two(name: str, values: Sequence[float]) -> dict[str, float]:
+def _compute_percentiles(name: str, values: Sequence[float]) -> dict[str, float]:
     return {f"{name}_p50": float(np.median(values)), f"{name}_p95": float(np.percentile(values, 95.0))}

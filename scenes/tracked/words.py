@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from html import escape
 
-from ar.overlay.composite import DOUBTFUL
+from ar.overlay.composite import DOUBTFUL_COLOUR
 from ar.overlay.gauge import Gauge
 from ar.overlay.hud import bound_words
 
-from ..page.text import RESEARCH, format_legend, format_tip_distance, format_unbroken, to_stroke
+from ..page.text import RESEARCH_ONLY, format_legend, format_tip_distance, format_unbroken, to_stroke
 from ..play.stage import TUMOUR_COLOUR
 from .follower import TrackingResult, TumourState
 from .run import Shown
 
 PATIENT_ERROR = "<p>Tumour position error: not known. Tissue and segmentation add to the overlay error.</p>"
-DRAWN = {  # Texts on the page, by the state of the tumour.
+STATE_TEXTS = {  # Texts on the page, by the state of the tumour.
     TumourState.GOOD: "The tumour is drawn where it is now.",
     TumourState.REST: "The tumour is drawn as in the scan, for the tool does not touch.",
 }
@@ -22,7 +22,7 @@ DRAWN = {  # Texts on the page, by the state of the tumour.
 
 def describe_overlay(name: str, who: str, tooled: bool) -> str:
     """Describe the image: its source, the meaning of the lines, and the deformation model."""
-    now, doubt = to_stroke(TUMOUR_COLOUR), to_stroke(DOUBTFUL)
+    now, doubt = to_stroke(TUMOUR_COLOUR), to_stroke(DOUBTFUL_COLOUR)
     keys = [
         (f'{now} stroke-width="3"', "tumour now"),
         (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone"),
@@ -36,7 +36,7 @@ def describe_overlay(name: str, who: str, tooled: bool) -> str:
         "tool are tracked in each image."
     )
     return (
-        f"<p>{seen} <b>{RESEARCH}</b></p>{format_legend(keys)}<p>Motion of the brain by {escape(who)}.</p>"
+        f"<p>{seen} <b>{RESEARCH_ONLY}</b></p>{format_legend(keys)}<p>Motion of the brain by {escape(who)}.</p>"
         '<p class="dim">A scene in its place: <code>sulcus demo</code>.</p>'
     )
 
@@ -49,7 +49,7 @@ def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
     known = shown.known
     parts = [format_distance(gauge, known.relied)] if tooled else []
     doubt = f'<p class="warn">{escape(known.words)}</p>'
-    parts.append(f"<p><b>{DRAWN[known.state]}</b></p>" if known.relied else doubt)
+    parts.append(f"<p><b>{STATE_TEXTS[known.state]}</b></p>" if known.relied else doubt)
     parts += [overlay_error(known), PATIENT_ERROR]
     placed = known.seen == known.time
     tool = "seen" if known.T_scan_tool is not None else "not seen" if placed else "not placed without the reference"

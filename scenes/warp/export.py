@@ -21,19 +21,19 @@ from .markups import write_markups
 from .meshes import build_surface_mesh, write_glb, write_stl, write_vtp
 from .moment import DeformedAnatomy
 from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation
-from .places import ENOUGH, Folded, SamplePlaces, compute_fields, find_folds, list_places
+from .places import FIELD_TOLERANCE, Folded, SamplePlaces, compute_fields, find_folds, list_places
 from .readme import write_readme
 
-LOOKS = {
+MESH_COLOURS = {
     "brain": (0.86, 0.72, 0.66, 0.35),
     "cortex": (0.86, 0.60, 0.54, 1.0),
     "tumour": (0.20, 0.94, 0.42, 1.0),
 }
 """Colours (RGBA, 0 to 1) of the surfaces."""
-MOVED = 1e-4  # Displacement above which a vertex moves [m].
-COARSE = 0.1  # Grid error at the tumour, relative to the largest motion, above which a warning is given.
+MIN_MOTION = 1e-4  # Displacement above which a vertex moves [m].
+MAX_GRID_ERROR = 0.1  # Grid error at the tumour, relative to the largest motion, above which a warning is given.
 SEQUENCE_SPACING = 3e-3  # Grid spacing of a sequence [m].
-MOST_NUMBERS = 400_000_000  # Maximum number of values of a sequence.
+MAX_VALUES = 400_000_000  # Maximum number of values of a sequence.
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,13 @@ def write_warp(
     report["anatomy"] = {"file": asked.source, "digest": moment.anatomy.digest}
     (place / "README.txt").write_text(write_readme(report, warped))
     files = sorted(path.name for path in place.iterdir())
-    sums = {name: _sha256(place / name) for name in files}
+    sums = {name: _compute_sha256(place / name) for name in files}
     report = {"format": "sulcus warp 1", "files": files, "spaces": describe_spaces(files), "sha256": sums, **report}
     (place / "warp.json").write_text(json.dumps(report, indent=1) + "\n")
     return report
 
 
-def _sha256(path: Path) -> str:
+def _compute_sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -106,7 +106,7 @@ def _write_surfaces(place: Path, moment: DeformedAnatomy) -> None:
     }
     nodes = moment.anatomy.mesh.nodes
     meshes = [
-        build_surface_mesh(name, which, nodes, moment.displacement, LOOKS[name])
+        build_surface_mesh(name, which, nodes, moment.displacement, MESH_COLOURS[name])
         for name, which in triangles.items()
         if len(which)
     ]
@@ -142,7 +142,7 @@ def _write_sequence(path: Path, sequence: Sequence[tuple[float, DeformedAnatomy]
     anatomy = sequence[0][1].anatomy
     moved = np.stack([remove_faint(moment.displacement) for _, moment in sequence])
     grid = warp_grid(anatomy, moved, SEQUENCE_SPACING)
-    if 3 * np.prod(grid.shape) * len(sequence) > MOST_NUMBERS:
+    if 3 * np.prod(grid.shape) * len(sequence) > MAX_VALUES:
         raise InputError(f"--sequence: {len(sequence)} moments are too many. Give a larger step.")
     pairs = zip(sequence, moved, strict=True)
     fields = [forward_on(grid, moment.left, displacement)[0] for (_, moment), displacement in pairs]
@@ -162,9 +162,9 @@ def collect_figures(
 ) -> dict[str, Any]:
     """Collect the report of a warp: millimetres, shares, counts of voxels, and warnings."""
     error = 1e3 * places.compute_errors(fields)
-    moving = np.linalg.norm(places.moved, axis=1) > MOVED
+    moving = np.linalg.norm(places.moved, axis=1) > MIN_MOTION
     gap, largest = moment.find_gap(), 1e3 * float(np.linalg.norm(moment.displacement, axis=1).max())
-    of_tumour = _errors(error[places.tumour])
+    of_tumour = _summarise_errors(error[places.tumour])
     folds = find_folds(moment, fields)
     return {
         "moved_by": moment.cause.words,
@@ -181,28 +181,28 @@ def collect_figures(
         "least_jacobian": dict(zip(("modeling", "resampling", "tetrahedra"), fields.least, strict=True)),
         "grid_error_mm": {
             "median": float(np.median(error)),
-            "moved_p95": _errors(error[moving])["p95"],
+            "moved_p95": _summarise_errors(error[moving])["p95"],
             "worst": float(error.max()),
             "tumour": of_tumour,
-            "cortex": _errors(error[places.cortex]),
-            "landmarks_worst": _errors(error[places.landmarks])["worst"],
+            "cortex": _summarise_errors(error[places.cortex]),
+            "landmarks_worst": _summarise_errors(error[places.landmarks])["worst"],
         },
         "landmarks": [one.name for one in places.marks],
         "images": [vars(one) for one in warped],
         "sequence_frames": frames,
         "fields_fold": fields.folds,
-        "folds": [_said(fold) for fold in folds],
-        "warnings": _warnings(largest, of_tumour["worst"], folds),
+        "folds": [_summarise_fold(fold) for fold in folds],
+        "warnings": _list_warnings(largest, of_tumour["worst"], folds),
     }
 
 
-def _errors(error: np.ndarray) -> dict[str, float]:
+def _summarise_errors(error: np.ndarray) -> dict[str, float]:
     if not len(error):
         return {"p95": 0.0, "worst": 0.0}
     return {"p95": float(np.quantile(error, 0.95)), "worst": float(error.max())}
 
 
-def _said(fold: Folded) -> dict[str, Any]:
+def _summarise_fold(fold: Folded) -> dict[str, Any]:
     return {
         "tetrahedra": fold.tetrahedra,
         "middle_in_scan_mm": [round(1e3 * value, 3) for value in fold.middle],
@@ -211,7 +211,7 @@ def _said(fold: Folded) -> dict[str, Any]:
     }
 
 
-def _warnings(largest: float, of_tumour: float, folds: Sequence[Folded]) -> list[str]:
+def _list_warnings(largest: float, of_tumour: float, folds: Sequence[Folded]) -> list[str]:
     found = []
     for fold in folds:
         x, y, z = (f"{1e3 * value:.1f}" for value in fold.middle)
@@ -219,7 +219,7 @@ def _warnings(largest: float, of_tumour: float, folds: Sequence[Folded]) -> list
             f"the finite elements fold {1e9 * fold.volume:.2f} mm3 at {x}, {y}, {z} mm in the scan (RAS). The fields "
             f"do not: there they differ by up to {1e3 * fold.off:.2f} mm, and are not to be relied on."
         )
-    if of_tumour > max(COARSE * largest, 1e3 * ENOUGH):
+    if of_tumour > max(MAX_GRID_ERROR * largest, 1e3 * FIELD_TOLERANCE):
         found.append(
             f"the grid is coarse for this tumour: its error of {of_tumour:.2f} mm is more than a tenth of the largest "
             f"motion, {largest:.2f} mm. Give a smaller --spacing."

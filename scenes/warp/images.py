@@ -21,37 +21,40 @@ from sim.fields.warp_fields import WarpFields
 
 from .nrrd_files import DIGITS
 
-ENOUGH = 0.98, 0.5  # Smallest shares of the brain inside an image, and on voxels that are not 0, without a warning.
-BRIGHTEST = 99.0  # Percentile of the positive values that counts as bright [%].
-DARK = 0.1  # Threshold of dark voxels (air with noise), relative to the value at BRIGHTEST.
-BETTER = 0.05  # Smallest gain of brain on bright voxels when x and y are negated.
-WELL = 0.7  # Smallest share of brain on bright voxels when x and y are negated.
-FEW = 120  # Largest number of distinct integers of a label map.
-SAMPLED = 3  # Sampling stride along each axis [voxels].
-ALIKE = 0.5  # Smallest share of neighbours of one value in a label map: labels fill areas.
+MIN_BRAIN_SHARES = (
+    0.98,
+    0.5,
+)  # Smallest shares of the brain inside an image, and on voxels that are not 0, without a warning.
+BRIGHT_PERCENTILE = 99.0  # Percentile of the positive values that counts as bright [%].
+DARK_RATIO = 0.1  # Threshold of dark voxels (air with noise), relative to the value at BRIGHTEST.
+MIN_FLIP_GAIN = 0.05  # Smallest gain of brain on bright voxels when x and y are negated.
+MIN_FLIPPED_SHARE = 0.7  # Smallest share of brain on bright voxels when x and y are negated.
+MAX_LABEL_VALUES = 120  # Largest number of distinct integers of a label map.
+SAMPLING_STRIDE = 3  # Sampling stride along each axis [voxels].
+MIN_EQUAL_NEIGHBOURS = 0.5  # Smallest share of neighbours of one value in a label map: labels fill areas.
 SUFFIXES = (".seg.nrrd", *READERS)  # Endings of image files.
 ORDERS = {"nearest": 0, "linear": 1, "cubic": 3}
 """Spline degree by the name of the interpolation."""
-WHOLE = np.uint8, np.int16, np.uint16, np.int32
+INTEGER_TYPES = np.uint8, np.int16, np.uint16, np.int32
 """Integer types that every reader of NIfTI supports."""
 DISPLACEMENT = 1006
 """NIfTI's intent: vectors in millimetres, RAS."""
-STILL = 1e-8  # Displacement below which voxels stay unchanged [m].
-TOGETHER = 8  # Number of slices processed together: limits memory.
+MOTION_TOLERANCE = 1e-8  # Displacement below which voxels stay unchanged [m].
+BATCH_SLICES = 8  # Number of slices processed together: limits memory.
 
 
 def measure_shown_share(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
     """Return the volume share of a brain inside the grid of voxels (I, J, K) with an affine to metres (RAS)."""
-    _, inside = _voxels(affine, shape, _middles(anatomy))
+    _, inside = _find_voxels(affine, shape, _compute_centroids(anatomy))
     return float(np.average(inside, weights=anatomy.mesh.volumes))
 
 
 def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatomy) -> list[str]:
     """List warnings, as predicates, about an image (I, J, K) that shows a part of a brain."""
-    found, middles, volumes = [], _middles(anatomy), anatomy.mesh.volumes
-    index, inside = _voxels(affine, values.shape, middles)
+    found, middles, volumes = [], _compute_centroids(anatomy), anatomy.mesh.volumes
+    index, inside = _find_voxels(affine, values.shape, middles)
     share = float(np.average(inside, weights=volumes))
-    if share < ENOUGH[0]:
+    if share < MIN_BRAIN_SHARES[0]:
         found.append(f"shows {share:.0%} of the brain; what lies outside is not in it")
     empty = float(np.average(values[tuple(index[inside].T)] == 0, weights=volumes[inside]))
     turned = _is_turned(values, affine, labels, middles, volumes)
@@ -60,14 +63,14 @@ def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy:
             f"fits the brain in {turned[0]:.0%} of its volume, but in {turned[1]:.0%} with x and y negated: "
             "it may be LPS marked as RAS"
         )
-    elif not labels and 1.0 - empty < ENOUGH[1]:
+    elif not labels and 1.0 - empty < MIN_BRAIN_SHARES[1]:
         found.append(
             f"is 0 in {empty:.0%} of the brain's volume: it may be in another space than the labels that the anatomy "
             "was made from"
         )
-    if not labels and _like_labels(values):
+    if not labels and _is_label_like(values):
         found.append("holds few values, all whole, as label maps do: give one by --labels, or labels are mixed")
-    elif labels and (alike := _alike(values)) < ALIKE:
+    elif labels and (alike := _compute_equal_share(values)) < MIN_EQUAL_NEIGHBOURS:
         found.append(
             f"has the same value in {alike:.0%} of neighbouring voxels, as intensities do: give them by --image, or "
             "values are not interpolated"
@@ -82,34 +85,43 @@ def _is_turned(
     values: np.ndarray, affine: np.ndarray, labels: bool, middles: np.ndarray, volumes: np.ndarray
 ) -> tuple[float, float] | None:
     """Return shares of the brain on bright voxels, unchanged and with x and y negated, if the latter is much larger."""
-    part = np.nan_to_num(values[::SAMPLED, ::SAMPLED, ::SAMPLED].astype(float))
-    air = 0.0 if labels else DARK * float(np.percentile(part[part > 0.0], BRIGHTEST)) if (part > 0.0).any() else 0.0
+    part = np.nan_to_num(values[::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE].astype(float))
+    air = (
+        0.0
+        if labels
+        else DARK_RATIO * float(np.percentile(part[part > 0.0], BRIGHT_PERCENTILE))
+        if (part > 0.0).any()
+        else 0.0
+    )
     shares = []
     for points in (middles, middles * LPS):
-        index, inside = _voxels(affine, values.shape, points)
+        index, inside = _find_voxels(affine, values.shape, points)
         shares.append(float(np.average(inside & (values[tuple(index.T)] > air), weights=volumes)))
     as_is, turned = shares
-    return (as_is, turned) if turned > WELL and turned - as_is > BETTER else None
+    return (as_is, turned) if turned > MIN_FLIPPED_SHARE and turned - as_is > MIN_FLIP_GAIN else None
 
 
-def _like_labels(values: np.ndarray) -> bool:
-    part = values[::SAMPLED, ::SAMPLED, ::SAMPLED]
-    return 1 < len(np.unique(part)) <= FEW and np.array_equal(part, np.rint(part))
+def _is_label_like(values: np.ndarray) -> bool:
+    part = values[::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE]
+    return 1 < len(np.unique(part)) <= MAX_LABEL_VALUES and np.array_equal(part, np.rint(part))
 
 
-def _alike(values: np.ndarray) -> float:
+def _compute_equal_share(values: np.ndarray) -> float:
     """Return the share of voxels, but for those that are 0, that have the value of the next along the first axis."""
-    one, two = values[:-1:SAMPLED, ::SAMPLED, ::SAMPLED], values[1::SAMPLED, ::SAMPLED, ::SAMPLED]
+    one, two = (
+        values[:-1:SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE],
+        values[1::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE],
+    )
     full = (one != 0) & (two != 0)
     return float((one == two)[full].mean()) if full.any() else 1.0
 
 
-def _middles(anatomy: Anatomy) -> np.ndarray:
+def _compute_centroids(anatomy: Anatomy) -> np.ndarray:
     """Return the centroids of the tetrahedra (T, 3) [m]."""
     return anatomy.mesh.nodes[anatomy.mesh.tets].mean(axis=1)
 
 
-def _voxels(affine: np.ndarray, shape: tuple[int, ...], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_voxels(affine: np.ndarray, shape: tuple[int, ...], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest voxels (n, 3) to points (n, 3) [m], and which of these lie within the volume (n,)."""
     index, last = index_of(affine, points), np.array(shape) - 1
     inside = np.asarray(((index >= -0.5) & (index <= last + 0.5)).all(axis=1))
@@ -158,7 +170,7 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> 
     if measure_shown_share(volume.affine, values.shape, anatomy) == 0.0:
         low, high = (1e3 * end for end in (anatomy.mesh.nodes.min(axis=0), anatomy.mesh.nodes.max(axis=0)))
         raise InputError(
-            f"{path}: shows none of this brain, which reaches from {_mm(low)} to {_mm(high)} mm (RAS). Give an image "
+            f"{path}: shows none of this brain, which reaches from {_format_millimetres(low)} to {_format_millimetres(high)} mm (RAS). Give an image "
             "in the space of the labels that the anatomy was made from, or register it to them first."
         )
     warnings = [*volume.notes, *list_warnings(values, volume.affine, labels, anatomy)]
@@ -174,7 +186,7 @@ def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
         return load_nifti(path)
     values = np.nan_to_num(volume.values)
     with np.errstate(invalid="ignore"):
-        whole = [kind for kind in WHOLE if np.array_equal(values, values.astype(kind))]
+        whole = [kind for kind in INTEGER_TYPES if np.array_equal(values, values.astype(kind))]
     values = values.astype(whole[0] if whole else np.float32)
     made = nibabel.Nifti1Image(values, volume.affine * [[1e3], [1e3], [1e3], [1.0]])
     made.header.set_xyzt_units("mm")
@@ -235,11 +247,11 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
     moved = outside = gone = 0
     last = np.array(values.shape) - 1
     sides = values.shape[1:]
-    for first in range(0, len(values), TOGETHER):
-        slab = out[first : first + TOGETHER]
+    for first in range(0, len(values), BATCH_SLICES):
+        slab = out[first : first + BATCH_SLICES]
         index = np.stack(np.unravel_index(np.arange(slab.size), slab.shape), axis=-1) + [first, 0, 0]
         now = index @ affine[:3, :3].T + affine[:3, 3]
-        went, rows = _moving(fields, now)
+        went, rows = _find_moving(fields, now)
         moved += len(rows)
         if not len(rows):
             continue
@@ -255,17 +267,17 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
         )
         numbers = np.ravel_multi_index(index[rows].T - np.array([[first], [0], [0]]), (len(slab), *sides))
         slab.reshape(-1)[numbers] = np.where(off | cut, 0, _as(read, values.dtype))
-        blank[first : first + TOGETHER].reshape(-1)[numbers] = off | cut
+        blank[first : first + BATCH_SLICES].reshape(-1)[numbers] = off | cut
         outside, gone = outside + int(off.sum()), gone + int(cut.sum())
     return out, Counts(moved, outside, gone, blank)
 
 
-def _moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Backward displacements (m, 3) [m] of those rows (m,) of places (n, 3) [m] that have one."""
     index = fields.grid.index(now)
     held = np.flatnonzero(((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1))
     went = fields.grid.read(fields.backward, now[held])
-    moves = np.abs(went).max(axis=1) > STILL
+    moves = np.abs(went).max(axis=1) > MOTION_TOLERANCE
     return went[moves], held[moves]
 
 
@@ -276,7 +288,7 @@ def _as(values: np.ndarray, kind: np.dtype) -> np.ndarray:
     return np.clip(np.rint(values), limits.min, limits.max).astype(kind)
 
 
-def _mm(point: np.ndarray) -> str:
+def _format_millimetres(point: np.ndarray) -> str:
     return ", ".join(f"{value:.0f}" for value in point)
 
 

@@ -16,14 +16,14 @@ from surrogate.locating.prior import compute_tumour_share
 TUMOUR, NEAREST, CORTEX = "tumour", "tumour, nearest to its centroid", "open cortex"  # Names of the landmarks.
 CENTROID = "centroid of the tumour now"
 """Name of the displaced tumour's centroid in Slicer."""
-SAID = {
+DESCRIPTIONS = {
     TUMOUR: "tissue at the centroid of the tumour's volume in the scan, as `sulcus locate` has it.",
     NEAREST: "that centroid lies outside the tissue; this is the tumour's point nearest to it.",
     CORTEX: "tissue on the surface, nearest to the middle of the open cortex in the scan.",
     CENTROID: "of the displaced tumour's volume. The tissue there may be another than in the scan.",
 }
 """Description of each landmark."""
-ROUNDING = 1e-9  # Tolerance within which a point belongs to a tetrahedron [m].
+INSIDE_TOLERANCE = 1e-9  # Tolerance within which a point belongs to a tetrahedron [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, .
     if body.in_tumour.any():
         point = compute_tumour_share(body) @ mesh.nodes
         at = locate(mesh, point[None])
-        if np.linalg.norm(at.read(mesh.nodes[None])[0, 0] - point) < ROUNDING:
+        if np.linalg.norm(at.read(mesh.nodes[None])[0, 0] - point) < INSIDE_TOLERANCE:
             found.append(Landmark(TUMOUR, point, point + at.read(displacement[None])[0, 0]))
         else:
             triangles = body.tumour_surface

@@ -58,14 +58,14 @@ def write_vtp(path: Path, mesh: NamedSurface) -> None:
 <Piece NumberOfPoints="{len(points)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" """
         f"""NumberOfPolys="{len(mesh.triangles)}">
 <PointData Vectors="displacement">
-{_array("displacement", "Float32", 3, moved.astype("<f4"))}
+{_format_array("displacement", "Float32", 3, moved.astype("<f4"))}
 </PointData>
 <Points>
-{_array("Points", "Float32", 3, points.astype("<f4"))}
+{_format_array("Points", "Float32", 3, points.astype("<f4"))}
 </Points>
 <Polys>
-{_array("connectivity", "Int32", 1, mesh.triangles.astype("<i4"))}
-{_array("offsets", "Int32", 1, ends.astype("<i4"))}
+{_format_array("connectivity", "Int32", 1, mesh.triangles.astype("<i4"))}
+{_format_array("offsets", "Int32", 1, ends.astype("<i4"))}
 </Polys>
 </Piece>
 </PolyData>
@@ -74,7 +74,7 @@ def write_vtp(path: Path, mesh: NamedSurface) -> None:
     )
 
 
-def _array(name: str, kind: str, components: int, values: np.ndarray) -> str:
+def _format_array(name: str, kind: str, components: int, values: np.ndarray) -> str:
     data = values.tobytes()
     text = base64.b64encode(struct.pack("<I", len(data)) + data).decode()
     head = f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" format="binary">'
@@ -118,7 +118,7 @@ def write_glb(path: Path, meshes: Sequence[NamedSurface]) -> None:
             {"name": mesh.name, "primitives": [{**parts[number], "material": number}]}
             for number, mesh in enumerate(meshes)
         ],
-        "materials": [_material(mesh) for mesh in meshes],
+        "materials": [_build_material(mesh) for mesh in meshes],
         "buffers": [{"byteLength": len(data)}],
         "bufferViews": views,
         "accessors": accessors,
@@ -129,7 +129,7 @@ def write_glb(path: Path, meshes: Sequence[NamedSurface]) -> None:
     path.write_bytes(struct.pack("<III", MAGIC, 2, 12 + len(chunks)) + chunks)
 
 
-def _material(mesh: NamedSurface) -> Mapping[str, object]:
+def _build_material(mesh: NamedSurface) -> Mapping[str, object]:
     look = {"baseColorFactor": list(mesh.colour), "metallicFactor": 0.0, "roughnessFactor": 0.8}
     clear = {"alphaMode": "BLEND", "doubleSided": True} if mesh.colour[3] < 1.0 else {"doubleSided": True}
     return {"name": mesh.name, "pbrMetallicRoughness": look, **clear}

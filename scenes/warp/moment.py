@@ -29,7 +29,7 @@ from ..script.scene import Scene
 
 ENSEMBLE = "registration, segmentation, tissue and skull, as `sulcus uncertainty` has it"
 """Description of the bound of a scene."""
-SAME = 1e-6  # Largest distance of corresponding nodes in two meshes of one body [m].
+NODE_TOLERANCE = 1e-6  # Largest distance of corresponding nodes in two meshes of one body [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +59,8 @@ def load_cause(loads: Loads) -> Cause:
     direction, radius = force / newton, 1e3 * float(pushed.footprint[0])
     record = {
         "kind": "load",
-        "place_mm": _rounded(place),
-        "direction": _rounded(direction),
+        "place_mm": _round_values(place),
+        "direction": _round_values(direction),
         "force_n": round(newton, 6),
         "radius_mm": round(radius, 6),
     }
@@ -75,7 +75,7 @@ def read_file_cause(path: Path) -> Cause:
     return Cause(f"displacement of {path.name}", {"kind": "file", "file": path.name})
 
 
-def _rounded(values: np.ndarray) -> list[float]:
+def _round_values(values: np.ndarray) -> list[float]:
     return [round(float(value), 6) + 0.0 for value in values]
 
 
@@ -141,16 +141,16 @@ class Played:
         fem = self.theatre.build_fem(self.scene, TRAIN, 1, live=True)
         needed = range(frames[-1] + 1) if is_history_dependent(fem) else frames
         answers = solve_reference_frames(
-            self.theatre, self.scene, [self._loads(number) for number in needed], progress, fem
+            self.theatre, self.scene, [self._build_loads(number) for number in needed], progress, fem
         )
         rows = {number: row for row, number in enumerate(needed)}
-        return [self._moment(number, answers.select(np.array([rows[number]])), fem) for number in frames]
+        return [self._build_moment(number, answers.select(np.array([rows[number]])), fem) for number in frames]
 
-    def _loads(self, number: int):
+    def _build_loads(self, number: int):
         scene, time = self.scene, float(self.scene.times[number])
         return scene.build_loads(self.theatre.site, scene.path(time), time)
 
-    def _moment(self, number: int, answer: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
+    def _build_moment(self, number: int, answer: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
         scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
         moved = answer.displacement[0]
         # Nothing is located here, and no locator is asked for.
@@ -160,7 +160,7 @@ class Played:
         tip = None if scene.tool is None else player.place_tool(scene.tool, scene.path(time), now).tip
         known = self.theatre.estimate_uncertainty(scene)
         bound = None if known is None else known.evaluate(time).prior
-        loads = self._loads(number)
+        loads = self._build_loads(number)
         cause = load_cause(loads) if self.load else play_scene_cause(scene, number)
         said = {} if bound is None else {"bound_words": ENSEMBLE}
         left = stage.select_stage(loads).anatomy
@@ -186,7 +186,7 @@ def read_moment(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
         )
     mesh = anatomy.mesh
     same = file.mesh.nodes.shape == mesh.nodes.shape and np.array_equal(file.mesh.tets, mesh.tets)
-    if not same or np.abs(file.mesh.nodes - mesh.nodes).max() > SAME:
+    if not same or np.abs(file.mesh.nodes - mesh.nodes).max() > NODE_TOLERANCE:
         raise InputError(f"{path}: is of another mesh than the anatomy. Give the anatomy that it was made with.")
     cause = read_file_cause(path)
     if "covariance" not in file.point_data:

@@ -18,19 +18,19 @@ from .landmarks import Landmark, list_landmarks
 from .moment import DeformedAnatomy
 
 # Weights of corners at the places inside a tetrahedron; no field is fitted there.
-WITHIN = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4))
+INNER_WEIGHTS = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4))
 # Weights of corners at the places inside a triangle; no field is fitted there.
-ON = 0.58 * np.eye(3) + 0.21 * (1.0 - np.eye(3))
-FINEST = 0.3e-3  # Smallest spacing of a field [m].
-COARSEST = 5e-3  # Largest spacing of a field [m].
-FIRST = 1e-3  # Spacing that is tried first [m].
-ENOUGH = 0.05e-3
+FACE_WEIGHTS = 0.58 * np.eye(3) + 0.21 * (1.0 - np.eye(3))
+MIN_SPACING = 0.3e-3  # Smallest spacing of a field [m].
+MAX_SPACING = 5e-3  # Largest spacing of a field [m].
+FIRST_SPACING = 1e-3  # Spacing that is tried first [m].
+FIELD_TOLERANCE = 0.05e-3
 """Tolerance of the error of tumour and landmarks in the search for a spacing [m]."""
-MOST = 32_000_000  # Maximum number of nodes in the search for a spacing. A million take 12 MB of memory.
-MOST_ASKED = 96_000_000  # Maximum number of nodes at a spacing given by the user.
-STEP = 0.05e-3  # Step of the spacing in the search [m].
-SPARE = 0.95  # Safety factor of the spacing in the search.
-TIMES = 3  # Maximum number of trials in the search for a spacing.
+MAX_NODES = 32_000_000  # Maximum number of nodes in the search for a spacing. A million take 12 MB of memory.
+MAX_REQUESTED_NODES = 96_000_000  # Maximum number of nodes at a spacing given by the user.
+SPACING_STEP = 0.05e-3  # Step of the spacing in the search [m].
+SAFETY_FACTOR = 0.95  # Safety factor of the spacing in the search.
+MAX_TRIALS = 3  # Maximum number of trials in the search for a spacing.
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,15 +66,21 @@ def list_places(moment: DeformedAnatomy) -> SamplePlaces:
     """Vertices of what is left of a body, four places in each tetrahedron, three on each open triangle, landmarks."""
     body, mesh = moment.left, moment.left.mesh
     used, marks = np.unique(mesh.tets), list_landmarks(body, moment.displacement)
-    within, on = len(WITHIN) * len(mesh.tets), len(ON) * len(body.open_surface)
+    within, on = len(INNER_WEIGHTS) * len(mesh.tets), len(FACE_WEIGHTS) * len(body.open_surface)
     part = np.repeat(np.arange(4), [len(used), within, on, len(marks)])
 
     def at(values: np.ndarray, landmarks: list[np.ndarray]) -> np.ndarray:
-        between = (WITHIN @ values[mesh.tets]).reshape(-1, 3), (ON @ values[body.open_surface]).reshape(-1, 3)
+        between = (
+            (INNER_WEIGHTS @ values[mesh.tets]).reshape(-1, 3),
+            (FACE_WEIGHTS @ values[body.open_surface]).reshape(-1, 3),
+        )
         return np.concatenate([values[used], *between, np.reshape(landmarks, (-1, 3))])
 
     tumour, cortex = np.zeros((2, len(part)), bool)
-    tumour[part == 0], tumour[part == 1] = np.isin(used, body.tumour_nodes), np.repeat(body.in_tumour, len(WITHIN))
+    tumour[part == 0], tumour[part == 1] = (
+        np.isin(used, body.tumour_nodes),
+        np.repeat(body.in_tumour, len(INNER_WEIGHTS)),
+    )
     cortex[part == 0], cortex[part == 2] = np.isin(used, body.open_surface), True
     rest = at(mesh.nodes, [one.rest for one in marks])
     moved = at(moment.displacement, [one.now - one.rest for one in marks])
@@ -119,7 +125,7 @@ def find_folds(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...
 
 def count_steps(spacing: float | None) -> int:
     """Return the number of steps of `compute_fields`: two fields for each tried spacing."""
-    return 2 * (1 + (TIMES if spacing is None else 0))
+    return 2 * (1 + (MAX_TRIALS if spacing is None else 0))
 
 
 def compute_fields(moment: DeformedAnatomy, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
@@ -132,15 +138,15 @@ def compute_fields(moment: DeformedAnatomy, spacing: float | None, step: Callabl
     InputError
         A spacing that makes too many nodes.
     """
-    if spacing is not None and (nodes := _nodes(moment, spacing)) > MOST_ASKED:
+    if spacing is not None and (nodes := _count_nodes(moment, spacing)) > MAX_REQUESTED_NODES:
         raise InputError(
             f"--spacing {1e3 * spacing:g}: the fields would have {nodes / 1e6:.0f} million nodes, and "
-            f"{MOST_ASKED / 1e6:.0f} million are the most. Give a larger one."
+            f"{MAX_REQUESTED_NODES / 1e6:.0f} million are the most. Give a larger one."
         )
     left = count_steps(spacing) - 2
-    fields = _fields(moment, spacing or FIRST, step)
+    fields = _compute_fields(moment, spacing or FIRST_SPACING, step)
     while left and (finer := find_finer_spacing(moment, fields)) is not None:
-        fields, left = _fields(moment, finer, step), left - 2
+        fields, left = _compute_fields(moment, finer, step), left - 2
     step(left)
     return fields
 
@@ -150,17 +156,19 @@ def find_finer_spacing(moment: DeformedAnatomy, fields: WarpFields) -> float | N
     now = fields.grid.spacing
     places = list_places(moment)
     worst = float(places.compute_errors(fields)[places.tumour | places.landmarks].max(initial=0.0))
-    if worst <= ENOUGH:
+    if worst <= FIELD_TOLERANCE:
         return None
-    steps = max(math.floor(SPARE * now * ENOUGH / worst / STEP), round(FINEST / STEP))
-    while _nodes(moment, STEP * steps) > MOST:
+    steps = max(
+        math.floor(SAFETY_FACTOR * now * FIELD_TOLERANCE / worst / SPACING_STEP), round(MIN_SPACING / SPACING_STEP)
+    )
+    while _count_nodes(moment, SPACING_STEP * steps) > MAX_NODES:
         steps += 1
-    return STEP * steps if steps < round(now / STEP) else None
+    return SPACING_STEP * steps if steps < round(now / SPACING_STEP) else None
 
 
-def _nodes(moment: DeformedAnatomy, spacing: float) -> float:
+def _count_nodes(moment: DeformedAnatomy, spacing: float) -> float:
     return float(np.prod(warp_grid(moment.anatomy, moment.displacement[None], spacing).shape, dtype=float))
 
 
-def _fields(moment: DeformedAnatomy, spacing: float, step: Callable[[int], object]) -> WarpFields:
+def _compute_fields(moment: DeformedAnatomy, spacing: float, step: Callable[[int], object]) -> WarpFields:
     return warp_fields(moment.anatomy, moment.displacement, spacing, moment.left, lambda: step(1))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from .images import Warped
-from .landmarks import CENTROID, NEAREST, SAID, TUMOUR
-from .places import WITHIN
+from .landmarks import CENTROID, DESCRIPTIONS, NEAREST, TUMOUR
+from .places import INNER_WEIGHTS
 
 # First part of the text.
 INTRODUCTION = """sulcus warp: a deformed brain, for other programs
@@ -67,7 +67,7 @@ def write_readme(report: dict, images: Sequence[Warped]) -> str:
         lines += f"{one.name}\n    your image now, on its own grid: {one.moved:,} voxels moved.\n"
         lines += f"    0 as their source lies outside: {one.outside:,}; as it was cut away: {one.gone:,}.\n"
     named = [*report["landmarks"], *([CENTROID] if {TUMOUR, NEAREST} & {*report["landmarks"]} else [])]
-    points = "".join(f"    {name}: {SAID[name]}\n" for name in named)
+    points = "".join(f"    {name}: {DESCRIPTIONS[name]}\n" for name in named)
     surfaces = (
         "brain, cortex, tumour    .vtp, .stl, and all together deformed.glb: the deformed surfaces.\n"
         "landmarks.mrk.json       points, in the scan and now:\n"
@@ -79,13 +79,13 @@ def write_readme(report: dict, images: Sequence[Warped]) -> str:
     limits = LIMITS.format(
         reach=report["reach_mm"],
         spacing=report["spacing_mm"],
-        fold=_folds(report),
+        fold=_describe_folds(report),
         median=error["median"],
         moved=error["moved_p95"],
         worst=error["worst"],
         tumour=error["tumour"],
         cortex=error["cortex"],
-        between=len(WITHIN),
+        between=len(INNER_WEIGHTS),
         faint=report["faint_mm"],
         landmarks=error["landmarks_worst"],
         bound=_bound(report),
@@ -96,7 +96,7 @@ def write_readme(report: dict, images: Sequence[Warped]) -> str:
     return start + FILES.format(sequence=sequence, images=lines, surfaces=surfaces) + limits
 
 
-def _folds(report: dict) -> str:
+def _describe_folds(report: dict) -> str:
     shares = report["least_jacobian"]
     least = ", ".join(f"{value:.3f}" for value in shares.values())
     said = f"Least volume that is left, as a share (modeling, resampling, tetrahedra): {least}."

@@ -57,7 +57,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
     instances = list[tuple[str, list[str]]]()
     apart = False  # nodes of an assembly that are in none of its instances: reference points
     with path.open(encoding="utf-8-sig", errors="replace") as lines:
-        for keyword, options, rows in _sections(lines):
+        for keyword, options, rows in _iterate_sections(lines):
             if keyword == "INCLUDE" or (keyword in ("NODE", "ELEMENT", "ELSET") and "INPUT" in options):
                 raise InputError("it includes another file. Merge both into one file.")
             if keyword in GENERATORS or (keyword == "NODE" and options.get("SYSTEM", "R") != "R"):
@@ -68,11 +68,11 @@ def read_abaqus(path: Path) -> AbaqusMesh:
             elif keyword == "NODE" and not apart:
                 _add_nodes(rows, index, points)
             elif keyword == "ELEMENT" and rows:
-                blocks.append(_elements(options.get("TYPE", ""), rows))
+                blocks.append(_parse_elements(options.get("TYPE", ""), rows))
                 if "ELSET" in options:
                     sets.setdefault(options["ELSET"], []).append(blocks[-1][1][:, 0])
             elif keyword == "ELSET" and "INTERNAL" not in options:
-                sets.setdefault(options["ELSET"], []).extend(_members(rows, "GENERATE" in options, sets))
+                sets.setdefault(options["ELSET"], []).extend(_parse_set_members(rows, "GENERATE" in options, sets))
     try:
         cells = [
             Block(kind, np.array([[index[n] for n in row[1:]] for row in table.tolist()])) for kind, table in blocks
@@ -81,10 +81,10 @@ def read_abaqus(path: Path) -> AbaqusMesh:
         raise InputError(f"an element names node {error}, which no *NODE lists: list it there.") from error
     known = {name: np.concatenate(numbers) for name, numbers in sets.items() if numbers}
     within = {name: [np.flatnonzero(np.isin(table[:, 0], n)) for _, table in blocks] for name, n in known.items()}
-    return AbaqusMesh(np.array(points).reshape(-1, 3) + _translation(instances), cells, within)
+    return AbaqusMesh(np.array(points).reshape(-1, 3) + _parse_translation(instances), cells, within)
 
 
-def _sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[str]]]:
+def _iterate_sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[str]]]:
     """Yield each keyword with its options and data lines; comments and blank lines are dropped."""
     head, rows = "", list[str]()
     for line in chain(map(str.strip, lines), "*"):
@@ -99,7 +99,7 @@ def _sections(lines: Iterable[str]) -> Iterator[tuple[str, dict[str, str], list[
             rows.append(line)
 
 
-def _translation(instances: list[tuple[str, list[str]]]) -> np.ndarray:
+def _parse_translation(instances: list[tuple[str, list[str]]]) -> np.ndarray:
     """Return the translation (3,) that all instances (part name, data lines) share; 0 without instances."""
     parts = [part for part, _ in instances if part]
     if any(len(rows) > 1 for _, rows in instances):
@@ -129,27 +129,27 @@ def _add_nodes(rows: list[str], index: dict[int, int], points: list[list[float]]
             )
 
 
-def _elements(name: str, rows: list[str]) -> tuple[str, np.ndarray]:
+def _parse_elements(name: str, rows: list[str]) -> tuple[str, np.ndarray]:
     """Return the type and table (n, 1 + k) of a block: element number and node numbers (k = 0 unless tetrahedra)."""
     if not name:
         raise InputError("an *ELEMENT has no TYPE: state it, such as TYPE=C3D4.")
     solid = SOLID.match(name)
     kind = SOLIDS[int(solid[1])] if solid else name
     if kind in WIDTHS:
-        return kind, np.array(_whole(rows), int).reshape(-1, WIDTHS[kind])
+        return kind, np.array(_parse_integers(rows), int).reshape(-1, WIDTHS[kind])
     first = (row for row, before in zip(rows, ["", *rows], strict=False) if not before.endswith(","))
     return kind, np.array([int(row.split(",")[0]) for row in first], int).reshape(-1, 1)
 
 
-def _members(rows: list[str], generate: bool, sets: Mapping[str, list[np.ndarray]]) -> list[np.ndarray]:
+def _parse_set_members(rows: list[str], generate: bool, sets: Mapping[str, list[np.ndarray]]) -> list[np.ndarray]:
     """Return element numbers: listed, or first, last and step (`generate`), plus those of the named sets."""
     if generate:
-        return [np.arange(first, last + 1, *step) for first, last, *step in (_whole([row]) for row in rows)]
+        return [np.arange(first, last + 1, *step) for first, last, *step in (_parse_integers([row]) for row in rows)]
     cells = [cell.strip(' "') for row in rows for cell in row.split(",")]
     named = [numbers for cell in cells for numbers in sets.get(cell.upper(), [])]
     return [np.array([int(cell) for cell in cells if cell.isdecimal()], int), *named]
 
 
-def _whole(rows: list[str]) -> list[int]:
+def _parse_integers(rows: list[str]) -> list[int]:
     """Parse the integers between commas; blank cells are skipped."""
     return [int(cell) for row in rows for cell in row.split(",") if cell.strip()]

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 NEIGHBOURS = np.ones((3, 3, 3), bool)  # all 26 neighbours of a cell, for the 2:1 balance
 # Corners of a square face in the two tangential axes, in cyclic order; edge k joins corners k and k + 1.
-SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+FACE_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 Sizing = Callable[[np.ndarray], np.ndarray]
 """Function that returns the requested cell size (n,) [m] at points (n, 3) [m]."""
@@ -43,7 +43,7 @@ def build_graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, lev
     """
     count = np.ceil((high - low) / coarsest).astype(int)
     origin = 0.5 * (low + high) - 0.5 * coarsest * count
-    exists, split = _octree(origin, count, coarsest, levels, size)
+    exists, split = _build_octree(origin, count, coarsest, levels, size)
     unit = coarsest / 2 ** (levels + 1)  # half the finest cell: every node has whole coordinates
     span = count * 2 ** (levels + 1) + 1
 
@@ -52,7 +52,9 @@ def build_graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, lev
     known = np.unique(
         np.concatenate(
             [
-                _key((at[:, None] + 2 ** (levels + 1 - level) * np.indices((2, 2, 2)).reshape(3, 8).T), span).ravel()
+                _compute_keys(
+                    (at[:, None] + 2 ** (levels + 1 - level) * np.indices((2, 2, 2)).reshape(3, 8).T), span
+                ).ravel()
                 for level, at in enumerate(corners)
             ]
         )
@@ -61,15 +63,15 @@ def build_graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, lev
     for level in range(levels + 1):
         edge = 2 ** (levels + 1 - level)
         for axis in range(3):
-            cells += _between_equals(leaves[level], axis, edge, known, span)
-            cells += _between_unequals(leaves[level], exists[level], axis, edge)
+            cells += _build_tets_between_equals(leaves[level], axis, edge, known, span)
+            cells += _build_tets_between_unequals(leaves[level], exists[level], axis, edge)
     corners_of_tets = np.concatenate(cells)
-    keys, tets = np.unique(_key(corners_of_tets, span), return_inverse=True)
+    keys, tets = np.unique(_compute_keys(corners_of_tets, span), return_inverse=True)
     whole = np.stack(np.unravel_index(keys, span), axis=1)
     return Lattice(origin + unit * whole, tets, ~np.isin(keys, known))
 
 
-def _octree(
+def _build_octree(
     origin: np.ndarray, count: np.ndarray, coarsest: float, levels: int, size: Sizing
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return two boolean grids per level: existing cells, and those of them that are halved."""
@@ -81,50 +83,52 @@ def _octree(
         halved = np.zeros(there.shape, bool)
         halved[tuple(index.T)] = size(origin + edge * (index + 0.5)) < edge
         split.append(halved)
-        there = _children(halved)
+        there = _mark_children(halved)
     split.append(np.zeros(count * 2**levels, bool))
     for level in range(levels - 1, 0, -1):  # balance: a halved cell's neighbours exist, so their parents are halved
         grown = ndimage.binary_dilation(split[level], NEIGHBOURS)
         split[level - 1] |= grown.reshape(*np.stack([count * 2 ** (level - 1), [2, 2, 2]], 1).ravel()).any((1, 3, 5))
-    return [np.ones(count, bool), *[_children(halved) for halved in split[:-1]]], split
+    return [np.ones(count, bool), *[_mark_children(halved) for halved in split[:-1]]], split
 
 
-def _children(halved: np.ndarray) -> np.ndarray:
+def _mark_children(halved: np.ndarray) -> np.ndarray:
     return halved.repeat(2, 0).repeat(2, 1).repeat(2, 2)
 
 
-def _key(whole: np.ndarray, span: np.ndarray) -> np.ndarray:
+def _compute_keys(whole: np.ndarray, span: np.ndarray) -> np.ndarray:
     """Return a unique integer for each integer coordinate triple (..., 3)."""
     return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(whole, -1, 0)), tuple(span)))
 
 
-def _face(corner: np.ndarray, axis: int, edge: int, upper: bool) -> np.ndarray:
+def _compute_face_corners(corner: np.ndarray, axis: int, edge: int, upper: bool) -> np.ndarray:
     """Return corners (n, 4, 3), cyclic, of the lower or upper face across `axis` of cells at `corner` (n, 3)."""
     offset = np.zeros((4, 3), int)
-    offset[:, [(axis + 1) % 3, (axis + 2) % 3]] = SQUARE * edge
+    offset[:, [(axis + 1) % 3, (axis + 2) % 3]] = FACE_CORNERS * edge
     offset[:, axis] = edge * upper
     return corner[:, None] + offset
 
 
-def _between_equals(leaf: np.ndarray, axis: int, edge: int, known: np.ndarray, span: np.ndarray) -> list[np.ndarray]:
+def _build_tets_between_equals(
+    leaf: np.ndarray, axis: int, edge: int, known: np.ndarray, span: np.ndarray
+) -> list[np.ndarray]:
     """Return BCC tetrahedra around each face between two leaves of equal size, halved at edges with a midpoint node."""
     ahead = np.delete(leaf, 0, axis)
     corner = np.argwhere(np.delete(leaf, -1, axis) & ahead) * edge
     below = corner + edge // 2
     above = below + edge * np.eye(3, dtype=int)[axis]
-    square = _face(corner, axis, edge, upper=True)
+    square = _compute_face_corners(corner, axis, edge, upper=True)
     tets = []
     for k in range(4):
         start, end = square[:, k], square[:, (k + 1) % 4]
         middle = (start + end) // 2
-        halved = np.isin(_key(middle, span), known)
+        halved = np.isin(_compute_keys(middle, span), known)
         tets.append(np.stack([below, above, start, end], 1)[~halved])
         tets.append(np.stack([below, above, start, middle], 1)[halved])
         tets.append(np.stack([below, above, middle, end], 1)[halved])
     return tets
 
 
-def _between_unequals(leaf: np.ndarray, exists: np.ndarray, axis: int, edge: int) -> list[np.ndarray]:
+def _build_tets_between_unequals(leaf: np.ndarray, exists: np.ndarray, axis: int, edge: int) -> list[np.ndarray]:
     """Return the split pyramids on both sides of each face between a leaf and a leaf of twice its size."""
     tets = []
     for step in (-1, 1):
@@ -135,10 +139,10 @@ def _between_unequals(leaf: np.ndarray, exists: np.ndarray, axis: int, edge: int
         index = np.argwhere(leaf & ~neighbour)
         small = index * edge + edge // 2
         large = (index + step * np.eye(3, dtype=int)[axis]) // 2 * 2 * edge + edge
-        square = _face(index * edge, axis, edge, upper=step > 0)
+        square = _compute_face_corners(index * edge, axis, edge, upper=step > 0)
         # The larger face's centre is the corner at which both tangential indices change from even to odd.
         tangential = np.stack([index[:, (axis + 1) % 3], index[:, (axis + 2) % 3]], 1)
-        first = np.argmax((SQUARE[None] == 1 - tangential[:, None] % 2).all(2), axis=1)
+        first = np.argmax((FACE_CORNERS[None] == 1 - tangential[:, None] % 2).all(2), axis=1)
         a, b, c, d = (square[np.arange(len(square)), (first + k) % 4] for k in range(4))
         lower, upper = (small, large) if step > 0 else (large, small)
         for p, q, r in ((a, b, c), (a, c, d)):

@@ -67,7 +67,7 @@ class Convention:
         return set(self.needed) <= labels and (not self.only or labels <= self.known)
 
 
-def _both(*left: int) -> tuple[int, ...]:
+def _add_right(*left: int) -> tuple[int, ...]:
     """Return left-hemisphere labels together with their right-hemisphere counterparts, by FreeSurfer's colour table."""
     return tuple(sorted((*left, *(RIGHT[label] for label in left))))
 
@@ -79,7 +79,7 @@ RIGHT = {
 """FreeSurfer labels of the left hemisphere, mapped to those of the right."""
 # Parcels of the cortex and of the white matter below it (aparc+aseg, wmparc), thousands per hemisphere.
 PARCELS = tuple(range(1000, 1036)), tuple(range(2000, 2036)), (*range(3000, 3036), 5001), (*range(4000, 4036), 5002)
-VENTRICLES = (*_both(4, 5), 14, 15, 72)  # FreeSurfer labels; both hemispheres, and midline
+VENTRICLES = (*_add_right(4, 5), 14, 15, 72)  # FreeSurfer labels; both hemispheres, and midline
 DEEP = (16, 77, 80, 85, *range(251, 256))
 """Labels without a side: brainstem, white matter lesions, chiasm and corpus callosum."""
 
@@ -87,7 +87,7 @@ FREESURFER = Convention(
     "freesurfer",
     "FreeSurfer's and FastSurfer's aseg, aparc+aseg and wmparc",
     brain=(
-        *_both(2, 3, 7, 8, 9, 10, 11, 12, 13, 17, 18, 26, 28, 30, 31, 78, 81),
+        *_add_right(2, 3, 7, 8, 9, 10, 11, 12, 13, 17, 18, 26, 28, 30, 31, 78, 81),
         *DEEP, *VENTRICLES, *(parcel for side in PARCELS for parcel in side),
     ),
     needed=(2, 41),
@@ -188,13 +188,13 @@ def check_labels_fit(
         if not why:
             return
     elif missing:
-        why = f"it lacks {_listed(missing)}"
+        why = f"it lacks {_format_labels(missing)}"
     elif convention.only and not labels <= convention.known:
-        why = f"it has {_listed(sorted(labels - convention.known))} in addition"
+        why = f"it has {_format_labels(sorted(labels - convention.known))} in addition"
     elif convention.apart and labels >= set(convention.apart):
         why = f"it has {' and '.join(map(str, convention.apart))} together"
     else:
-        why = f"it has none of {_listed([label for label in convention.tumour if label not in own])}"
+        why = f"it has none of {_format_labels([label for label in convention.tumour if label not in own])}"
     others: dict[object, str] = {}
     for one in CONVENTIONS.values():
         if kin and bool(one.tumour) != bool(convention.tumour):
@@ -208,5 +208,5 @@ def check_labels_fit(
     raise InputError(f"{path}: is not labelled as {convention.name} ({convention.source}): {why}. {looks}{sure}.")
 
 
-def _listed(labels: list[int]) -> str:
+def _format_labels(labels: list[int]) -> str:
     return ", ".join(map(str, labels[:8])) + (", ..." if len(labels) > 8 else "")

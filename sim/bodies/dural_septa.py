@@ -16,11 +16,11 @@ from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
 
 SEPTA = ("falx", "tentorium")
 """Names of the septa."""
-FEWEST = 5  # minimum sample points per mesh edge, in the test against a sheet
-MOST = 200  # maximum sample points per mesh edge
-SHALLOWEST = 10e-3
+MIN_SAMPLES = 5  # minimum sample points per mesh edge, in the test against a sheet
+MAX_SAMPLES = 200  # maximum sample points per mesh edge
+MIN_FALX_DEPTH = 10e-3
 """Minimum depth of a synthetic falx [m]."""
-DEEPEST = 60e-3
+MAX_FALX_DEPTH = 60e-3
 """Maximum depth of a synthetic falx [m]."""
 SPACING = 1e-3
 """Point spacing of a synthetic falx [m]."""
@@ -46,9 +46,9 @@ def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
     InputError
         A depth outside 10 to 60 mm.
     """
-    if not SHALLOWEST <= depth <= DEEPEST:
+    if not MIN_FALX_DEPTH <= depth <= MAX_FALX_DEPTH:
         raise InputError(
-            f"a falx of {1e3 * depth:g} mm is outside {1e3 * SHALLOWEST:g} to {1e3 * DEEPEST:g} mm: "
+            f"a falx of {1e3 * depth:g} mm is outside {1e3 * MIN_FALX_DEPTH:g} to {1e3 * MAX_FALX_DEPTH:g} mm: "
             "choose a depth between."
         )
     low, high = cortex.min(axis=0), cortex.max(axis=0)
@@ -77,7 +77,7 @@ def find_held_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
     if not close.any():
         return held
     ends, corners = ends[close], corners[close]
-    count = int(np.clip(np.ceil(length[close].max() / septum.reach), FEWEST, MOST))
+    count = int(np.clip(np.ceil(length[close].max() / septum.reach), MIN_SAMPLES, MAX_SAMPLES))
     along = np.linspace(0.0, 1.0, count)
     places = corners[:, :1] + along[:, None] * (corners[:, 1:] - corners[:, :1])
     distance = tree.query(places.reshape(-1, 3), distance_upper_bound=septum.reach)[0].reshape(places.shape[:2])

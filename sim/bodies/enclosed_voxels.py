@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import InputError
 
-ASIDE = np.array([3.37e-5, 7.13e-5])
+RAY_OFFSET = np.array([3.37e-5, 7.13e-5])
 """Offset of the rays from the lattice [voxels], so that no ray hits an edge of triangles aligned with the lattice."""
 
 
@@ -27,8 +27,8 @@ def fill_enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tup
     low = np.floor(points.min(axis=0) / edge) - 1.0
     shape = (np.ceil(points.max(axis=0) / edge) - low + 2.0).astype(int)
     corners = (points / edge - low)[triangles]
-    corners[..., :2] += ASIDE
-    column, height = _crossings(corners)
+    corners[..., :2] += RAY_OFFSET
+    column, height = _find_crossings(corners)
     first = np.clip(np.ceil(height).astype(int), 0, shape[2] - 1)
     changes = np.zeros(shape, np.int32)
     np.add.at(changes, (column[:, 0], column[:, 1], first), 1)
@@ -37,7 +37,7 @@ def fill_enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tup
     return np.cumsum(changes, axis=2) % 2 == 1, affine
 
 
-def _crossings(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_crossings(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return voxel columns (r, 2) whose ray along z meets a triangle (m, 3, 3) [voxels], and the heights (r,)."""
     low = np.ceil(corners[..., :2].min(axis=1)).astype(int)
     extent = np.maximum(np.floor(corners[..., :2].max(axis=1)).astype(int) - low + 1, 0)
@@ -47,14 +47,14 @@ def _crossings(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     column = low[owner] + np.stack([number // extent[owner, 1], number % extent[owner, 1]], axis=1)
     a, b, c = (corners[owner, corner] for corner in range(3))
     ab, ac, at = (b - a)[:, :2], (c - a)[:, :2], column - a[:, :2]
-    area = _cross(ab, ac)
+    area = _compute_cross_products(ab, ac)
     flat = area == 0.0
     area = np.where(flat, 1.0, area)
-    to_b, to_c = _cross(at, ac) / area, _cross(ab, at) / area
+    to_b, to_c = _compute_cross_products(at, ac) / area, _compute_cross_products(ab, at) / area
     met = ~flat & (to_b >= 0.0) & (to_c >= 0.0) & (to_b + to_c <= 1.0)
     height = a[:, 2] + to_b * (b - a)[:, 2] + to_c * (c - a)[:, 2]
     return column[met], height[met]
 
 
-def _cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _compute_cross_products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]

@@ -26,10 +26,10 @@ def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
         A file that is not FIF, is truncated or damaged, or does not contain one surface in MRI coordinates.
     """
     with read_as(path, "one surface in FIF, in the frame of the MRI", "Reinstall its package."):
-        tags = _tags(path.read_bytes())
+        tags = _parse_tags(path.read_bytes())
         ((_, frame),), (points,), (triangles,) = (tags[kind] for kind in (FRAME, POINTS, TRIANGLES))
-        vertices = _matrix(*points, FLOATS).astype(np.float64)
-        faces = _matrix(*triangles, INTEGERS).astype(np.int64) - 1
+        vertices = _parse_matrix(*points, FLOATS).astype(np.float64)
+        faces = _parse_matrix(*triangles, INTEGERS).astype(np.int64) - 1
         if struct.unpack(">i", frame) != (MRI,) or not np.isfinite(vertices).all():
             raise ValueError(frame)
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -37,7 +37,7 @@ def read_surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
         return vertices, faces
 
 
-def _tags(raw: bytes) -> dict[int, list[tuple[int, bytes]]]:
+def _parse_tags(raw: bytes) -> dict[int, list[tuple[int, bytes]]]:
     """Return type and data of all tags by kind. A header gives the next position: 0 for adjacent, -1 for the end."""
     tags: dict[int, list[tuple[int, bytes]]] = {}
     at = 0
@@ -53,7 +53,7 @@ def _tags(raw: bytes) -> dict[int, list[tuple[int, bytes]]]:
     return tags
 
 
-def _matrix(of: int, data: bytes, wanted: tuple[int, str]) -> np.ndarray:
+def _parse_matrix(of: int, data: bytes, wanted: tuple[int, str]) -> np.ndarray:
     columns, rows, axes = struct.unpack(">iii", data[-12:])
     if of != wanted[0] or (columns, axes) != (3, 2):
         raise ValueError("no table of three columns")

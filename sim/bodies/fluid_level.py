@@ -3,7 +3,7 @@
 import numpy as np
 
 # Distance of the fluid level above the highest (full) or below the lowest (drained) vertex [m].
-SPARE = 1e-3
+LEVEL_MARGIN = 1e-3
 
 
 def compute_fluid_level(nodes: np.ndarray, down: np.ndarray, share: float) -> float:
@@ -12,5 +12,5 @@ def compute_fluid_level(nodes: np.ndarray, down: np.ndarray, share: float) -> fl
     `share` ranges from 0 (drained) to 1 (above the highest vertex).
     """
     height = -nodes @ down
-    low, high = height.min() - SPARE, height.max() + SPARE
+    low, high = height.min() - LEVEL_MARGIN, height.max() + LEVEL_MARGIN
     return float(low + share * (high - low))

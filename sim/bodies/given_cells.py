@@ -18,14 +18,14 @@ from ..geometry.tetmesh import FACES, TetMesh
 VOLUMES = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron", "VTK_LAGRANGE_TETRA", "VTK_LAGRANGE_HEXA",
            "VTK_LAGRANGE_WEDGE", "VTK_LAGRANGE_PYRAMID")  # fmt: skip
 # Maximum number of cells for which one region per cell is accepted; for more cells, unique values are an index.
-FEW = 8
+MAX_ONE_CELL_REGIONS = 8
 # Merge distance of nodes, as a fraction of the body's size.
-COINCIDENT = 1e-9
+MERGE_TOLERANCE = 1e-9
 # Minimum barycentric coordinate of a point strictly inside a tetrahedron.
-INSIDE = 1e-3
+MIN_INSIDE_WEIGHT = 1e-3
 # Maximum number of nodes and centroids tested for overlap: enough to detect an overlap of 0.1 % of the volume.
-PROBES = 2**13
-SPELT = {"tumor": "tumour", "edema": "oedema", "ventricle": "ventricles", **{name: name for name in REGION_NAMES}}
+MAX_PROBES = 2**13
+SPELLINGS = {"tumor": "tumour", "edema": "oedema", "ventricle": "ventricles", **{name: name for name in REGION_NAMES}}
 """Region names by alternative spelling."""
 
 
@@ -58,7 +58,7 @@ def merge_nodes(
     used = np.unique(table)
     whole = used[0] >= 0 and used[-1] < len(points)  # invalid node numbers are rejected with the mesh
     size = np.ptp(points[used], axis=0).max() if whole else 0.0
-    pairs = KDTree(points[used]).query_pairs(COINCIDENT * size, output_type="ndarray") if whole else used[:0]
+    pairs = KDTree(points[used]).query_pairs(MERGE_TOLERANCE * size, output_type="ndarray") if whole else used[:0]
     if not len(pairs):
         return points, table, dict(data), 0
     first = np.arange(len(points))
@@ -87,7 +87,7 @@ def check_one_body(points: np.ndarray, tets: np.ndarray) -> None:
     twice = len(tets) - len(np.unique(np.sort(tets, axis=1), axis=0)) if folded else 0
     if twice:
         raise InputError(f"{twice} tetrahedra are listed twice: list each once.")
-    inside = folded or _inside_others(points, tets)
+    inside = folded or _count_overlaps(points, tets)
     if inside:
         raise InputError(
             f"its tetrahedra overlap, at {inside} {'faces' if folded else 'nodes or middles'}: each place must lie in "
@@ -112,20 +112,20 @@ def note_pieces(mesh: TetMesh) -> tuple[str, ...]:
     )
 
 
-def _inside_others(points: np.ndarray, tets: np.ndarray) -> int:
+def _count_overlaps(points: np.ndarray, tets: np.ndarray) -> int:
     """Count nodes and centroids of tetrahedra (T, 4), at most `PROBES`, that lie inside another tetrahedron."""
     corners = points[tets]
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
     probes = np.concatenate([middle, points[np.unique(tets)]])
-    chosen = np.linspace(0, len(probes) - 1, min(PROBES, len(probes))).astype(int)
+    chosen = np.linspace(0, len(probes) - 1, min(MAX_PROBES, len(probes))).astype(int)
     near = KDTree(probes[chosen]).query_ball_point(middle, reach)
     which = np.repeat(np.arange(len(tets)), [len(one) for one in near])
     probe = chosen[np.concatenate(near).astype(int)]
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
     inner = np.einsum("nij,nj->ni", np.linalg.inv(edges)[which], probes[probe] - corners[which, 0])
     least = np.minimum(inner.min(axis=1), 1.0 - inner.sum(axis=1))
-    return len(np.unique(probe[(least > INSIDE) & (probe != which)]))
+    return len(np.unique(probe[(least > MIN_INSIDE_WEIGHT) & (probe != which)]))
 
 
 def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -139,12 +139,14 @@ def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str,
         `region` that is not one integer per tetrahedron, several arrays that differ, or sets that overlap.
     """
     if "region" in raw.cell_data:
-        region = _whole(np.concatenate([raw.cell_data["region"][number] for number in blocks]))
+        region = _to_integers(np.concatenate([raw.cell_data["region"][number] for number in blocks]))
         if region is None:
             raise InputError("cell data `region` must be one whole number for each tetrahedron.")
         return region, ()
-    stored = {name: _whole(np.concatenate([on[number] for number in blocks])) for name, on in raw.cell_data.items()}
-    varied = {name: one for name, one in stored.items() if one is not None and _parts(one)}
+    stored = {
+        name: _to_integers(np.concatenate([on[number] for number in blocks])) for name, on in raw.cell_data.items()
+    }
+    varied = {name: one for name, one in stored.items() if one is not None and _is_partition(one)}
     if "gmsh:physical" in varied:
         varied.pop("gmsh:geometrical", None)  # geometrical entities of the physical groups
     groups = {name: np.atleast_1d(value) for name, value in raw.field_data.items()}
@@ -156,16 +158,16 @@ def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str,
     if any(not np.array_equal(region, other) for other in varied.values()):
         said = ", ".join(f"`{one}`" for one in varied)
         raise InputError(f"its cell data {said} may each be its regions: call the right one `region`.")
-    return _named(region, names, f"cell data `{name}`")
+    return _match_group_names(region, names, f"cell data `{name}`")
 
 
-def _parts(values: np.ndarray) -> bool:
+def _is_partition(values: np.ndarray) -> bool:
     """Return True if integers (T,) partition the cells rather than number them."""
     count = len(np.unique(values))
-    return count > 1 and (count < len(values) or count <= FEW)
+    return count > 1 and (count < len(values) or count <= MAX_ONE_CELL_REGIONS)
 
 
-def _whole(values: np.ndarray) -> np.ndarray | None:
+def _to_integers(values: np.ndarray) -> np.ndarray | None:
     """Return the values (T,) as integers; None if they are not integers."""
     if values.ndim != 1 or values.dtype.kind not in "biuf":
         return None
@@ -190,17 +192,17 @@ def _from_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]
     if np.sum([*marked.values()], axis=0).max() > 1:
         raise InputError(f"its sets of cells {', '.join(marked)} overlap: store cell data `region` in their place.")
     region = np.select([*marked.values()], range(1, len(marked) + 1), 0).astype(np.int32)
-    return _named(region, dict(enumerate(marked, 1)), "its sets of cells", free=True)
+    return _match_group_names(region, dict(enumerate(marked, 1)), "its sets of cells", free=True)
 
 
-def _named(
+def _match_group_names(
     region: np.ndarray, names: Mapping[int, str], said: str, free: bool = False
 ) -> tuple[np.ndarray, tuple[str]]:
     """Return regions renumbered to match the group `names`, and a note; `free` numbers are not from the file.
 
     Without contradiction between numbers and known names, numbers of the file are kept.
     """
-    known = {number: SPELT.get(names.get(number, "").strip().lower()) for number in np.unique(region).tolist()}
+    known = {number: SPELLINGS.get(names.get(number, "").strip().lower()) for number in np.unique(region).tolist()}
     wrong = [number for number, name in known.items() if name and REGION_NAMES[name] != number]
     if wrong or (free and any(known.values())):
         number = {old: REGION_NAMES[name] for old, name in known.items() if name}

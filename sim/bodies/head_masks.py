@@ -16,14 +16,14 @@ from .label_map import Label, LabelMap, Mask, count_on_border, format_labels, re
 from .one_space import has_one_space
 from .placement import describe_side
 from .volume import read_volume
-from .voxels import OF_BRAINS, VoxelGrid, Voxels
+from .voxels import DEFAULT_VOXELS, VoxelGrid, Voxels
 
 # Fraction of labelled voxels that may lie outside the mask without a note.
-OUTSIDE = 0.01
+MAX_OUTSIDE_FRACTION = 0.01
 NECROSIS = "necrosis"
 """Name of the part that belongs to the tumour; all other parts belong to the brain."""
 # Margin kept around brain and tumour [voxels]: larger than the tumour extension beyond the cortex.
-SURROUNDINGS = 10
+CROP_MARGIN = 10
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class HeadMasks:
     cut: int = 0
     parts: dict[str, np.ndarray] = field(default_factory=dict)
     grids: tuple[VoxelGrid, ...] = ()
-    voxels: Voxels = OF_BRAINS
+    voxels: Voxels = DEFAULT_VOXELS
 
 
 def read_head_masks(sources: Sources) -> HeadMasks:
@@ -112,20 +112,20 @@ def read_head_masks(sources: Sources) -> HeadMasks:
         Labels that are missing or named twice; no labels and no replacement. Left labels on the right
         side. A tumour in another file that does not lie at the brain.
     """
-    convention = _convention(sources)
-    _demand_named(sources, convention)
+    convention = _get_convention(sources)
+    _check_sources(sources, convention)
     whole = read_labels(sources.labels, sources.voxels)
-    brain, tumour = _meant(whole, sources, convention)
+    brain, tumour = _select_labels(whole, sources, convention)
     marked = {} if sources.mask else {"brain": whole.mask(brain)}
     marked |= {} if sources.tumour_in else {"tumour": whole.mask(tumour)}
-    parts = {} if convention is None else _parts(whole, convention)
+    parts = {} if convention is None else _build_part_masks(whole, convention)
     named = {name: labels for name, labels in sources.parts.items() if name != NECROSIS or not sources.tumour_in}
     parts |= {name: whole.mask(labels) for name, labels in named.items()}
     for name in named:
-        if (around := _around(name)) in marked:
+        if (around := _get_enclosing_mask(name)) in marked:
             marked[around] = marked[around] | parts[name]
     marked |= parts
-    others = _others(sources, tumour)
+    others = _read_other_masks(sources, tumour)
     either = False
     if others:
         ours = {name: Mask(Path(sources.labels), mask, whole.affine) for name, mask in marked.items()}
@@ -138,14 +138,16 @@ def read_head_masks(sources: Sources) -> HeadMasks:
     marked |= {name: other.resample(shape, affine) for name, other in others.items()}
     notes = whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes)
     if convention is None and not sources.mask and not sources.tumour_in:
-        notes += _unnamed(whole, (*brain, *tumour, *(label for labels in named.values() for label in labels)))
+        notes += _note_unassigned_labels(
+            whole, (*brain, *tumour, *(label for labels in named.values() for label in labels))
+        )
     if not sources.tumour_in:
-        notes += _doubtful(whole, tumour, sources.parts)
+        notes += _note_contradictions(whole, tumour, sources.parts)
     if sources.mask:
-        notes += _outside(marked, affine) + _cavity(whole, convention, named)
+        notes += _note_voxels_outside(marked, affine) + _note_cavity(whole, convention, named)
     if either:
-        notes += (_side(marked, affine, next(iter(others.values())).path),)
-    marked, affine = _cropped(marked, affine)
+        notes += (_note_tumour_side(marked, affine, next(iter(others.values())).path),)
+    marked, affine = _crop_masks(marked, affine)
     return HeadMasks(
         name=" and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_in) if path),
         meant=f"the mask {sources.mask}" if sources.mask else f"the labels {format_labels(brain)}",
@@ -163,7 +165,7 @@ def read_head_masks(sources: Sources) -> HeadMasks:
     )
 
 
-def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
+def _note_unassigned_labels(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
     """Return a note on labels of the file that have no assigned meaning."""
     names = {(one.layer, one.value): one.name for one in whole.segments}
     found = {(layer, value) for layer, present in enumerate(whole.present) for value in present}
@@ -171,7 +173,9 @@ def _unnamed(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
     return (f"neither brain nor tumour: what is labelled {format_labels(left)}",) if left else ()
 
 
-def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]) -> tuple[str, ...]:
+def _note_contradictions(
+    whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]
+) -> tuple[str, ...]:
     """Return a note on the user's own labels if the anatomy contradicts them."""
     if whole.layers.shape[-1] > 1 or not {NECROSIS, "oedema"}.intersection(parts):
         return ()
@@ -182,7 +186,7 @@ def _doubtful(whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tupl
     return (f"{found.reason}: see that the labels mean this",) if found else ()
 
 
-def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
+def _note_tumour_side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
     """Return a note on the side of the tumour, for a file that would also fit with x and y negated."""
     low, high = Mask(path, marked["brain"], affine).box
     centre = affine[:3, :3] @ np.argwhere(marked["tumour"]).mean(axis=0) + affine[:3, 3]
@@ -192,19 +196,21 @@ def _side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
     )
 
 
-def _outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ...]:
+def _note_voxels_outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ...]:
     """Return a note if many labelled voxels lie outside the brain mask."""
     labelled = np.logical_or.reduce([mask for name, mask in marked.items() if name != "brain"])
     out = int((labelled & ~marked["brain"]).sum())
-    if out <= OUTSIDE * labelled.sum():
+    if out <= MAX_OUTSIDE_FRACTION * labelled.sum():
         return ()
     lost = 1e6 * out * abs(float(np.linalg.det(affine[:3, :3])))
     return (f"{lost:.2g} ml of what is labelled lie outside of the mask: see that both files are of one space",)
 
 
-def _cavity(whole: LabelMap, convention: Convention | None, named: Mapping[str, Sequence[Label]]) -> tuple[str, ...]:
+def _note_cavity(
+    whole: LabelMap, convention: Convention | None, named: Mapping[str, Sequence[Label]]
+) -> tuple[str, ...]:
     """Return a note on cavity fluid that a tumour convention marks, since a brain mask may include it."""
-    fluid = _there(convention.csf, whole) if convention and convention.tumour else ()
+    fluid = _select_present(convention.csf, whole) if convention and convention.tumour else ()
     if not fluid or set(fluid) <= {label for labels in named.values() for label in labels}:
         return ()
     ml = 1e6 * int(whole.mask(fluid).sum()) * abs(float(np.linalg.det(whole.affine[:3, :3])))
@@ -215,18 +221,18 @@ def _cavity(whole: LabelMap, convention: Convention | None, named: Mapping[str, 
     )
 
 
-def _cropped(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _crop_masks(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return the masks cropped to brain and tumour with a margin of `SURROUNDINGS` voxels, and their affine (4, 4)."""
     anything = marked["brain"] | marked["tumour"]
     ends = [np.flatnonzero(anything.any(axis=tuple({0, 1, 2} - {axis})))[[0, -1]] for axis in range(3)]
-    low = np.maximum(0, np.array(ends)[:, 0] - SURROUNDINGS)
-    part = tuple(slice(first, end[1] + 1 + SURROUNDINGS) for first, end in zip(low, ends, strict=True))
+    low = np.maximum(0, np.array(ends)[:, 0] - CROP_MARGIN)
+    part = tuple(slice(first, end[1] + 1 + CROP_MARGIN) for first, end in zip(low, ends, strict=True))
     moved = affine.copy()
     moved[:3, 3] += affine[:3, :3] @ low
     return {name: np.ascontiguousarray(mask[part]) for name, mask in marked.items()}, moved
 
 
-def _meant(
+def _select_labels(
     whole: LabelMap, sources: Sources, convention: Convention | None
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
     """Return the labels of brain and tumour: the user's, or those of the convention that occur."""
@@ -239,31 +245,31 @@ def _meant(
         checked = convention.deepest or (convention.tumour and not sources.tumour and not sources.parts)
         doubts = (build_contradiction_check(whole, convention),) if checked else ()
         check_labels_fit(sources.labels, convention, whole.labels, named, *doubts)
-        _demand_sides(whole, convention)
+        _check_hemispheres(whole, convention)
         if not brain and not sources.mask:
-            brain = _there(convention.brain, whole)
+            brain = _select_present(convention.brain, whole)
         if not tumour and not sources.tumour_in:
-            tumour = _there(convention.tumour, whole)
+            tumour = _select_present(convention.tumour, whole)
     options = {"brain": "--brain" if sources.brain else "--convention", "tumour": "--tumour"}
     own = {"brain": brain, "tumour": tumour, **sources.parts}
     elsewhere = ("tumour", NECROSIS) if sources.tumour_in else ()
-    _demand_one_meaning(
+    _check_labels_unique(
         whole, {name: (options.get(name, f"--{name}"), of) for name, of in own.items() if name not in elsewhere}
     )
     return brain, tumour
 
 
-def _there(labels: Sequence[int], whole: LabelMap) -> tuple[int, ...]:
+def _select_present(labels: Sequence[int], whole: LabelMap) -> tuple[int, ...]:
     return tuple(label for label in labels if label in whole.labels)
 
 
-def _parts(whole: LabelMap, convention: Convention) -> dict[str, np.ndarray]:
+def _build_part_masks(whole: LabelMap, convention: Convention) -> dict[str, np.ndarray]:
     """Return masks of the convention's other tissues that occur in the file."""
     groups = {NECROSIS: convention.necrosis, "oedema": convention.oedema, "ventricles": convention.ventricles}
-    return {name: whole.mask(found) for name, of in groups.items() if (found := _there(of, whole))}
+    return {name: whole.mask(found) for name, of in groups.items() if (found := _select_present(of, whole))}
 
 
-def _others(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
+def _read_other_masks(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
     """Read the masks that other files define, by name."""
     others = {}
     if sources.mask:
@@ -282,7 +288,7 @@ def _others(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
     return others
 
 
-def _convention(sources: Sources) -> Convention | None:
+def _get_convention(sources: Sources) -> Convention | None:
     if sources.convention is None:
         return None
     if sources.convention not in CONVENTIONS:
@@ -290,7 +296,7 @@ def _convention(sources: Sources) -> Convention | None:
     return CONVENTIONS[sources.convention]
 
 
-def _demand_named(sources: Sources, convention: Convention | None) -> None:
+def _check_sources(sources: Sources, convention: Convention | None) -> None:
     """Reject sources that do not define the brain and the tumour exactly once."""
     if sources.mask and sources.brain:
         raise InputError("--mask and --brain both define the brain: give only one of them.")
@@ -312,13 +318,13 @@ def _demand_named(sources: Sources, convention: Convention | None) -> None:
         )
 
 
-def _demand_one_meaning(whole: LabelMap, named: Mapping[str, tuple[str, Sequence[Label]]]) -> None:
+def _check_labels_unique(whole: LabelMap, named: Mapping[str, tuple[str, Sequence[Label]]]) -> None:
     """Reject a label that two options name; `named` maps each tissue to its option and labels.
 
     A part of the brain may also be labelled brain, and necrosis also tumour.
     """
     for (one, (option, labels)), (two, (other, others)) in combinations(named.items(), 2):
-        if one == _around(two):
+        if one == _get_enclosing_mask(two):
             continue
         places = whole.find_layers(labels)
         both = [label for label, place in zip(others, whole.find_layers(others), strict=True) if place in places]
@@ -329,12 +335,12 @@ def _demand_one_meaning(whole: LabelMap, named: Mapping[str, tuple[str, Sequence
             )
 
 
-def _around(part: str) -> str:
+def _get_enclosing_mask(part: str) -> str:
     """Return the mask that contains a part; empty for brain and tumour themselves."""
     return "" if part in ("brain", "tumour") else "tumour" if part == NECROSIS else "brain"
 
 
-def _demand_sides(whole: LabelMap, convention: Convention) -> None:
+def _check_hemispheres(whole: LabelMap, convention: Convention) -> None:
     """Reject labels of the left hemisphere that lie on the right: the file's orientation is wrong."""
     right = []
     for side in (convention.left, convention.right):

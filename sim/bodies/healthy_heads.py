@@ -16,13 +16,13 @@ from .head_masks import HeadMasks
 from .intensity import Intensity, read_intensity
 from .label_map import count_on_border
 from .label_volume import fill_brain
-from .template import MIDDLE, HealthyHead, measure_size, scale_affine
+from .template import MNI_CENTRE, HealthyHead, measure_size, scale_affine
 from .volume import read_volume
 
-SEEN_FROM = (1e-3 * MIDDLE[0], 1e-3 * MIDDLE[1], 1e-3 * MIDDLE[2])  # centre of the view [m]
+VIEW_CENTRE = (1e-3 * MNI_CENTRE[0], 1e-3 * MNI_CENTRE[1], 1e-3 * MNI_CENTRE[2])  # centre of the view [m]
 INNER_SKULL = Path("data", "fsaverage", "fsaverage-inner_skull-bem.fif")
 """Path of the inner skull surface in the package mne."""
-VOXEL = 1e-3
+VOXEL_SIZE = 1e-3
 """Voxel edge for the voxelised skull [m]."""
 REMEDY = install_hint("heads")  # remedy of messages about the package mne
 
@@ -44,8 +44,8 @@ def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None =
     notes = list(read.notes)
     masks = HeadMasks(str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, cut=count_on_border(brain))
     solid = fill_brain(masks, notes)
-    healthy = HealthyHead(solid, read.affine, t1 and read_intensity(t1), SEEN_FROM, tuple(notes))
-    return healthy if volume is None else _scaled(healthy, volume)
+    healthy = HealthyHead(solid, read.affine, t1 and read_intensity(t1), VIEW_CENTRE, tuple(notes))
+    return healthy if volume is None else _scale_head(healthy, volume)
 
 
 def read_fsaverage_head(volume: float) -> HealthyHead:
@@ -58,16 +58,16 @@ def read_fsaverage_head(volume: float) -> HealthyHead:
     InputError
         The package mne is missing, or does not contain the skull as one closed surface.
     """
-    path = _skull_path()
+    path = _find_skull_path()
     points, triangles = read_surface(path)
     try:
-        mask, affine = fill_enclosed(points, triangles, VOXEL)
+        mask, affine = fill_enclosed(points, triangles, VOXEL_SIZE)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return _scaled(HealthyHead(mask, affine, middle=SEEN_FROM), volume)
+    return _scale_head(HealthyHead(mask, affine, middle=VIEW_CENTRE), volume)
 
 
-def _skull_path() -> Path:
+def _find_skull_path() -> Path:
     found = find_spec("mne")
     if found is None or not found.submodule_search_locations:
         raise InputError(f"fsaverage's skull is in the package mne, which is not installed. {REMEDY}")
@@ -77,7 +77,7 @@ def _skull_path() -> Path:
     return path
 
 
-def _scaled(healthy: HealthyHead, volume: float) -> HealthyHead:
+def _scale_head(healthy: HealthyHead, volume: float) -> HealthyHead:
     centre, own = measure_size(healthy.mask, healthy.affine)
     factor = (volume / own) ** (1.0 / 3.0)
     grey = healthy.intensity

@@ -12,10 +12,10 @@ from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
 from ..runtime.atomic_files import write_atomically
 from .volume import read_volume
-from .voxels import OF_BRAINS, Voxels
+from .voxels import DEFAULT_VOXELS, Voxels
 
 # Relative difference below which grey values count as equal.
-ALIKE = 1e-6
+GREY_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Window:
     plain: float = 0.8
 
 
-KEPT = Window(dark=0.25, light=0.75)
+STORED_WINDOW = Window(dark=0.25, light=0.75)
 """Window of the file stored with a mesh: it preserves values darker and lighter than nearly all of the brain."""
 
 
@@ -78,7 +78,7 @@ class Intensity:
         affine = self.affine.copy()
         affine[:3, 3] += self.affine[:3, :3] @ low
         part = Intensity(self.values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))], affine)
-        return Intensity(np.rint(255.0 * part.apply_window(mesh, KEPT)).astype(np.uint8), affine)
+        return Intensity(np.rint(255.0 * part.apply_window(mesh, STORED_WINDOW)).astype(np.uint8), affine)
 
     def apply_window(self, mesh: TetMesh, window: Window = Window()) -> np.ndarray:
         """Return the values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same coordinates.
@@ -104,7 +104,7 @@ class Intensity:
         low, middle, high = np.interp([0.01 * window.low, 0.5, 0.01 * window.high], share, found[order])
         values = self.values.astype(np.float64)
         values[~(np.isfinite(values) & (values <= high + window.beyond * (high - low)))] = middle
-        if high - low <= ALIKE * max(abs(low), abs(high)):
+        if high - low <= GREY_TOLERANCE * max(abs(low), abs(high)):
             return np.full(values.shape, window.plain, np.float32)
         grey = window.dark + (window.light - window.dark) * (values - low) / (high - low)
         return np.clip(grey, 0.0, 1.0).astype(np.float32)
@@ -133,7 +133,7 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
         nibabel.save(image, partial)
 
 
-def read_intensity(path: str | Path, voxels: Voxels = OF_BRAINS) -> Intensity:
+def read_intensity(path: str | Path, voxels: Voxels = DEFAULT_VOXELS) -> Intensity:
     """Read a grey value volume, from `write_intensity` or a patient's scan.
 
     Raises

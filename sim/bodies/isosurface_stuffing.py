@@ -23,7 +23,7 @@ PAIR_FIRST = {3: [0, 1, 2, 3], 5: [0, 2, 3, 1], 9: [0, 3, 1, 2], 6: [1, 2, 0, 3]
 # Same for two corners first, by the bit mask of their numbers.
 # Dompierre et al. 1999: rotate a prism so that its smallest node comes first, then split the two quadrilaterals there
 # from that node and the third from its own smallest; neighbouring prisms then conform without communication.
-TURN = np.array(
+PRISM_ROTATIONS = np.array(
     [
         [0, 1, 2, 3, 4, 5],
         [1, 2, 0, 4, 5, 3],
@@ -104,9 +104,9 @@ def cut(
     """
     nodes = pieces.nodes.copy()
     values = field(nodes)
-    edges = _crossed_edges(pieces.tets, values)
-    at = _crossings(field, nodes, edges, values, settings.bisections)
-    snapped, onto = _snapped(edges, at, _snapping_reach(pieces, edges, settings))
+    edges = _find_crossed_edges(pieces.tets, values)
+    at = _find_crossings(field, nodes, edges, values, settings.bisections)
+    snapped, onto = _select_snapped_nodes(edges, at, _compute_snap_fractions(pieces, edges, settings))
     values[snapped] = 0.0
     loose = snapped if pinned is None else snapped[~pinned[snapped]]
     onto = onto if pinned is None else onto[~pinned[snapped]]
@@ -124,7 +124,7 @@ def cut(
     return Pieces(nodes, np.append(pieces.kind, np.full(len(added), CUT)), tets, inside, surface)
 
 
-def _crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _find_crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return edges (E, 2), smaller node first, whose ends lie strictly on different sides."""
     sides = np.sign(values)[tets]
     crossed = tets[(sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)]
@@ -134,7 +134,9 @@ def _crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.stack([keys // len(values), keys % len(values)], axis=1)
 
 
-def _crossings(field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.ndarray, bisections: int) -> np.ndarray:
+def _find_crossings(
+    field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.ndarray, bisections: int
+) -> np.ndarray:
     """Return positions (E,) in (0, 1) of the field's zero on each edge, by bisection: the field may be non-smooth."""
     start, along = nodes[edges[:, 0]], nodes[edges[:, 1]] - nodes[edges[:, 0]]
     sign = np.sign(values[edges[:, 0]])
@@ -146,23 +148,23 @@ def _crossings(field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.nd
     return 0.5 * (low + high)
 
 
-def _snapping_reach(pieces: Pieces, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
+def _compute_snap_fractions(pieces: Pieces, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
     """Return the fraction (E, 2) of each edge within which a crossing snaps either end."""
     kinds = pieces.kind[edges]
     share = np.where(kinds[:, 0] == kinds[:, 1], settings.snap_long, settings.snap_short)
     share = np.where((kinds == CUT).any(axis=1), settings.snap_other, share)
     ends = pieces.tets[:, EDGES].reshape(-1, 2)
     shortest = np.full(len(pieces.nodes), np.inf)
-    np.minimum.at(shortest, ends.ravel(), np.repeat(_lengths(pieces.nodes, ends), 2))
+    np.minimum.at(shortest, ends.ravel(), np.repeat(_compute_lengths(pieces.nodes, ends), 2))
     farthest = settings.snap_shortest * shortest[edges]
-    return np.minimum(share[:, None], farthest / _lengths(pieces.nodes, edges)[:, None])
+    return np.minimum(share[:, None], farthest / _compute_lengths(pieces.nodes, edges)[:, None])
 
 
-def _lengths(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def _compute_lengths(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.linalg.norm(nodes[edges[:, 1]] - nodes[edges[:, 0]], axis=1)
 
 
-def _snapped(edges: np.ndarray, at: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _select_snapped_nodes(edges: np.ndarray, at: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes (S,) to move onto the surface, and the edge (S,) whose crossing each moves to.
 
     Closest pairs come first: a moved node removes the crossings of all its edges, so neighbours may not need to move.
@@ -200,7 +202,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     apex, *others = turned.T
     base = [between(apex, other) for other in others]
     tips = np.stack([apex, *base], axis=1)
-    stumps, stump_of = _prisms_split(np.stack([*base, *others], axis=1))
+    stumps, stump_of = _split_prisms(np.stack([*base, *others], axis=1))
 
     # Two corners against two: one wedge on each side.
     pairs = mixed & ~lone
@@ -208,8 +210,8 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     order = np.array([PAIR_FIRST.get(number, [0, 1, 2, 3]) for number in range(16)])[code]
     a, b, c, d = np.take_along_axis(tets[pairs], order, axis=1).T
     ac, ad, bc, bd = between(a, c), between(a, d), between(b, c), between(b, d)
-    within, _ = _prisms_split(np.stack([a, ac, ad, b, bc, bd], axis=1))
-    beyond, _ = _prisms_split(np.stack([c, ac, bc, d, ad, bd], axis=1))
+    within, _ = _split_prisms(np.stack([a, ac, ad, b, bc, bd], axis=1))
+    beyond, _ = _split_prisms(np.stack([c, ac, bc, d, ad, bd], axis=1))
 
     parts = [
         (tets[~mixed], inner[~mixed] > 0),
@@ -221,9 +223,9 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     return np.concatenate([part for part, _ in parts]), np.concatenate([inside for _, inside in parts])
 
 
-def _prisms_split(prisms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _split_prisms(prisms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return tetrahedra (n, 4) of prisms (P, 6), and the prism (n,) of each; those with a repeated node are dropped."""
-    turned = np.take_along_axis(prisms, TURN[np.argmin(prisms, axis=1)], axis=1)
+    turned = np.take_along_axis(prisms, PRISM_ROTATIONS[np.argmin(prisms, axis=1)], axis=1)
     first = turned[:, [1, 5]].min(axis=1) < turned[:, [2, 4]].min(axis=1)
     tets = np.where(first[:, None, None], turned[:, SPLIT_15], turned[:, SPLIT_24]).reshape(-1, 4)
     ordered = np.sort(tets, axis=1)

@@ -12,14 +12,14 @@ from .conventions import CONVENTIONS, Convention
 from .label_map import LabelMap
 
 # Minimum oedema volume, as a fraction of all labelled voxels; smaller ones are noise.
-SPECK = 0.02
+MIN_OEDEMA_FRACTION = 0.02
 # Fraction of an oedema's surface that faces neither tumour nor oedema.
-HIDDEN = 0.2  # below it in no tumour
-SURE = 0.4  # above it in every tumour
+MIN_OUTER_FRACTION = 0.2  # below it in no tumour
+CERTAIN_OUTER_FRACTION = 0.4  # above it in every tumour
 # Significant difference between two such fractions.
-MARGIN = 0.1
+MIN_DIFFERENCE = 0.1
 # Fraction of the enhancing tumour's surface at necrosis above which the necrosis lies outside.
-WRAPPED = 0.7
+MAX_WRAPPED_FRACTION = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +78,21 @@ def find_contradiction(contacts: Contacts, convention: Convention) -> Contradict
     for label in there.intersection(convention.deepest):
         least = min((contacts.share({one}, {0}) for one in there.intersection(convention.known) - {label}), default=1.0)
         found = contacts.share({label}, {0})
-        if found > least + MARGIN:
+        if found > least + MIN_DIFFERENCE:
             return Contradiction(f"label {label} lies outside of the others, {found:.0%} of its surface at no label")
-    if oedema and tumour and contacts.compute_share(oedema) >= SPECK:
+    if oedema and tumour and contacts.compute_share(oedema) >= MIN_OEDEMA_FRACTION:
         found = contacts.share(oedema, outside)
-        if found < HIDDEN or found < min(SURE, contacts.share(necrosis, outside) - MARGIN):
+        if found < MIN_OUTER_FRACTION or found < min(
+            CERTAIN_OUTER_FRACTION, contacts.share(necrosis, outside) - MIN_DIFFERENCE
+        ):
             return Contradiction(
-                f"label {_words(oedema)} would be oedema and lies inside the tumour, {found:.0%} of its surface at "
+                f"label {_to_text(oedema)} would be oedema and lies inside the tumour, {found:.0%} of its surface at "
                 "healthy tissue"
             )
     found = contacts.share(tumour - necrosis, necrosis)
-    if found > max(WRAPPED, contacts.share(necrosis, tumour)):
+    if found > max(MAX_WRAPPED_FRACTION, contacts.share(necrosis, tumour)):
         return Contradiction(
-            f"label {_words(necrosis)} would be necrosis and lies round the enhancing tumour, of whose surface it "
+            f"label {_to_text(necrosis)} would be necrosis and lies round the enhancing tumour, of whose surface it "
             f"covers {found:.0%}",
             certain=False,
         )
@@ -122,8 +124,8 @@ def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[
 def _has_oedema_outside(contacts: Contacts, convention: Convention) -> bool:
     there = set(contacts.labels.tolist())
     outside = there.difference(convention.tumour, convention.oedema)
-    return contacts.share(there.intersection(convention.oedema), outside) >= SURE
+    return contacts.share(there.intersection(convention.oedema), outside) >= CERTAIN_OUTER_FRACTION
 
 
-def _words(labels: Collection[int]) -> str:
+def _to_text(labels: Collection[int]) -> str:
     return " and ".join(map(str, sorted(labels)))

@@ -12,12 +12,12 @@ import numpy as np
 from scipy import ndimage
 
 from ..errors import InputError
-from ..runtime.file_limits import MOST_VOXELS
+from ..runtime.file_limits import MAX_VOXELS
 from .volume import read_volume
-from .voxels import OF_BRAINS, Segment, VoxelGrid, Voxels
+from .voxels import DEFAULT_VOXELS, Segment, VoxelGrid, Voxels
 
 # Maximum distance of a label from an integer, as left by scaling or resampling.
-ROUND_OFF = 1e-3
+LABEL_TOLERANCE = 1e-3
 
 Label = int | str
 """Label number, or its name in the file."""
@@ -87,10 +87,10 @@ class LabelMap:
             wrong = (
                 f"has no label {format_labels(missing)}" if missing and missing != [0] else "has label 0 as background"
             )
-            raise InputError(f"{self.path}: {wrong}. Choose from {self._choice()}.")
+            raise InputError(f"{self.path}: {wrong}. Choose from {self._format_labels()}.")
         for label, at in zip(labels, found, strict=True):
             if len(at) > 1:
-                raise InputError(f"{self.path}: several segments {self._several(label, at)}.")
+                raise InputError(f"{self.path}: several segments {self._format_conflict(label, at)}.")
         return [at[0] for at in found]
 
     def _place(self, label: Label) -> list[tuple[int, int]]:
@@ -102,7 +102,7 @@ class LabelMap:
         alike = alike or [one for one, name in composed.items() if name.casefold() == wanted.casefold()]
         return [(one.layer, one.value) for one in alike if one.value in self.present[one.layer]]
 
-    def _several(self, label: Label, at: list[tuple[int, int]]) -> str:
+    def _format_conflict(self, label: Label, at: list[tuple[int, int]]) -> str:
         """Format the conflict of several segments that match one label, and the remedy."""
         if isinstance(label, int):
             names = ", ".join(sorted(one.name for one in self.segments if (one.layer, one.value) in at))
@@ -112,13 +112,13 @@ class LabelMap:
         remedy = f"give its number, of {', '.join(map(str, numbers))}" if clear else "rename all but one in 3D Slicer"
         return f"are called {label}: {remedy}"
 
-    def _choice(self) -> str:
+    def _format_labels(self) -> str:
         if self.segments:
             return format_labels([one.name for one in self.segments if one.value in self.present[one.layer]])
         return format_labels(sorted(self.labels))
 
 
-def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
+def read_labels(path: str | Path, voxels: Voxels = DEFAULT_VOXELS) -> LabelMap:
     """Return the label map in a file; values within 1e-3 of integers are rounded, with a note.
 
     Raises
@@ -143,7 +143,7 @@ def read_labels(path: str | Path, voxels: Voxels = OF_BRAINS) -> LabelMap:
 
 def has_whole_numbers(values: np.ndarray) -> bool:
     """Return True if all values are integers up to the round-off of a scale."""
-    return bool((np.abs(values - np.rint(values)) <= ROUND_OFF).all())
+    return bool((np.abs(values - np.rint(values)) <= LABEL_TOLERANCE).all())
 
 
 def format_labels(labels: Sequence[Label]) -> str:
@@ -190,7 +190,7 @@ class Mask:
 
     def resample(self, shape: tuple[int, ...], affine: np.ndarray) -> np.ndarray:
         """Return the mask (I, J, K) resampled to another grid by nearest neighbour."""
-        if _alike(shape, affine, self):
+        if _is_same_grid(shape, affine, self):
             return self.marked
         matrix = np.linalg.inv(self.affine) @ affine
         found = ndimage.affine_transform(
@@ -211,13 +211,13 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
     """
     inverse = np.linalg.inv(affine)
     index = other.outline @ inverse[:3, :3].T + inverse[:3, 3]
-    margin = 0 if _alike(shape, affine, other) else 1
+    margin = 0 if _is_same_grid(shape, affine, other) else 1
     low = np.maximum(0, margin - np.floor(index.min(axis=0)).astype(int))
     high = np.maximum(0, margin + np.ceil(index.max(axis=0)).astype(int) - np.array(shape) + 1)
     voxels = float(np.prod(np.array(shape, float) + low + high))
-    if voxels > MOST_VOXELS:
+    if voxels > MAX_VOXELS:
         raise InputError(
-            f"{other.path}: on the labels' grid it takes {voxels:.3g} voxels; the maximum is {MOST_VOXELS:.3g}. "
+            f"{other.path}: on the labels' grid it takes {voxels:.3g} voxels; the maximum is {MAX_VOXELS:.3g}. "
             "Resample the labels more coarsely."
         )
     moved = affine.copy()
@@ -225,7 +225,7 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
     return np.stack([low, high], axis=1), moved
 
 
-def _alike(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> bool:
+def _is_same_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> bool:
     """Return True if the grid is that of the mask."""
     return shape == other.marked.shape and np.allclose(affine, other.affine, rtol=0.0, atol=1e-9)
 

@@ -98,12 +98,12 @@ def build_masked_subject(
     affine, voxel = masks.affine, abs(float(np.linalg.det(masks.affine[:3, :3])))
     notes = list(masks.notes)
     solid = fill_brain(masks, notes, settings)
-    inside = _inside(masks.name, solid, masks.tumour, voxel, notes, settings)
+    inside = _extract_tumour(masks.name, solid, masks.tumour, voxel, notes, settings)
     cortex, interface = find_rim(solid, affine), find_rim(inside, affine)
-    pieces = _pieces(inside, affine)
+    pieces = _list_pieces(inside, affine)
     return Subject(
         brain=mask_field(solid, affine, settings.blur),
-        tumour=mask_field(_extended(inside, solid, settings.extension), affine, settings.blur),
+        tumour=mask_field(_extend_tumour(inside, solid, settings.extension), affine, settings.blur),
         cortex=cortex,
         interface=interface,
         tumour_volume=float(inside.sum() * voxel),
@@ -111,19 +111,19 @@ def build_masked_subject(
         intensity=intensity,
         notes=tuple(notes),
         pieces=pieces,
-        parts=_parts(masks, solid, inside, regions, settings),
-        septa=tuple(_septum(name, masks) for name in SEPTA if name in masks.parts),
+        parts=_build_parts(masks, solid, inside, regions, settings),
+        septa=tuple(_build_septum(name, masks) for name in SEPTA if name in masks.parts),
     )
 
 
-def _septum(name: str, masks: HeadMasks) -> Septum:
+def _build_septum(name: str, masks: HeadMasks) -> Septum:
     """Return the dural sheet that voxels mark."""
     edges = masks.affine[:3, :3]
     points = np.argwhere(masks.parts[name]) @ edges.T + masks.affine[:3, 3]
     return Septum(name, points, 0.5 * float(np.sqrt((edges**2).sum())))
 
 
-def _parts(
+def _build_parts(
     masks: HeadMasks, solid: np.ndarray, tumour: np.ndarray, regions: Sequence[str], settings: Labelling
 ) -> tuple[SubjectPart, ...]:
     """Return the parts that become regions; each volume counts only voxels that the mesh will assign to it."""
@@ -146,7 +146,7 @@ def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelli
         A brain volume outside the limits of `settings`.
     """
     voxel = abs(float(np.linalg.det(masks.affine[:3, :3])))
-    solid = _whole(masks.brain, masks.tumour, voxel, notes)
+    solid = _extract_brain(masks.brain, masks.tumour, voxel, notes)
     smallest, largest = settings.smallest_brain, settings.largest_brain
     if not smallest <= solid.sum() * voxel <= largest:
         raise InputError(
@@ -162,7 +162,7 @@ def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelli
     return solid
 
 
-def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
+def _extract_brain(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
     """Return the component of brain or tumour with most of the brain, its holes filled."""
     component, _ = cast(tuple[np.ndarray, int], ndimage.label(brain | tumour))
     solid = component == np.bincount(component[brain]).argmax()
@@ -176,7 +176,7 @@ def _whole(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]
     return filled
 
 
-def _inside(
+def _extract_tumour(
     name: str,
     solid: np.ndarray,
     tumour: np.ndarray,
@@ -212,7 +212,7 @@ def _inside(
     return result
 
 
-def _extended(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
+def _extend_tumour(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
     """Return the tumour extended outside the brain by up to `by` voxels whose nearest brain voxel is tumour.
 
     The field of a tumour at the cortex then crosses the cortex instead of touching it.
@@ -227,7 +227,7 @@ def _extended(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
     return extended
 
 
-def _pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
+def _list_pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
     """Return the tumour's connected components, the largest first; the centre is the mean of the surface voxels."""
     component, count = cast(tuple[np.ndarray, int], ndimage.label(tumour, np.ones((3, 3, 3))))
     voxel = abs(float(np.linalg.det(affine[:3, :3])))

@@ -30,13 +30,13 @@ def clean(tets: np.ndarray) -> np.ndarray:
     keep = np.ones(len(tets), bool)
     while True:
         keep[keep] = find_largest_piece(tets[keep])
-        offending = _pinching(tets[keep])
+        offending = _find_pinching_tets(tets[keep])
         if len(offending) == 0:
             return keep
         keep[np.flatnonzero(keep)[offending]] = False
 
 
-def _pinching(tets: np.ndarray) -> np.ndarray:
+def _find_pinching_tets(tets: np.ndarray) -> np.ndarray:
     """Return indices of the tetrahedra behind every surface fan except the largest at its node."""
     faces = tets[:, FACES].reshape(-1, 3)
     _, first, count = np.unique(compute_row_keys(faces), return_index=True, return_counts=True)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from ..errors import InputError
-from ..runtime.file_limits import FARTHEST
+from ..runtime.file_limits import MAX_COORDINATE
 from ..runtime.outside_files import read_as, to_path
 
 SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
@@ -20,10 +20,10 @@ SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
 NUMBERED = {"0": "RAS", "1": "LPS"}
 """Codes of the coordinate system in older files."""
 REMEDY = "Save a point, a line or a closed curve from 3D Slicer's Markups."
-LARGEST = 2**22  # maximum file size [bytes]
-MOST = 5000  # maximum points of a markup
-DRAWN = 256  # points of a sampled curve
-PLACE = slice(1, 4)  # columns of the coordinates in a row of `.fcsv`
+MAX_FILE_SIZE = 2**22  # maximum file size [bytes]
+MAX_POINTS = 5000  # maximum points of a markup
+CURVE_POINTS = 256  # points of a sampled curve
+POSITION = slice(1, 4)  # columns of the coordinates in a row of `.fcsv`
 STATUS = 14  # column of the optional position status
 DEFINED = "2"  # position status of a placed point
 
@@ -50,7 +50,7 @@ class Markup:
             raise InputError(f"{self.path}: its curve needs at least three distinct points. {REMEDY}")
         along = np.concatenate([[0.0], np.cumsum(steps)])
         spline = CubicSpline(along, points, bc_type="periodic")
-        return spline(np.linspace(0.0, along[-1], DRAWN, endpoint=False))
+        return spline(np.linspace(0.0, along[-1], CURVE_POINTS, endpoint=False))
 
 
 def read_markup(path: str | Path) -> Markup:
@@ -64,24 +64,24 @@ def read_markup(path: str | Path) -> Markup:
     """
     path = to_path(path)
     with read_as(path, "markups of 3D Slicer", REMEDY):
-        if path.stat().st_size > LARGEST:
+        if path.stat().st_size > MAX_FILE_SIZE:
             raise InputError(f"{path}: is too large for markups. {REMEDY}")
         text = path.read_bytes().decode("utf-8-sig")
-        kind, system, placed = _fcsv(text) if path.name.lower().endswith(".fcsv") else _json(text)
+        kind, system, placed = _parse_fcsv(text) if path.name.lower().endswith(".fcsv") else _parse_json(text)
         if system not in SIGNS:
             said = f"its coordinate system is {system!r}" if system else "it does not state its coordinate system"
             raise InputError(f"{path}: {said}: it must be LPS or RAS. {REMEDY}")
-        if not 1 <= len(placed) <= MOST:
-            raise InputError(f"{path}: has {len(placed)} placed points; must be 1 to {MOST}. {REMEDY}")
+        if not 1 <= len(placed) <= MAX_POINTS:
+            raise InputError(f"{path}: has {len(placed)} placed points; must be 1 to {MAX_POINTS}. {REMEDY}")
         points = np.array(placed, np.float64).reshape(-1, 3)
         if not np.isfinite(points).all():
             raise InputError(f"{path}: has points with non-finite coordinates. {REMEDY}")
-        if np.abs(points).max() > 1e3 * FARTHEST:
-            raise InputError(f"{path}: has points more than {FARTHEST:g} m away: coordinates are in mm. {REMEDY}")
+        if np.abs(points).max() > 1e3 * MAX_COORDINATE:
+            raise InputError(f"{path}: has points more than {MAX_COORDINATE:g} m away: coordinates are in mm. {REMEDY}")
         return Markup(path, kind, 1e-3 * points * SIGNS[system])
 
 
-def _json(text: str) -> tuple[str, str, list[list[float]]]:
+def _parse_json(text: str) -> tuple[str, str, list[list[float]]]:
     """Parse kind, coordinate system, and placed points [mm] of the only markup in a `.mrk.json` file."""
     markups = json.loads(text)["markups"]
     if len(markups) != 1:
@@ -95,7 +95,7 @@ def _json(text: str) -> tuple[str, str, list[list[float]]]:
     return str(markup["type"]), str(markup.get("coordinateSystem", "LPS")), placed
 
 
-def _fcsv(text: str) -> tuple[str, str, list[list[float]]]:
+def _parse_fcsv(text: str) -> tuple[str, str, list[list[float]]]:
     """Parse kind, coordinate system (empty if not given), and placed points [mm] of a `.fcsv` file.
 
     Its columns are id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID, and in Slicer 5 the position
@@ -104,6 +104,6 @@ def _fcsv(text: str) -> tuple[str, str, list[list[float]]]:
     stated = re.search(r"^# *CoordinateSystem *= *(\w+)", text, re.MULTILINE)
     lines = (line for line in text.replace("\r", "").split("\n") if line.strip() and not line.startswith("#"))
     rows = list(csv.reader(lines, strict=True))
-    placed = [[float(x) for x in row[PLACE]] for row in rows if row[STATUS : STATUS + 1] in ([], [DEFINED])]
+    placed = [[float(x) for x in row[POSITION]] for row in rows if row[STATUS : STATUS + 1] in ([], [DEFINED])]
     system = stated[1] if stated else ""
     return "Fiducial", NUMBERED.get(system, system), placed

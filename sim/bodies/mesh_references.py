@@ -6,11 +6,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from ..errors import InputError
-from ..runtime.file_limits import INFLATION, MeshBytes, build_too_large_error
+from ..runtime.file_limits import MAX_INFLATION, MeshBytes, build_too_large_error
 
 # Formats of meshio whose readers terminate on truncated files (those of .mdpa, .tec and .node do not), and
 # whose files give their uncompressed size (.gz does not).
-ENDINGS = (
+SUFFIXES = (
     *(".vtu", ".vtk", ".msh", ".inp", ".xdmf", ".xmf", ".mesh", ".meshb", ".bdf", ".nas", ".fem", ".med", ".cgns"),
     *(".h5m", ".hmf", ".avs", ".vol", ".su2", ".ugrid", ".f3grid", ".post", ".dato"),
 )
@@ -27,11 +27,11 @@ def check_mesh_references(path: Path, limits: MeshBytes) -> None:
     import h5py  # optional dependency, like meshio
 
     suffix = path.suffix.lower()
-    if suffix not in ENDINGS:
+    if suffix not in SUFFIXES:
         given = suffix or "a name without ending"
-        raise InputError(f"no mesh is read from {given}: give a tetrahedral mesh as {', '.join(ENDINGS)}.")
+        raise InputError(f"no mesh is read from {given}: give a tetrahedral mesh as {', '.join(SUFFIXES)}.")
     if suffix in (".xdmf", ".xmf"):
-        for other in _named(path):
+        for other in _find_references(path):
             check_hdf5_storage(other, limits)
     elif h5py.is_hdf5(path):
         check_hdf5_storage(path, limits)
@@ -65,7 +65,7 @@ def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
             elif isinstance(found, h5py.Dataset) and found.shape is not None:
                 if found.is_virtual or found.external:
                     raise InputError(f"`{here}` of {path.name} lies in another file. Store the array itself there.")
-                if found.nbytes > INFLATION * found.id.get_storage_size():
+                if found.nbytes > MAX_INFLATION * found.id.get_storage_size():
                     raise InputError(f"`{here}` of {path.name} declares more than it holds. Write the file again.")
                 left -= found.nbytes
                 if left < 0:
@@ -75,7 +75,7 @@ def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
         look(file, "")
 
 
-def _named(path: Path) -> set[Path]:
+def _find_references(path: Path) -> set[Path]:
     """Return the HDF5 files, in the same folder, that an XDMF file refers to."""
     folder = path.resolve().parent
     named = set()

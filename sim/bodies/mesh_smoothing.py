@@ -15,9 +15,9 @@ Projection = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Function of desired points (n, 3) [m] and their nodes (n,) that returns the nearest admissible points (n, 3)."""
 
 # The two faces that meet at each edge of a tetrahedron (face k is opposite corner k).
-MEETING = np.array([[2, 3], [1, 3], [1, 2], [0, 3], [0, 2], [0, 1]])
-TRIALS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # 26 unit directions of a trial move
-TRIALS /= np.linalg.norm(TRIALS, axis=1, keepdims=True)
+EDGE_FACES = np.array([[2, 3], [1, 3], [1, 2], [0, 3], [0, 2], [0, 1]])
+DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # 26 unit directions of a trial move
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def compute_smallest_sines(corners: np.ndarray) -> np.ndarray:
     areas = np.linalg.norm(normals, axis=-1)
     lengths = np.linalg.norm(corners[..., EDGES[:, 1], :] - corners[..., EDGES[:, 0], :], axis=-1)
     six_volumes = -np.einsum("...i,...i->...", normals[..., 3, :], corners[..., 3, :] - corners[..., 0, :])
-    product = np.maximum(areas[..., MEETING[:, 0]] * areas[..., MEETING[:, 1]], 1e-300)
+    product = np.maximum(areas[..., EDGE_FACES[:, 0]] * areas[..., EDGE_FACES[:, 1]], 1e-300)
     return (six_volumes[..., None] * lengths / product).min(axis=-1)
 
 
@@ -80,7 +80,7 @@ def fit_nodes(
     on = on[movable[on]]
     if len(on) == 0:
         return nodes
-    middle, area = _middles_and_areas(nodes, triangles)
+    middle, area = _compute_centres_and_areas(nodes, triangles)
     weight, total = np.zeros(len(nodes)), np.zeros(len(nodes))
     for corner in triangles.T:
         np.add.at(weight, corner, area)
@@ -92,7 +92,7 @@ def fit_nodes(
     if volume is not None:
         moving = movable[triangles].mean(axis=1)  # a triangle sweeps volume in proportion to its movable corners
         for _ in range(2):
-            _, area = _middles_and_areas(nodes, triangles)
+            _, area = _compute_centres_and_areas(nodes, triangles)
             missing = (volume - compute_enclosed_volume(nodes, triangles)) / (area @ moving)
             level = np.clip(level + missing, -most, most)
             nodes[on] = project_onto_level(field, nodes[on], level)
@@ -116,7 +116,7 @@ def compute_enclosed_volume(nodes: np.ndarray, triangles: np.ndarray) -> float:
     return float(np.einsum("ti,ti->", a, np.cross(b, c))) / 6.0
 
 
-def _middles_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compute_centres_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     corners = nodes[triangles]
     return corners.mean(axis=1), compute_areas(corners)
 
@@ -135,7 +135,7 @@ def improve_mesh(
     step = np.full(len(nodes), settings.largest_step)
     sines = compute_smallest_sines(nodes[tets])
     for _ in range(settings.rounds):
-        movers = _independent(tets, sines, step, settings)
+        movers = _select_independent_nodes(tets, sines, step, settings)
         if len(movers) == 0:
             break
         counts = begin[movers + 1] - begin[movers]
@@ -147,14 +147,14 @@ def improve_mesh(
         corners = nodes[tets[near]]
         edges = np.linalg.norm(corners - nodes[movers][row, None], axis=2)
         length = np.minimum.reduceat(np.where(own, np.inf, edges).min(axis=1), first)
-        trials = nodes[movers, None] + (step[movers] * length)[:, None, None] * TRIALS
-        placed = project(trials.reshape(-1, 3), np.repeat(movers, len(TRIALS))).reshape(trials.shape)
+        trials = nodes[movers, None] + (step[movers] * length)[:, None, None] * DIRECTIONS
+        placed = project(trials.reshape(-1, 3), np.repeat(movers, len(DIRECTIONS))).reshape(trials.shape)
         astray = np.linalg.norm(placed - trials, axis=2) > (step[movers] * length)[:, None]
         trials = np.where(astray[..., None], nodes[movers, None], placed)
         tried = np.where(own[:, None, :, None], trials[row][:, :, None], corners[:, None])
-        badness = np.add.reduceat(_badness(compute_smallest_sines(tried), good), first)
+        badness = np.add.reduceat(_compute_penalties(compute_smallest_sines(tried), good), first)
         best = badness.argmin(axis=1)
-        better = badness.min(axis=1) < 0.99 * np.add.reduceat(_badness(sines[near], good), first)
+        better = badness.min(axis=1) < 0.99 * np.add.reduceat(_compute_penalties(sines[near], good), first)
 
         step[movers[~better]] *= 0.4
         moved = movers[better]
@@ -166,7 +166,7 @@ def improve_mesh(
     return nodes
 
 
-def _independent(tets: np.ndarray, sines: np.ndarray, step: np.ndarray, settings: Smoothing) -> np.ndarray:
+def _select_independent_nodes(tets: np.ndarray, sines: np.ndarray, step: np.ndarray, settings: Smoothing) -> np.ndarray:
     """Return nodes of bad tetrahedra that may still move, worst first, no two in one tetrahedron."""
     bad = np.flatnonzero(sines < settings.good_sine)
     worst = np.full(len(step), np.inf)
@@ -181,6 +181,6 @@ def _independent(tets: np.ndarray, sines: np.ndarray, step: np.ndarray, settings
     return movers[~beaten[movers]]
 
 
-def _badness(sines: np.ndarray, good: float) -> np.ndarray:
+def _compute_penalties(sines: np.ndarray, good: float) -> np.ndarray:
     """Return the squared deficit of the sines, the objective of node moves; squaring emphasises the worst angles."""
     return np.maximum(good - sines, 0.0) ** 2

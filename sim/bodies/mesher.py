@@ -111,10 +111,10 @@ def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> Tet
         A solid or tumour volume that this number of nodes cannot resolve, with a sufficient number if up to 2.5 times
         as many suffice. A count that the search for a lattice size does not reach.
     """
-    mesh = _meshed(solids, count, settings)
+    mesh = _build_mesh_or_reason(solids, count, settings)
     if isinstance(mesh, TetMesh):
         return mesh
-    raise build_too_few_error(count, mesh, settings.more, lambda number: _would_do(solids, number, settings))
+    raise build_too_few_error(count, mesh, settings.more, lambda number: _can_build_mesh(solids, number, settings))
 
 
 def build_too_few_error(
@@ -146,14 +146,14 @@ def describe_lost_pieces(pieces: Sequence[Piece], lost: Sequence[bool]) -> str:
     return f"{sum(lost)} of the tumour's {len(pieces)} pieces, {1e6 * volume:.2g} ml in all"
 
 
-def _would_do(solids: Solids, count: int, settings: Meshing) -> bool:
+def _can_build_mesh(solids: Solids, count: int, settings: Meshing) -> bool:
     try:
-        return isinstance(_meshed(solids, count, settings), TetMesh)
+        return isinstance(_build_mesh_or_reason(solids, count, settings), TetMesh)
     except InputError:
         return False
 
 
-def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[str, str]:
+def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[str, str]:
     """Return the mesh with `count` nodes, or reason and remedy if it fails. Raises as `build_mesh`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
@@ -168,7 +168,7 @@ def _meshed(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[st
     assert best is not None
     if abs(len(best.nodes) - count) > settings.farthest * count:
         raise InputError(f"{count} nodes are not possible for this anatomy (closest: {len(best.nodes)}): request more.")
-    return _finished(solids, best, settings)
+    return _fit_mesh_or_reason(solids, best, settings)
 
 
 def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
@@ -195,7 +195,7 @@ def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
     return cut(body, solids.tumour, surface, settings.stuffing)
 
 
-def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tuple[str, str]:
+def _fit_mesh_or_reason(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tuple[str, str]:
     """Return the fitted and improved mesh, on failure retried without inverting moves; else reason and remedy."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
@@ -205,7 +205,9 @@ def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tu
         be = "is" if sum(lost) == 1 else "are"
         return f"{describe_lost_pieces(solids.pieces, lost)}, {be} too small", "leave what is small out of the labels"
     for fold in (True, False):
-        found = _improved(solids, _fitted(solids, pieces, solids.tumour_volume - gone, settings, fold), settings)
+        found = _improve_pieces(
+            solids, _fit_to_surfaces(solids, pieces, solids.tumour_volume - gone, settings, fold), settings
+        )
         if compute_smallest_sines(found.nodes[found.tets]).min() >= np.sin(np.radians(SLIVER_DEGREES)):
             mesh = TetMesh(found.nodes, found.tets, np.where(found.inside, TUMOUR_LABEL, BRAIN_LABEL))
             volume = mesh.volumes[found.inside].sum()
@@ -213,12 +215,12 @@ def _finished(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tu
     return INTRICATE
 
 
-def _fitted(solids: Solids, pieces: Pieces, volume: float, settings: Meshing, fold: bool) -> Pieces:
+def _fit_to_surfaces(solids: Solids, pieces: Pieces, volume: float, settings: Meshing, fold: bool) -> Pieces:
     """Fit nodes to the outer surface, then to the tumour's with a `volume` [m^3]; return the updated pieces.
 
     Unless `fold`, nodes keep their position where a tetrahedron would be inverted.
     """
-    (surface, _), smoothing = _surfaces(pieces), settings.smoothing
+    (surface, _), smoothing = _mark_surfaces(pieces), settings.smoothing
     outer, inner = find_single_faces(pieces.tets), find_single_faces(pieces.tets[pieces.inside])
     nodes = fit_nodes(pieces.nodes, outer, solids.brain, surface, settings=smoothing)
     nodes = nodes if fold else prevent_folds(pieces.nodes, nodes, pieces.tets)
@@ -226,17 +228,17 @@ def _fitted(solids: Solids, pieces: Pieces, volume: float, settings: Meshing, fo
     return replace(pieces, nodes=moved if fold else prevent_folds(nodes, moved, pieces.tets))
 
 
-def _improved(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
+def _improve_pieces(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
     """Remove flat tetrahedra on the surfaces and improve bad angles."""
     for slack in settings.slacks:
         bad = compute_smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
         pieces = pieces.select(~find_removable_tetrahedra(pieces.tets, bad))
-        projection = _projection(solids, pieces, slack)
+        projection = _build_projection(solids, pieces, slack)
         pieces = replace(pieces, nodes=improve_mesh(pieces.nodes, pieces.tets, projection, settings.smoothing))
     return pieces
 
 
-def _surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
+def _mark_surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
     """Return two masks (V,): nodes on the outer surface, and nodes on the tumour's surface."""
     marks = np.zeros((2, len(pieces.nodes)), bool)
     marks[0, find_single_faces(pieces.tets)] = True
@@ -244,9 +246,9 @@ def _surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
     return marks[0], marks[1]
 
 
-def _projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
+def _build_projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
     """Return a function that keeps each surface node within `slack` [m] of its current level of the fields."""
-    surface, interface = _surfaces(pieces)
+    surface, interface = _mark_surfaces(pieces)
     interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # tumour cortex
     levels = solids.brain(pieces.nodes), solids.tumour(pieces.nodes)
 

@@ -34,8 +34,8 @@ UNITS = {"m": 1.0, "mm": 1e-3}  # length units [m]
 CELLS = {4: "tetra", 10: "tetra10"}
 
 REMEDY = "Convert it to .vtu or .msh."
-LONGEST = 200  # maximum length of meshio's reason in a message [characters]
-TITLE = 400  # maximum length of a VTK title line [characters]
+MAX_REASON_LENGTH = 200  # maximum length of meshio's reason in a message [characters]
+MAX_TITLE_LENGTH = 400  # maximum length of a VTK title line [characters]
 REASONS = {
     r"Incompatible cell data '([^']+)'": (
         "its `{}` is given of some cells only: put every volume into a group, and save it again."
@@ -53,8 +53,8 @@ REASONS = {
 """Messages by a pattern in meshio's reason, or in a line that meshio cannot read."""
 UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")  # lines that meshio cannot read
 
-SMALLEST = 5e-3  # minimum of an anatomy's longest side [m]; a mouse brain has 15 mm
-LARGEST = 1.0  # maximum of an anatomy's longest side [m]; a whole head has 0.3 m
+MIN_SIZE = 5e-3  # minimum of an anatomy's longest side [m]; a mouse brain has 15 mm
+MAX_SIZE = 1.0  # maximum of an anatomy's longest side [m]; a whole head has 0.3 m
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +90,12 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
         with warnings.catch_warnings(), nullcontext() if counted else limit_memory(limits.largest):
             warnings.simplefilter("ignore")  # meshio warns about arrays that it skips
             check_mesh_references(path, limits)
-            raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _by_meshio(path)
+            raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _read_with_meshio(path)
     with read_as(path, "a mesh", REMEDY):
-        return _taken(path, raw, UNITS[unit])
+        return _build_mesh_file(path, raw, UNITS[unit])
 
 
-def _by_meshio(path: Path) -> meshio.Mesh:
+def _read_with_meshio(path: Path) -> meshio.Mesh:
     """Read a mesh in a format other than Abaqus.
 
     Raises
@@ -119,12 +119,12 @@ def _by_meshio(path: Path) -> meshio.Mesh:
                 said = next((str(found[0], "ascii") for line in lines if (found := UNREAD.search(line.strip()))), "")
         if not said:
             raise
-        reason = f"meshio reports `{said[:LONGEST]}`. {REMEDY}"
+        reason = f"meshio reports `{said[:MAX_REASON_LENGTH]}`. {REMEDY}"
         known = ((re.search(words, said), reason) for words, reason in REASONS.items())
         raise InputError(next((own.format(*found.groups()) for found, own in known if found), reason)) from error
 
 
-def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
+def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
     """Build the mesh of a parsed file whose length unit is `metre` [m]."""
     kinds = {block.type for block in raw.cells}
     found = kinds.intersection(CELLS.values())
@@ -144,7 +144,7 @@ def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
     region, said = collect_regions(raw, blocks)
     table, turned = orient_tetrahedra(raw.points, np.concatenate([raw.cells[number].data for number in blocks]))
     data, places = {name: np.asarray(field) for name, field in raw.point_data.items()}, np.asarray(raw.points, float)
-    if _space_of(path) == "LPS":  # half a turn about z, which preserves orientation
+    if _read_space(path) == "LPS":  # half a turn about z, which preserves orientation
         places = places * SIGNS["LPS"]
         vectors = {name for name, field in data.items() if field.shape[1:] == (3,) and field.dtype.kind in "if"}
         data.update({name: data[name] * SIGNS["LPS"] for name in vectors})
@@ -160,14 +160,14 @@ def _taken(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
     return MeshFile(mesh, data, (*notes, *said, *note_pieces(mesh)))
 
 
-def _space_of(path: Path) -> str:
+def _read_space(path: Path) -> str:
     """Read the space in the title of a `.vtk`, as 3D Slicer writes it (`SPACE=LPS`); empty if absent."""
     if path.suffix.lower() != ".vtk":
         return ""
     with path.open("rb") as lines:
-        lines.readline(TITLE)
+        lines.readline(MAX_TITLE_LENGTH)
         said = re.search(
-            r"\bSPACE\s*=\s*([LRAPSI]{3})\b", lines.readline(TITLE).decode(errors="replace"), re.IGNORECASE
+            r"\bSPACE\s*=\s*([LRAPSI]{3})\b", lines.readline(MAX_TITLE_LENGTH).decode(errors="replace"), re.IGNORECASE
         )
     if said and said[1].upper() not in SIGNS:
         raise InputError(f"{path}: its title states SPACE={said[1]}: {' or '.join(SIGNS)} is required. {REMEDY}")
@@ -194,10 +194,10 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
             cell_data={"region": [mesh.region]},
         ).write(partial)
         head, grid, rest = partial.read_bytes().partition(b"<UnstructuredGrid>")
-        partial.write_bytes(head + grid + _said(space).encode() + rest)
+        partial.write_bytes(head + grid + _format_space(space).encode() + rest)
 
 
-def _said(space: str) -> str:
+def _format_space(space: str) -> str:
     """Return unit and space, as a comment and as field data.
 
     The name carries the information, since meshio cannot read text as field data.
@@ -234,9 +234,9 @@ def read_anatomy(path: str | Path) -> Anatomy:
                 raise InputError(f"`{name}` has values that are no finite numbers: give 0 or 1, or unit normals.")
         anatomy = Anatomy(file.mesh, data["held"] != 0, data["slide_normal"], data["craniotomy"] != 0)
         size = float(np.ptp(anatomy.mesh.nodes, axis=0).max())
-        if not SMALLEST <= size <= LARGEST:
+        if not MIN_SIZE <= size <= MAX_SIZE:
             raise InputError(
-                f"the body measures {1e3 * size:,.3g} mm, and an anatomy {1e3 * SMALLEST:g} to {1e3 * LARGEST:g} mm: "
+                f"the body measures {1e3 * size:,.3g} mm, and an anatomy {1e3 * MIN_SIZE:g} to {1e3 * MAX_SIZE:g} mm: "
                 "its coordinates must be metres."
             )
         return anatomy

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..runtime.file_limits import MOST_VOXELS
-from .voxels import PIECE, REMEDY, SURPLUS, Volume, Voxels, open_volume, unpack_file
+from ..runtime.file_limits import MAX_VOXELS
+from .voxels import BLOCK, REMEDY, SURPLUS, Volume, Voxels, open_volume, unpack_file
 
 if TYPE_CHECKING:
     from nibabel.fileholders import FileHolder
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from nibabel.nifti1 import Nifti1Image
 
 # Tolerance by which a quaternion's squared length may exceed 1.
-ROUNDED = 1e-3
+NORM_TOLERANCE = 1e-3
 METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}  # length units [m]
 
 
@@ -35,16 +35,16 @@ def read_nifti(path: Path, voxels: Voxels) -> Volume:
     with open_volume(path) as file:
         header = type(image.header).from_fileobj(file, check=False)  # the image's header lacks slope and size
     slope, shift = float(header["scl_slope"]), float(header["scl_inter"])
-    _demand_few(path, image.shape)
+    _check_voxel_count(path, image.shape)
     if not math.isfinite(slope) or not math.isfinite(shift):
         raise InputError(
             f"{path}: its values have the slope {slope:g} and the intercept {shift:g}, which are no numbers. Export it "
             "again."
         )
     needed = int(header["vox_offset"]) + math.prod(image.shape) * header.get_data_dtype().itemsize
-    _demand_held(path, needed)
+    _check_file_length(path, needed)
     metre = METRES.get(str(image.header.get_xyzt_units()[0]), 1e-3)
-    affine, notes = _placed(path, image, metre, voxels)
+    affine, notes = _read_affine(path, image, metre, voxels)
     size = np.asarray(header["pixdim"], np.float64)[1:4]
     if image.header["sform_code"] == 0 and not (size > 0.0).all():
         raise InputError(f"{path}: its voxel size is {size} (pixdim): every edge must be above 0.")
@@ -74,22 +74,22 @@ def load_nifti(path: Path) -> Nifti1Image:
     kind = nibabel.Nifti2Image if two else nibabel.Nifti1Image
     header = kind.header_class(start[: kind.header_class.template_dtype.itemsize], check=False)
     over = sum(float(header[f"quatern_{axis}"]) ** 2 for axis in "bcd") - 1.0
-    if over > ROUNDED and int(header["qform_code"]) > 0 >= int(header["sform_code"]):
+    if over > NORM_TOLERANCE and int(header["qform_code"]) > 0 >= int(header["sform_code"]):
         raise InputError(
             f"{path}: its qform has a quaternion of length {(over + 1.0) ** 0.5:.4g}, which is no rotation: the length "
             "must be 1. Export it again, with its orientation."
         )
-    if 0.0 < over <= ROUNDED:  # half a turn, as the reference code assumes; nibabel allows single round-off
-        rounded = type("Rounded", (kind.header_class,), {"quaternion_threshold": 2.0 * ROUNDED})
+    if 0.0 < over <= NORM_TOLERANCE:  # half a turn, as the reference code assumes; nibabel allows single round-off
+        rounded = type("Rounded", (kind.header_class,), {"quaternion_threshold": 2.0 * NORM_TOLERANCE})
         kind = type("RoundedImage", (kind,), {"header_class": rounded})
     try:
         with LoggingOutputSuppressor():  # nibabel logs repaired fields
-            return kind.from_file_map({"image": _holder(path)})
+            return kind.from_file_map({"image": _build_file_holder(path)})
     except HeaderDataError as error:
         raise InputError(f"{path}: nibabel reports `{error}`. {REMEDY}") from error
 
 
-def _holder(path: Path) -> FileHolder:
+def _build_file_holder(path: Path) -> FileHolder:
     from nibabel.fileholders import FileHolder
 
     given = unpack_file(path)
@@ -107,12 +107,12 @@ def read_mgh(path: Path, voxels: Voxels) -> Volume:
     """
     import nibabel
 
-    image = nibabel.MGHImage.from_file_map({"image": _holder(path)})
+    image = nibabel.MGHImage.from_file_map({"image": _build_file_holder(path)})
     header = image.header
     shape = tuple(map(int, image.shape))
-    _demand_few(path, shape)
+    _check_voxel_count(path, shape)
     needed = header.get_data_offset() + math.prod(shape) * header.get_data_bytespervox()
-    _demand_held(path, needed)
+    _check_file_length(path, needed)
     with open_volume(path) as file:
         flag = file.read(30)[28:]  # nibabel's header always has an orientation
     if flag != b"\x00\x01":
@@ -120,27 +120,27 @@ def read_mgh(path: Path, voxels: Voxels) -> Volume:
             f"{path}: does not state how its axes lie in the head (goodRASFlag 0). Set its orientation, "
             "for instance with mri_convert, and give that file."
         )
-    return Volume(np.asanyarray(image.dataobj), _affine(image, 1e-3))
+    return Volume(np.asanyarray(image.dataobj), _scale_affine(image, 1e-3))
 
 
-def _affine(image: Nifti1Image | MGHImage, metre: float) -> np.ndarray:
+def _scale_affine(image: Nifti1Image | MGHImage, metre: float) -> np.ndarray:
     affine = np.array(image.affine, np.float64)
     affine[:3] *= metre
     return affine
 
 
-def _demand_few(path: Path, shape: tuple[int, ...]) -> None:
+def _check_voxel_count(path: Path, shape: tuple[int, ...]) -> None:
     """Reject a file that declares more than `MOST_VOXELS` voxels, before memory is allocated."""
     voxels = math.prod(shape)
-    if voxels > MOST_VOXELS:
-        raise InputError(f"{path}: has {voxels:.3g} voxels; the maximum is {MOST_VOXELS:.3g}. Resample it.")
+    if voxels > MAX_VOXELS:
+        raise InputError(f"{path}: has {voxels:.3g} voxels; the maximum is {MAX_VOXELS:.3g}. Resample it.")
 
 
-def _demand_held(path: Path, needed: int) -> None:
+def _check_file_length(path: Path, needed: int) -> None:
     """Reject a file with fewer bytes than it declares, before memory is allocated."""
     held = 0
     with open_volume(path) as file:
-        while piece := file.read(PIECE):  # to the end, where gzip stores its checksum
+        while piece := file.read(BLOCK):  # to the end, where gzip stores its checksum
             held += len(piece)
             if held > needed + SURPLUS:
                 break
@@ -148,7 +148,7 @@ def _demand_held(path: Path, needed: int) -> None:
         raise InputError(f"{path}: ends after {held:,} of {needed:,} bytes. Copy or export it again.")
 
 
-def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tuple[np.ndarray, tuple[str, ...]]:
+def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the affine (4, 4) to metres (RAS) of an image in units of `metre` [m], and notes on inconsistencies.
 
     Raises
@@ -162,9 +162,9 @@ def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tup
     except ValueError:  # the qform is not a rotation; nibabel ignores it if the sform is valid
         qform = None
     if sform is None and qform is None:
-        return _turned(path, image, metre, voxels.axes), ()
+        return _build_centred_affine(path, image, metre, voxels.axes), ()
     if sform is None or qform is None:
-        return _affine(image, metre), voxels.ignored_axes
+        return _scale_affine(image, metre), voxels.ignored_axes
     corners = np.stack([*np.ndindex(2, 2, 2)]) * (np.array(image.shape[:3]) - 1)
     apart = metre * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
     note = f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken"
@@ -175,10 +175,13 @@ def _placed(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tup
             f"its sform and qform disagree on which side is left (up to {apart * 1e3:.3g} mm apart): left and right "
             "are swapped in one of them. The sform is taken"
         )
-    return _affine(image, metre), (*voxels.ignored_axes, note) if apart > voxels.same_place else voxels.ignored_axes
+    return _scale_affine(image, metre), (
+        *voxels.ignored_axes,
+        note,
+    ) if apart > voxels.same_place else voxels.ignored_axes
 
 
-def _turned(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:
+def _build_centred_affine(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:
     """Return the affine (4, 4) to metres of a volume centred at the origin, with axis directions `axes`."""
     if not axes:
         raise InputError(

@@ -14,8 +14,8 @@ from typing import BinaryIO
 import numpy as np
 
 from ..errors import InputError
-from ..runtime.file_limits import INFLATION, LITTLE, MOST_VOXELS
-from .voxels import PIECE, REMEDY, SURPLUS, Segment, Volume, Voxels
+from ..runtime.file_limits import BZIP2_ALLOWANCE, MAX_INFLATION, MAX_VOXELS
+from .voxels import BLOCK, REMEDY, SURPLUS, Segment, Volume, Voxels
 
 SIGNS = {
     "right-anterior-superior": (1.0, 1.0, 1.0),
@@ -38,8 +38,8 @@ TYPES = {  # NumPy types by NRRD names, without byte order
     "double": "f8",
 }
 ENDIAN = {"little": "<", "big": ">"}  # NumPy byte order
-LONGEST = 2**16  # maximum length of a header line [characters]
-MOST_LINES = 2**14  # maximum header lines; 100 segments take 1,000
+MAX_LINE_LENGTH = 2**16  # maximum length of a header line [characters]
+MAX_HEADER_LINES = 2**14  # maximum header lines; 100 segments take 1,000
 ONE_FILE = "Save it as one file (.nrrd), with its header and voxels together."
 
 
@@ -56,35 +56,35 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
         than declared, or too many.
     """
     with path.open("rb") as file:
-        fields, keys = _header(path, file)
-        sizes = [int(size) for size in _field(path, fields, "sizes").split()]
-        if len(sizes) != int(_field(path, fields, "dimension")) or min(sizes, default=0) < 1:
+        fields, keys = _read_header(path, file)
+        sizes = [int(size) for size in _get_field(path, fields, "sizes").split()]
+        if len(sizes) != int(_get_field(path, fields, "dimension")) or min(sizes, default=0) < 1:
             raise InputError(f"{path}: its sizes do not match its dimension. Save it again.")
-        if math.prod(sizes) > MOST_VOXELS:
+        if math.prod(sizes) > MAX_VOXELS:
             raise InputError(
-                f"{path}: has {math.prod(sizes):.3g} voxels; the maximum is {MOST_VOXELS:.3g}. Resample it."
+                f"{path}: has {math.prod(sizes):.3g} voxels; the maximum is {MAX_VOXELS:.3g}. Resample it."
             )
-        dtype = _dtype(path, fields)
+        dtype = _parse_dtype(path, fields)
         needed = math.prod(sizes) * dtype.itemsize
-        beside = _beside(path, fields)
+        beside = _find_data_file(path, fields)
         with nullcontext(file) if beside is None else beside.open("rb") as voxels_file:
-            held = _voxels(beside or path, voxels_file, fields, needed)
+            held = _read_voxels(beside or path, voxels_file, fields, needed)
         values = np.frombuffer(held, dtype, math.prod(sizes)).reshape(sizes, order="F")
     values = values.astype(dtype.newbyteorder("="), copy=False)
-    affine, across = _affine(path, fields, len(sizes))
+    affine, across = _parse_affine(path, fields, len(sizes))
     if across:
         values = np.moveaxis(values, across[0], -1)
-    return Volume(values, affine, segments=_segments(path, keys, values.shape[3] if across else 1))
+    return Volume(values, affine, segments=_parse_segments(path, keys, values.shape[3] if across else 1))
 
 
-def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]:
+def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]:
     """Read the fields, by names in lower case, and the custom keys; the file is then positioned at its voxels."""
-    if not re.fullmatch(rb"(\xef\xbb\xbf)?NRRD000[1-5]\s*", file.readline(LONGEST)):
+    if not re.fullmatch(rb"(\xef\xbb\xbf)?NRRD000[1-5]\s*", file.readline(MAX_LINE_LENGTH)):
         raise InputError(f"{path}: does not begin with an NRRD header. {REMEDY}")
     fields, keys = {}, {}
-    for _ in range(MOST_LINES):
-        line = file.readline(LONGEST)
-        if not line and _named(fields):
+    for _ in range(MAX_HEADER_LINES):
+        line = file.readline(MAX_LINE_LENGTH)
+        if not line and _get_data_file_name(fields):
             return fields, keys
         if not line.endswith(b"\n"):
             break
@@ -102,14 +102,14 @@ def _header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]
     raise InputError(f"{path}: its header has no end. Copy or save it again.")
 
 
-def _named(fields: Mapping[str, str]) -> str:
+def _get_data_file_name(fields: Mapping[str, str]) -> str:
     """Return the name of the detached data file; empty if the data is attached."""
     return fields.get("data file", fields.get("datafile", ""))
 
 
-def _beside(path: Path, fields: Mapping[str, str]) -> Path | None:
+def _find_data_file(path: Path, fields: Mapping[str, str]) -> Path | None:
     """Return the path of the detached data file, in the same folder; None if the data is attached."""
-    name = _named(fields)
+    name = _get_data_file_name(fields)
     if not name:
         return None
     if name != PureWindowsPath(name).name or name == "..":
@@ -120,29 +120,29 @@ def _beside(path: Path, fields: Mapping[str, str]) -> Path | None:
     return found
 
 
-def _field(path: Path, fields: Mapping[str, str], name: str) -> str:
+def _get_field(path: Path, fields: Mapping[str, str], name: str) -> str:
     if name not in fields:
         raise InputError(f"{path}: its header does not state its {name}. Save it again with another program.")
     return fields[name]
 
 
-def _dtype(path: Path, fields: Mapping[str, str]) -> np.dtype:
-    kind = _field(path, fields, "type").lower()
+def _parse_dtype(path: Path, fields: Mapping[str, str]) -> np.dtype:
+    kind = _get_field(path, fields, "type").lower()
     if kind not in TYPES:
         raise InputError(f"{path}: holds values of type {kind!r}, not plain numbers. {REMEDY}")
     if TYPES[kind].endswith("1"):
         return np.dtype(TYPES[kind])
-    endian = _field(path, fields, "endian").lower()
+    endian = _get_field(path, fields, "endian").lower()
     if endian not in ENDIAN:
         raise InputError(f"{path}: states its endian as {endian!r}: must be little or big. Save it again.")
     return np.dtype(ENDIAN[endian] + TYPES[kind])
 
 
-def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) -> bytes:
+def _read_voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) -> bytes:
     """Read all bytes of the voxels; memory is allocated only for data that the file can contain."""
     if any(float(fields.get(skip, 0)) for skip in ("byte skip", "byteskip", "line skip", "lineskip")):
         raise InputError(f"{path}: skips bytes before its voxels. {ONE_FILE}")
-    coding = _field(path, fields, "encoding").lower()
+    coding = _get_field(path, fields, "encoding").lower()
     if coding in ("gzip", "gz"):
         stream = gzip.GzipFile(fileobj=file)
     elif coding in ("bzip2", "bz2"):
@@ -152,17 +152,17 @@ def _voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) 
     else:
         raise InputError(f"{path}: its voxels are coded as {coding!r}: must be raw, gzip or bzip2. Save it again.")
     size = path.stat().st_size
-    if needed > (size if stream is file else max(LITTLE * (coding[0] == "b"), INFLATION * size)):
+    if needed > (size if stream is file else max(BZIP2_ALLOWANCE * (coding[0] == "b"), MAX_INFLATION * size)):
         raise InputError(f"{path}: is too short for its {needed:,} bytes of voxels. Copy or save it again.")
     held = bytearray()
-    while len(held) < needed + SURPLUS and (piece := stream.read(PIECE)):  # to the end, where gzip stores its checksum
+    while len(held) < needed + SURPLUS and (piece := stream.read(BLOCK)):  # to the end, where gzip stores its checksum
         held += piece
     if len(held) < needed:
         raise InputError(f"{path}: ends after {len(held):,} of {needed:,} bytes of voxels. Copy or save it again.")
     return bytes(held[:needed])
 
 
-def _affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarray, list[int]]:
+def _parse_affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarray, list[int]]:
     """Return the affine (4, 4) from indices to metres (RAS), and the non-spatial axes: at most one."""
     stated = fields.get("space", "").lower()
     space = SHORT.get(stated, stated)
@@ -172,7 +172,7 @@ def _affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarra
             f"{path}: {said}, so its left side is unknown. Save it from 3D Slicer, or state "
             f"`space: {next(reversed(SIGNS))}` if that is so; known are {', '.join(SIGNS)}."
         )
-    vectors = re.findall(r"none|\([^)]*\)", _field(path, fields, "space directions").lower())
+    vectors = re.findall(r"none|\([^)]*\)", _get_field(path, fields, "space directions").lower())
     across = [axis for axis, vector in enumerate(vectors) if vector == "none"]
     if len(vectors) != axes or len(across) > 1 or axes - len(across) != 3:
         raise InputError(f"{path}: has {axes} axes, of which {axes - len(across)} lie in space. {REMEDY}")
@@ -180,13 +180,13 @@ def _affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarra
     if len(metres) != 1 or None in metres:
         raise InputError(f"{path}: its space units are {fields['space units']}. Save it in mm.")
     affine = np.eye(4)
-    places = [*(vector for vector in vectors if vector != "none"), _field(path, fields, "space origin")]
+    places = [*(vector for vector in vectors if vector != "none"), _get_field(path, fields, "space origin")]
     columns = [[float(number) for number in place.strip("() ").split(",")] for place in places]
     affine[:3] = next(iter(metres)) * (np.array(SIGNS[space])[:, None] * np.array(columns).T)
     return affine, across
 
 
-def _segments(path: Path, keys: Mapping[str, str], layers: int) -> tuple[Segment, ...]:
+def _parse_segments(path: Path, keys: Mapping[str, str], layers: int) -> tuple[Segment, ...]:
     """Read Slicer's segment names and labels. Old files have a layer of ones for each segment, without layer keys."""
     numbers = sorted({int(found[1]) for key in keys if (found := re.match(r"Segment(\d+)_", key))})
     segments = tuple(

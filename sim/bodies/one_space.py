@@ -11,10 +11,10 @@ from ..errors import InputError
 from .label_map import Mask
 from .voxels import LPS, VoxelGrid
 
-AMISS = 0.5  # fraction of points inside, below which the spaces differ
-EXPLAINED = 0.9  # fraction inside after negating x and y, above which LPS is the cause
-SAMPLED = 500  # approximate number of tested points
-ONE_OF_BOTH = "one of the two states LPS as RAS. Export that one again."
+MIN_INSIDE_FRACTION = 0.5  # fraction of points inside, below which the spaces differ
+MIN_MIRRORED_FRACTION = 0.9  # fraction inside after negating x and y, above which LPS is the cause
+TEST_POINTS = 500  # approximate number of tested points
+EXPORT_REMEDY = "one of the two states LPS as RAS. Export that one again."
 
 
 def has_one_space(brain: Mask, tumour: Mask) -> bool:
@@ -28,20 +28,20 @@ def has_one_space(brain: Mask, tumour: Mask) -> bool:
     check_not_negated(brain.grid, tumour.grid)
     boxes = [mask.box for mask in (brain, tumour)]
     apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
-    points = _places(tumour.grid, _thinned(np.argwhere(tumour.marked)))
-    planes = ConvexHull(_corners(brain)).equations
+    points = _compute_positions(tumour.grid, _thin_points(np.argwhere(tumour.marked)))
+    planes = ConvexHull(_widen_outline(brain)).equations
     within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), LPS))
-    if within < AMISS and turned > EXPLAINED:
+    if within < MIN_INSIDE_FRACTION and turned > MIN_MIRRORED_FRACTION:
         raise InputError(
-            f"{tumour.path}: its tumour lies at {_box(boxes[1])}, and the brain of {brain.path} at {_box(boxes[0])}. "
-            f"With x and y negated it would lie in the brain: {ONE_OF_BOTH}"
+            f"{tumour.path}: its tumour lies at {_format_box(boxes[1])}, and the brain of {brain.path} at {_format_box(boxes[0])}. "
+            f"With x and y negated it would lie in the brain: {EXPORT_REMEDY}"
         )
     if apart:
         raise InputError(
-            f"{tumour.path}: its tumour lies at {_box(boxes[1])} and does not overlap the brain of {brain.path}, at "
-            f"{_box(boxes[0])}. Give volumes of one space, or resample one into the other's."
+            f"{tumour.path}: its tumour lies at {_format_box(boxes[1])} and does not overlap the brain of {brain.path}, at "
+            f"{_format_box(boxes[0])}. Give volumes of one space, or resample one into the other's."
         )
-    return turned > EXPLAINED and not _same(brain.grid, tumour.grid)
+    return turned > MIN_MIRRORED_FRACTION and not _is_same_grid(brain.grid, tumour.grid)
 
 
 def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -> None:
@@ -54,12 +54,12 @@ def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -
     """
     for grid in grids:
         check_not_negated(grid, scan)
-    points = _thinned(brain.outline)
+    points = _thin_points(brain.outline)
     within, turned = (share_on(scan.shape, scan.affine, points * signs) for signs in (np.ones(3), LPS))
-    if within < AMISS and turned > EXPLAINED:
+    if within < MIN_INSIDE_FRACTION and turned > MIN_MIRRORED_FRACTION:
         raise InputError(
             f"{scan.path}: holds {100.0 * within:.0f} % of the brain of {brain.path}. With x and y negated it would "
-            f"hold {100.0 * turned:.0f} %: {ONE_OF_BOTH}"
+            f"hold {100.0 * turned:.0f} %: {EXPORT_REMEDY}"
         )
 
 
@@ -72,20 +72,20 @@ def check_not_negated(one: VoxelGrid, other: VoxelGrid) -> None:
         For such grids.
     """
     negated = np.array([*LPS, 1.0])[:, None] * other.affine
-    if _same(one, VoxelGrid(other.path, other.shape, negated)):
-        raise InputError(f"{other.path}: has the grid of {one.path}, but with x and y negated: {ONE_OF_BOTH}")
+    if _is_same_grid(one, VoxelGrid(other.path, other.shape, negated)):
+        raise InputError(f"{other.path}: has the grid of {one.path}, but with x and y negated: {EXPORT_REMEDY}")
 
 
-def _same(one: VoxelGrid, other: VoxelGrid) -> bool:
+def _is_same_grid(one: VoxelGrid, other: VoxelGrid) -> bool:
     return one.shape == other.shape and np.allclose(one.affine, other.affine, rtol=0.0, atol=1e-6)
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
+def _thin_points(points: np.ndarray) -> np.ndarray:
     """Return a regular subset of at least `SAMPLED` points, or all."""
-    return points[:: max(1, len(points) // SAMPLED)]
+    return points[:: max(1, len(points) // TEST_POINTS)]
 
 
-def _places(grid: VoxelGrid, index: np.ndarray) -> np.ndarray:
+def _compute_positions(grid: VoxelGrid, index: np.ndarray) -> np.ndarray:
     """Return the positions (n, 3) [m] of voxel indices (n, 3)."""
     return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
@@ -97,7 +97,7 @@ def share_on(shape: tuple[int, ...], affine: np.ndarray, points: np.ndarray) -> 
     return float(((index >= 0) & (index < np.array(shape))).all(axis=1).mean())
 
 
-def _corners(mask: Mask) -> np.ndarray:
+def _widen_outline(mask: Mask) -> np.ndarray:
     """Return the outline shifted by half a voxel to both sides (n, 3) [m], so that a single slice has a convex hull."""
     half = 0.5 * mask.affine[:3, :3].sum(axis=1)
     return np.concatenate([mask.outline - half, mask.outline + half])
@@ -111,6 +111,6 @@ def _share_within(planes: np.ndarray, points: np.ndarray) -> float:
     return float((outermost <= 0.0).mean())
 
 
-def _box(box: np.ndarray) -> str:
+def _format_box(box: np.ndarray) -> str:
     low, high = (", ".join(f"{1e3 * value:.0f}" for value in end) for end in box)
     return f"{low} to {high} mm (RAS)"

@@ -14,7 +14,7 @@ from ..geometry.closest_point import find_closest_points
 from ..geometry.surface import compute_areas, compute_vertex_normals, normalise_vectors
 
 # Distance below which a point counts as on the edge [m].
-ON_RIM = 1e-9
+EDGE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class OpenCortex:
                 raise InputError(f"{name} has shape {given.shape}: give one number, in millimetres.")
         found = self.find_nearest(self.origin + 1e-3 * (right_mm * self.right + up_mm * self.up))
         rim = find_border_edges(self.anatomy.mesh.nodes, self.anatomy.open_surface)
-        if not compute_distances(rim, found.point[None])[0] > ON_RIM:
+        if not compute_distances(rim, found.point[None])[0] > EDGE_TOLERANCE:
             raise InputError(
                 f"the place {right_mm:g} mm right, {up_mm:g} mm up lies outside the open cortex: stay within "
                 f"{1e3 * self.clearance:.3g} mm of its middle, or open the skull wider with --craniotomy."

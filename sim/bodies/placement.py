@@ -13,7 +13,7 @@ AXES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
 """Names of the negative and positive direction of each RAS axis."""
 
 
-AT_ONCE = 256  # points per block in the test against all hull planes
+BLOCK_SIZE = 256  # points per block in the test against all hull planes
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings
 def find_reachable_site(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """Return the point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that is accessible through the skull."""
     floor = min(cortex[:, 2].min() + settings.base * np.ptp(cortex[:, 2]), centre[2])
-    return _nearest_outer(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
+    return _find_nearest_outer(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
 
 
 def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
@@ -87,15 +87,15 @@ def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement =
     InputError
         A point that is not finite, or farther than `near` from there; one over the brainstem.
     """
-    _demand_finite(point, "--opening-at")
-    site = _nearest_outer(cortex, point, cortex, settings)
+    _check_finite(point, "--opening-at")
+    site = _find_nearest_outer(cortex, point, cortex, settings)
     apart = float(np.linalg.norm(site - point))
     if apart > settings.near:
         raise InputError(
-            f"the opening at {_mm(point)} mm lies {apart * 1e3:.0f} mm from the nearest cortex that the skull covers; "
-            f"{settings.near * 1e3:g} mm is the most. {_box(cortex)} Over a deep point, give --opening-over."
+            f"the opening at {_to_mm(point)} mm lies {apart * 1e3:.0f} mm from the nearest cortex that the skull covers; "
+            f"{settings.near * 1e3:g} mm is the most. {_format_box(cortex)} Over a deep point, give --opening-over."
         )
-    return _not_over_stem(cortex, site, settings)
+    return _check_not_over_stem(cortex, site, settings)
 
 
 def find_opening_over(
@@ -108,13 +108,13 @@ def find_opening_over(
     InputError
         A point that is not finite, or more than `outside` outside the brain; one over the brainstem.
     """
-    _demand_finite(point, "--opening-over")
+    _check_finite(point, "--opening-over")
     if not depth > -settings.outside:
         raise InputError(
-            f"the point {_mm(point)} mm lies {-depth * 1e3:.0f} mm outside the brain: give a point inside. "
-            f"{_box(cortex)}"
+            f"the point {_to_mm(point)} mm lies {-depth * 1e3:.0f} mm outside the brain: give a point inside. "
+            f"{_format_box(cortex)}"
         )
-    return _not_over_stem(cortex, find_reachable_site(cortex, point, settings), settings)
+    return _check_not_over_stem(cortex, find_reachable_site(cortex, point, settings), settings)
 
 
 def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
@@ -129,7 +129,7 @@ def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Place
     if apart > settings.near:
         raise InputError(
             f"the opening's outline lies up to {apart * 1e3:.0f} mm from the cortex; {settings.near * 1e3:g} mm is "
-            f"the most. {_box(cortex)} See that its coordinates are those of the labels."
+            f"the most. {_format_box(cortex)} See that its coordinates are those of the labels."
         )
     inside = cortex[find_within_outline(cortex, outline)]
     return find_opening_at(cortex, inside.mean(axis=0) if len(inside) else outline.mean(axis=0), settings)
@@ -154,34 +154,34 @@ def find_within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     return found
 
 
-def _nearest_outer(points: np.ndarray, place: np.ndarray, cortex: np.ndarray, settings: Placement) -> np.ndarray:
+def _find_nearest_outer(points: np.ndarray, place: np.ndarray, cortex: np.ndarray, settings: Placement) -> np.ndarray:
     """Return the point nearest to a place (3,) among `points` (k, 3) of the `cortex` (n, 3) near its convex hull."""
     hull = ConvexHull(cortex).equations
     order = np.argsort(np.linalg.norm(points - place, axis=1), kind="stable")
-    parts = (points[order[first : first + AT_ONCE]] for first in range(0, len(order), AT_ONCE))
+    parts = (points[order[first : first + BLOCK_SIZE]] for first in range(0, len(order), BLOCK_SIZE))
     outer = (part[-(part @ hull[:, :3].T + hull[:, 3]).max(axis=1) <= settings.hull_depth] for part in parts)
     return next(part[0] for part in outer if len(part))
 
 
-def _demand_finite(point: np.ndarray, option: str) -> None:
+def _check_finite(point: np.ndarray, option: str) -> None:
     if not np.isfinite(point).all():
-        raise InputError(f"{option} {_mm(point)}: every coordinate must be a finite number [mm].")
+        raise InputError(f"{option} {_to_mm(point)}: every coordinate must be a finite number [mm].")
 
 
-def _not_over_stem(cortex: np.ndarray, site: np.ndarray, settings: Placement) -> np.ndarray:
+def _check_not_over_stem(cortex: np.ndarray, site: np.ndarray, settings: Placement) -> np.ndarray:
     lowest, height = cortex[cortex[:, 2].argmin()], np.ptp(cortex[:, 2])
     if np.linalg.norm(site - lowest) <= settings.stem * height:
         raise InputError(
-            f"the opening at {_mm(site)} mm lies over the brainstem, which is held: choose a point farther from the "
-            f"brain's lowest one, {_mm(lowest)} mm."
+            f"the opening at {_to_mm(site)} mm lies over the brainstem, which is held: choose a point farther from the "
+            f"brain's lowest one, {_to_mm(lowest)} mm."
         )
     return site
 
 
-def _mm(point: np.ndarray) -> str:
+def _to_mm(point: np.ndarray) -> str:
     return ", ".join(f"{1e3 * value:.0f}" for value in point)
 
 
-def _box(cortex: np.ndarray) -> str:
-    low, high = _mm(cortex.min(axis=0)), _mm(cortex.max(axis=0))
+def _format_box(cortex: np.ndarray) -> str:
+    low, high = _to_mm(cortex.min(axis=0)), _to_mm(cortex.max(axis=0))
     return f"The brain reaches from {low} to {high} mm (right, anterior, superior)."

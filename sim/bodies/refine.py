@@ -17,37 +17,37 @@ from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh, orient_tetrahedra
 # one of its three diagonals, around which its other four nodes lie in this order.
 CORNERS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3]])
 DIAGONALS = np.array([[4, 9], [5, 7], [6, 8]])
-ROUND = np.array([[6, 7, 8, 5], [4, 6, 9, 8], [4, 5, 9, 7]])
+DIAGONAL_RINGS = np.array([[6, 7, 8, 5], [4, 6, 9, 8], [4, 5, 9, 7]])
 # Local node at the midpoint of each edge.
-MIDDLE = {frozenset(edge): 4 + k for k, edge in enumerate(QUADRATIC_EDGES.tolist())}
+MIDPOINT_NODES = {frozenset(edge): 4 + k for k, edge in enumerate(QUADRATIC_EDGES.tolist())}
 
 
-def _patterns() -> dict[tuple[int, ...], list[list[int]]]:
+def _build_patterns() -> dict[tuple[int, ...], list[list[int]]]:
     """Return the children of a tetrahedron by its halved edges: none, one, two opposite ones, or those of a face."""
     found: dict[tuple[int, ...], list[list[int]]] = {(): [[0, 1, 2, 3]]}
     for a, b in combinations(range(4), 2):
         c, d = (k for k in range(4) if k not in (a, b))
-        one, other = MIDDLE[frozenset((a, b))], MIDDLE[frozenset((c, d))]
+        one, other = MIDPOINT_NODES[frozenset((a, b))], MIDPOINT_NODES[frozenset((c, d))]
         found[(one,)] = [[a, one, c, d], [one, b, c, d]]
         found[tuple(sorted((one, other)))] = [[x, one, y, other] for x in (a, b) for y in (c, d)]
     for a, b, c in combinations(range(4), 3):
-        ab, bc, ac = (MIDDLE[frozenset(edge)] for edge in ((a, b), (b, c), (a, c)))
+        ab, bc, ac = (MIDPOINT_NODES[frozenset(edge)] for edge in ((a, b), (b, c), (a, c)))
         d = 6 - a - b - c
         found[tuple(sorted((ab, bc, ac)))] = [[a, ab, ac, d], [ab, b, bc, d], [ac, bc, c, d], [ab, bc, ac, d]]
     return found
 
 
-PATTERNS = _patterns()  # children by halved edges
+PATTERNS = _build_patterns()  # children by halved edges
 
 
-def _closed() -> np.ndarray:
+def _find_closing_patterns() -> np.ndarray:
     """Return the smallest pattern (64, 6) bool that contains each set of halved edges; all six if no other does."""
     sets = (np.arange(64)[:, None] >> np.arange(6)) & 1 > 0
     known = np.array([np.isin(np.arange(4, 10), one) for one in sorted(PATTERNS, key=len)] + [np.ones(6, bool)])
     return known[(sets[:, None] <= known).all(axis=2).argmax(axis=1)]
 
 
-CLOSED = _closed()  # smallest pattern by the bit mask of halved edges
+CLOSING_PATTERNS = _find_closing_patterns()  # smallest pattern by the bit mask of halved edges
 
 
 def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
@@ -73,8 +73,8 @@ def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
     if near_opening:
         reach = compute_edge_lengths(nodes[anatomy.open_surface]).mean()
         halved[count:] = KDTree(nodes[np.unique(opening)]).query(nodes[count:])[0] <= reach
-    halved = _conforming(table, halved)
-    tets, parent = _children(nodes, table, halved[table[:, 4:]])
+    halved = _make_conforming(table, halved)
+    tets, parent = _build_children(nodes, table, halved[table[:, 4:]])
     held, normal = space.extend_held(anatomy.held), space.extend_normals(anatomy.slide_normal, anatomy.held)
     craniotomy = np.zeros(space.count, bool)
     craniotomy[opening] = True
@@ -86,18 +86,18 @@ def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
     return Anatomy(fine, held[halved], normal[halved], (craniotomy & free)[halved])
 
 
-def _conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
+def _make_conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
     """Return the marked nodes (N,) bool with further edge midpoints added, until each tetrahedron has a pattern."""
     halved, middles = halved.copy(), table[:, 4:]
     while True:
         asked = halved[middles]
-        cut = CLOSED[asked @ (1 << np.arange(6))]
+        cut = CLOSING_PATTERNS[asked @ (1 << np.arange(6))]
         if (cut == asked).all():
             return halved
         halved[middles[cut]] = True
 
 
-def _children(nodes: np.ndarray, table: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _build_children(nodes: np.ndarray, table: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return children (C, 4) and their parents (C,), in the parents' order; `cut` (T, 6) marks the halved edges."""
     tets, parent = [], []
     for pattern, parts in PATTERNS.items():
@@ -108,7 +108,7 @@ def _children(nodes: np.ndarray, table: np.ndarray, cut: np.ndarray) -> tuple[np
     whole = table[rows]
     ends = nodes[whole[:, DIAGONALS]]
     shortest = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2).argmin(axis=1)
-    around = ROUND[shortest]
+    around = DIAGONAL_RINGS[shortest]
     inner = [np.column_stack([DIAGONALS[shortest], around[:, k], around[:, (k + 1) % 4]]) for k in range(4)]
     octahedron = np.stack([np.take_along_axis(whole, one, axis=1) for one in inner], axis=1)
     tets.append(np.concatenate([whole[:, CORNERS], octahedron], axis=1).reshape(-1, 4))

@@ -20,12 +20,12 @@ from .placement import Piece, Placement, find_within_outline
 from .refine import refine
 from .signed_distance import Field
 
-FEWEST_NODES = 2_000  # minimum mesh nodes
-MOST_NODES = 250_000  # maximum mesh nodes
+MIN_NODES = 2_000  # minimum mesh nodes
+MAX_NODES = 250_000  # maximum mesh nodes
 # Barycentric coordinates (20, 4) of sample points in a tetrahedron.
-SPREAD = np.array([corners for corners in product(range(4), repeat=4) if sum(corners) == 3]) / 4.0 + 1.0 / 16.0
-SMALLEST_CRANIOTOMY = 0.015  # minimum diameter [m]
-LARGEST_CRANIOTOMY = 0.120  # maximum diameter [m]
+SAMPLE_WEIGHTS = np.array([corners for corners in product(range(4), repeat=4) if sum(corners) == 3]) / 4.0 + 1.0 / 16.0
+MIN_CRANIOTOMY = 0.015  # minimum diameter [m]
+MAX_CRANIOTOMY = 0.120  # maximum diameter [m]
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class MeshPlan:
     fine_opening: bool = False
 
     def __post_init__(self) -> None:
-        if not FEWEST_NODES <= self.nodes <= MOST_NODES:
-            raise InputError(f"{self.nodes} nodes are outside {FEWEST_NODES} to {MOST_NODES}: choose a number between.")
-        if not SMALLEST_CRANIOTOMY <= self.craniotomy <= LARGEST_CRANIOTOMY:
+        if not MIN_NODES <= self.nodes <= MAX_NODES:
+            raise InputError(f"{self.nodes} nodes are outside {MIN_NODES} to {MAX_NODES}: choose a number between.")
+        if not MIN_CRANIOTOMY <= self.craniotomy <= MAX_CRANIOTOMY:
             raise InputError(
-                f"a craniotomy of {self.craniotomy * 1e3:g} mm is outside {SMALLEST_CRANIOTOMY * 1e3:g} to "
-                f"{LARGEST_CRANIOTOMY * 1e3:g} mm: choose a diameter between."
+                f"a craniotomy of {self.craniotomy * 1e3:g} mm is outside {MIN_CRANIOTOMY * 1e3:g} to "
+                f"{MAX_CRANIOTOMY * 1e3:g} mm: choose a diameter between."
             )
 
 
@@ -134,12 +134,12 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     solids = Solids(
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
-    mesh = _with_parts(build_mesh(solids, plan.nodes, plan.meshing), subject)
+    mesh = _assign_parts(build_mesh(solids, plan.nodes, plan.meshing), subject)
     made = add_boundary_conditions(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline, subject.septa)
     return refine(made, near_opening=True) if plan.fine_opening else made
 
 
-def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
+def _assign_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
     """Return the mesh with the regions of the subject's parts.
 
     Each part takes the tetrahedra with the largest fraction inside, until their volume is closest to its own.
@@ -148,7 +148,7 @@ def _with_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
     for part in reversed(subject.parts):
         around = TUMOUR_LABEL if part.label == NECROSIS_LABEL else BRAIN_LABEL
         free = np.flatnonzero(region == around)
-        points = np.einsum("pk,tki->tpi", SPREAD, mesh.nodes[mesh.tets[free]])
+        points = np.einsum("pk,tki->tpi", SAMPLE_WEIGHTS, mesh.nodes[mesh.tets[free]])
         share = (part.inside(points.reshape(-1, 3)) < 0.0).reshape(points.shape[:2]).mean(axis=1)
         touched = np.argsort(-share, kind="stable")[: np.count_nonzero(share)]
         taken = np.concatenate([[0.0], np.cumsum(mesh.volumes[free[touched]])])

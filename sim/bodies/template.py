@@ -16,7 +16,7 @@ from .placement import Piece, find_reachable_site
 from .signed_distance import Field, mask_field
 from .subject import Subject, find_rim
 
-MIDDLE = (0.0, -17.4, 5.4)
+MNI_CENTRE = (0.0, -17.4, 5.4)
 """Centre of the template's bounding box, the origin of the directions in `SITES` [mm]."""
 SITES = {
     "frontal": (32.0, 42.0, 36.0),
@@ -28,10 +28,10 @@ SITES = {
 """Named points on the right hemisphere's convexity, seen from `MIDDLE`: MNI152 coordinates [mm]."""
 
 Shape = Literal["sphere", "lobed"]  # tumour shapes
-SMALLEST_RADIUS = 3e-3  # minimum tumour radius [m]
-LARGEST_RADIUS = 35e-3  # maximum tumour radius [m]
-SMALLEST_COVER = 1e-3  # minimum depth of the tumour's top under the cortex [m]
-LARGEST_COVER = 60e-3  # maximum depth of the tumour's top under the cortex [m]
+MIN_RADIUS = 3e-3  # minimum tumour radius [m]
+MAX_RADIUS = 35e-3  # maximum tumour radius [m]
+MIN_COVER = 1e-3  # minimum depth of the tumour's top under the cortex [m]
+MAX_COVER = 60e-3  # maximum depth of the tumour's top under the cortex [m]
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ class Tumour:
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
-            ("radius", self.radius, SMALLEST_RADIUS, LARGEST_RADIUS),
-            ("cover", self.cover, SMALLEST_COVER, LARGEST_COVER),
+            ("radius", self.radius, MIN_RADIUS, MAX_RADIUS),
+            ("cover", self.cover, MIN_COVER, MAX_COVER),
         ):
             if not low <= value <= high:
                 raise InputError(
@@ -192,7 +192,7 @@ def build_template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     InputError
         A tumour that would extend beyond the brain.
     """
-    return build_synthetic_subject(tumour, _scaled_template(head), head)
+    return build_synthetic_subject(tumour, _load_scaled_template(head), head)
 
 
 def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> Subject:
@@ -205,14 +205,14 @@ def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = H
     """
     brain, cortex = mask_field(healthy.mask, healthy.affine), find_rim(healthy.mask, healthy.affine)
     if tumour.middle is None:
-        site, inward = _site(brain, cortex, healthy.middle, tumour.site, head.smooth)
+        site, inward = _find_site(brain, cortex, healthy.middle, tumour.site, head.smooth)
         shape = _round(
             tumour, lambda unit, scale: site + (tumour.cover + scale * unit.compute_radius(-inward[None])[0]) * inward
         )
     else:
         shape = _round(tumour, lambda unit, scale: np.array(tumour.middle))
         site = find_reachable_site(cortex, shape.middle)
-    interface = shape.middle + _sphere(400) * shape.compute_radius(_sphere(400))[:, None]
+    interface = shape.middle + _sample_sphere(400) * shape.compute_radius(_sample_sphere(400))[:, None]
     if (brain(interface) > -head.clearance).any():
         raise InputError(
             f"a {tumour.shape} tumour of {tumour.radius * 1e3:g} mm radius {tumour.place} reaches out of the brain: "
@@ -238,7 +238,7 @@ def measure_size(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, floa
     return centre, float(mask.sum() * abs(np.linalg.det(affine[:3, :3])))
 
 
-def _scaled_template(head: Head) -> HealthyHead:
+def _load_scaled_template(head: Head) -> HealthyHead:
     with require_extra("heads", "an anatomy of the average brain needs"):
         from nilearn.datasets import load_mni152_template  # takes seconds
 
@@ -252,7 +252,7 @@ def _scaled_template(head: Head) -> HealthyHead:
     return HealthyHead(mask, affine, Intensity(grey, affine))
 
 
-def _site(
+def _find_site(
     brain: Field, cortex: np.ndarray, seen_from: tuple[float, float, float] | None, name: str, smooth: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the point (3,) [m] where the ray to a named site leaves the brain, and the inward normal (3,) there."""
@@ -273,11 +273,11 @@ def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobe
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     heights = rng.uniform(0.3, 1.0, len(directions)) * lobes.height
     unit = Lobed(np.zeros(3), directions, heights, 1.0, lobes.sharpness)
-    scale = tumour.radius / (unit.compute_radius(_sphere(20_000)) ** 3).mean() ** (1.0 / 3.0)
+    scale = tumour.radius / (unit.compute_radius(_sample_sphere(20_000)) ** 3).mean() ** (1.0 / 3.0)
     return Lobed(middle(unit, scale), directions, heights, scale, lobes.sharpness)
 
 
-def _sphere(count: int) -> np.ndarray:
+def _sample_sphere(count: int) -> np.ndarray:
     """Return unit directions (count, 3) of a Fibonacci lattice, uniform on the sphere."""
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count

@@ -95,7 +95,7 @@ class TipGauge:
                 f"the distance from tip to tumour needs vertex {self.nodes[row[self.nodes] < 0][0]}, which the "
                 "displacements lack: request the open cortex and the tumour."
             )
-        tips = self._tips(loads, displacement, row[self._open[0]], tool, lift)
+        tips = self._compute_tips(loads, displacement, row[self._open[0]], tool, lift)
         found, at = np.empty(len(loads)), row[self._tumour[0]]
         for first in range(0, len(loads), self.together):
             some = slice(first, first + self.together)
@@ -104,7 +104,7 @@ class TipGauge:
             found[some] = np.linalg.norm(near - tips[some], axis=1)
         return found
 
-    def _tips(
+    def _compute_tips(
         self, loads: Loads, displacement: np.ndarray, row: np.ndarray, tool: BuiltIn | None, lift: float
     ) -> np.ndarray:
         """Return the tool tips (B, 3) [m]; `row` (m,) are the rows of the exposed cortex in `displacement`."""

@@ -9,7 +9,7 @@ from ..errors import InputError
 from ..runtime.outside_files import read_as, to_path
 from .nifti import read_mgh, read_nifti
 from .nrrd import read_nrrd
-from .voxels import OF_BRAINS, REMEDY, Volume, Voxels, check_volume
+from .voxels import DEFAULT_VOXELS, REMEDY, Volume, Voxels, check_volume
 
 READERS = {
     ".nii": ("NIfTI", read_nifti),
@@ -22,7 +22,9 @@ READERS = {
 """Format name and reader by file suffix."""
 
 
-def read_volume(path: str | Path, voxels: Voxels = OF_BRAINS, finite: bool = True, layered: bool = False) -> Volume:
+def read_volume(
+    path: str | Path, voxels: Voxels = DEFAULT_VOXELS, finite: bool = True, layered: bool = False
+) -> Volume:
     """Read one numeric volume from a file; unless `finite` is False, all values must be finite.
 
     If `layered`, the values of a segmentation may be (I, J, K, L), in layers that overlap.

@@ -19,9 +19,9 @@ REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd, .
 LPS = np.array([-1.0, -1.0, 1.0])
 """Signs of the conversion between LPS and RAS."""
 SURPLUS = 2**24  # maximum data after the voxels, read for a checksum [bytes]
-PIECE = 2**20  # block size of reading [bytes]
+BLOCK = 2**20  # block size of reading [bytes]
 # Maximum decompressed size of a file whose suffix does not show its compression [bytes].
-MOST_UNPACKED = 2**31
+MAX_UNPACKED_BYTES = 2**31
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Voxels:
         return (f"its own orientation is used: axes {self.axes} are ignored",) if self.axes else ()
 
 
-OF_BRAINS = Voxels()
+DEFAULT_VOXELS = Voxels()
 """Default limits, for brain scanners."""
 
 
@@ -101,19 +101,19 @@ def open_volume(path: Path) -> Any:
     InputError
         An archive of several files.
     """
-    return _opener(path)(path, "rb")
+    return _find_opener(path)(path, "rb")
 
 
 def unpack_file(path: Path) -> str | BytesIO:
     """Return the file name if it shows the compression to nibabel, else the decompressed bytes."""
     named = gzip.open if path.name.lower().endswith(("gz", "mgz")) else open
-    if _opener(path) is named:
+    if _find_opener(path) is named:
         return str(path)
     with open_volume(path) as file:
-        return BytesIO(file.read(MOST_UNPACKED))
+        return BytesIO(file.read(MAX_UNPACKED_BYTES))
 
 
-def _opener(path: Path) -> Callable[..., Any]:
+def _find_opener(path: Path) -> Callable[..., Any]:
     with path.open("rb") as file:
         start = file.read(4)
     if start == b"PK\3\4":

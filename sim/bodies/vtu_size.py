@@ -20,7 +20,7 @@ from ..runtime.file_limits import build_too_large_error
 # Start of raw appended data, as meshio finds it.
 RAW = re.compile(rb'<AppendedData[^>]+">')
 # Block size of decompression [bytes].
-PIECE = 2**20
+BLOCK = 2**20
 # Decompressor by VTK name.
 OPENERS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompressor": lzma.LZMADecompressor}
 WORDS = {"UInt32": "u4", "UInt64": "u8"}  # header word type
@@ -68,18 +68,18 @@ def check_vtu_size(path: Path, most: int) -> bool:
         kind = array.get("format")
         if kind in ("binary", "appended"):
             inside = behind[int(array.get("offset", 0)) :] if kind == "appended" else (array.text or "").strip()
-            declared, blocks = _packed(inside, word)
+            declared, blocks = _parse_blocks(inside, word)
             left -= declared
             if left < 0:
                 raise build_too_large_error(most)
             for block in blocks:
-                declared -= _inflated(opener, block, declared)
+                declared -= _measure_inflated_size(opener, block, declared)
                 if declared < 0:
                     raise InputError("an array inflates to more than its header says. Write the file again.")
     return not raw
 
 
-def _packed(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
+def _parse_blocks(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
     """Return the size an array declares [bytes], and its compressed blocks.
 
     They follow a header: number of blocks, size of a block and of the last one, compressed size of each.
@@ -89,28 +89,28 @@ def _packed(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
     def part(place: int, size: int) -> bytes:
         if isinstance(inside, bytes):
             return inside[place : place + size]
-        return base64.b64decode(inside[place : place + _letters(size)])
+        return base64.b64decode(inside[place : place + _count_base64_characters(size)])
 
     count = int(np.frombuffer(part(0, word.itemsize), word, 1)[0])
     header = word.itemsize * (3 + count)
     size, _, *sizes = map(int, np.frombuffer(part(0, header), word)[1 : 3 + count])
-    packed = part(header if isinstance(inside, bytes) else _letters(header), sum(sizes))
+    packed = part(header if isinstance(inside, bytes) else _count_base64_characters(header), sum(sizes))
     ends = [0, *accumulate(sizes)]
     return count * size, (packed[start:end] for start, end in pairwise(ends))
 
 
-def _letters(size: int) -> int:
+def _count_base64_characters(size: int) -> int:
     """Return the base64 characters for `size` bytes."""
     return -(-size // 3) * 4
 
 
-def _inflated(opener: Callable[[], Any], block: bytes, most: int) -> int:
+def _measure_inflated_size(opener: Callable[[], Any], block: bytes, most: int) -> int:
     """Return the decompressed size of all streams of a block [bytes], or any number above `most`."""
     total, rest = 0, block
     while rest and total <= most:
         opened = opener()
         while total <= most and not opened.eof:
-            piece = opened.decompress(rest, PIECE)
+            piece = opened.decompress(rest, BLOCK)
             rest = getattr(opened, "unconsumed_tail", b"")
             total += len(piece)
             if not piece and not rest:

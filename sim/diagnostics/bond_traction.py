@@ -82,14 +82,14 @@ class Bond:
     def compute_shares(self, force: wp.array) -> np.ndarray:
         """Compute the relative traction (n, B) at `nodes` (n,) from the skull's forces (3N, B) [N] on the brain."""
         share = wp.zeros((len(self.nodes), force.shape[1]), dtype=wp.float64, device=self._device.name)
-        self._largest(force, share)
+        self._compute_largest_ratio(force, share)
         return share.numpy()
 
     def share(self, force: wp.array) -> np.ndarray:
         """Return the maximum of `shares` (B,): above 1 the bond would fail. NaN without a skull."""
-        return self._largest(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
+        return self._compute_largest_ratio(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 
-    def _largest(self, force: wp.array, share: wp.array | None = None) -> wp.array:
+    def _compute_largest_ratio(self, force: wp.array, share: wp.array | None = None) -> wp.array:
         """Compute the largest relative traction of each load case (B,), on the device.
 
         All values (n, B) are written to `share`, if it is given.

@@ -10,19 +10,22 @@ from ..runtime.device import Device, forward_kernel
 
 # Range of principal stretches in tests of human brain: engineering strains of 50 % in Jin, Zhu, Mao, Shen, Yang 2013,
 # "A comprehensive experimental study on material properties of human brain tissue", J. Biomech. 46:2795-2801.
-LEAST, MOST = 0.5, 1.5
+MIN_STRETCH, MAX_STRETCH = 0.5, 1.5
 ROUND_OFF = 1e-4  # tolerance of the range, for a stretch of 1.5 in single precision
 # Volume beyond that range above which a deformation is unreliable. Tools strain some tissue beyond it at their edges:
 # surgical loads up to 0.6 ml, the hardest spatulas 2.5 ml.
-VOLUME = 1e-6  # [m^3].
-SHARE = 0.1  # Relative to a small mesh.
+MAX_VOLUME = 1e-6  # [m^3].
+MAX_FRACTION = 0.1  # Relative to a small mesh.
 
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
     """Build the kernel over (element, load case)."""
     scalar, vec, mat = device.scalar, device.vector, device.matrix
-    low, high = wp.constant(wp.float64((LEAST - ROUND_OFF) ** 2)), wp.constant(wp.float64((MOST + ROUND_OFF) ** 2))
+    low, high = (
+        wp.constant(wp.float64((MIN_STRETCH - ROUND_OFF) ** 2)),
+        wp.constant(wp.float64((MAX_STRETCH + ROUND_OFF) ** 2)),
+    )
 
     @forward_kernel(module="unique")
     def measure(
@@ -71,7 +74,7 @@ class Stretch:
         elements = space.split_elements(np.ones(len(space.mesh.tets), bool))[0].elements
         count, most = elements.table.shape
         size = np.full(count, most, np.int32) if elements.size is None else elements.size
-        self._device, self._limit = device, min(VOLUME, SHARE * float(elements.weight.sum()))
+        self._device, self._limit = device, min(MAX_VOLUME, MAX_FRACTION * float(elements.weight.sum()))
         self._shape = [
             device.upload(size, wp.int32),
             device.upload(elements.table, wp.int32),

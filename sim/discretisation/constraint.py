@@ -132,7 +132,7 @@ class Constraint:
 
     def __init__(self, held: np.ndarray, normal: np.ndarray, device: Device, freedom: MinFreeDofs = MinFreeDofs()):
         self.held, self._freedom = held, freedom
-        self.normal, drag = _within_free(held, normal, freedom.normal)
+        self.normal, drag = _restrict_normals(held, normal, freedom.normal)
         self.device = device
         self._held = device.upload(held.astype(np.int8), wp.int8)
         self._normal = device.upload(self.normal, device.vector)
@@ -216,7 +216,7 @@ class Constraint:
         if self._weight is None:
             return None
         self.project_nodes(gradient)
-        return self._solved(self._average(gradient))
+        return self._solve_gram(self._average(gradient))
 
     def build_basis(self) -> sp.csc_array:
         """Return a sparse orthonormal basis (3N, n) of the motions that fixed and sliding nodes admit."""
@@ -244,15 +244,15 @@ class Constraint:
         self.device.launch(build_kernels(self.device).average, dim, [self._weight, v], [out])
         return out.numpy().astype(np.float64)
 
-    def _solved(self, mean: np.ndarray) -> np.ndarray:
+    def _solve_gram(self, mean: np.ndarray) -> np.ndarray:
         return np.linalg.solve(self._gram, mean.T[:, :, None])[:, :, 0].T
 
     def _spread(self, mean: np.ndarray, v: wp.array) -> None:
-        inputs = [self._weight, self.device.upload(self._solved(mean))]
+        inputs = [self._weight, self.device.upload(self._solve_gram(mean))]
         self.device.launch(build_kernels(self.device).spread, (len(self.held), v.shape[1]), inputs, [v])
 
 
-def _within_free(held: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+def _restrict_normals(held: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the unit normals (N, 3) of sliding nodes without their fixed components; zero if these leave too little.
 
     Also return `drag` (N, 3), the motion along them per unit of each fixed component, so that normal . u = 0.

@@ -109,7 +109,7 @@ def assemble_hooke_stiffness(
         used = np.arange(most) < size[:, None]
         column, start = table[used], np.append(0, np.cumsum(size))
         slope = elements.gradient[part].reshape(-1, most, 3)[used]
-        for modulus, of in ((2.0 * mu[part], _strain), (lam[part], _volume_change)):
+        for modulus, of in ((2.0 * mu[part], _build_strain), (lam[part], _build_divergence)):
             if modulus.any():
                 blocks, weight = of(slope), (modulus[:, None] * elements.weight[part]).ravel()
                 shape = blocks.shape[1] * len(table), 3 * elements.nodes
@@ -119,12 +119,12 @@ def assemble_hooke_stiffness(
     return sp.csc_array(total.T)  # symmetric
 
 
-def _volume_change(slope: np.ndarray) -> np.ndarray:
+def _build_divergence(slope: np.ndarray) -> np.ndarray:
     """Return the blocks (M, 1, 3) of the divergence for shape functions with gradients (M, 3)."""
     return slope[:, None]
 
 
-def _strain(slope: np.ndarray) -> np.ndarray:
+def _build_strain(slope: np.ndarray) -> np.ndarray:
     """Return the blocks (M, 6, 3) of the small strain, Mandel's order (xx, yy, zz, root 2 times yz, xz, xy)."""
     blocks = np.zeros((len(slope), 6, 3))
     for i in range(3):

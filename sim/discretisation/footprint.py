@@ -120,8 +120,8 @@ class ContactSurface:
 
     def find_nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the nearest points (B, 3) [m] to `points` (B, 3), and distances (B,), inf if > `within` (B,) [m]."""
-        imprint = self.build_footprints(self._tools(points, within))
-        self._touch(imprint)
+        imprint = self.build_footprints(self._pack_tools(points, within))
+        self._find_contacts(imprint)
         touched = imprint.touched.numpy().reshape(-1, 4)
         return touched[:, :3], touched[:, 3]
 
@@ -138,7 +138,7 @@ class ContactSurface:
         """
         key, last = np.column_stack([points, radii]).tobytes(), self._last
         if last is None or last[0] != key:
-            last = self._last = key, self._pressed(points, radii)
+            last = self._last = key, self._compute_footprints(points, radii)
         return last[1]  # another thread may have replaced self._last since
 
     def build_footprints(self, tools: wp.array) -> FootprintArrays:
@@ -154,7 +154,7 @@ class ContactSurface:
 
     def put(self, imprint: FootprintArrays) -> None:
         """Compute the footprints on the device alone; distance inf and weight 0 for a tool without contact."""
-        self._touch(imprint)
+        self._find_contacts(imprint)
         imprint.weight.zero_()
         imprint.sums.zero_()
         inputs = [self._corners, self._ball, self._table, self._position, imprint.tools, imprint.touched]
@@ -169,21 +169,21 @@ class ContactSurface:
         InputError
             With the first such tool.
         """
-        self._demand(points, radii, self.find_nearest(points, radii)[1])
+        self._check_touching(points, radii, self.find_nearest(points, radii)[1])
 
-    def _pressed(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
+    def _compute_footprints(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
         small = radii.min(initial=np.inf)
         if small < self._least:
             raise InputError(
                 f"a footprint of {1e3 * small:.3g} mm is too small for the triangles of this surface: give a radius of "
                 f"at least {1e3 * self._least:.3g} mm."
             )
-        imprint = self.build_footprints(self._tools(points, radii))
+        imprint = self.build_footprints(self._pack_tools(points, radii))
         self.put(imprint)
-        self._demand(points, radii, imprint.touched.numpy().reshape(-1, 4)[:, 3])
+        self._check_touching(points, radii, imprint.touched.numpy().reshape(-1, 4)[:, 3])
         return Footprints(self.nodes, imprint.weight, imprint.sums)
 
-    def _demand(self, points: np.ndarray, radii: np.ndarray, away: np.ndarray) -> None:
+    def _check_touching(self, points: np.ndarray, radii: np.ndarray, away: np.ndarray) -> None:
         """Reject tools whose distance `away` (B,) from the surface is infinite."""
         missed = np.flatnonzero(np.isinf(away))
         if len(missed):
@@ -193,15 +193,15 @@ class ContactSurface:
                 f"{1e3 * radii[number]:.3g} mm, which does not touch the {self._name}: choose a point on it."
             )
 
-    def _tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
+    def _pack_tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
         return self.device.upload(np.column_stack([points, radii]), wp.vec4d)
 
-    def _touch(self, imprint: FootprintArrays) -> None:
+    def _find_contacts(self, imprint: FootprintArrays) -> None:
         """Find the first contact point of each tool and its distance; inf if larger than its radius."""
         inputs = [self._corners, self._ball, imprint.tools]
         self.device.launch(_search, imprint.found[0].shape, inputs, [imprint.found[0]])
         for some, fewer in pairwise(imprint.found):
-            self.device.launch(_settle, fewer.shape, [some], [fewer])
+            self.device.launch(_reduce_candidates, fewer.shape, [some], [fewer])
 
 
 def compute_footprint_weights(
@@ -219,7 +219,7 @@ def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 
 @wp.func
-def _on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+def _find_on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
     """Return the point nearest to `point` on the segment a-b."""
     edge = b - a
     square = wp.dot(edge, edge)
@@ -230,7 +230,7 @@ def _on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
-def _nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+def _select_nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
     """Return the one nearer to `point`."""
     return wp.where(wp.length_sq(one - point) <= wp.length_sq(other - point), one, other)
 
@@ -242,7 +242,9 @@ def on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.ve
     Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the projection onto the plane if it lies inside, else
     the nearest point of the edges. Degenerate triangles use their edges only.
     """
-    nearest = _nearer(_nearer(_on_edge(a, b, point), _on_edge(b, c, point), point), _on_edge(c, a, point), point)
+    nearest = _select_nearer(
+        _select_nearer(_find_on_edge(a, b, point), _find_on_edge(b, c, point), point), _find_on_edge(c, a, point), point
+    )
     first, second, offset = b - a, c - a, point - a
     # barycentric coordinates of the projection from the Gram matrix of two edges
     aa, ab, bb = wp.dot(first, first), wp.dot(first, second), wp.dot(second, second)
@@ -250,7 +252,7 @@ def on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.ve
     area = aa * bb - ab * ab
     v, w = bb * pa - ab * pb, aa * pb - ab * pa
     if area > wp.float64(0.0) and v >= wp.float64(0.0) and w >= wp.float64(0.0) and v + w <= area:
-        nearest = _nearer(a + (v / area) * first + (w / area) * second, nearest, point)
+        nearest = _select_nearer(a + (v / area) * first + (w / area) * second, nearest, point)
     return nearest
 
 
@@ -261,7 +263,7 @@ def _place(of: wp.vec4d) -> wp.vec3d:
 
 
 @wp.func
-def _joined(place: wp.vec3d, length: wp.float64) -> wp.vec4d:
+def _pack_candidate(place: wp.vec3d, length: wp.float64) -> wp.vec4d:
     return wp.vec4d(place[0], place[1], place[2], length)
 
 
@@ -277,7 +279,7 @@ def _search(
     chunk, c = wp.tid()
     point = _place(tools[c])
     best = tools[c][3]
-    found[chunk, c] = _joined(point, wp.float64(wp.inf))
+    found[chunk, c] = _pack_candidate(point, wp.float64(wp.inf))
     for s in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, ball.shape[0])):
         near = ball[s][3] + best
         if wp.length_sq(_place(ball[s]) - point) <= near * near:
@@ -285,11 +287,11 @@ def _search(
             far = wp.length(nearest - point)
             if far <= best:
                 best = far
-                found[chunk, c] = _joined(nearest, far)
+                found[chunk, c] = _pack_candidate(nearest, far)
 
 
 @forward_kernel
-def _settle(
+def _reduce_candidates(
     found: wp.array2d(dtype=wp.vec4d),
     # outputs
     nearest: wp.array2d(dtype=wp.vec4d),

@@ -12,7 +12,7 @@ from ..runtime.device import forward_kernel, load
 from .footprint import on_triangle
 
 # Number of alternating projections between a triangle and an extended core.
-TURNS = 16
+PROJECTION_ITERATIONS = 16
 
 
 class NearestPlaces(NamedTuple):
@@ -73,14 +73,14 @@ class Nearest:
     def __init__(self, count: int):
         self._corners = np.empty((count, 3, 3))
         self._found = NearestPlaces(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
-        load(_nearest.module)
+        load(_find_nearest.module)
         kinds = (wp.vec3d, wp.vec3d, wp.float64, wp.vec3d)
         given = zip((self._corners, *self._found), kinds, strict=True)
         arrays = [wp.array(each, dtype=kind, device="cpu", copy=False) for each, kind in given]
         stands = [wp.vec3d(), wp.mat33d(), wp.vec3d(), 1]
         # A recorded launch costs a tenth of another one.
         self._launch = wp.launch(
-            _nearest, count, [arrays[0], *stands], arrays[1:], device="cpu", record_cmd=True, record_tape=False
+            _find_nearest, count, [arrays[0], *stands], arrays[1:], device="cpu", record_cmd=True, record_tape=False
         )
 
     def to(self, core: PlacedBox, corners: np.ndarray) -> NearestPlaces:
@@ -89,14 +89,14 @@ class Nearest:
             return self._found
         self._corners[:] = corners
         stands = wp.vec3d(*core.middle), wp.mat33d(*core.axes.ravel()), wp.vec3d(*core.half)
-        for number, value in enumerate([*stands, TURNS if core.half.any() else 1], 1):
+        for number, value in enumerate([*stands, PROJECTION_ITERATIONS if core.half.any() else 1], 1):
             self._launch.set_param_at_index(number, value)
         self._launch.launch()
         return self._found
 
 
 @forward_kernel
-def _nearest(
+def _find_nearest(
     corners: wp.array2d(dtype=wp.vec3d),
     middle: wp.vec3d,
     axes: wp.mat33d,
@@ -117,7 +117,7 @@ def _nearest(
     ahead = wp.vec3d(place)  # copies, since plain assignment would alias
     for _turn in range(turns):
         last, before = wp.vec3d(place), wp.float64(pace)
-        place = on_triangle(a, b, c, _of_box(ahead, middle, axes, half))
+        place = on_triangle(a, b, c, _find_nearest_in_box(ahead, middle, axes, half))
         pace = (one + wp.sqrt(one + wp.float64(4.0) * before * before)) / wp.float64(2.0)
         ahead = place + ((before - one) / pace) * (place - last)
     first, second, offset = b - a, c - a, place - a
@@ -127,16 +127,16 @@ def _nearest(
     v = wp.clamp((bb * pa - ab * pb) / area, wp.float64(0.0), one)
     w = wp.clamp((aa * pb - ab * pa) / area, wp.float64(0.0), one - v)
     share[face] = wp.vec3d(one - v - w, v, w)
-    away = place - _of_box(place, middle, axes, half)
+    away = place - _find_nearest_in_box(place, middle, axes, half)
     distance[face] = wp.length(away)
     normal[face] = wp.normalize(away)
     down = -wp.vec3d(axes[0, 2], axes[1, 2], axes[2, 2])
-    above = _through(place, middle, axes, half)
+    above = _compute_face_height(place, middle, axes, half)
     if above >= wp.float64(0.0):
         distance[face] = -above
         normal[face] = down
     for corner in range(3):
-        above = _through(corners[face, corner], middle, axes, half)
+        above = _compute_face_height(corners[face, corner], middle, axes, half)
         if above >= wp.float64(0.0) and -above < distance[face]:
             distance[face] = -above
             normal[face] = down
@@ -146,7 +146,7 @@ def _nearest(
 
 
 @wp.func
-def _through(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.float64:
+def _compute_face_height(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.float64:
     """Return the height of a point above a flat box if it is over the face; else -1."""
     none = wp.float64(0.0)
     local = wp.transpose(axes) @ (point - middle)
@@ -155,7 +155,7 @@ def _through(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d)
 
 
 @wp.func
-def _of_box(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.vec3d:
+def _find_nearest_in_box(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.vec3d:
     """Return the point of the box nearest to a point."""
     local = wp.transpose(axes) @ (point - middle)
     for i in range(3):

@@ -63,10 +63,10 @@ def compute_remains(anatomy: Anatomy, effect: Resection, slides: bool = True) ->
     InputError
         A body that is not fixed; a step with a tetrahedron that the mesh does not have, or the last of the body.
     """
-    return tuple(_remains(anatomy, effect, slides))
+    return tuple(_iterate_bodies(anatomy, effect, slides))
 
 
-def _remains(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[RemainingBody]:
+def _iterate_bodies(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[RemainingBody]:
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
     check_held(anatomy.mesh, anatomy.held, normal)  # else all of it would count as disconnected
     yield RemainingBody(0, anatomy, np.zeros(0, np.int64))

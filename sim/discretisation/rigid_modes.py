@@ -28,12 +28,12 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float 
     loose = np.flatnonzero(~used & ~held.all(axis=1))
     if len(loose):
         raise InputError(f"node {loose[0]} (and {len(loose) - 1} more) belongs to no tetrahedron: remove or hold it.")
-    key = np.unique(np.repeat(_clusters(mesh.tets), mesh.table.shape[1]) * count + mesh.table.ravel())
+    key = np.unique(np.repeat(_label_clusters(mesh.tets), mesh.table.shape[1]) * count + mesh.table.ravel())
     cluster, node = divmod(key, count)
-    piece = _components(cluster, cluster.max() + 1 + node, cluster.max() + 1 + count)[cluster]
+    piece = _label_components(cluster, cluster.max() + 1 + node, cluster.max() + 1 + count)[cluster]
     for number in np.unique(piece):
         mine = piece == number
-        free, at = _free_motions(mesh.nodes, held, normal, cluster[mine], node[mine], felt)
+        free, at = _count_free_motions(mesh.nodes, held, normal, cluster[mine], node[mine], felt)
         if free == 0:
             continue
         hinged = len(np.unique(cluster[mine])) > 1
@@ -54,33 +54,33 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float 
 def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, felt: float = 1e-6) -> np.ndarray:
     """Return tetrahedra (n,) that can move rigidly: without fixed nodes or, if `slides`, sufficient slide normals."""
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
-    cluster, nodes = _clusters(anatomy.mesh.tets), anatomy.mesh.nodes
+    cluster, nodes = _label_clusters(anatomy.mesh.tets), anatomy.mesh.nodes
     loose = []
     for number in np.unique(cluster):
         mine = np.flatnonzero(cluster == number)
         node = np.unique(anatomy.mesh.table[mine])
         if not anatomy.held[node].any():
             one = np.zeros(len(node), np.int64)
-            if _free_motions(nodes, anatomy.held, normal, one, node, felt)[0]:
+            if _count_free_motions(nodes, anatomy.held, normal, one, node, felt)[0]:
                 loose.append(mine)
     return np.concatenate(loose) if loose else np.zeros(0, np.int64)
 
 
-def _components(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
+def _label_components(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
     """Return the component numbers (count,) of a graph with edges (first, second)."""
     graph = sp.coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
     return sp.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def _clusters(tets: np.ndarray) -> np.ndarray:
+def _label_clusters(tets: np.ndarray) -> np.ndarray:
     """Return the cluster (T,) of each element; face neighbours belong to one cluster."""
     keys = compute_row_keys(tets[:, FACES].reshape(-1, 3))
     order = np.argsort(keys)
     same = keys[order[1:]] == keys[order[:-1]]
-    return _components(order[:-1][same] // 4, order[1:][same] // 4, len(tets))
+    return _label_components(order[:-1][same] // 4, order[1:][same] // 4, len(tets))
 
 
-def _free_motions(
+def _count_free_motions(
     nodes: np.ndarray, held: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray, felt: float
 ) -> tuple[int, int]:
     """Return the number of unresisted rigid motions, and the cluster that moves most in one of them.

@@ -17,16 +17,16 @@ from .element import Elements, build_linear_elements
 def build_edge_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     """Build one element per edge and region, over the `chosen` tetrahedra (T,) bool around it."""
     ends = np.sort(mesh.tets[chosen][:, EDGES].reshape(-1, 2))
-    return _averaged(mesh, chosen, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
+    return _build_averaged_elements(mesh, chosen, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
 
 
 def build_node_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     """Build one element per node and region, over the `chosen` tetrahedra (T,) bool around it."""
     corners = mesh.tets[chosen].astype(np.int64)
-    return _averaged(mesh, chosen, corners, corners.reshape(-1, 1))
+    return _build_averaged_elements(mesh, chosen, corners, corners.reshape(-1, 1))
 
 
-def _averaged(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.ndarray) -> Elements:
+def _build_averaged_elements(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.ndarray) -> Elements:
     """Build one element per distinct number in `key` (T, k); tetrahedron t adds V_t / k to each of its numbers.
 
     `vertices` (T k, n) are the mesh vertices of each number. Regions are not mixed, since their tissues differ.

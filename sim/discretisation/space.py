@@ -88,7 +88,7 @@ class Discretisation:
             return (ElementPart(build_linear_elements(self.mesh, chosen), "whole"),)
         if self.element == "p2":
             return (ElementPart(build_quadratic_elements(self.nodes, self.table, chosen), "whole"),)
-        edges, nodes = _smoothed(self.mesh, chosen.tobytes())
+        edges, nodes = _build_smoothed_elements(self.mesh, chosen.tobytes())
         return ElementPart(edges, "shape"), ElementPart(nodes, "volume")
 
     def extend_held(self, held: np.ndarray) -> np.ndarray:
@@ -135,7 +135,7 @@ class Discretisation:
 
 
 @lru_cache(2)  # shared by effects, tissues and diagnostics: 10 % of a locator's set-up on a GPU
-def _smoothed(mesh: TetMesh, chosen: bytes) -> tuple[Elements, Elements]:
+def _build_smoothed_elements(mesh: TetMesh, chosen: bytes) -> tuple[Elements, Elements]:
     """Build edge and node elements over the `chosen` tetrahedra (T,), given as bytes of bool."""
     tets = np.frombuffer(chosen, bool)
     return build_edge_elements(mesh, tets), build_node_elements(mesh, tets)

@@ -8,10 +8,10 @@ from scipy.spatial import KDTree
 from ..geometry.closest_point import find_closest_points
 from ..geometry.tetmesh import find_single_faces
 
-NEAR = 16  # candidate triangles for the closest point
-TOGETHER = 4096  # points per block
-SHARE = 0.5  # maximum extrapolated change, as a fraction of the surface value: zero stays zero
-TINY = 1e-30  # guard against division by 0
+CANDIDATE_TRIANGLES = 16  # candidate triangles for the closest point
+BLOCK_SIZE = 4096  # points per block
+MAX_CHANGE_FRACTION = 0.5  # maximum extrapolated change, as a fraction of the surface value: zero stays zero
+MIN_DIVISOR = 1e-30  # guard against division by 0
 
 
 def extrapolate_beyond_surface(
@@ -26,16 +26,16 @@ def extrapolate_beyond_surface(
     corners, slopes = nodes[surface], compute_vertex_gradients(nodes, tets, values)
     middles = KDTree(corners.mean(axis=1))
     found = np.empty((len(points), 3))
-    for first in range(0, len(points), TOGETHER):
-        some = slice(first, first + TOGETHER)
-        near = middles.query(points[some], k=min(NEAR, len(surface)))[1].reshape(len(points[some]), -1)
+    for first in range(0, len(points), BLOCK_SIZE):
+        some = slice(first, first + BLOCK_SIZE)
+        near = middles.query(points[some], k=min(CANDIDATE_TRIANGLES, len(surface)))[1].reshape(len(points[some]), -1)
         place, which, weights = find_closest_points(points[some], corners[near])
         vertices = surface[near[np.arange(len(near)), which]]
         gradient = np.einsum("nc,ncij->nij", weights, slopes[vertices])
         level = np.einsum("nc,nci->ni", weights, values[vertices])
         change = np.einsum("nij,nj->ni", gradient, points[some] - place)
-        size, most = (np.linalg.norm(values, axis=1, keepdims=True) for values in (change, SHARE * level))
-        found[some] = level + change * np.minimum(1.0, most / np.maximum(size, TINY))
+        size, most = (np.linalg.norm(values, axis=1, keepdims=True) for values in (change, MAX_CHANGE_FRACTION * level))
+        found[some] = level + change * np.minimum(1.0, most / np.maximum(size, MIN_DIVISOR))
     return found
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 # Smoothing iterations on filled nodes, against jumps where two known nodes are equally near.
-SWEEPS = 6
+SMOOTHING_ITERATIONS = 6
 
 
 def extend_field(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
@@ -19,7 +19,7 @@ def extend_field(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarr
     moving = np.argwhere(filled.any(axis=0))
     if not len(moving):
         return filled
-    away = int(np.ceil(reach)) + SWEEPS
+    away = int(np.ceil(reach)) + SMOOTHING_ITERATIONS
     low, high = np.maximum(moving.min(axis=0) - away, 0), moving.max(axis=0) + away + 1
     window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     _fill(filled[(slice(None), *window)], known[window], reach)
@@ -40,7 +40,7 @@ def _fill(field: np.ndarray, known: np.ndarray, reach: float) -> None:
     fade = (left * left * (3.0 - 2.0 * left)).astype(np.float32)
     for part in field:
         part[free] = fade * part[source]
-    smooth(field, free, SWEEPS)
+    smooth(field, free, SMOOTHING_ITERATIONS)
 
 
 def smooth(field: np.ndarray, free: np.ndarray, sweeps: int) -> None:

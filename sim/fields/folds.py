@@ -8,25 +8,25 @@ from scipy.optimize import minimize
 
 from .extension import smooth
 
-TIGHT = 0.05  # Jacobian determinant below which a cell is corrected
-WANTED = 0.15  # target determinant of the correction
-ROUND = 2  # margin of movable nodes around such a cell
-TIMES = 12  # maximum attempts
-STEPS = 200  # maximum iterations per attempt
-STUCK = 4  # attempt from which folds are smoothed first, to leave local minima
-SWEEPS = 3  # smoothing iterations of such an attempt
+MIN_DETERMINANT = 0.05  # Jacobian determinant below which a cell is corrected
+TARGET_DETERMINANT = 0.15  # target determinant of the correction
+FOLD_MARGIN = 2  # margin of movable nodes around such a cell
+MAX_ATTEMPTS = 12  # maximum attempts
+MAX_ITERATIONS = 200  # maximum iterations per attempt
+FIRST_SMOOTHED_ATTEMPT = 4  # attempt from which folds are smoothed first, to leave local minima
+SMOOTHING_ITERATIONS = 3  # smoothing iterations of such an attempt
 # Weights of a node's squared move [spacings] relative to a cell's squared volume deficit.
-STIFF = 1.0  # in the body
-COLLAR = 0.1  # in the collar
-SOFT = 1e-4  # elsewhere
+BODY_WEIGHT = 1.0  # in the body
+COLLAR_WEIGHT = 0.1  # in the collar
+OUTER_WEIGHT = 1e-4  # elsewhere
 # Relative edge change below which no corner of a cell can fold.
-GENTLE = 0.15
+MAX_SAFE_CHANGE = 0.15
 # Slices per block, to limit memory.
-TOGETHER = 4
+BLOCK_SLICES = 4
 # Corners of a cell, and for each corner its three edge neighbours, ordered for a volume of consistent sign.
 CORNERS = np.array(list(np.ndindex(2, 2, 2)))
-ALONG = np.array([[corner, *np.where(np.eye(3, dtype=int), 1 - corner, corner)] for corner in CORNERS])
-SIGNS = (1.0 - 2.0 * CORNERS).prod(axis=1)
+CORNER_NEIGHBOURS = np.array([[corner, *np.where(np.eye(3, dtype=int), 1 - corner, corner)] for corner in CORNERS])
+CORNER_SIGNS = (1.0 - 2.0 * CORNERS).prod(axis=1)
 
 
 def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
@@ -37,8 +37,8 @@ def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
     deformation, one corner is evaluated.
     """
     found = np.empty(tuple(side - 1 for side in field.shape[1:]), np.float32)
-    for first in range(0, len(found), TOGETHER):
-        part = field[:, first : first + TOGETHER + 1] / np.float32(spacing)
+    for first in range(0, len(found), BLOCK_SLICES):
+        part = field[:, first : first + BLOCK_SLICES + 1] / np.float32(spacing)
         ax, ay, az = np.diff(part, axis=1)
         bx, by, bz = np.diff(part, axis=2)
         cx, cy, cz = np.diff(part, axis=3)
@@ -55,24 +55,24 @@ def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
         ax, ay, az, bx, by, bz, cx, cy, cz = (edges[at] for edges in (ax, ay, az, bx, by, bz, cx, cy, cz))
         ax, by, cz = ax + 1.0, by + 1.0, cz + 1.0
         least = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
-        strong = np.argwhere(most > GENTLE)
+        strong = np.argwhere(most > MAX_SAFE_CHANGE)
         places = part.reshape(3, -1).T.astype(np.float64) + np.moveaxis(np.indices(part.shape[1:]), 0, -1).reshape(
             -1, 3
         )
         least[tuple(strong.T)] = compute_corner_volumes(places, find_corner_nodes(strong, part.shape[1:])).min(axis=1)
-        found[first : first + TOGETHER] = least
+        found[first : first + BLOCK_SLICES] = least
     return found
 
 
 def find_corner_nodes(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return node numbers (n, 8, 4) in a grid: each corner of cells (n, 3), and the ends of its edges."""
-    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(cells[:, None, None] + ALONG, -1, 0)), shape))
+    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(cells[:, None, None] + CORNER_NEIGHBOURS, -1, 0)), shape))
 
 
 def compute_corner_volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Return signed volumes (n, 8) at the corners (n, 8, 4) of cells, from node positions (N, 3) [spacings]."""
     at = places[corners]
-    return SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
+    return CORNER_SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
 
 
 def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
@@ -84,11 +84,11 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
     tried again; there the body itself may fold.
     """
     found = compute_jacobians(field, spacing)
-    for turn in range(TIMES):
-        bad = found < TIGHT
+    for turn in range(MAX_ATTEMPTS):
+        bad = found < MIN_DETERMINANT
         if not bad.any():
             break
-        grown = ROUND + turn
+        grown = FOLD_MARGIN + turn
         labels = np.empty(bad.shape, np.int32)
         ndimage.label(ndimage.maximum_filter(bad, 2 * grown + 5), output=labels)
         for where in ndimage.find_objects(labels):
@@ -96,22 +96,22 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
             part = field[(slice(None), *window)]
             nodes = np.pad(bad[where], [(0, 1)] * 3)
             near = ndimage.maximum_filter(nodes, 2 * grown + 2)
-            if turn >= STUCK:
-                smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), SWEEPS)
-            stiff = np.where(inside[window], STIFF, np.where(collar[window], COLLAR, SOFT))
-            _mend(part, near, stiff, spacing)
+            if turn >= FIRST_SMOOTHED_ATTEMPT:
+                smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), SMOOTHING_ITERATIONS)
+            stiff = np.where(inside[window], BODY_WEIGHT, np.where(collar[window], COLLAR_WEIGHT, OUTER_WEIGHT))
+            _repair_cells(part, near, stiff, spacing)
             found[where] = compute_jacobians(part, spacing)
     return float(found.min())
 
 
-def _mend(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float) -> None:
+def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float) -> None:
     """Move nodes marked `near` (I, J, K) of a field part (3, I, J, K) [m] until its cells have positive volume."""
     shape = near.shape
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
     cells = np.argwhere(ndimage.maximum_filter(near, 2, origin=-1)[:-1, :-1, :-1])
     used, corners = np.unique(find_corner_nodes(cells, shape), return_inverse=True)
     corners = corners.reshape(-1, 4)
-    signs = np.tile(SIGNS, len(cells))
+    signs = np.tile(CORNER_SIGNS, len(cells))
     flat = part.reshape(3, -1)
     rest = flat[:, used].T / spacing + np.stack(np.unravel_index(used, shape), axis=-1)
     free = np.flatnonzero(near.reshape(-1)[used])
@@ -124,7 +124,7 @@ def _mend(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float)
         at = places[corners]
         a, b, c = np.moveaxis(at[:, 1:] - at[:, :1], 1, 0)
         ends = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-        lack = np.maximum(WANTED - signs * (a * ends[:, 0]).sum(axis=1), 0.0)
+        lack = np.maximum(TARGET_DETERMINANT - signs * (a * ends[:, 0]).sum(axis=1), 0.0)
         some = np.flatnonzero(lack > 0.0)
         pull = -2.0 * (signs[some] * lack[some])[:, None, None] * ends[some]
         pulls, pulled = np.concatenate([-pull.sum(axis=1, keepdims=True), pull], axis=1), corners[some].ravel()
@@ -132,7 +132,7 @@ def _mend(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float)
         size = float((lack * lack).sum() + (held * change * change).sum())
         return size, (slope[free] + 2.0 * held * change).ravel()
 
-    found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options={"maxiter": STEPS})
+    found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options={"maxiter": MAX_ITERATIONS})
     change = (spacing * found.x.reshape(-1, 3).T).astype(part.dtype)
     for values, more in zip(part, change, strict=True):
         values[np.unravel_index(used[free], shape)] += more

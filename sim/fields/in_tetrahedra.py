@@ -10,9 +10,9 @@ import numpy as np
 from .grid import Grid
 
 # Grid lines per block, to limit memory.
-TOGETHER = 500_000
+BLOCK_LINES = 500_000
 # Tolerance of the inside test [spacings], so that nodes on a face belong to both sides.
-ROUNDING = 1e-7
+INSIDE_TOLERANCE = 1e-7
 
 
 class _Hits(NamedTuple):
@@ -33,19 +33,19 @@ def interpolate_in_tetrahedra(
     count = int(np.prod(grid.shape))
     field, inside = np.zeros((3, count), np.float32), np.zeros(count, bool)
     first, slopes = values[tets[:, 0]], values[tets[:, 1:]] - values[tets[:, :1]]
-    for hits in _lines(grid.shape, grid.index(nodes[tets])):
+    for hits in _iterate_hits(grid.shape, grid.index(nodes[tets])):
         field[:, hits.node] = (first[hits.tet] + np.einsum("nc,nci->ni", hits.weights, slopes[hits.tet])).T
         inside[hits.node] = True
     return field.reshape(3, *grid.shape), inside.reshape(grid.shape)
 
 
-def _lines(shape: tuple[int, int, int], corners: np.ndarray) -> Iterator[_Hits]:
+def _iterate_hits(shape: tuple[int, int, int], corners: np.ndarray) -> Iterator[_Hits]:
     """Yield the grid nodes in tetrahedra with corners (T, 4, 3) [indices], in blocks of lines along the last axis."""
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)  # barycentric
-    slack = ROUNDING * np.linalg.norm(gradients, axis=2)
-    low = np.maximum(np.ceil(corners.min(axis=1) - ROUNDING), 0).astype(np.int64)
-    high = np.minimum(np.floor(corners.max(axis=1) + ROUNDING), np.array(shape) - 1).astype(np.int64)
+    slack = INSIDE_TOLERANCE * np.linalg.norm(gradients, axis=2)
+    low = np.maximum(np.ceil(corners.min(axis=1) - INSIDE_TOLERANCE), 0).astype(np.int64)
+    high = np.minimum(np.floor(corners.max(axis=1) + INSIDE_TOLERANCE), np.array(shape) - 1).astype(np.int64)
     sides = np.maximum(high - low + 1, 0)
     sizes = sides[:, 0] * sides[:, 1] * (sides[:, 2] > 0)
     ends, begin = np.cumsum(sizes), 0
@@ -53,7 +53,7 @@ def _lines(shape: tuple[int, int, int], corners: np.ndarray) -> Iterator[_Hits]:
     at_first[:, 0] += 1.0
     while begin < len(corners):
         done = ends[begin - 1] if begin else 0
-        end = max(begin + 1, int(np.searchsorted(ends, done + TOGETHER, side="right")))
+        end = max(begin + 1, int(np.searchsorted(ends, done + BLOCK_LINES, side="right")))
         some = slice(begin, end)
         tet = np.repeat(np.arange(begin, end), sizes[some])
         i, j = np.divmod(np.arange(len(tet)) - np.repeat(ends[some] - sizes[some] - done, sizes[some]), sides[tet, 1])

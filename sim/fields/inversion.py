@@ -6,11 +6,11 @@ import numpy as np
 
 from .grid import Grid
 
-EXACT = 1e-6  # tolerance [m]
-STEPS = 25  # maximum iterations
-LONGEST = 2.0  # maximum Newton step [spacings]
+INVERSION_TOLERANCE = 1e-6  # tolerance [m]
+MAX_ITERATIONS = 25  # maximum iterations
+MAX_NEWTON_STEP = 2.0  # maximum Newton step [spacings]
 # Required contraction of fixed-point steps; points that miss it use Newton's method.
-SHORTER = 0.6
+MAX_CHANGE_RATIO = 0.6
 
 
 def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
@@ -21,13 +21,13 @@ def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.
     """
     found, going, left = guess.copy(), np.arange(len(points)), []
     last = np.full(len(points), np.inf)
-    for _ in range(STEPS):
+    for _ in range(MAX_ITERATIONS):
         new = -grid.read(forward, points[going] + found[going])
         change = np.linalg.norm(new - found[going], axis=1)
-        nearer = change < SHORTER * last[going]
+        nearer = change < MAX_CHANGE_RATIO * last[going]
         left.append(going[~nearer])
         found[going[nearer]], last[going[nearer]] = new[nearer], change[nearer]
-        going = going[nearer & (change > EXACT)]
+        going = going[nearer & (change > INVERSION_TOLERANCE)]
         if not len(going):
             break
     hard = np.concatenate([*left, going])
@@ -40,7 +40,7 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
     best, least = guess.copy(), np.full(len(points), np.inf)
     trial, going, share = guess.copy(), np.arange(len(points)), np.ones(len(points))
     step = np.zeros_like(guess)
-    for _ in range(STEPS):
+    for _ in range(MAX_ITERATIONS):
         at = points[going] + trial[going]
         rest = trial[going] + grid.read(forward, at)
         size = np.linalg.norm(rest, axis=1)
@@ -48,15 +48,15 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
         best[going[good]], least[going[good]] = trial[going[good]], size[good]
         share[going] = np.where(good, 1.0, 0.5 * share[going])  # halve a step that increased the residual
         fresh = going[good]
-        step[fresh] = _newton(grid, forward, points[fresh] + best[fresh], rest[good])
-        going = going[least[going] > EXACT]
+        step[fresh] = _compute_newton_step(grid, forward, points[fresh] + best[fresh], rest[good])
+        going = going[least[going] > INVERSION_TOLERANCE]
         if not len(going):
             break
         trial[going] = best[going] + share[going, None] * step[going]
     return best
 
 
-def _newton(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _compute_newton_step(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Return the Newton step (n, 3) [m] at places (n, 3) [m] with residuals `rest` (n, 3)."""
     half = 0.25 * grid.spacing
     columns = []
@@ -68,4 +68,4 @@ def _newton(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -
     matrix[flat] = np.eye(3)
     step = -np.linalg.solve(matrix, rest[..., None])[..., 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
-    return step * np.minimum(1.0, LONGEST * grid.spacing / np.maximum(length, 1e-30))
+    return step * np.minimum(1.0, MAX_NEWTON_STEP * grid.spacing / np.maximum(length, 1e-30))

@@ -16,20 +16,20 @@ from ..geometry.tetmesh import find_single_faces
 from .grid import Grid
 
 # Interpolation error above which tetrahedra are fitted [m].
-ENOUGH = 2e-5
-LOOKED = 1.0  # points per grid spacing along a tetrahedron's longest edge, in the error test
-FITTED = 1.5  # the same in the fit
-MOST = 10  # maximum subdivisions of an edge
-ON_SURFACE = 2.0  # points per grid spacing along a surface triangle's longest edge
-SURFACE = 10.0  # weight of a cell face of surface, relative to a cell's volume
+FIT_TOLERANCE = 2e-5
+TEST_DENSITY = 1.0  # points per grid spacing along a tetrahedron's longest edge, in the error test
+FIT_DENSITY = 1.5  # the same in the fit
+MAX_SUBDIVISIONS = 10  # maximum subdivisions of an edge
+SURFACE_DENSITY = 2.0  # points per grid spacing along a surface triangle's longest edge
+SURFACE_WEIGHT = 10.0  # weight of a cell face of surface, relative to a cell's volume
 # Points per block, to limit memory.
-TOGETHER = 200_000
+BLOCK_POINTS = 200_000
 # Penalty weights relative to the squared error.
-SMALL = 1e-3  # change of the field
-EVEN = 1e-2  # differences of the change between nodes
-STRAIGHT = 3e-3  # second differences of the field in the collar
-EXACT = 1e-3  # relative tolerance of the linear solver
-STEPS = 300  # maximum iterations of the linear solver
+CHANGE_WEIGHT = 1e-3  # change of the field
+DIFFERENCE_WEIGHT = 1e-2  # differences of the change between nodes
+CURVATURE_WEIGHT = 3e-3  # second differences of the field in the collar
+SOLVER_TOLERANCE = 1e-3  # relative tolerance of the linear solver
+MAX_ITERATIONS = 300  # maximum iterations of the linear solver
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +60,11 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     """
     flat = field.reshape(3, -1)
     bad = np.zeros(len(body.tets), bool)
-    for some in _samples(grid, body, np.arange(len(body.tets)), LOOKED):
+    for some in _sample_tetrahedra(grid, body, np.arange(len(body.tets)), TEST_DENSITY):
         numbers, weights = grid.find_corners(some.points)
-        bad[some.simplex[np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1) > ENOUGH]] = True
+        bad[some.simplex[np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1) > FIT_TOLERANCE]] = True
     free = np.zeros(flat.shape[1], bool)
-    for some in _samples(grid, body, np.flatnonzero(bad), FITTED):
+    for some in _sample_tetrahedra(grid, body, np.flatnonzero(bad), FIT_DENSITY):
         free[grid.find_corners(some.points)[0]] = True
     free &= inside.reshape(-1) | (collar.reshape(-1) & flat.any(axis=0))
     nodes = np.flatnonzero(free)
@@ -74,18 +74,18 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     column[nodes] = np.arange(len(nodes))
     touched = np.zeros(len(body.nodes), bool)
     touched[body.tets[bad]] = True
-    matrix, side = _penalties(grid, flat, nodes, column, inside.reshape(-1), collar.reshape(-1))
-    within = _samples(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), FITTED)
-    for some in chain(within, _on_surface(grid, body, touched)):
+    matrix, side = _build_penalties(grid, flat, nodes, column, inside.reshape(-1), collar.reshape(-1))
+    within = _sample_tetrahedra(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), FIT_DENSITY)
+    for some in chain(within, _sample_surface(grid, body, touched)):
         numbers, weights = grid.find_corners(some.points)
-        rows = _rows(column, numbers, weights)
+        rows = _build_rows(column, numbers, weights)
         weighted = rows.T.multiply(some.weights).tocsr()
         matrix = matrix + weighted @ rows
         side += weighted @ (some.values - _read(flat, numbers, weights))
     scale = sparse.diags(1.0 / np.asarray(matrix.diagonal(), np.float64))
     change = np.zeros_like(field)
     for part, right in zip(change.reshape(3, -1), side.T, strict=True):
-        part[nodes] = cg(matrix, right, rtol=EXACT, maxiter=STEPS, M=scale)[0]
+        part[nodes] = cg(matrix, right, rtol=SOLVER_TOLERANCE, maxiter=MAX_ITERATIONS, M=scale)[0]
     field += change
 
 
@@ -94,24 +94,24 @@ def _read(flat: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> np.ndar
     return np.stack([np.einsum("nc,nc->n", part[numbers], weights) for part in flat], axis=-1)
 
 
-def _samples(grid: Grid, body: NodalField, which: np.ndarray, density: float) -> Iterator[_Samples]:
+def _sample_tetrahedra(grid: Grid, body: NodalField, which: np.ndarray, density: float) -> Iterator[_Samples]:
     """Yield `density` points per grid spacing along the longest edge of some tetrahedra, weighted by volume [cells]."""
     corners = body.nodes[body.tets[which]]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / (6.0 * grid.spacing**3)
-    for some in _lattices(grid, body, body.tets[which], volumes, density):
+    for some in _sample_simplices(grid, body, body.tets[which], volumes, density):
         yield some._replace(simplex=which[some.simplex])
 
 
-def _on_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
+def _sample_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
     """Yield points of the surface triangles with a vertex in `touched` (V,)."""
     faces = find_single_faces(body.tets)
     faces = faces[touched[faces].any(axis=1)]
     a, b, c = body.nodes[faces].transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / (2.0 * grid.spacing**2)
-    return _lattices(grid, body, faces, SURFACE * areas, ON_SURFACE)
+    return _sample_simplices(grid, body, faces, SURFACE_WEIGHT * areas, SURFACE_DENSITY)
 
 
-def _lattices(
+def _sample_simplices(
     grid: Grid, body: NodalField, simplices: np.ndarray, weights: np.ndarray, density: float
 ) -> Iterator[_Samples]:
     """Yield regular lattice points of simplices (n, c) of vertices; the points of one share its weight (n,)."""
@@ -119,10 +119,10 @@ def _lattices(
     size = simplices.shape[1]
     first, second = np.triu_indices(size, 1)
     longest = np.linalg.norm(corners[:, first] - corners[:, second], axis=2).max(axis=1, initial=0.0)
-    orders = np.clip(np.ceil(density * longest / grid.spacing), 1, MOST).astype(int)
+    orders = np.clip(np.ceil(density * longest / grid.spacing), 1, MAX_SUBDIVISIONS).astype(int)
     for order in np.unique(orders):
-        lattice, alike = _lattice(order, size), np.flatnonzero(orders == order)
-        step = max(1, TOGETHER // len(lattice))
+        lattice, alike = _build_lattice(order, size), np.flatnonzero(orders == order)
+        step = max(1, BLOCK_POINTS // len(lattice))
         for begin in range(0, len(alike), step):
             some = alike[begin : begin + step]
             yield _Samples(
@@ -134,14 +134,14 @@ def _lattices(
 
 
 @cache
-def _lattice(order: int, size: int) -> np.ndarray:
+def _build_lattice(order: int, size: int) -> np.ndarray:
     """Return barycentric weights (n, size) of the lattice points that divide a simplex's edges into `order` parts."""
     parts = np.indices((order + 1,) * (size - 1)).reshape(size - 1, -1)
     weights = np.stack([*parts, order - parts.sum(axis=0)], axis=1)
     return weights[weights[:, -1] >= 0] / order
 
 
-def _rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> sparse.csr_matrix:
+def _build_rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> sparse.csr_matrix:
     """Build the sparse matrix (n, free) that sums nodes (n, m) with weights (n, m), without fixed nodes."""
     columns = column[numbers]
     free = columns >= 0
@@ -150,7 +150,7 @@ def _rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> spars
     return sparse.csr_matrix((np.broadcast_to(weights, columns.shape)[free], (row, columns[free])), shape)
 
 
-def _penalties(
+def _build_penalties(
     grid: Grid, flat: np.ndarray, nodes: np.ndarray, column: np.ndarray, inside: np.ndarray, collar: np.ndarray
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Return matrix and right side (n, 3) of the penalties on size, unevenness and curvature."""
@@ -164,6 +164,13 @@ def _penalties(
     pair, bend = np.concatenate(pairs), np.concatenate(bends)
     pair = pair[(column[pair] >= 0).all(axis=1)]
     bend = bend[(inside | collar)[bend].all(axis=1) & collar[bend].any(axis=1)]
-    even, straight = _rows(column, pair, np.array([1.0, -1.0])), _rows(column, bend, np.array([1.0, -2.0, 1.0]))
-    matrix = SMALL * sparse.identity(len(nodes)) + EVEN * even.T @ even + STRAIGHT * straight.T @ straight
-    return matrix.tocsr(), -STRAIGHT * straight.T @ (flat[:, bend] @ np.array([1.0, -2.0, 1.0])).T
+    even, straight = (
+        _build_rows(column, pair, np.array([1.0, -1.0])),
+        _build_rows(column, bend, np.array([1.0, -2.0, 1.0])),
+    )
+    matrix = (
+        CHANGE_WEIGHT * sparse.identity(len(nodes))
+        + DIFFERENCE_WEIGHT * even.T @ even
+        + CURVATURE_WEIGHT * straight.T @ straight
+    )
+    return matrix.tocsr(), -CURVATURE_WEIGHT * straight.T @ (flat[:, bend] @ np.array([1.0, -2.0, 1.0])).T

@@ -18,14 +18,14 @@ from .in_tetrahedra import interpolate_in_tetrahedra
 from .inversion import invert_field
 from .projection import NodalField, project
 
-LEAST_REACH = 5e-3  # constant part of the distance over which the field fades to zero [m]
-REACHES = 2.0  # variable part of that distance [maximum displacements]
-EDGE = 3  # margin of the grid beyond that distance [nodes]
-STILL = 1e-5  # displacement below which no inverse is computed [m]
-TINY = 1e-30  # guard against division by 0
-FAINT = 2e-5
+MIN_FADE_DISTANCE = 5e-3  # constant part of the distance over which the field fades to zero [m]
+FADE_FACTOR = 2.0  # variable part of that distance [maximum displacements]
+GRID_MARGIN = 3  # margin of the grid beyond that distance [nodes]
+INVERSION_THRESHOLD = 1e-5  # displacement below which no inverse is computed [m]
+MIN_DIVISOR = 1e-30  # guard against division by 0
+ZEROING_THRESHOLD = 2e-5
 """Displacement below which it is set to 0 [m]; above twice the limit it is unchanged."""
-SHARE = 2.5e-3
+ZEROING_FRACTION = 2.5e-3
 """Maximum of that limit, as a fraction of the maximum displacement."""
 
 
@@ -65,18 +65,18 @@ class WarpFields:
 
 def compute_reach(displacement: np.ndarray) -> float:
     """Return the distance [m] over which the field of displacements (..., 3) [m] fades to zero."""
-    return LEAST_REACH + REACHES * float(np.linalg.norm(displacement, axis=-1).max())
+    return MIN_FADE_DISTANCE + FADE_FACTOR * float(np.linalg.norm(displacement, axis=-1).max())
 
 
 def compute_faint_threshold(displacement: np.ndarray) -> float:
     """Return the limit [m] below which displacements (..., 3) [m] are neglected, so that the grid can be smaller."""
-    return min(FAINT, SHARE * float(np.linalg.norm(displacement, axis=-1).max()))
+    return min(ZEROING_THRESHOLD, ZEROING_FRACTION * float(np.linalg.norm(displacement, axis=-1).max()))
 
 
 def remove_faint(displacement: np.ndarray) -> np.ndarray:
     """Return displacements (..., 3) [m] with negligible ones set to zero."""
     size = np.linalg.norm(displacement, axis=-1, keepdims=True)
-    share = np.clip(size / max(compute_faint_threshold(displacement), TINY) - 1.0, 0.0, 1.0)
+    share = np.clip(size / max(compute_faint_threshold(displacement), MIN_DIVISOR) - 1.0, 0.0, 1.0)
     return displacement * (share * share * (3.0 - 2.0 * share))
 
 
@@ -90,7 +90,7 @@ def warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Gr
     places = [mesh.nodes[held], *(mesh.nodes[held] + displacements[:, held])]
     for some in (mesh.nodes[outer], *(mesh.nodes[outer] + displacements[:, outer])):
         places += [some - reach, some + reach]
-    return build_grid_around(np.concatenate(places), spacing, EDGE * spacing)
+    return build_grid_around(np.concatenate(places), spacing, GRID_MARGIN * spacing)
 
 
 def find_collar(inside: np.ndarray) -> np.ndarray:
@@ -125,7 +125,7 @@ def invert_on_grid(
     """
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
     field, inside = interpolate_in_tetrahedra(grid, now, tets, -displacement)
-    numbers = np.flatnonzero(~inside & (np.abs(forward).max(axis=0) > STILL))
+    numbers = np.flatnonzero(~inside & (np.abs(forward).max(axis=0) > INVERSION_THRESHOLD))
     flat = field.reshape(3, -1)
     guess = -forward.reshape(3, -1)[:, numbers].T.astype(np.float64)
     flat[:, numbers] = invert_field(grid, forward, grid.compute_points(numbers), guess).T

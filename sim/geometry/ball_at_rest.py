@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import InputError
 
-SLACK = 1e-9  # Tolerance relative to the radius, so that by rounding no ball slips between a face and its edge.
+TOLERANCE = 1e-9  # Tolerance relative to the radius, so that by rounding no ball slips between a face and its edge.
 
 
 def find_resting_tip(
@@ -47,7 +47,10 @@ def find_resting_tips(
     case, face = np.nonzero(((least <= reach) & (most >= -reach)).all(axis=2))
     corners = nodes[case[:, None], triangles[face]] - through[case, None]
     first = np.full(len(nodes), np.inf)
-    for distance in (part(corners, inward, radius[case, None]) for part in (_vertices, _edges, _faces)):
+    for distance in (
+        part(corners, inward, radius[case, None])
+        for part in (_compute_vertex_paths, _compute_edge_paths, _compute_face_paths)
+    ):
         np.minimum.at(first, case, distance.min(axis=1))
     passing = np.flatnonzero(first == np.inf)
     if len(passing):
@@ -58,14 +61,14 @@ def find_resting_tips(
     return through + (first + radius)[:, None] * inward
 
 
-def _vertices(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def _compute_vertex_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Compute the centre's path (M, 3) [m] to the first contact with each corner (M, 3, 3) [m]; inf: no contact."""
     along = corners @ inward
     room = radius**2 - (np.einsum("mpi,mpi->mp", corners, corners) - along**2)
     return np.where(room >= 0.0, along - np.sqrt(np.maximum(room, 0.0)), np.inf)
 
 
-def _edges(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def _compute_edge_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Compute the centre's path (M, 3) to the first contact with the interior of each edge."""
     edge = np.roll(corners, -1, axis=1) - corners
     square = np.einsum("mei,mei->me", edge, edge)
@@ -75,25 +78,25 @@ def _edges(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.nd
     down, away = inward - slope[..., None] * unit, corners - offset[..., None] * unit
     steep, half = np.einsum("mei,mei->me", down, down), np.einsum("mei,mei->me", down, away)
     room = half**2 - steep * (np.einsum("mei,mei->me", away, away) - radius**2)
-    crosses = (square > 0.0) & (steep > SLACK) & (room >= 0.0)
+    crosses = (square > 0.0) & (steep > TOLERANCE) & (room >= 0.0)
     distance = (half - np.sqrt(np.maximum(room, 0.0))) / np.where(crosses, steep, 1.0)
-    place, slack = distance * slope - offset, SLACK * radius
+    place, slack = distance * slope - offset, TOLERANCE * radius
     return np.where(crosses & (place >= -slack) & (place <= np.sqrt(square) + slack), distance, np.inf)
 
 
-def _faces(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def _compute_face_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Compute the centre's path (M, 1) to the first contact with the interior of each triangle, from either side."""
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(ab, ac)
     twice = np.linalg.norm(normal, axis=1)
     normal = normal / np.where(twice > 0.0, twice, 1.0)[:, None]
     facing = normal @ inward
-    meets = np.abs(facing) > SLACK
+    meets = np.abs(facing) > TOLERANCE
     ahead, off = np.einsum("mi,mi->m", normal, a), radius[:, 0]
     distance = ahead / np.where(meets, facing, 1.0) - off / np.where(meets, np.abs(facing), 1.0)
     foot = distance[:, None] * inward + (off * np.sign(facing))[:, None] * normal - a
     first, second = np.cross(foot, ac), np.cross(ab, foot)
     share = np.stack([np.einsum("mi,mi->m", normal, each) for each in (first, second)])
-    slack = SLACK * twice
+    slack = TOLERANCE * twice
     inside = (share >= -slack).all(axis=0) & (share.sum(axis=0) <= twice + slack)
     return np.where(meets & inside, distance, np.inf)[:, None]

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-ROUNDING = 1e-9  # Relative difference of one distance computed in two ways.
-TOGETHER = 128  # Points compared with shared triangles at once: more only take more memory.
+DISTANCE_TOLERANCE = 1e-9  # Relative difference of one distance computed in two ways.
+BLOCK_SIZE = 128  # Points compared with shared triangles at once: more only take more memory.
 
 
 class Closest(NamedTuple):
@@ -28,9 +28,9 @@ def find_closest_points(points: np.ndarray, corners: np.ndarray) -> Closest:
     if corners.ndim == 3:
         middle, reach = compute_bounding_balls(corners)
         parts = []
-        for first in range(0, len(points), TOGETHER):
-            some = points[first : first + TOGETHER]
-            near = _candidates(some, middle, reach)
+        for first in range(0, len(points), BLOCK_SIZE):
+            some = points[first : first + BLOCK_SIZE]
+            near = _list_candidates(some, middle, reach)
             found = find_closest_points(some, corners[near])
             parts.append(found._replace(triangle=near[np.arange(len(near)), found.triangle]))
         return parts[0] if len(parts) == 1 else Closest(*map(np.concatenate, zip(*parts, strict=True)))
@@ -67,7 +67,7 @@ def compute_bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
 
 
-def _candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) -> np.ndarray:
+def _list_candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """List triangles (B, k), given by their `compute_bounding_balls`, that include the closest one to each point.
 
     A triangle is left out if no point of it can be closer than the nearest centroid.
@@ -77,7 +77,7 @@ def _candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) -> np
     """
     x, y, z = (points[:, axis, None] - middle[:, axis] for axis in range(3))
     away = np.sqrt(x * x + y * y + z * z)
-    maybe = ~(away - reach > (1.0 + ROUNDING) * away.min(axis=1, keepdims=True))
+    maybe = ~(away - reach > (1.0 + DISTANCE_TOLERANCE) * away.min(axis=1, keepdims=True))
     row, triangle = np.divmod(np.flatnonzero(maybe), len(middle))
     count = np.bincount(row, minlength=len(points))
     first = np.cumsum(count) - count

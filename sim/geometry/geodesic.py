@@ -21,7 +21,7 @@ def compute_geodesic_distances(
     size = np.linalg.norm(nodes[triangles] - nodes[np.roll(triangles, 1, axis=1)], axis=2).max()
     near = np.linalg.norm(nodes[triangles] - source, axis=2).min(axis=1) <= limit + size
     used, local = np.unique(triangles[near], return_inverse=True)
-    points, corners = _with_steiner_points(nodes[used], local, steiner)
+    points, corners = _add_steiner_points(nodes[used], local, steiner)
 
     links = corners[:, np.array([(i, j) for i in range(3 + 3 * steiner) for j in range(i)])].reshape(-1, 2)
     nearest = np.linalg.norm(nodes[used] - source, axis=1).argmin()
@@ -38,7 +38,7 @@ def compute_geodesic_distances(
     return result
 
 
-def _with_steiner_points(nodes: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _add_steiner_points(nodes: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return all points of the graph, the nodes first, and their numbers on each triangle (S, 3 + 3 count)."""
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, first, number = np.unique(compute_row_keys(sides), return_index=True, return_inverse=True)

@@ -11,8 +11,8 @@ from scipy.spatial import KDTree
 
 from .tetmesh import TetMesh
 
-FIRST = 4  # Nearest tetrahedra that are tested first: they contain 97 % of points.
-ROUNDING = 1e-12  # Barycentric weights below this are round-off.
+FIRST_CANDIDATES = 4  # Nearest tetrahedra that are tested first: they contain 97 % of points.
+WEIGHT_TOLERANCE = 1e-12  # Barycentric weights below this are round-off.
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,10 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
 
     In graded meshes the tetrahedron of a point is among the 64 `candidates` with the nearest centroids.
     """
-    tet, weights = _best(mesh, points, min(FIRST, candidates))
-    unheld = np.flatnonzero(weights.min(axis=1) < -ROUNDING)
-    tet[unheld], weights[unheld] = _best(mesh, points[unheld], candidates)
-    inside = np.where(weights > ROUNDING, weights, 0.0)
+    tet, weights = _choose_tetrahedra(mesh, points, min(FIRST_CANDIDATES, candidates))
+    unheld = np.flatnonzero(weights.min(axis=1) < -WEIGHT_TOLERANCE)
+    tet[unheld], weights[unheld] = _choose_tetrahedra(mesh, points[unheld], candidates)
+    inside = np.where(weights > WEIGHT_TOLERANCE, weights, 0.0)
     return Located(mesh.tets[tet], inside / inside.sum(axis=1, keepdims=True))
 
 
@@ -51,15 +51,15 @@ class _Cells(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _cells(mesh: TetMesh) -> _Cells:
+def _build_cells(mesh: TetMesh) -> _Cells:
     corners = mesh.nodes[mesh.tets]
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
     return _Cells(KDTree(corners.mean(axis=1)), corners[:, 0], np.linalg.inv(edges))
 
 
-def _best(mesh: TetMesh, points: np.ndarray, candidates: int) -> tuple[np.ndarray, np.ndarray]:
+def _choose_tetrahedra(mesh: TetMesh, points: np.ndarray, candidates: int) -> tuple[np.ndarray, np.ndarray]:
     """Choose, of the nearest `candidates`, the tetrahedra (n,) with the largest minimum weight, and weights (n, 4)."""
-    cells, count = _cells(mesh), min(candidates, len(mesh.tets))
+    cells, count = _build_cells(mesh), min(candidates, len(mesh.tets))
     near = cells.middles.query(points, k=count)[1].reshape(len(points), count)
     inner = np.einsum("nkij,nkj->nki", cells.inverse[near], points[:, None] - cells.corner[near])
     weights = np.concatenate([1.0 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)

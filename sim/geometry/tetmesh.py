@@ -15,7 +15,7 @@ FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # Corners of the
 EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])  # Corners of the edges.
 # Edges of quadratic tetrahedra in the order of VTK and meshio; corners, then mid-edge nodes, with corners 2, 3 swapped.
 QUADRATIC_EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
-TURNED = [0, 1, 3, 2, 4, 8, 7, 6, 5, 9]
+FLIPPED_ORDER = [0, 1, 3, 2, 4, 8, 7, 6, 5, 9]
 TRIANGLE_EDGES = np.array([[0, 1], [1, 2], [2, 0]])  # Corners of a triangle's edges.
 ZERO_VOLUME = 1e-12  # Volume, relative to the longest edge cubed, below which an element is degenerate.
 SLIVER_DEGREES = 1.0  # Dihedral angle below which an element is a sliver [degrees].
@@ -177,7 +177,7 @@ def orient_tetrahedra(nodes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray,
     _check_corners(nodes, tets)
     negative = compute_signed_volumes(nodes, tets) < 0.0
     turned = np.array(table)
-    turned[negative] = turned[negative][:, TURNED[: table.shape[1]]]
+    turned[negative] = turned[negative][:, FLIPPED_ORDER[: table.shape[1]]]
     return turned, int(negative.sum())
 
 

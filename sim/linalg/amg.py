@@ -19,7 +19,7 @@ from .pcg import Preconditioner
 Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
 """Function that solves K over motions L (n, m), unknowns numbered by node (m,), as `multifrontal.Factor` does."""
 # No strength threshold. Energy-minimising smoothing draws no random numbers: the same mesh gives the same levels.
-SETTING: dict[str, Any] = {
+AMG_SETTINGS: dict[str, Any] = {
     "strength": ("symmetric", {"theta": 0.0}),
     "smooth": ("energy", {"krylov": "cg", "maxiter": 2, "degree": 1}),
     "improve_candidates": None,
@@ -47,28 +47,28 @@ def build_multigrid_cycle(
         K is singular over the last level's motions.
     """
     *fine, _ = pyamg.smoothed_aggregation_solver(
-        sp.bsr_matrix(stiffness), B=motions, max_coarse=largest_last, **SETTING
+        sp.bsr_matrix(stiffness), B=motions, max_coarse=largest_last, **AMG_SETTINGS
     ).levels
     if not fine:
-        return _direct(sp.csc_array(stiffness), sp.csc_array(sp.eye_array(len(motions))), 3, direct)
+        return _build_direct_solver(sp.csc_array(stiffness), sp.csc_array(sp.eye_array(len(motions))), 3, direct)
     *upper, lowest = fine
-    coarse = _direct(sp.csc_array(lowest.A), sp.csc_array(lowest.P), lowest.P.blocksize[1], direct)
-    solver = TwoLevel(coarse, _blocks(lowest.A), device, smoother=smoother)
+    coarse = _build_direct_solver(sp.csc_array(lowest.A), sp.csc_array(lowest.P), lowest.P.blocksize[1], direct)
+    solver = TwoLevel(coarse, _to_bsr(lowest.A), device, smoother=smoother)
     for level in reversed(upper):
         solver = TwoLevel(
-            ReducedPreconditioner(sp.bsr_array(level.P), solver, device), _blocks(level.A), device, smoother=smoother
+            ReducedPreconditioner(sp.bsr_array(level.P), solver, device), _to_bsr(level.A), device, smoother=smoother
         )
     solver.name = f"algebraic multigrid, {len(fine) + 1} levels"
     return solver
 
 
-def _direct(stiffness: sp.csc_array, motions: sp.csc_array, size: int, direct: Direct) -> Preconditioner:
+def _build_direct_solver(stiffness: sp.csc_array, motions: sp.csc_array, size: int, direct: Direct) -> Preconditioner:
     """Build a direct solver over the motions, `size` to a node; zero motions, of small aggregates, are left out."""
     moving = np.flatnonzero(abs(motions).sum(axis=0) > 0.0)
     return direct(stiffness, motions[:, moving], moving // size)
 
 
-def _blocks(matrix: sp.bsr_matrix) -> sp.bsr_array:
+def _to_bsr(matrix: sp.bsr_matrix) -> sp.bsr_array:
     return make_regular(sp.csr_array(matrix), matrix.blocksize[0])
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
-BESIDE = 3  # Temporary block rows, in addition to the matrix, during an exchange.
+TEMPORARY_ROWS = 3  # Temporary block rows, in addition to the matrix, during an exchange.
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def measure_rate_of_work(where: str, trial: int = Exchange.trial) -> float:
 
 def exchange_bytes(count: int, settings: Exchange = Exchange()) -> int:
     """Estimate the memory of an exchange [bytes]: half the matrix in double precision, and temporary block rows."""
-    return 8 * (count * (count + settings.block) // 2 + BESIDE * min(count, settings.block) * count)
+    return 8 * (count * (count + settings.block) // 2 + TEMPORARY_ROWS * min(count, settings.block) * count)
 
 
 def can_exchange(count: int, where: str, besides: int = 0, settings: Exchange = Exchange()) -> bool:
@@ -93,7 +93,7 @@ def invert(rows: Sequence[torch.Tensor]) -> None:
     for k in range(len(rows)):
         stop = rows[k].shape[1]
         own = slice(stop - len(rows[k]), stop)
-        inverse = _inverse(rows[k][:, own])
+        inverse = _invert_block(rows[k][:, own])
         across = torch.cat([rows[k], *(row[:, own].T for row in rows[k + 1 :])], dim=1)
         across[:, own] = 0.0
         solved = inverse @ across
@@ -141,14 +141,14 @@ def _eliminate(row: torch.Tensor, below: Sequence[torch.Tensor]) -> None:
     stop = row.shape[1]
     own = slice(stop - len(row), stop)
     across = torch.cat([later[:, own].T for later in below], dim=1)
-    solved = _inverse(row[:, own]) @ across
+    solved = _invert_block(row[:, own]) @ across
     for later in below:
         mine = slice(later.shape[1] - len(later) - stop, later.shape[1] - stop)
         later[:, stop:].addmm_(across[:, mine].T, solved[:, : mine.stop], alpha=-1.0)
         later[:, own] = solved[:, mine].T
 
 
-def _inverse(block: torch.Tensor) -> torch.Tensor:
+def _invert_block(block: torch.Tensor) -> torch.Tensor:
     return torch.cholesky_inverse(torch.linalg.cholesky(block))
 
 

@@ -11,7 +11,7 @@ from ..runtime.device import Device, forward_kernel
 # Block row times x (n, b) on the CPU; blocks are stored by columns. Eight columns of x together fill vector registers.
 # For a single column the rows of a block do, WIDE >= ROWS of them: the surplus belongs to the next column, or is
 # padding.
-ROW = """
+ROW_CODE = """
     const int b = x.shape[1];
     int c = 0;
     for (; c + 8 <= b; c += 8) {
@@ -78,7 +78,7 @@ def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
     """Build the CPU kernel for the same product, over block rows."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
-    code = ROW.replace("real", real).replace("WIDE", str(-(-rows // LANES) * LANES))
+    code = ROW_CODE.replace("real", real).replace("WIDE", str(-(-rows // LANES) * LANES))
 
     @wp.func_native(code.replace("ROWS", str(rows)).replace("COLUMNS", str(columns)))
     def add_row(

@@ -60,7 +60,7 @@ class Compliance:
         self.known = np.zeros(len(nodes), bool)
         size = self._width * problem.rows * np.dtype(device.precision).itemsize
         self._kept = max(columns.fewest_blocks, columns.most_bytes // size)
-        self._block = lru_cache(self._kept)(self._columns)
+        self._block = lru_cache(self._kept)(self._compute_columns)
 
     def apply(self, force: Any) -> Any:
         """Compute H force: displacements (3N, b) [m] under forces (3N, b) [N]."""
@@ -79,8 +79,8 @@ class Compliance:
         force = cast_like(out, force)
         # On a GPU, multiplying by zeros is faster than asking where they are.
         at_hand = device.on_cuda and self.known[: len(force) // 3].all() and every <= self._kept
-        for block in range(every) if at_hand else self._acting(to_host((force != 0.0).any(1))):
-            some = force[self._rows(block)]
+        for block in range(every) if at_hand else self._find_blocks(to_host((force != 0.0).any(1))):
+            some = force[self._get_rows(block)]
             out += self._block(block)[:, : len(some)] @ some
         return out
 
@@ -101,19 +101,19 @@ class Compliance:
         missing = acting & ~self.known
         if missing.any() and isinstance(self._preconditioner, Factor):
             self.columns[:], self.known[:] = self._preconditioner.compute_compliance(self.rows).T, True
-        for block in self._acting(np.repeat(acting & ~self.known, 3)):
+        for block in self._find_blocks(np.repeat(acting & ~self.known, 3)):
             self._block(block)
 
-    def _acting(self, rows: np.ndarray) -> list[int]:
+    def _find_blocks(self, rows: np.ndarray) -> list[int]:
         """Return the blocks that some rows (3n,) bool belong to."""
         return np.unique(np.flatnonzero(rows) // self._width).tolist()
 
-    def _rows(self, block: int) -> slice:
+    def _get_rows(self, block: int) -> slice:
         return slice(self._width * block, self._width * (block + 1))
 
-    def _columns(self, block: int) -> Any:
+    def _compute_columns(self, block: int) -> Any:
         """Compute a block's columns (3N, k) [m/N], and store their rows at the nodes in double precision."""
-        own = self._rows(block)
+        own = self._get_rows(block)
         unit = np.zeros((self._problem.rows, self._width))
         unit[self.rows[own], np.arange(len(self.rows[own]))] = 1.0
         whole = self.apply(to_library(self._problem.device, unit))[:, : len(self.rows[own])]

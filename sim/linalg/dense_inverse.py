@@ -23,9 +23,9 @@ from . import block_inverse
 from .half_symv import add_product, list_tiles
 
 TILE = 64  # Tensor cores need rows and columns in multiples of this.
-SOME = 8  # Rows per thread.
+ROWS_PER_THREAD = 8  # Rows per thread.
 # Type of the stored matrix, for each precision of the solver.
-LOW = {"float32": wp.float16, "float64": wp.float64}
+LOW_TYPES = {"float32": wp.float16, "float64": wp.float64}
 
 
 def can_invert(rows: int, device: Device) -> bool:
@@ -35,7 +35,7 @@ def can_invert(rows: int, device: Device) -> bool:
 
 def estimate_inverse_bytes(rows: int, device: Device) -> int:
     """Estimate the memory of the inverse of `rows` unknowns [bytes]."""
-    return wp.types.type_size_in_bytes(LOW[device.precision]) * rows**2
+    return wp.types.type_size_in_bytes(LOW_TYPES[device.precision]) * rows**2
 
 
 @cache
@@ -122,11 +122,11 @@ class DenseInverse:
         block_inverse.invert(rows)
         scale = torch.cat([-row[:, -len(row) :].diagonal() for row in rows]).sqrt()
         self._size = -(-count // TILE) * TILE
-        self._inverse = _scaled(rows, scale, self._size, wp.dtype_to_torch(LOW[device.precision]))
+        self._inverse = _build_matrix(rows, scale, self._size, wp.dtype_to_torch(LOW_TYPES[device.precision]))
         block_inverse.release(where)
         self._scale = device.upload(scale.cpu().numpy())
         back = motions @ sp.diags_array(scale.cpu().numpy())
-        self._into, self._back = (_compressed(sp.csr_array(matrix), device) for matrix in (motions.T, back))
+        self._into, self._back = (_copy_to_device(sp.csr_array(matrix), device) for matrix in (motions.T, back))
         self._tiles = list_tiles(self._size, device.name)
         self._rooms: dict[int, Buffers] = {}
         torch.cuda.synchronize(where)
@@ -137,13 +137,13 @@ class DenseInverse:
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """Multiply by the dense matrix, in Warp's stream."""
         device, count = self._device, r.shape[1]
-        room, some = self._room(count), SOME if count > 1 else 1
+        room, some = self._get_buffers(count), ROWS_PER_THREAD if count > 1 else 1
         lower, raise_ = build_kernels(device, room.right.dtype, some)
         room.square.zero_()
         add_dots(device, r, r, room.square)
         inputs = [*self._into, self._scale, room.square, r]
         device.launch(lower, (-(-self._scale.shape[0] // some), count), inputs, [room.right])
-        if self._halves(count):
+        if self._is_half_read(count):
             room.solved.zero_()
             add_product(self._tiles, wp.from_torch(self._inverse), room.right.flatten(), room.solved.flatten())
         else:
@@ -152,16 +152,16 @@ class DenseInverse:
         inputs = [*self._back, room.square, room.solved]
         device.launch(raise_, (-(-r.shape[0] // some), count), inputs, [out])
 
-    def _halves(self, count: int) -> bool:
+    def _is_half_read(self, count: int) -> bool:
         """Return True if only half of the matrix is read: for one load case reading is the whole cost."""
         return count == 1 and self._inverse.dtype == torch.float16
 
-    def _room(self, count: int) -> Buffers:
+    def _get_buffers(self, count: int) -> Buffers:
         """Return the buffers for a batch width; those of workspace widths stay cached, and the latest other."""
         if count not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_workspace_width(width)}
-            low, name = LOW[self._device.precision], self._device.name
-            if self._halves(count):
+            low, name = LOW_TYPES[self._device.precision], self._device.name
+            if self._is_half_read(count):
                 low = wp.float32
             shape = (self._size, -(-count // TILE) * TILE if count > 1 else 1)
             right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))
@@ -169,7 +169,7 @@ class DenseInverse:
         return self._rooms[count]
 
 
-def _scaled(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torch.dtype) -> torch.Tensor:
+def _build_matrix(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torch.dtype) -> torch.Tensor:
     """Build the scaled matrix (size, size) whose negative lower half is in `rows` of blocks.
 
     Empties `rows`, to free their memory.
@@ -186,6 +186,6 @@ def _scaled(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torc
     return out
 
 
-def _compressed(matrix: sp.csr_array, device: Device) -> list[wp.array]:
+def _copy_to_device(matrix: sp.csr_array, device: Device) -> list[wp.array]:
     indices = [device.upload(index, wp.int32) for index in (matrix.indptr, matrix.indices)]
     return [*indices, device.upload(matrix.data)]

@@ -110,7 +110,7 @@ class Factor:
         # Scaled, because single precision cannot represent forces of 1e-40 N in a product with load cases of 1 N.
         size = np.abs(x).max(axis=0, initial=0.0)
         size[size == 0.0] = 1.0
-        solved[:, live] = self._motions @ (self._solved((x / size).astype(self._precision)) * size)
+        solved[:, live] = self._motions @ (self._solve_columns((x / size).astype(self._precision)) * size)
         out.assign(solved)
 
     def compute_compliance(self, rows: np.ndarray) -> np.ndarray:
@@ -133,19 +133,19 @@ class Factor:
             for first in firsts:
                 strip = slice(first, first + size)
                 x = unit[:, strip].toarray(order="C").astype(self._precision)
-                out[:, strip] = chosen @ _swept(panels, x)
+                out[:, strip] = chosen @ _apply_sweeps(panels, x)
 
         share = choose_threads(len(rows))
         with limit_to_one_thread():
             run_together([partial(fill, range(size * k, len(rows), size * share)) for k in range(share)])
         return out
 
-    def _solved(self, x: np.ndarray) -> np.ndarray:
+    def _solve_columns(self, x: np.ndarray) -> np.ndarray:
         if x.shape[1] <= self._settings.few:
             return self._sweep.solve(x)
         # BLAS threads wait for one another at every front, very long where other processes use their cores.
         with limit_to_one_thread():
-            return _swept(self._panels, x)
+            return _apply_sweeps(self._panels, x)
 
 
 def find_moved_nodes(basis: sp.csc_array) -> np.ndarray:
@@ -177,7 +177,7 @@ class FrontPanel:
         x[self.front.first : self.front.stop] = self.values @ x[self.front.rows]
 
 
-def _swept(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
+def _apply_sweeps(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
     """Apply both sweeps through these panels to x (n, b), in place."""
     for panel in panels:
         panel.substitute_forward(x)
@@ -232,7 +232,7 @@ class _Fronts:
         for number in numbers:
             panel = self._panels[number]
             front, size = panel.front, len(panel.values)
-            whole = self._rows(front)
+            whole = self._assemble_rows(front)
             for border, update in updates.pop(number, ()):
                 add_lower(update, np.searchsorted(front.rows, border), whole)
             root, info = potrf(whole[:size, :size], lower=1)
@@ -245,7 +245,7 @@ class _Fronts:
                 updates.setdefault(int(self._owner[front.border[0]]), []).append((front.border, update))
                 panel.values[:, size:] = -trsm(1.0, root, across, side=1, lower=1).T
 
-    def _rows(self, front: Front) -> np.ndarray:
+    def _assemble_rows(self, front: Front) -> np.ndarray:
         """Assemble the matrix (k + m, k + m) at a front's unknowns from its own columns; the lower half."""
         start, rows, size = self._matrix.indptr, front.rows, front.stop - front.first
         whole = np.zeros((len(rows), len(rows)), order="F")

@@ -108,9 +108,9 @@ class TwoLevel:
         self._coarse, self._device = coarse, device
         self._stiffness = Sparse(stiffness, device)
         self._size = stiffness.blocksize[0]
-        inverse = np.linalg.inv(_diagonal(stiffness))
+        inverse = np.linalg.inv(_extract_diagonal(stiffness))
         self._inverse = device.upload(inverse, wp.types.matrix((self._size, self._size), device.scalar))
-        self._largest = smoother.margin * self._power()
+        self._largest = smoother.margin * self._estimate_eigenvalue()
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing: the undeformed stiffness is used at every state."""
@@ -118,18 +118,18 @@ class TwoLevel:
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
         """Run one cycle, for the live load cases."""
         if live.all():
-            wp.copy(out, self._cycle(r))
+            wp.copy(out, self._run_cycle(r))
             return
         columns = np.flatnonzero(live)
-        scatter_columns(self._device, self._cycle(gather_columns(self._device, r, columns)), columns, out)
+        scatter_columns(self._device, self._run_cycle(gather_columns(self._device, r, columns)), columns, out)
 
-    def _cycle(self, r: wp.array) -> wp.array:
+    def _run_cycle(self, r: wp.array) -> wp.array:
         x, correction = self._device.allocate(*r.shape), self._device.allocate(*r.shape)
         every = np.ones(r.shape[1], bool)
         self._smooth(x, wp.clone(r))
-        self._coarse.apply(self._residual(r, x), every, correction)
+        self._coarse.apply(self._compute_residual(r, x), every, correction)
         combine_columns(self._device, x, np.ones(x.shape[1]), correction, x)
-        self._smooth(x, self._residual(r, x))
+        self._smooth(x, self._compute_residual(r, x))
         return x
 
     def _smooth(self, x: wp.array, r: wp.array) -> None:
@@ -145,7 +145,7 @@ class TwoLevel:
             self._step(following * ratio, 2.0 * following / radius, r, d, x)
             ratio = following
 
-    def _residual(self, r: wp.array, x: wp.array) -> wp.array:
+    def _compute_residual(self, r: wp.array, x: wp.array) -> wp.array:
         out = wp.clone(r)
         self._stiffness.add_to(out, -1.0, x)
         return out
@@ -155,7 +155,7 @@ class TwoLevel:
         inputs = [self._inverse, scalar(kept), scalar(added), r]
         self._device.launch(step, (r.shape[0] // self._size, r.shape[1]), inputs, [d, x])
 
-    def _power(self) -> float:
+    def _estimate_eigenvalue(self) -> float:
         """Estimate the largest eigenvalue of D^-1 K by power iteration."""
         device = self._device
         x = device.upload(np.random.default_rng(0).normal(size=(self._stiffness.rows, 1)))
@@ -204,7 +204,7 @@ def make_regular(matrix: sp.csr_array, size: int) -> sp.bsr_array:
     return sp.bsr_array(sp.csr_array(matrix + sp.diags_array(missing)), blocksize=(size, size))
 
 
-def _diagonal(blocks: sp.bsr_array) -> np.ndarray:
+def _extract_diagonal(blocks: sp.bsr_array) -> np.ndarray:
     """Return the diagonal blocks (N, k, k)."""
     row = np.repeat(np.arange(len(blocks.indptr) - 1), np.diff(blocks.indptr))
     return blocks.data[row == blocks.indices]

@@ -69,18 +69,18 @@ def choose_preconditioner(
     try:
         if space.element == "p2":
             stiffness = problem.rest_curvature(step)
-            if device.on_cuda and _inverts(len(constraint.build_basis().indptr) - 1, device):
-                return _solver(stiffness, constraint, space.nodes, device, settings)
-            lifted = _on_corners(stiffness, space, constraint, device, settings)
+            if device.on_cuda and _can_invert(len(constraint.build_basis().indptr) - 1, device):
+                return _build_solver(stiffness, constraint, space.nodes, device, settings)
+            lifted = _build_corner_preconditioner(stiffness, space, constraint, device, settings)
             name = f"p-multigrid on {name_of(lifted.coarse)}"
             return TwoLevel(lifted, project_to_free(stiffness, constraint), device, name, settings.smoother)
         if space.element == "smoothed" and problem.rows > settings.largest_smoothed_factor:
             # Averaging reduces the stiffness, so that the coarse solver never overshoots.
-            coarse = _solver(unsmoothed(step), constraint, space.nodes, device, settings)
+            coarse = _build_solver(unsmoothed(step), constraint, space.nodes, device, settings)
             name = f"two levels on {name_of(coarse)}"
             fine = project_to_free(problem.rest_curvature(step), constraint)
             return TwoLevel(coarse, fine, device, name, settings.smoother)
-        return _solver(problem.rest_curvature(step), constraint, space.nodes, device, settings)
+        return _build_solver(problem.rest_curvature(step), constraint, space.nodes, device, settings)
     except RuntimeError as error:
         raise InputError(explain_no_factor(error, device.name)) from error
 
@@ -123,24 +123,24 @@ def build_rest_solver(problem: Problem) -> Preconditioner:
     return build_direct(problem.rest_curvature(), basis, find_moved_nodes(basis), device, device.precision)
 
 
-def _on_corners(
+def _build_corner_preconditioner(
     stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device, settings: Preconditioning
 ) -> ReducedPreconditioner:
     """Build the coarse preconditioner on linear tetrahedra with the same corners, as far as their motion is free."""
     corner, free = np.unique(space.table[:, :4]), constraint.build_basis()
     every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
     own = Constraint(constraint.held[corner], constraint.normal[corner], device)
-    coarse = _solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device, settings)
+    coarse = _build_solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device, settings)
     return ReducedPreconditioner(sp.bsr_array(sp.csr_array(every), blocksize=(3, 3)), coarse, device)
 
 
-def _solver(
+def _build_solver(
     stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray, device: Device, settings: Preconditioning
 ) -> Preconditioner:
     """Build the solver of K (3N, 3N) over free nodes at points (N, 3): direct if fast enough, else multigrid."""
     basis = constraint.build_basis()
     count = len(basis.indptr) - 1
-    if _inverts(count, device) if device.on_cuda else count <= settings.largest_factor:
+    if _can_invert(count, device) if device.on_cuda else count <= settings.largest_factor:
         return build_direct(stiffness, basis, find_moved_nodes(basis), device)
     from .amg import build_multigrid_cycle, build_rigid_motions
 
@@ -149,7 +149,7 @@ def _solver(
     return build_multigrid_cycle(blocks, motions, coarse, device, settings.largest_last, settings.smoother)
 
 
-def _inverts(count: int, device: Device) -> bool:
+def _can_invert(count: int, device: Device) -> bool:
     """Return True if a GPU inverts `count` unknowns."""
     from .dense_inverse import can_invert
 
@@ -168,7 +168,7 @@ def build_direct(
     RuntimeError
         K is singular.
     """
-    if device.on_cuda and _inverts(len(node), device):
+    if device.on_cuda and _can_invert(len(node), device):
         from .dense_inverse import DenseInverse
 
         return DenseInverse(stiffness, motions, device)

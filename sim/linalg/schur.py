@@ -62,12 +62,12 @@ def condense_exterior(
     rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > settings.round_off * abs(whole).max())
     stiffness = beyond[rows][:, rows].toarray()
     far = sp.csc_array(basis[:, ~np.isin(find_moved_nodes(basis), nodes)])
-    follow, taken = _followed(whole, far, sp.csc_array(whole[part[rows]].T), problem.device, settings.strip)
+    follow, taken = _compute_reduction(whole, far, sp.csc_array(whole[part[rows]].T), problem.device, settings.strip)
     stiffness -= taken
     return Condensation(rows, (stiffness + stiffness.T) / 2, follow)
 
 
-def _followed(
+def _compute_reduction(
     whole: sp.csr_array, far: sp.csc_array, coupling: sp.csc_array, device: Device, strip: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute -L (L^T K L)^-1 L^T B (3N, m) and the Schur reduction (m, m), of motions L and a coupling B (3N, m).

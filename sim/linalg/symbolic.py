@@ -66,8 +66,8 @@ def build_fronts(
     graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
     graph += graph.T  # an entry may be zero by round-off, and not stored, on one side only
     order = order_by_dissection(graph, settings.leaf)
-    groups = _groups(sp.csr_array(graph[order][:, order]), weight[order], settings)
-    divided = _divided(groups, weight[order], parts, settings.most_above)
+    groups = _group_nodes(sp.csr_array(graph[order][:, order]), weight[order], settings)
+    divided = _split_subtrees(groups, weight[order], parts, settings.most_above)
     inner = np.concatenate([np.zeros(0, int), *(groups[number][0] for part in divided for number in part)])
     order, place = order[inner], np.argsort(inner)
     weight = weight[order]
@@ -122,7 +122,7 @@ def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:
     return np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
-def _parents(graph: sp.csr_array) -> list[int]:
+def _build_elimination_tree(graph: sp.csr_array) -> list[int]:
     """Return the elimination tree (N,) of a graph in its order; -1 at roots. Liu 1990, algorithm 4.2."""
     count = len(graph.indptr) - 1
     parent, ancestor = [-1] * count, [-1] * count
@@ -137,12 +137,12 @@ def _parents(graph: sp.csr_array) -> list[int]:
     return parent
 
 
-def _groups(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> list[tuple[np.ndarray, np.ndarray]]:
+def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> list[tuple[np.ndarray, np.ndarray]]:
     """List groups of nodes that are eliminated together, each with the later nodes that it couples.
 
     graph (N, N) in its order; weight (N,) unknowns per node.
     """
-    parent, count = _parents(graph), len(weight)
+    parent, count = _build_elimination_tree(graph), len(weight)
     below, top = weight.tolist(), list(range(count))
     for node, above in enumerate(parent):
         if above != -1:
@@ -155,7 +155,7 @@ def _groups(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> li
         members.setdefault(top[node], []).append(node)
 
     # Sets of nodes are the bits of integers: a union is one operation.
-    alike = {int(unknowns): _bits(np.flatnonzero(weight == unknowns), count) for unknowns in np.unique(weight)}
+    alike = {int(unknowns): _encode_nodes(np.flatnonzero(weight == unknowns), count) for unknowns in np.unique(weight)}
 
     def size(nodes: int) -> int:
         return sum(unknowns * (nodes & which).bit_count() for unknowns, which in alike.items())
@@ -168,7 +168,7 @@ def _groups(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> li
     for last in sorted(members):
         own = members[last]
         spans = [graph.indices[graph.indptr[node] : graph.indptr[node + 1]] for node in own]
-        border = _bits(np.concatenate(spans), count)
+        border = _encode_nodes(np.concatenate(spans), count)
         for child in children[last]:
             border |= groups[child][1]
         border = border >> last + 1 << last + 1
@@ -181,10 +181,10 @@ def _groups(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> li
         groups[last] = own, border, k, m
         if border:
             children[(border & -border).bit_length() - 1].append(last)
-    return [(np.array(own), _nodes(border, count)) for own, border, _, _ in groups.values()]
+    return [(np.array(own), _decode_nodes(border, count)) for own, border, _, _ in groups.values()]
 
 
-def _divided(
+def _split_subtrees(
     groups: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, parts: int, most_above: int
 ) -> list[list[int]]:
     """Divide whole subtrees of groups into `parts` parts, and what is above them into a last one; each in its order.
@@ -228,14 +228,14 @@ def _divided(
     return [*(sorted(lower for number in share for lower in subtree(number)) for share in best[:-1]), sorted(best[-1])]
 
 
-def _bits(nodes: np.ndarray, count: int) -> int:
+def _encode_nodes(nodes: np.ndarray, count: int) -> int:
     """Encode some of `count` nodes as the bits of an integer."""
     flags = np.zeros(count, bool)
     flags[nodes] = True
     return int.from_bytes(np.packbits(flags, bitorder="little").tobytes(), "little")
 
 
-def _nodes(bits: int, count: int) -> np.ndarray:
+def _decode_nodes(bits: int, count: int) -> np.ndarray:
     """Decode the nodes, ascending."""
     packed = np.frombuffer(bits.to_bytes(-(-count // 8), "little"), np.uint8)
     return np.flatnonzero(np.unpackbits(packed, bitorder="little"))

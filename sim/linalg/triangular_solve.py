@@ -14,7 +14,7 @@ from .symbolic import Front
 
 # Elimination: x_own becomes the first k of t = panel^T x_own, and the others are added to x_border. Four rows of a
 # panel at a time read and write t once; the rows begin with zeros.
-UP = """
+FORWARD_CODE = """
     real* x = xs.data + (size_t)column * xs.shape[1];
     real* t = work.data + (size_t)column * work.shape[1];
     for (int f = 0; f < fronts.shape[0]; ++f) {
@@ -41,7 +41,7 @@ UP = """
     }
 """
 # Back substitution: x_own = panel (x_own, x_border). Sixteen sums let the compiler use vector registers.
-DOWN = """
+BACKWARD_CODE = """
     real* x = xs.data + (size_t)column * xs.shape[1];
     real* t = work.data + (size_t)column * work.shape[1];
     for (int f = fronts.shape[0] - 1; f >= 0; --f) {
@@ -96,7 +96,7 @@ def build_kernel(device: Device, code: str) -> wp.Kernel:
 
 
 # Scatter-add of the lower half of a matrix to rows and columns of another.
-ADD = """
+SCATTER_CODE = """
     for (int j = 0; j < place.shape[0]; ++j) {
         double* to = whole.data + (size_t)place.data[j] * whole.shape[1];
         const double* from = part.data + (size_t)j * part.shape[1];
@@ -105,7 +105,7 @@ ADD = """
 """
 
 
-@wp.func_native(ADD)
+@wp.func_native(SCATTER_CODE)
 def _add(part: wp.array2d(dtype=wp.float64), place: wp.array(dtype=wp.int64), whole: wp.array2d(dtype=wp.float64)): ...
 
 
@@ -159,7 +159,7 @@ class Sweep:
         columns, parts = x.shape[1], len(self._lower)
         rows = self._device.allocate(parts, columns, len(x))
         work = self._device.allocate(parts, columns, self._longest)
-        values, (up, down) = rows.numpy(), (build_kernel(self._device, code) for code in (UP, DOWN))
+        values, (up, down) = rows.numpy(), (build_kernel(self._device, code) for code in (FORWARD_CODE, BACKWARD_CODE))
 
         def sweep(kernel: wp.Kernel, fronts: wp.array, part: int) -> None:
             inputs = [fronts, self._border, self._panel]

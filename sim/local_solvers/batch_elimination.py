@@ -33,7 +33,7 @@ from ..minimisers.lbfgs import Descended, Lbfgs
 from ..minimisers.residual import ResidualEvaluator, ResidualState
 from ..runtime.columns import combine_columns, put_rows, take_rows
 from ..runtime.dense_product import build_product
-from .outer_loop import USUAL, CycleLimits, run_cycles
+from .outer_loop import DEFAULT_CYCLE_LIMITS, CycleLimits, run_cycles
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class NearPart:
     stragglers: float = 0.05
 
 
-NEAR = NearPart()  # Default.
+NEAR_PART = NearPart()  # Default.
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,8 @@ class BatchElimination:
     lbfgs: Lbfgs
     shared: wp.array
     follow: Callable[[wp.array, wp.array], None]
-    limits: CycleLimits = USUAL
-    near: NearPart = NEAR
+    limits: CycleLimits = DEFAULT_CYCLE_LIMITS
+    near: NearPart = NEAR_PART
 
     def descend(
         self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
@@ -90,11 +90,11 @@ class BatchElimination:
         """Solve as `Lbfgs.descend`, in at most `most` cycles; returns no L-BFGS history."""
 
         def cycle(judge: ResidualEvaluator, now: ResidualState, force: np.ndarray) -> ResidualState:
-            return judge(self._corrected(now.u, now.g, force))
+            return judge(self._run_cycle(now.u, now.g, force))
 
         return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
 
-    def _corrected(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
+    def _run_cycle(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
         """Run one cycle from residual g (3N, b) at u (3N, b); return the next state (3N, b).
 
         The near part is solved to a residual of `force` (b,) [N].
@@ -128,14 +128,14 @@ class BatchElimination:
 
 def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
     """Return True if the free surface is a small part of the whole surface, and not empty."""
-    return 0 < len(open_vertices(space, constraint)) <= NEAR.largest_opening * len(np.unique(space.mesh.surface))
+    return 0 < len(open_vertices(space, constraint)) <= NEAR_PART.largest_opening * len(np.unique(space.mesh.surface))
 
 
 def find_near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray:
     """Mark (T,) bool the fraction `NEAR.share` of the tetrahedra that is nearest to the free surface."""
     mesh = space.mesh
     distance, _ = KDTree(mesh.nodes[open_vertices(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
-    return distance <= np.quantile(distance, NEAR.share)
+    return distance <= np.quantile(distance, NEAR_PART.share)
 
 
 def open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:

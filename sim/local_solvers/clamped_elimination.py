@@ -52,7 +52,7 @@ class ClampedSize:
 
 
 # Few cycles, because each is expensive; the line search already rejects steps whose forces explode.
-DEAR = CycleLimits(cycles=30, patience=8, rise=1e6, forcing=0.1, enough=0.5)
+CLAMPED_CYCLE_LIMITS = CycleLimits(cycles=30, patience=8, rise=1e6, forcing=0.1, enough=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class ClampedElimination:
     preconditioner: Preconditioner
     effects: Iterable[Effect]
     space: Discretisation
-    limits: CycleLimits = DEAR
+    limits: CycleLimits = CLAMPED_CYCLE_LIMITS
     size: ClampedSize = ClampedSize()
 
     def descend(
@@ -88,59 +88,59 @@ class ClampedElimination:
         def cycle(judge: ResidualEvaluator, now: ResidualState, force: np.ndarray) -> ResidualState:
             nonlocal chosen, part, pairs, z
             if part is None:
-                z = self._solved(now.g)
-                chosen = self._touching(self._strained(now.u.numpy()[:, 0] - z))
+                z = self._compute_response(now.g)
+                chosen = self._mark_touching(self._find_strained_nodes(now.u.numpy()[:, 0] - z))
                 if not chosen.any():
                     return replace(now, free=np.full(1, np.inf))
                 part = ClampedPart(self.problem, self.effects, self.space, chosen, judge.constant, now.u)
                 new = judge(part.settle(now.u, force[0]))
-                z = self._solved(new.g)
+                z = self._compute_response(new.g)
                 return new
-            new = self._lower(
-                judge, now, part, -z - pairs.compute_motion(pairs.compute_weights(_host(now.g))), force[0]
+            new = self._search_line(
+                judge, now, part, -z - pairs.compute_motion(pairs.compute_weights(_copy_to_host(now.g))), force[0]
             )
             if not new.finite[0]:
                 return new
-            after = self._solved(new.g)
-            s, y = _host(new.u) - _host(now.u), _host(new.g) - _host(now.g)
+            after = self._compute_response(new.g)
+            s, y = _copy_to_host(new.u) - _copy_to_host(now.u), _copy_to_host(new.g) - _copy_to_host(now.g)
             if s @ y > 0.0:
                 pairs = pairs.add_pair(s, y, after - z)
             if new.free[0] > self.size.left * now.free[0]:
-                more = self._left(_host(new.g), part.nodes)
+                more = self._find_residual_nodes(_copy_to_host(new.g), part.nodes)
                 if len(more):
-                    chosen |= self._touching(more)
+                    chosen |= self._mark_touching(more)
                     part = ClampedPart(self.problem, self.effects, self.space, chosen, judge.constant, new.u)
             z = after
             return new
 
         return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
 
-    def _lower(
+    def _search_line(
         self, judge: ResidualEvaluator, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float
     ) -> ResidualState:
         """Search along d (3N,) with the part solved to `force` [N] at each trial; return the accepted state.
 
         Its residual is not finite if no trial step is accepted.
         """
-        promised, device = -float(_host(now.g) @ d), self.problem.device
+        promised, device = -float(_copy_to_host(now.g) @ d), self.problem.device
         way = device.upload(d[:, None])
         length = float(self.problem.longest_step(now.u, way)[0])
         for _ in range(self.size.cuts if promised > 0.0 else 0):
             new = judge(part.settle(combine_columns(device, now.u, length, way, wp.empty_like(way)), force))
-            slope = float(_host(new.g) @ d)
+            slope = float(_copy_to_host(new.g) @ d)
             if new.finite[0] and not is_step_too_long(slope, promised):
                 return new
             length *= backtrack_by_slopes(slope, promised)
         return replace(now, free=np.full(1, np.inf))
 
-    def _solved(self, g: wp.array) -> np.ndarray:
+    def _compute_response(self, g: wp.array) -> np.ndarray:
         """Compute the linear response (3N,) [m] of the undeformed mesh to a force g (3N, 1) [N]."""
         z = wp.zeros_like(g)
         self.preconditioner.apply(g, np.ones(1, bool), z)
         self.problem.constraint.project_nodes(z)
-        return _host(z)
+        return _copy_to_host(z)
 
-    def _strained(self, u: np.ndarray) -> np.ndarray:
+    def _find_strained_nodes(self, u: np.ndarray) -> np.ndarray:
         """Return the nodes (k,) of the tetrahedra that a displacement u (3N,) [m] strains most."""
         table = self.space.table
         slope = np.einsum("tai,taj->tij", u.reshape(-1, 3)[table[:, :4]], self._slopes)
@@ -148,7 +148,7 @@ class ClampedElimination:
         most = min(int(self.size.largest * len(strain)), int((strain > self.size.strained).sum()))
         return table[np.argsort(-strain)[:most]].ravel()
 
-    def _left(self, g: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    def _find_residual_nodes(self, g: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """Return the few nodes (k,) outside the part that have most of the residual g (3N,) there.
 
         Empty if it is spread over more nodes.
@@ -158,7 +158,7 @@ class ClampedElimination:
         most = np.argsort(-square)[: self.size.added]
         return most if 2.0 * square[most].sum() > square.sum() else most[:0]
 
-    def _touching(self, nodes: np.ndarray) -> np.ndarray:
+    def _mark_touching(self, nodes: np.ndarray) -> np.ndarray:
         """Mark (T,) bool the tetrahedra that contain any of these nodes (k,)."""
         touched = np.zeros(self.space.count, bool)
         touched[nodes] = True
@@ -170,6 +170,6 @@ class ClampedElimination:
         return build_linear_elements(self.space.mesh, every).gradient[:, 0].astype(np.float32)
 
 
-def _host(column: wp.array) -> np.ndarray:
+def _copy_to_host(column: wp.array) -> np.ndarray:
     """Copy a column (3N, 1) on the CPU to (3N,)."""
     return column.numpy()[:, 0]

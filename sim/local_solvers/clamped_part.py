@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..accuracy import FLOOR, Accuracy
+from ..accuracy import MIN_TOLERANCE, Accuracy
 from ..compile import compile_clamped_part
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
@@ -92,7 +92,7 @@ class ClampedPart:
             return u
         if found.status[0] != DONE:
             _, _, scale = part.residual(end)
-            aim = float(np.clip(force / scale[0], FLOOR[device.precision], 0.5))
+            aim = float(np.clip(force / scale[0], MIN_TOLERANCE[device.precision], 0.5))
             budget = Accuracy(aim, limits.outer, limits.inner, device.precision, 0)
             end = find_equilibrium(part, NewtonCG(self._factor, limits.inner), end, budget).u
         if found.steps[0] > limits.stale:

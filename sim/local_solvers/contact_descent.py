@@ -33,11 +33,11 @@ from ..minimisers.residual import ResidualEvaluator, build_evaluator
 from ..runtime.device import Device
 from ..runtime.views import cast_like, from_view, run_in_order, select_columns, to_double, to_host, to_library, view
 from .contact_batch import Batch, ContactState
-from .contact_forces import BENT, FORCES, ContactCompliance, ForceLimits, allocate_scratch, solve_contact_forces
-from .contact_limits import CONTACT, ContactLimits
-from .contact_steps import PROMISED, STATUS, ContactSteps, read_step_result
-from .contact_structs import CROWDED, FOUND, Scratch
-from .strained_part import STRAINS, StrainedPart, StrainLimits
+from .contact_forces import FORCES, NONCONVEX, ContactCompliance, ForceLimits, allocate_scratch, solve_contact_forces
+from .contact_limits import CONTACT_LIMITS, ContactLimits
+from .contact_steps import PREDICTED_DECREASE, STATUS, ContactSteps, read_step_result
+from .contact_structs import SOLVED, TOO_MANY_TOUCHED, Scratch
+from .strained_part import STRAIN_LIMITS, StrainedPart, StrainLimits
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,8 @@ class ContactDescent:
     problem: Problem
     preconditioner: Preconditioner
     barrier: Local
-    limits: ContactLimits = CONTACT
-    strains: StrainLimits = STRAINS
+    limits: ContactLimits = CONTACT_LIMITS
+    strains: StrainLimits = STRAIN_LIMITS
     replays: bool = False
 
     @cached_property
@@ -113,15 +113,15 @@ class ContactDescent:
         result, live = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
         with run_in_order(device):
-            batch = self._begun(start)
+            batch = self._begin_batch(start)
             if count == 1 and self.steps is not None:
                 self._replay(self.steps, batch, tolerance, most)
             ready = np.ones(count, bool)
             while True:
-                over = ready & self._ended(batch, tolerance[live], most)
+                over = ready & self._find_ended(batch, tolerance[live], most)
                 done = over & (batch.now.relative <= tolerance[live])
                 if (ready & ~over).any():
-                    over |= self._aimed(batch, ready & ~over, tolerance[live])
+                    over |= self._compute_directions(batch, ready & ~over, tolerance[live])
                 if over.any():
                     leave = np.flatnonzero(over)
                     there = live[leave]
@@ -135,13 +135,13 @@ class ContactDescent:
                         stay = np.flatnonzero(~batch.gone)
                         batch.keep(stay)
                         live = live[stay]
-                ready = self._tried(batch)
+                ready = self._try_steps(batch)
 
-    def _begun(self, start: wp.array) -> Batch:
+    def _begin_batch(self, start: wp.array) -> Batch:
         judge, count = build_evaluator(self.problem, start), start.shape[1]
-        now = self._judged(judge, view(start) + 0.0)
-        force, none = self._felt(now), np.zeros(count)
-        rest = self._answered(now.smooth, force)
+        now = self._evaluate_state(judge, view(start) + 0.0)
+        force, none = self._compute_balancing_forces(now), np.zeros(count)
+        rest = self._compute_response(now.smooth, force)
         model = None
         if self._strained is not None and count <= self.strains.columns:
             model = self._strained.build_model(start, np.arange(count))
@@ -163,26 +163,26 @@ class ContactDescent:
         if batch.model is None or not steps.set_tools(judge.constant):
             return
         batch.now, batch.force, batch.rest, batch.x = steps.hold(batch.now, batch.force, batch.rest)
-        while not self._ended(batch, tolerance, most).any():
-            self._renew(batch, np.ones(1, bool))
+        while not self._find_ended(batch, tolerance, most).any():
+            self._rebuild_models(batch, np.ones(1, bool))
             if batch.model is not known:
                 known = batch.model
                 steps.load(known)
             said = steps.compute_direction(
-                self._exactly(batch, tolerance)[0], batch.drag[0], bool(self._bends(batch)[0])
+                self._compute_force_tolerance(batch, tolerance)[0], batch.drag[0], bool(self._find_nonconvex(batch)[0])
             )
-            if said[STATUS] == CROWDED:
+            if said[STATUS] == TOO_MANY_TOUCHED:
                 return
-            if self._waits(batch, said[[STATUS]] != FOUND).any():
+            if self._increase_proximal_term(batch, said[[STATUS]] != SOLVED).any():
                 return
             if batch.waiting.any():
                 # Its model may have been reset.
                 known = None if batch.failed[0] % limits.times == 0 else known
                 continue
-            batch.promised[:] = said[PROMISED]
+            batch.promised[:] = said[PREDICTED_DECREASE]
             while True:
                 t, ahead, free, scale = read_step_result(said, judge.square)
-                there, misled = self._decided(batch, t, ahead, free)
+                there, misled = self._take_steps(batch, t, ahead, free)
                 if there.any() or misled.any():
                     break
                 said = steps.shorten_step(batch.length[0])
@@ -192,12 +192,12 @@ class ContactDescent:
             else:  # its model has been reset
                 known = None
 
-    def _ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
+    def _find_ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
         """Return the load cases (b,) that have ended, in equilibrium or not."""
         lost = (batch.slow >= self.limits.patience) | (batch.steps >= most) | ~batch.now.finite
         return lost | (batch.now.relative <= tolerance)
 
-    def _renew(self, batch: Batch, wanted: np.ndarray) -> None:
+    def _rebuild_models(self, batch: Batch, wanted: np.ndarray) -> None:
         """Recompute the stale models of the load cases `wanted` (b,) bool."""
         renewed = np.flatnonzero(wanted & batch.stale)
         if batch.model is not None and self._strained is not None and len(renewed):
@@ -206,45 +206,45 @@ class ContactDescent:
             if fresh is not None:
                 batch.model = batch.model.merge_columns(renewed, fresh)
 
-    def _exactly(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
+    def _compute_force_tolerance(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
         """Return the relative tolerance (b,) of the tools' forces."""
         limits = self.limits
         return np.maximum(limits.forcing * np.minimum(batch.now.relative, 1.0), limits.enough * tolerance)
 
-    def _aimed(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
+    def _compute_directions(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
         """Compute directions of the load cases `wanted` (b,) bool; return which (b,) have failed finally.
 
         A load case whose model has no equilibrium waits for the next call, with a larger proximal term; then its model
         is reset; at last a model that is not convex is accepted. Other load cases do not wait for it.
         """
-        self._renew(batch, wanted)
+        self._rebuild_models(batch, wanted)
         force, found = batch.force + 0.0, np.zeros(len(wanted), bool)
-        bent = self._bends(batch)
-        for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), BENT)):
+        bent = self._find_nonconvex(batch)
+        for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), NONCONVEX)):
             if len(some):
                 on = select_columns(self.problem.device, some, len(wanted))
-                force[:, on], found[some] = self._forces(batch, some, tolerance, limits)
-        over = self._waits(batch, wanted & ~found)
+                force[:, on], found[some] = self._solve_forces(batch, some, tolerance, limits)
+        over = self._increase_proximal_term(batch, wanted & ~found)
         some = np.flatnonzero(found)
         if len(some):
-            self._direct(batch, some, force)
+            self._compute_steps(batch, some, force)
         return over
 
-    def _bends(self, batch: Batch) -> np.ndarray:
+    def _find_nonconvex(self, batch: Batch) -> np.ndarray:
         """Return the load cases (b,) whose model may be non-convex."""
         return batch.failed >= 2 * self.limits.times
 
-    def _waits(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
+    def _increase_proximal_term(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
         """Increase the proximal coefficient where no forces were found (b,) bool; return which (b,) fail finally."""
         times = self.limits.times
         batch.waiting = waiting
         batch.failed = np.where(waiting, batch.failed + 1, 0)
         fresh = waiting & (batch.failed % times == 0)
         batch.forget(np.flatnonzero(fresh))
-        batch.drag = np.where(fresh, 0.0, np.where(waiting, self._harder(batch.drag), batch.drag))
+        batch.drag = np.where(fresh, 0.0, np.where(waiting, self._raise_drag(batch.drag), batch.drag))
         return batch.failed >= 3 * times
 
-    def _direct(self, batch: Batch, some: np.ndarray, force: Any) -> None:
+    def _compute_steps(self, batch: Batch, some: np.ndarray, force: Any) -> None:
         """Compute directions, step lengths and predicted decreases of load cases (k,) under forces (3n, b)."""
         now, device = batch.now, self.problem.device
         on = select_columns(device, some, len(batch.drag))
@@ -254,15 +254,15 @@ class ContactDescent:
             batch.x[:, on] = -batch.rest[:, on]
         else:
             batch.aimed[:, on] = force[:, on]
-            batch.x[:, on] = -batch.rest[:, on] - self.compliance.apply(self._bent(batch, force)[0])[:, on]
+            batch.x[:, on] = -batch.rest[:, on] - self.compliance.apply(self._compute_forces(batch, force)[0])[:, on]
         if batch.pairs.most:
             learnt = batch.pairs.get_history(some)
             batch.x[:, on] -= learnt.compute_motion(learnt.compute_weights(self._pull(now.smooth, force)[:, on]))
         longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.x))
         batch.length[some] = longest[some]
-        batch.promised[some] = -_dots(now.whole[:, on], batch.x[:, on])
+        batch.promised[some] = -_compute_dots(now.whole[:, on], batch.x[:, on])
 
-    def _forces(
+    def _solve_forces(
         self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
     ) -> tuple[Any, np.ndarray]:
         """Solve for the tools' forces (3n, k) on the model for load cases (k,); return which (k,) are solved."""
@@ -271,10 +271,10 @@ class ContactDescent:
         barrier, known = self.barrier.reduce(some), batch.force[:, on]
         if barrier is None:
             return known, np.ones(len(some), bool)
-        exact = self._exactly(batch, tolerance)[some]
+        exact = self._compute_force_tolerance(batch, tolerance)[some]
         soft, free = ContactCompliance(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
         if batch.model is not None:
-            free = free - self._bent(batch, batch.force)[1]
+            free = free - self._compute_forces(batch, batch.force)[1]
             soft = replace(soft, own=batch.model.own[on])
         free, here = free[:, on], to_double(now.u[rows][:, on])
         if batch.pairs.most:
@@ -285,7 +285,7 @@ class ContactDescent:
             free = free - (to_double(weights).mT @ own)[:, 0].T
         return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.drag[some], most)
 
-    def _bent(self, batch: Batch, force: Any) -> tuple[Any, Any]:
+    def _compute_forces(self, batch: Batch, force: Any) -> tuple[Any, Any]:
         """Compute additional forces (3N, b) [N] on the undeformed mesh: changes of contact forces, model corrections.
 
         Return also the motion (3n, b) [m] of the touchable nodes under the model's corrections.
@@ -299,10 +299,10 @@ class ContactDescent:
         out[compliance.places] += own
         return out, cast_like(batch.rest, compliance.compute_motion(own)[: len(self._rows)])
 
-    def _harder(self, drag: np.ndarray) -> np.ndarray:
+    def _raise_drag(self, drag: np.ndarray) -> np.ndarray:
         return np.maximum(self.limits.drag, self.limits.growth * drag)
 
-    def _tried(self, batch: Batch) -> np.ndarray:
+    def _try_steps(self, batch: Batch) -> np.ndarray:
         """Evaluate the trial step of each load case that does not wait; return which (b,) need another direction.
 
         That is, they accepted the step, because the energy still falls there, or nearly so; or backtracking left almost
@@ -312,19 +312,19 @@ class ContactDescent:
         t = np.where(going, batch.length, 0.0)
         if not going.any():
             return batch.waiting & ~batch.gone
-        new = self._judged(
+        new = self._evaluate_state(
             batch.judge, now.u + to_library(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
         )
-        ahead = np.where(new.finite, _dots(new.whole, batch.x), np.inf)
-        there, misled = self._decided(batch, t, ahead, new.free)
+        ahead = np.where(new.finite, _compute_dots(new.whole, batch.x), np.inf)
+        there, misled = self._take_steps(batch, t, ahead, new.free)
         taken = np.flatnonzero(there)
         if len(taken):
             some = select_columns(self.problem.device, taken, len(t))
-            self._learn(batch, new, taken, some)
+            self._update_models(batch, new, taken, some)
             now.put(taken, some, new)
         return misled | there | (batch.waiting & ~batch.gone)
 
-    def _decided(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _take_steps(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
         """Accept steps of length t (b,), or shorten them; return which (b,) are accepted, and which reset their model.
 
         The decision uses the slopes `ahead` (b,) and the residuals `free` (b,) there.
@@ -338,30 +338,32 @@ class ContactDescent:
         well = (t > limits.long) & (free <= limits.left * now.free)
         eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
         worse = (t < limits.long) | (free > now.free)
-        drag = np.where(there & well, eased, np.where(misled | (there & worse), self._harder(batch.drag), batch.drag))
+        drag = np.where(
+            there & well, eased, np.where(misled | (there & worse), self._raise_drag(batch.drag), batch.drag)
+        )
         batch.drag, batch.steps = drag, batch.steps + (misled | there)
         batch.stale |= there & (free > limits.stale * now.free)
         batch.slow = np.where(there & well, 0, batch.slow + (misled | there))
         batch.forget(np.flatnonzero(misled))
         return there, misled
 
-    def _learn(self, batch: Batch, new: ContactState, taken: np.ndarray, some: Any) -> None:
+    def _update_models(self, batch: Batch, new: ContactState, taken: np.ndarray, some: Any) -> None:
         """Update the models with the accepted steps of load cases (k,); `some` is this selection for device arrays."""
         now = batch.now
         if batch.model is not None:
             batch.force[:, some] = batch.aimed[:, some]
-            batch.rest[:, some] = self._answered(new.smooth[:, some], batch.force[:, some])
+            batch.rest[:, some] = self._compute_response(new.smooth[:, some], batch.force[:, some])
             return
         moved, change = new.u[:, some] - now.u[:, some], new.smooth[:, some] - now.smooth[:, some]
-        rest = self._answered(new.smooth[:, some], batch.force[:, some])
+        rest = self._compute_response(new.smooth[:, some], batch.force[:, some])
         way = rest - batch.rest[:, some]
         batch.rest[:, some] = rest
-        felt = np.flatnonzero((_dots(moved, change) > self.limits.felt) & new.finite[taken])
+        felt = np.flatnonzero((_compute_dots(moved, change) > self.limits.felt) & new.finite[taken])
         if len(felt):
             on = select_columns(self.problem.device, felt, len(taken))
             batch.pairs.update_history(taken[felt], moved[:, on], change[:, on], way[:, on])
 
-    def _felt(self, now: ContactState) -> Any:
+    def _compute_balancing_forces(self, now: ContactState) -> Any:
         """Return the forces (3n, b) at touched nodes that balance the smooth terms."""
         barrier, rows = self.barrier.reduce(np.arange(len(now.free))), self._rows
         own = to_double(now.smooth[rows])
@@ -378,7 +380,7 @@ class ContactDescent:
         out[self._rows] += force
         return out
 
-    def _judged(self, judge: ResidualEvaluator, u: Any) -> ContactState:
+    def _evaluate_state(self, judge: ResidualEvaluator, u: Any) -> ContactState:
         """Evaluate the states u (3N, b) as `Problem.residual` does."""
         problem, device = self.problem, self.problem.device
         place, pressed = device.allocate(*u.shape), device.allocate(*u.shape)
@@ -389,10 +391,10 @@ class ContactDescent:
         whole = view(found.g)
         return ContactState(view(place), whole - view(pressed), whole, found.free, found.scale)
 
-    def _answered(self, smooth: Any, force: Any) -> Any:
+    def _compute_response(self, smooth: Any, force: Any) -> Any:
         """Compute the linear response (3N, b) [m] of the undeformed mesh to the residual."""
         return self.compliance.apply(self._pull(smooth, force))
 
 
-def _dots(x: Any, y: Any) -> np.ndarray:
+def _compute_dots(x: Any, y: Any) -> np.ndarray:
     return to_host((x * y).sum(0)).astype(np.float64)

@@ -27,7 +27,7 @@ from ..runtime.device import Device
 from ..runtime.threads import run_together
 from ..runtime.views import from_view, select_columns, to_host, view
 from .contact_kernel import build_kernel
-from .contact_structs import CROWDED, FOUND, OPEN, UNKNOWN, ComplianceModel, Ends, Scratch
+from .contact_structs import OPEN, SOLVED, TOO_MANY_TOUCHED, UNKNOWN, ComplianceModel, Ends, Scratch
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class ForceLimits:
 
 
 FORCES = ForceLimits()  # Default.
-BENT = ForceLimits(late=FORCES.iterations)
+NONCONVEX = ForceLimits(late=FORCES.iterations)
 """Limits for a model that need not be convex."""
 
 
@@ -121,15 +121,15 @@ def solve_contact_forces(
     out, status = known + 0.0, np.full(here.shape[1], OPEN)
     soft.ensure_known(known)
     for room in (limits.few, limits.most):
-        status[status == CROWDED] = OPEN
+        status[status == TOO_MANY_TOUCHED] = OPEN
         each = max(1, limits.bytes // (4 * 8 * (3 * room) ** 2))
         while (status == OPEN).any():
             some = np.flatnonzero(status == OPEN)[:each]
             on = select_columns(soft.device, some, len(status))
             own = here[:, on], there[:, on], known[:, on]
             asked = tolerance[some], drag[some]
-            force, status[some], touched = _solved(barrier, soft, some, own, asked, limits, room)
-            ready = np.flatnonzero(status[some] == FOUND)
+            force, status[some], touched = _solve_forces(barrier, soft, some, own, asked, limits, room)
+            ready = np.flatnonzero(status[some] == SOLVED)
             if len(ready):
                 here_too = select_columns(soft.device, ready, len(some))
                 out[:, select_columns(soft.device, some[ready], len(status))] = force[:, here_too]
@@ -137,10 +137,10 @@ def solve_contact_forces(
             if lacking.any():
                 soft.ensure_known((to_host(touched)[:, lacking] >= 0).repeat(3, axis=0))
                 status[some[lacking]] = OPEN
-    return out, status == FOUND
+    return out, status == SOLVED
 
 
-def _solved(
+def _solve_forces(
     barrier: Reduction,
     soft: ContactCompliance,
     columns: np.ndarray,

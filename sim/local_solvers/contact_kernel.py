@@ -9,10 +9,10 @@ from ..linalg.block_factor import build_functions
 from ..minimisers.lbfgs_kernels import DEFAULT_BACKTRACK, MAX_BACKTRACK, MIN_BACKTRACK, OVERSHOOT
 from ..runtime.blocks import before, get_block_shape, total, wait
 from ..runtime.device import Device, forward_kernel
-from .contact_structs import CROWDED, FOUND, NONE, OPEN, UNKNOWN, ComplianceModel, Ends, Scratch
+from .contact_structs import NO_EQUILIBRIUM, OPEN, SOLVED, TOO_MANY_TOUCHED, UNKNOWN, ComplianceModel, Ends, Scratch
 
-WIDE = 8  # Sums per thread at once, to hide memory latency on the CPU.
-NARROW = 2  # The same on CUDA, with its many threads.
+CPU_SUMS = 8  # Sums per thread at once, to hide memory latency on the CPU.
+CUDA_SUMS = 2  # The same on CUDA, with its many threads.
 TOUCHED, ACTING = wp.constant(0), wp.constant(1)  # Columns of `Scratch.counts`: touched nodes; nodes with a change.
 
 
@@ -21,7 +21,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     """Build the kernel for a barrier, launched over (load case, thread)."""
     down, across = get_block_shape(device)
     threads, dense, Stage, Near = down * across, build_functions(device), barrier.stage, barrier.near
-    wide = wp.constant(NARROW if device.on_cuda else WIDE)
+    wide = wp.constant(CUDA_SUMS if device.on_cuda else CPU_SUMS)
     Strip = wp.types.vector(length=wide, dtype=wp.float64)
     overshoot, least, middle, most = (
         wp.constant(wp.float64(x)) for x in (OVERSHOOT, MIN_BACKTRACK, DEFAULT_BACKTRACK, MAX_BACKTRACK)
@@ -308,7 +308,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         if m > ends.room or not are_known(model, m, s, c):
             wait()
             if me == 0:
-                status[c] = wp.where(m > ends.room, CROWDED, UNKNOWN)
+                status[c] = wp.where(m > ends.room, TOO_MANY_TOUCHED, UNKNOWN)
             return
         sound = wp.bool(False)  # True if `soft` holds a valid Cholesky factor
         if m > 0:
@@ -343,11 +343,11 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             wait()
             left = dot(s.change, s.change, c, me)
             if left <= tolerance[c] * tolerance[c] * dot(s.slope, s.slope, c, me):
-                verdict = wp.int32(FOUND)
+                verdict = wp.int32(SOLVED)
             elif m > ends.room:
-                verdict = wp.int32(CROWDED)
+                verdict = wp.int32(TOO_MANY_TOUCHED)
             elif step == ends.iterations or not (convex or step <= ends.late):
-                verdict = wp.int32(NONE)
+                verdict = wp.int32(NO_EQUILIBRIUM)
             elif fresh and not are_known(model, m, s, c):
                 verdict = wp.int32(UNKNOWN)
             if verdict != OPEN:
@@ -391,7 +391,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 s.force[r, c] = s.force[r, c] + t * s.change[r, c]
                 s.w[r, c] = s.at[r, c]
             wait()
-        if verdict == FOUND:
+        if verdict == SOLVED:
             for r in range(me, size, threads):
                 out[r, c] = s.force[r, c]
         if me == 0:

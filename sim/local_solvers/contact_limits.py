@@ -44,4 +44,4 @@ class ContactLimits:
     crowd: float = 0.125
 
 
-CONTACT = ContactLimits()  # Default.
+CONTACT_LIMITS = ContactLimits()  # Default.

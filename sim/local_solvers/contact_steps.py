@@ -23,7 +23,7 @@ from ..runtime.columns import build_kernels as columns_kernels_of
 from ..runtime.device import Device, forward_kernel
 from ..runtime.views import from_view, view
 from .contact_batch import ContactState
-from .contact_forces import BENT, FORCES, allocate_ends, allocate_scratch
+from .contact_forces import FORCES, NONCONVEX, allocate_ends, allocate_scratch
 from .contact_kernel import build_kernel
 from .contact_structs import ComplianceModel as Softness
 from .contact_structs import Ends
@@ -31,11 +31,11 @@ from .press_kernel import build_press_kernel
 from .strained_part import StrainedModel
 
 # Threads that share one row of a matrix product.
-PARTS = 16
+ROW_THREADS = 16
 # Slots of the input: tolerance of the tools' forces, proximal coefficient, length of a shortened step; their number.
-TOLERANCE, DRAG, LENGTH, GIVEN = 0, 1, 2, 3
+TOLERANCE, DRAG, LENGTH, INPUT_SIZE = 0, 1, 2, 3
 # Slots of the output: status, step length, predicted decrease, slope, largest square norm, sums; their number.
-STATUS, TRIED, PROMISED, AHEAD, LOUD, WHOLE_SUM, FREE_SUM, SAID = range(8)
+STATUS, TRIED_LENGTH, PREDICTED_DECREASE, TRIAL_SLOPE, MAX_SQUARE_NORM, WHOLE_SUM, FREE_SUM, OUTPUT_SIZE = range(8)
 
 
 @dataclass(frozen=True)
@@ -113,13 +113,13 @@ def build_kernels(device: Device) -> ContactStepKernels:
     ):
         """Write the results for the host to one array."""
         out[STATUS] = wp.float64(status[0])
-        out[TRIED] = wp.float64(length[0])
-        out[PROMISED] = -promised[0]
-        out[AHEAD] = ahead[0]
+        out[TRIED_LENGTH] = wp.float64(length[0])
+        out[PREDICTED_DECREASE] = -promised[0]
+        out[TRIAL_SLOPE] = ahead[0]
         loudest = wp.float64(0.0)
         for i in range(own.shape[0]):
             loudest = wp.where(own[i, 0] <= loudest, loudest, own[i, 0])
-        out[LOUD] = loudest
+        out[MAX_SQUARE_NORM] = loudest
         out[WHOLE_SUM] = sums[WHOLE, 0]
         out[FREE_SUM] = sums[FREE, 0]
 
@@ -133,9 +133,9 @@ def read_step_result(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, 
     """
     with np.errstate(invalid="ignore", over="ignore"):
         free = np.sqrt(said[[FREE_SUM]])
-        scale = np.sqrt(np.maximum(np.maximum(square, said[LOUD]), said[[WHOLE_SUM]] - said[FREE_SUM]))
-    ahead = np.where(np.isfinite(free) & np.isfinite(scale), said[[AHEAD]], np.inf)
-    return said[[TRIED]], ahead, free, scale
+        scale = np.sqrt(np.maximum(np.maximum(square, said[MAX_SQUARE_NORM]), said[[WHOLE_SUM]] - said[FREE_SUM]))
+    ahead = np.where(np.isfinite(free) & np.isfinite(scale), said[[TRIAL_SLOPE]], np.inf)
+    return said[[TRIED_LENGTH]], ahead, free, scale
 
 
 class ContactSteps:
@@ -185,8 +185,8 @@ class ContactSteps:
         self._status = wp.zeros(1, dtype=wp.int32, device=name)
         self._length = wp.zeros(1, dtype=device.scalar, device=name)
         self._promised, self._ahead = (wp.zeros(1, dtype=wp.float64, device=name) for _ in range(2))
-        self._given, self._up = self._both_sides(GIVEN)
-        self._out, self._down = self._both_sides(SAID)
+        self._given, self._up = self._allocate_pair(INPUT_SIZE)
+        self._out, self._down = self._allocate_pair(OUTPUT_SIZE)
         self._live = np.ones(1, bool)
         self._graphs: dict[str, wp.Graph] = {}
 
@@ -207,17 +207,17 @@ class ContactSteps:
         returned array is overwritten by the next call.
         """
         self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, drag
-        ends = allocate_ends(BENT if bent else FORCES, FORCES.few)
-        return self._run("bent" if bent else "aim", lambda: self._aim(ends))
+        ends = allocate_ends(NONCONVEX if bent else FORCES, FORCES.few)
+        return self._run("bent" if bent else "aim", lambda: self._compute_direction(ends))
 
     def shorten_step(self, length: float) -> np.ndarray:
         """Evaluate a shorter step; return its results."""
         self._up.numpy()[LENGTH] = length
-        return self._run("again", self._again)
+        return self._run("again", self._retry_shorter_step)
 
     def move_to_last_step(self) -> None:
         """Accept the last step."""
-        self._run("accept", self._accept)
+        self._run("accept", self._take_step)
 
     def set_tools(self, constant: wp.array) -> bool:
         """Load the tools' poses from the problem, and constant gradients (3N, 1) [N]; False if there are no tools."""
@@ -251,7 +251,7 @@ class ContactSteps:
                 self._graphs[name] = capture.graph
         return self._down.numpy()
 
-    def _aim(self, ends: Ends) -> None:
+    def _compute_direction(self, ends: Ends) -> None:
         device, k = self._device, build_kernels(self._device)
         assert self._touch is not None
         kernel, stage = self._touch
@@ -274,7 +274,7 @@ class ContactSteps:
         combine_columns(device, self._own, 1.0, self._change, self._own)
         self._pull.zero_()
         put_rows(device, self._own, self._rows, self._pull)
-        self._answered(self._answer)
+        self._compute_response(self._answer)
         combine_columns(device, self._answer, 1.0, self._rest, self._x)
         combine_columns(device, self._x, -2.0, self._x, self._x)
         self._length.fill_(1.0)
@@ -284,7 +284,7 @@ class ContactSteps:
         add_dots(device, self._whole, self._x, self._promised)
         self._try()
 
-    def _again(self) -> None:
+    def _retry_shorter_step(self) -> None:
         wp.copy(self._given, self._up)
         self._device.launch(build_kernels(self._device).shorten, (1,), [self._given], [self._length])
         self._try()
@@ -303,12 +303,12 @@ class ContactSteps:
         add_dots(device, found.g, self._x, self._ahead)
         wp.copy(self._pull, self._new_smooth)
         device.launch(k.push, (len(self._touched),), [self._touched, self._found], [self._pull])
-        self._answered(self._new_rest)
+        self._compute_response(self._new_rest)
         inputs = [self._status, self._length, self._promised, self._ahead, found.sums, found.own]
         device.launch(k.report, (1,), inputs, [self._out])
         wp.copy(self._down, self._out)
 
-    def _accept(self) -> None:
+    def _take_step(self) -> None:
         for to, new in (
             (self._u, self._new_u),
             (self._smooth, self._new_smooth),
@@ -322,23 +322,25 @@ class ContactSteps:
         """Multiply the motions near the tools by the matrix of the model."""
         self._own.zero_()
         inputs = [self._matrix, self._nodes, self._near]
-        dim = (PARTS, 1, self._matrix.shape[2])
-        self._device.launch(build_press_kernel(self._device, wp.float64, wp.float64, PARTS), dim, inputs, [self._own])
+        dim = (ROW_THREADS, 1, self._matrix.shape[2])
+        self._device.launch(
+            build_press_kernel(self._device, wp.float64, wp.float64, ROW_THREADS), dim, inputs, [self._own]
+        )
 
     def _give(self, force: wp.array, out: wp.array, rows: int) -> None:
         """Add the motion under forces to the first `rows` of `out`."""
         inputs = [self._compliance, self._every, force]
         self._device.launch(
-            build_press_kernel(self._device, wp.float64, wp.float64, PARTS), (PARTS, 1, rows), inputs, [out]
+            build_press_kernel(self._device, wp.float64, wp.float64, ROW_THREADS), (ROW_THREADS, 1, rows), inputs, [out]
         )
 
-    def _answered(self, out: wp.array) -> None:
+    def _compute_response(self, out: wp.array) -> None:
         """Compute the linear response of the undeformed mesh to the forces in `_pull`."""
         self._problem.constraint.project_nodes(self._pull)
         self._preconditioner.apply(self._pull, self._live, out)
         self._problem.constraint.project_nodes(out)
 
-    def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:
+    def _allocate_pair(self, count: int) -> tuple[wp.array, wp.array]:
         """Allocate `count` values on the device, and as many in pinned host memory for direct transfer."""
         there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
         return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-OPEN, FOUND, NONE, CROWDED, UNKNOWN = (wp.constant(number) for number in range(5))
+OPEN, SOLVED, NO_EQUILIBRIUM, TOO_MANY_TOUCHED, UNKNOWN = (wp.constant(number) for number in range(5))
 """Status of a load case: open; solved; no equilibrium; too many touched nodes; compliance not yet computed."""
 
 

@@ -42,7 +42,7 @@ class CycleLimits:
     enough: float = 0.3
 
 
-USUAL = CycleLimits()  # Default.
+DEFAULT_CYCLE_LIMITS = CycleLimits()  # Default.
 Cycle = Callable[[ResidualEvaluator, ResidualState, np.ndarray], ResidualState]
 """Function that returns the next states of b load cases; the local solution may keep residuals (b,) [N]. A load case
 without an accepted step gets a residual that is not finite."""

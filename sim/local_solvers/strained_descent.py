@@ -28,7 +28,7 @@ from ..runtime.threads import limit_to_one_thread
 from .batch_elimination import open_vertices
 from .strained_part import StrainedPart, StrainLimits
 
-SINGLE = StrainLimits(nodes=320, cut=np.inf)
+SINGLE_LIMITS = StrainLimits(nodes=320, cut=np.inf)
 """Limits for a single model, which has all the memory, and may be incomplete: L-BFGS corrects the remainder."""
 
 
@@ -68,11 +68,11 @@ class StiffnessUpdate:
     @property
     def learnt(self) -> dict[str, np.ndarray]:
         """Entries for the `warm` data of a solution."""
-        return {name: getattr(self, field)[None] for field, name in LEARNT.items()}
+        return {name: getattr(self, field)[None] for field, name in UPDATE_KEYS.items()}
 
 
 # Keys of warm-start data, by field of `StiffnessUpdate`.
-LEARNT = {field: f"stiffening's {field}" for field in ("rows", "added", "factor", "pivots")}
+UPDATE_KEYS = {field: f"stiffening's {field}" for field in ("rows", "added", "factor", "pivots")}
 
 
 class StiffenedPreconditioner:
@@ -127,7 +127,7 @@ class StrainedDescent:
         """Solve as `Lbfgs.descend`, for one load case; `learnt` is the model. The first call takes 0.5 s to prepare."""
         self._part.prepare()
         u, left, steps = start, most, 0
-        self._preconditioner.stiffening = self.get_warm_start(learnt) or self._stiffening(u)
+        self._preconditioner.stiffening = self.get_warm_start(learnt) or self._build_stiffness_update(u)
         while True:
             some = min(left, self._renewal.evaluations)
             found = self._lbfgs.descend(u, tolerance, some)
@@ -135,12 +135,12 @@ class StrainedDescent:
             if not len(found.left) or left <= 0:
                 break
             u = found.u
-            self._preconditioner.stiffening = self._stiffening(u)
+            self._preconditioner.stiffening = self._build_stiffness_update(u)
         stiffening, self._preconditioner.stiffening = self._preconditioner.stiffening, None
         serves = learnt is not None and steps <= self._renewal.served
         return replace(found, steps=np.array([steps]), learnt=stiffening.learnt if stiffening and serves else {})
 
-    def _stiffening(self, u: wp.array) -> StiffnessUpdate | None:
+    def _build_stiffness_update(self, u: wp.array) -> StiffnessUpdate | None:
         """Compute the update at u (3N, 1) [m]; None if no tissue is strained."""
         found = self._part.find_stiffening(u, np.arange(1))
         if found is None or not found[0].shape[1]:
@@ -158,9 +158,9 @@ class StrainedDescent:
 
     def get_warm_start(self, learnt: Mapping[str, np.ndarray] | None) -> StiffnessUpdate | None:
         """Read the update of an earlier descent of this problem from warm-start data; None if it does not fit."""
-        if learnt is None or any(name not in learnt for name in LEARNT.values()):
+        if learnt is None or any(name not in learnt for name in UPDATE_KEYS.values()):
             return None
-        rows, added, factor, pivots = (np.asarray(learnt[name]) for name in LEARNT.values())
+        rows, added, factor, pivots = (np.asarray(learnt[name]) for name in UPDATE_KEYS.values())
         size = rows.shape[-1]
         shapes = [array.shape for array in (rows, added, factor, pivots)]
         if shapes != [(1, size), (1, size, size), (1, size, size), (1, size)]:
@@ -175,7 +175,7 @@ class StrainedDescent:
 
 
 def build_strained_part(
-    problem: Problem, preconditioner: Preconditioner, space: Discretisation, strains: StrainLimits = SINGLE
+    problem: Problem, preconditioner: Preconditioner, space: Discretisation, strains: StrainLimits = SINGLE_LIMITS
 ) -> StrainedPart:
     """Build the finder of strained tissue for a mesh with a small opening: models use the nodes nearest to it."""
     distance, _ = KDTree(space.nodes[open_vertices(space, problem.constraint)]).query(space.nodes)

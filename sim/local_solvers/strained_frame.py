@@ -21,9 +21,9 @@ from .press_kernel import build_press_kernel
 from .strained_part import StrainedPart
 
 # Keys of warm-start data.
-NODES, MATRIX = "bent nodes", "bent matrix"
+NODES_KEY, MATRIX_KEY = "bent nodes", "bent matrix"
 # Threads that share one row of a matrix product.
-PARTS = 16
+ROW_THREADS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class UpdatedModel:
     @property
     def learnt(self) -> dict[str, np.ndarray]:
         """Entries for the `warm` data of a solution."""
-        return {NODES: self.nodes.numpy(), MATRIX: self.matrix.numpy()}
+        return {NODES_KEY: self.nodes.numpy(), MATRIX_KEY: self.matrix.numpy()}
 
 
 def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel | None:
@@ -70,9 +70,9 @@ def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedM
 
 def restore_updated_model(warm: Mapping[str, np.ndarray], device: Device, count: int, size: int) -> UpdatedModel | None:
     """Read a model for `count` nodes from warm-start data; None if there is none, or it does not have 3n = `size`."""
-    if NODES not in warm or MATRIX not in warm:
+    if NODES_KEY not in warm or MATRIX_KEY not in warm:
         return None
-    nodes, matrix = np.asarray(warm[NODES]), np.asarray(warm[MATRIX])
+    nodes, matrix = np.asarray(warm[NODES_KEY]), np.asarray(warm[MATRIX_KEY])
     if nodes.shape != (1, size // 3) or matrix.shape != (1, size, size) or nodes.dtype.kind != "i":
         return None
     if matrix.dtype != np.float32 or not is_all_finite(matrix) or (nodes < 0).any() or (nodes >= count).any():
@@ -117,7 +117,10 @@ class UpdatedPreconditioner:
         device = self._problem.device
         self._rest.apply(r, live, out)
         self._pull.zero_()
-        kernel, shape = build_press_kernel(device, wp.float32, device.scalar, PARTS), (PARTS, *self._matrix.shape[:2])
+        kernel, shape = (
+            build_press_kernel(device, wp.float32, device.scalar, ROW_THREADS),
+            (ROW_THREADS, *self._matrix.shape[:2]),
+        )
         device.launch(kernel, shape, [self._matrix, self._nodes, out], [self._pull])
         self._problem.constraint.project_nodes(self._pull)
         self._rest.apply(self._pull, live, self._more)

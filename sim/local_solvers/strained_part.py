@@ -62,8 +62,8 @@ class StrainLimits:
     bytes: int = 2**31
 
 
-STRAINS = StrainLimits()  # Default.
-ON_CARD = StrainLimits(least=0.1, nodes=480, cut=0.5, near=1600)
+STRAIN_LIMITS = StrainLimits()  # Default.
+CUDA_STRAIN_LIMITS = StrainLimits(least=0.1, nodes=480, cut=0.5, near=1600)
 """Limits on a GPU, which inverts a larger model in less time than the saved steps take."""
 
 
@@ -100,12 +100,12 @@ class StrainedModel:
     def merge_columns(self, columns: np.ndarray, other: StrainedModel) -> StrainedModel:
         """Return the models with those of some load cases (k,) replaced by another's."""
         most = max(self.nodes.shape[1], other.nodes.shape[1])
-        mine, its = self._widened(most), other._widened(most)
+        mine, its = self._pad_nodes(most), other._pad_nodes(most)
         for one, two in ((mine.nodes, its.nodes), (mine.matrix, its.matrix), (mine.own, its.own)):
             one[columns] = two
         return mine
 
-    def _widened(self, most: int) -> StrainedModel:
+    def _pad_nodes(self, most: int) -> StrainedModel:
         """Return the models with capacity for `most` nodes."""
         missing = most - self.nodes.shape[1]
         nodes, matrix = pad_zeros(self.nodes, (missing,)), pad_zeros(self.matrix, (3 * missing, 3 * missing))
@@ -148,7 +148,7 @@ class StrainedPart:
         Limits of a model.
     """
 
-    def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: StrainLimits = STRAINS):
+    def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: StrainLimits = STRAIN_LIMITS):
         device, nodes = problem.device, compliance.nodes
         self._problem, self.compliance, self._touchable, self._strains = problem, compliance, touchable, strains
         self.size = 3 * min(strains.nodes, len(nodes))
@@ -162,7 +162,7 @@ class StrainedPart:
     def build_model(self, u: wp.array, columns: np.ndarray) -> StrainedModel | None:
         """Build models of load cases (k,) of the begun batch at u (3N, b) [m]; None if strained tissue does not fit."""
         found = self.find_stiffening(u, columns)
-        return None if found is None else self._bent(*found)
+        return None if found is None else self._build_models(*found)
 
     def prepare(self) -> None:
         """Compute the compliance at all nodes, unless that is done."""
@@ -199,7 +199,7 @@ class StrainedPart:
         between = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
         return 0.5 * (between + between.mT)
 
-    def _bent(self, nodes: Any, stiffer: Any) -> StrainedModel:
+    def _build_models(self, nodes: Any, stiffer: Any) -> StrainedModel:
         """Build models from D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
         self.prepare()
         device, count, size = self._problem.device, len(nodes), stiffer.shape[1]

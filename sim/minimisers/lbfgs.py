@@ -17,14 +17,14 @@ from ..arguments import is_all_finite
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from ..linalg.pcg import Preconditioner
-from ..runtime.columns import EXACT, find_workspace_width, scatter_columns
+from ..runtime.columns import MAX_EXACT, find_workspace_width, scatter_columns
 from .lbfgs_kernels import LIVE, PAIRS, STOPPED
 from .lbfgs_state import Workspace, allocate_memory
 
 # L-BFGS history of a descent on the host, load cases first: s and w (b, m, 3N), products (b, m, m), slot of the newest
 # pair and number of pairs (b,).
-LEARNT = ("s", "w", "sy", "yw", "head", "known")
-CARRIED = EXACT  # Largest batch [load cases] that hands its history on: a larger one has no next frame.
+HISTORY_KEYS = ("s", "w", "sy", "yw", "head", "known")
+MAX_CARRIED = MAX_EXACT  # Largest batch [load cases] that hands its history on: a larger one has no next frame.
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Schedule:
     smaller: float = 0.85
 
 
-ON_CUDA = Schedule(between=2, smaller=0.75)  # A check stalls the GPU.
+CUDA_SCHEDULE = Schedule(between=2, smaller=0.75)  # A check stalls the GPU.
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class Lbfgs:
 
     def __init__(self, problem: Problem, preconditioner: Preconditioner, schedule: Schedule | None = None):
         self._problem = problem
-        self._schedule = schedule or (ON_CUDA if problem.device.on_cuda else Schedule())
+        self._schedule = schedule or (CUDA_SCHEDULE if problem.device.on_cuda else Schedule())
         self._preconditioner = preconditioner
         self._workspaces: dict[int, Workspace] = {}
         self._ground: dict[str, wp.array] = {}
@@ -109,12 +109,15 @@ class Lbfgs:
         device, count = self._problem.device, start.shape[1]
         u, place = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
-        carried = learnt is not None and count <= CARRIED
+        carried = learnt is not None and count <= MAX_CARRIED
         if count == 0:
             return Descended(u, status, steps, residual, {})
-        workspace, tried = self._workspace(count), 0
+        workspace, tried = self._get_workspace(count), 0
         workspace.begin(
-            start, tolerance, np.zeros(count) if force is None else force, (learnt or {}) if count <= CARRIED else {}
+            start,
+            tolerance,
+            np.zeros(count) if force is None else force,
+            (learnt or {}) if count <= MAX_CARRIED else {},
         )
         if ahead is not None:
             workspace.set_direction(*ahead)
@@ -125,7 +128,7 @@ class Lbfgs:
             now = workspace.columns["status"].numpy()[: len(place)]
             left = int((now == LIVE).sum())
             last = tried >= most or left <= stragglers * count
-            if last or (count > CARRIED and self._width(left) <= self._schedule.smaller * workspace.width):
+            if last or (count > MAX_CARRIED and self._find_width(left) <= self._schedule.smaller * workspace.width):
                 leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
                 there = place[leave]
                 scatter_columns(device, workspace.columns["u"], there, u, leave)
@@ -133,15 +136,15 @@ class Lbfgs:
                     workspace.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
                 )
                 if last:
-                    learnt = {name: to_rows_first(workspace.columns[name]) for name in LEARNT} if carried else {}
+                    learnt = {name: to_rows_first(workspace.columns[name]) for name in HISTORY_KEYS} if carried else {}
                     return Descended(u, status, steps, residual, learnt)
                 stay = np.flatnonzero(now == LIVE)
-                place, before, workspace = place[stay], workspace, self._workspace(len(stay))
+                place, before, workspace = place[stay], workspace, self._get_workspace(len(stay))
                 workspace.take(before, stay)
 
-    def _workspace(self, count: int) -> Workspace:
+    def _get_workspace(self, count: int) -> Workspace:
         """Return a workspace for `count` load cases or slightly more."""
-        width = self._width(count)
+        width = self._find_width(count)
         if width > max(self._workspaces, default=0):
             self._workspaces, self._ground = {}, {}  # free the old memory before more is allocated
             self._ground = allocate_memory(self._problem, width)
@@ -149,7 +152,7 @@ class Lbfgs:
             self._workspaces[width] = Workspace(self._problem, self._preconditioner, width, self._ground)
         return self._workspaces[width]
 
-    def _width(self, count: int) -> int:
+    def _find_width(self, count: int) -> int:
         return find_workspace_width(self._problem.device, count)
 
 
@@ -163,9 +166,9 @@ def restore_history(cases: Cases, rows: int) -> dict[str, np.ndarray]:
 
     The history only saves iterations, so one with values that are not finite is dropped.
     """
-    if any(name not in cases.warm for name in LEARNT):
+    if any(name not in cases.warm for name in HISTORY_KEYS):
         return {}
-    found = {name: np.asarray(cases.warm[name]) for name in LEARNT}
+    found = {name: np.asarray(cases.warm[name]) for name in HISTORY_KEYS}
     shape = {"s": (PAIRS, rows), "w": (PAIRS, rows), "sy": (PAIRS, PAIRS), "yw": (PAIRS, PAIRS)}
     if any(array.shape != (len(cases.loads), *shape.get(name, ())) for name, array in found.items()):
         return {}

@@ -23,12 +23,12 @@ MAX_BACKTRACK = 0.7  # Backtracking factor: upper bound.
 MAX_BACKTRACKS = 12  # Maximum number of backtracking steps in a row.
 ROWS_PER_THREAD = 16  # Rows, or nodes, per thread, so that the data of their load case are read once.
 # Smallest change of the slope along a step, relative to |phi'(0)|, for a pair of positive curvature to be stored.
-LEAST_CURVATURE = 1e-3
+MIN_CURVATURE = 1e-3
 # Rows of `sums`: |g - constant|^2, |g|^2, |residual|^2, residual . d, with g the gradient.
 OWN, WHOLE, FREE, SLOPE = 0, 1, 2, 3
 SUMS = 4  # Number of rows of `sums`.
 # Rows of `products` after the 2 m with the pairs: g' . z', g' . z, y . w.
-GZ, GOLD, YW = 0, 1, 2
+GZ, GZ_OLD, YW = 0, 1, 2
 PRODUCTS = 3  # Number of these rows.
 
 
@@ -60,9 +60,9 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
     products_of_pairs = wp.types.matrix(shape=(pairs, pairs), dtype=wp.float64)
     m, chunk, some, few = pairs, CHUNK, ROWS_PER_THREAD, get_rows_per_thread(device)
     overshoot, least_kept, kept, most_kept = OVERSHOOT, MIN_BACKTRACK, DEFAULT_BACKTRACK, MAX_BACKTRACK
-    cuts, least_curvature = MAX_BACKTRACKS, LEAST_CURVATURE
+    cuts, least_curvature = MAX_BACKTRACKS, MIN_CURVATURE
     whole_row, free_row, slope_row = WHOLE, FREE, SLOPE
-    gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
+    gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GZ_OLD, 2 * m + YW
 
     @forward_kernel(module="unique")
     def absorb(

@@ -55,7 +55,7 @@ def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
 def allocate_memory(problem: Problem, width: int) -> dict[str, wp.array]:
     """Allocate memory, by number type, that workspaces of at most this width share: only one is in use at a time."""
     return {
-        kind: wp.zeros((_rows(moved) + _rows(written), width), dtype=dtype, device=problem.device.name)
+        kind: wp.zeros((_count_values(moved) + _count_values(written), width), dtype=dtype, device=problem.device.name)
         for kind, (dtype, moved, written) in describe_layout(problem).items()
     }
 
@@ -76,9 +76,9 @@ def allocate_state(problem: Problem, width: int, ground: Mapping[str, wp.array])
     for kind, (_, moved, written) in describe_layout(problem).items():
         first = 0
         for name, shape in {**moved, **written}.items():
-            columns[name] = _placed(ground[kind], first, (*shape, width))
+            columns[name] = _view_memory(ground[kind], first, (*shape, width))
             first += width * prod(shape)
-        together[kind] = _placed(ground[kind], 0, (_rows(moved), width))
+        together[kind] = _view_memory(ground[kind], 0, (_count_values(moved), width))
     return LbfgsState(columns, together, ground)
 
 
@@ -113,7 +113,7 @@ class Workspace:
         for array in (a["d"], a["g"], a["z"], self.state.moved["double"], self.state.moved["whole"]):
             array.zero_()
         if spare:
-            index = self._padded(np.arange(start.shape[1]))
+            index = self._pad_indices(np.arange(start.shape[1]))
             self._problem.keep(index)
             gather_columns(device, start, index, a["u"])
         else:
@@ -133,18 +133,18 @@ class Workspace:
     def set_direction(self, g: wp.array, z: wp.array) -> None:
         """Set the first direction to -z (3N, b), from a start with residual g (3N, b)."""
         a, device, count = self.columns, self._problem.device, g.shape[1]
-        index = device.upload(self._padded(np.arange(count)), wp.int32)
+        index = device.upload(self._pad_indices(np.arange(count)), wp.int32)
         gather_columns(device, g, index, a["g"])
         gather_columns(device, z, index, a["z"])
         combine_columns(device, a["d"], -1.0, a["z"], a["d"])
         a["promised"].zero_()
         add_dots(device, a["g"], a["z"], a["promised"])
         a["t"].fill_(1.0)
-        self._clamp()
+        self._limit_steps()
 
     def take(self, other: Workspace, stay: np.ndarray) -> None:
         """Continue with these load cases (k,) of another workspace's batch."""
-        index = self._padded(stay)
+        index = self._pad_indices(stay)
         self._problem.keep(index)
         there = self._problem.device.upload(index, wp.int32)
         for kind, own in self.state.moved.items():
@@ -153,7 +153,7 @@ class Workspace:
             self.columns["status"][len(stay) :].fill_(DONE)
         self.prepare()
 
-    def _padded(self, stay: np.ndarray) -> np.ndarray:
+    def _pad_indices(self, stay: np.ndarray) -> np.ndarray:
         """Repeat the last index until the workspace is full."""
         return np.append(stay, np.full(self.width - len(stay), stay[-1]))
 
@@ -177,7 +177,7 @@ class Workspace:
         if self._graph is None:
             self.run_iteration()  # loads modules, which a capture cannot
             if not self.columns["aiming"].numpy().any():
-                self._aim()  # loads those that no load case has used
+                self._compute_directions()  # loads those that no load case has used
             with wp.ScopedCapture(device.name, force_module_load=False) as capture:
                 self.run_iteration()
             self._graph = capture.graph
@@ -198,15 +198,15 @@ class Workspace:
         names = ("status", "accepted", "steps", "cut", "t", "gone", "residual", "slot", "aiming")
         device.launch(k.judge, one, inputs, [a[name] for name in names])
         if count == 1 and (not device.on_cuda or wp.is_conditional_graph_supported()):
-            wp.capture_if(a["aiming"], self._aim)
+            wp.capture_if(a["aiming"], self._compute_directions)
         else:
-            self._aim()
+            self._compute_directions()
         inputs = [a["status"], a["accepted"], a["known"], a["slot"], a["gone"], a["along_s"], a["along_w"]]
         outputs = [a["u"], a["d"], a["g"], a["z"], a["s"], a["w"]]
         device.launch(k.move, (-(-rows // get_rows_per_thread(device)), count), [*inputs, found.g, a["new_z"]], outputs)
-        self._clamp()
+        self._limit_steps()
 
-    def _aim(self) -> None:
+    def _compute_directions(self) -> None:
         """Compute the next direction of the load cases whose step was accepted, from their new gradients."""
         a, k = self.columns, self._kernels
         problem, device, g = self._problem, self._problem.device, self._trial.g
@@ -229,18 +229,18 @@ class Workspace:
         outputs += [a["sg"], a["wg"], a["sy"], a["yw"], a["along_s"], a["along_w"]]
         device.launch(k.aim, (count,), inputs, outputs)
 
-    def _clamp(self) -> None:
+    def _limit_steps(self) -> None:
         a, bound = self.columns, self.columns["bound"]
         for term in self._problem.terms:
             term.longest_step(a["u"], a["d"], bound)
         self._problem.device.launch(self._kernels.clamp, (self.width,), [], [bound, a["t"]])
 
 
-def _placed(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
+def _view_memory(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
     """View the memory from element `first` on with a shape: slices of Warp arrays cannot skip 2^31 elements."""
     address = ground.ptr + first * wp.types.type_size_in_bytes(ground.dtype)
     return wp.array(ptr=address, dtype=ground.dtype, shape=shape, device=ground.device)
 
 
-def _rows(shapes: Shapes) -> int:
+def _count_values(shapes: Shapes) -> int:
     return sum(prod(shape) for shape in shapes.values())

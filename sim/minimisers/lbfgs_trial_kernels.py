@@ -12,10 +12,10 @@ import warp as wp
 
 from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
-from .lbfgs_kernels import FREE, GOLD, GZ, OWN, ROWS_PER_THREAD, SLOPE, WHOLE, YW
+from .lbfgs_kernels import FREE, GZ, GZ_OLD, OWN, ROWS_PER_THREAD, SLOPE, WHOLE, YW
 
-EACH = 2  # Rows, or nodes, of a single load case per thread on CUDA.
-EACH_ON_CPU = 1024  # The same on the CPU.
+ROWS_PER_CUDA_THREAD = 2  # Rows, or nodes, of a single load case per thread on CUDA.
+ROWS_PER_CPU_THREAD = 1024  # The same on the CPU.
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def spread_of(device: Device, columns: int) -> ThreadSpread:
     """Choose how the threads of a device share the rows of a batch of this many load cases."""
     if columns > 1:
         return ThreadSpread(1, ROWS_PER_THREAD)
-    return ThreadSpread(get_warp_width(device), EACH if device.on_cuda else EACH_ON_CPU)
+    return ThreadSpread(get_warp_width(device), ROWS_PER_CUDA_THREAD if device.on_cuda else ROWS_PER_CPU_THREAD)
 
 
 @wp.func
@@ -122,7 +122,7 @@ def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
     """Build the kernel `multiply` for a single load case, launched over (products, threads of rows)."""
     scalar, m, spread = device.scalar, pairs, spread_of(device, 1)
     lanes, each = spread.lanes, spread.each
-    gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GOLD, 2 * m + YW
+    gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GZ_OLD, 2 * m + YW
 
     @forward_kernel(module="unique")
     def multiply(

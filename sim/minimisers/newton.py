@@ -135,7 +135,7 @@ def round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
     The residual cannot fall below this: the required displacements are not representable in the floating-point type.
     """
     device = problem.device
-    near = problem.gradient(_nearest(device, u))
+    near = problem.gradient(_perturb_last_digit(device, u))
     problem.constraint.project(near)
     return compute_norms(device, combine_columns(device, near, -1.0, g, near))
 
@@ -151,7 +151,9 @@ def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
         return np.linalg.norm(force.numpy().reshape(-1, 3, u.shape[1]), axis=1)
 
     change = wp.empty_like(u)
-    combine_columns(problem.device, problem.gradient(_nearest(problem.device, u)), -1.0, problem.gradient(u), change)
+    combine_columns(
+        problem.device, problem.gradient(_perturb_last_digit(problem.device, u)), -1.0, problem.gradient(u), change
+    )
     noise = at_nodes(change)
     out = np.ones(u.shape[1], bool)
     for term in problem.terms:
@@ -161,7 +163,7 @@ def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
     return out
 
 
-def _nearest(device: Device, u: wp.array) -> wp.array:
+def _perturb_last_digit(device: Device, u: wp.array) -> wp.array:
     """Return displacements u (3N, b) with the last digit of each changed, up or down at random."""
     values = u.numpy()
     sign = np.random.default_rng(0).choice([-1.0, 1.0], (len(values), 1))

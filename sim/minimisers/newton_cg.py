@@ -79,7 +79,7 @@ class NewtonCG:
         self._preconditioner.prepare(problem, columns)
         rhs, pulled = compute_right_hand_side(problem, g, gap)
         # No radius where a gap must be closed in full, or where the curvature is that of the undeformed stiffness.
-        self._radius = np.where(pulled | definite, np.inf, self._followed(taken))
+        self._radius = np.where(pulled | definite, np.inf, self._compute_radius(taken))
         tolerance = forcing * compute_norms(device, rhs)
         found = solve_conjugate_gradients(
             problem, self._preconditioner, wp.clone(rhs), tolerance, self._most, self._radius
@@ -88,7 +88,7 @@ class NewtonCG:
         promised = compute_dots(device, rhs, found.x)
         return Direction(close_constraints(device, found.x, gap), promised, found.iterations)
 
-    def _followed(self, taken: np.ndarray) -> np.ndarray:
+    def _compute_radius(self, taken: np.ndarray) -> np.ndarray:
         if self._radius is None:
             return np.full(len(taken), np.inf)
         step = self._growth * taken * self._size

@@ -21,7 +21,7 @@ from ..runtime.device import Device, forward_kernel
 
 # Largest displacement of a central difference [edge lengths]: the error grows with its square, here to at most 3e-5 of
 # the third order; round-off and the error of linear solves grow with its inverse square.
-STEP = 0.003
+DIFFERENCE_STEP = 0.003
 
 
 @cache
@@ -138,13 +138,13 @@ def expand_taylor(
     device = problem.device
     unbalanced = problem.gradient(device.allocate(problem.rows, loads))
     problem.constraint.project(unbalanced)
-    force = _times(device, -1.0, unbalanced)
+    force = _multiply_columns(device, -1.0, unbalanced)
     yield force
-    moved = at_rest(_times(device, 1.0, force))
+    moved = at_rest(_multiply_columns(device, 1.0, force))
     largest = np.abs(moved.numpy()).max(axis=0).reshape(-1, sizes).max(axis=1)
-    size = STEP * edge / np.where(largest > 0.0, largest, 1.0)
+    size = DIFFERENCE_STEP * edge / np.where(largest > 0.0, largest, 1.0)
     # From here on loads are scaled by `size`, so that the displacements suit central differences.
-    force, moved = (_times(device, np.repeat(size, sizes), each) for each in (force, moved))
+    force, moved = (_multiply_columns(device, np.repeat(size, sizes), each) for each in (force, moved))
     found = [moved]
     for order in range(2, orders + 1):
         direction = choose_unit_directions(sizes, order)
@@ -155,7 +155,8 @@ def expand_taylor(
             )
         even, odd = sums
         up, down = (
-            _resisting(problem, combine_columns(device, even, sign, odd, wp.empty_like(odd))) for sign in (1.0, -1.0)
+            _compute_internal_forces(problem, combine_columns(device, even, sign, odd, wp.empty_like(odd)))
+            for sign in (1.0, -1.0)
         )
         if order % 2:
             combine_columns(device, up, -1.0, down, up)
@@ -163,12 +164,12 @@ def expand_taylor(
         else:
             combine_columns(device, up, 1.0, down, up)
         left = mix_columns(device, up, -0.5 * np.linalg.inv(compute_products(direction, order)))
-        yield _times(device, np.repeat(size**-order, len(direction)), left)
+        yield _multiply_columns(device, np.repeat(size**-order, len(direction)), left)
         if order < orders:
             found.append(at_rest(left))
 
 
-def _resisting(problem: Problem, u: wp.array) -> wp.array:
+def _compute_internal_forces(problem: Problem, u: wp.array) -> wp.array:
     """Compute the internal forces (3N, b) [N] at displacements (3N, b) [m], without loads, on the free unknowns."""
     out = problem.device.allocate(*u.shape)
     for term in problem.terms:
@@ -178,6 +179,6 @@ def _resisting(problem: Problem, u: wp.array) -> wp.array:
     return out
 
 
-def _times(device: Device, factor: np.ndarray | float, x: wp.array) -> wp.array:
+def _multiply_columns(device: Device, factor: np.ndarray | float, x: wp.array) -> wp.array:
     """Multiply x (rows, b) by one factor, or by one for each column (b,)."""
     return combine_columns(device, wp.zeros_like(x), factor, x, wp.empty_like(x))

@@ -23,8 +23,8 @@ from ..discretisation.term import Strained
 from ..runtime.threads import choose_threads, run_together
 from ..runtime.views import run_in_order, to_host, to_library
 
-FEW = 256  # Elements of one batch on the CPU: the data of a pair fit into the cache of a core.
-MANY = 4096  # The same on CUDA: they fill a GPU.
+CPU_BATCH = 256  # Elements of one batch on the CPU: the data of a pair fit into the cache of a core.
+CUDA_BATCH = 4096  # The same on CUDA: they fill a GPU.
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,11 @@ def compute_second_order(
     first, second = np.nonzero(np.triu(np.repeat(np.repeat(near, 3, axis=0), 3, axis=1)))
     start = np.searchsorted(first, np.arange(len(moved) + 1))
     terms = [term for term in problem.terms if isinstance(term, Strained)]
-    work = [one for term in terms for one in _some(*term.second_order(), MANY if device.on_cuda else FEW)]
+    work = [
+        one
+        for term in terms
+        for one in _list_batches(*term.second_order(), CUDA_BATCH if device.on_cuda else CPU_BATCH)
+    ]
     others, done = to_library(device, second), count(1)
     tasks = 1 if device.on_cuda else choose_threads(sum(len(each.chosen) for each in work))
     tables = [to_library(device, np.zeros((len(first), len(answers)), np.float32)) for _ in range(tasks)]
@@ -75,7 +79,7 @@ def compute_second_order(
             progress(next(done), len(work))
 
     def add(table: Any, some: _Some) -> None:
-        gradient = _gradients(some.elements, some.chosen)
+        gradient = _build_gradient_matrix(some.elements, some.chosen)
         weight = np.repeat(some.elements.weight[some.chosen].ravel(), 9)[:, None]
         strain = to_library(device, (gradient @ moved.T).astype(np.float32).reshape(-1, 9, len(moved)))
         lever = to_library(device, (weight * (gradient @ answers.T)).astype(np.float32))
@@ -93,7 +97,7 @@ def compute_second_order(
     return np.column_stack([first, second]), table * twice[:, None]
 
 
-def _some(elements: Elements, tensors: np.ndarray, kind: np.ndarray, most: int) -> list[_Some]:
+def _list_batches(elements: Elements, tensors: np.ndarray, kind: np.ndarray, most: int) -> list[_Some]:
     """List all elements of a term by tissue, in batches of at most `most`."""
     found = []
     for each, tensor in enumerate(tensors):
@@ -103,7 +107,7 @@ def _some(elements: Elements, tensors: np.ndarray, kind: np.ndarray, most: int) 
     return found
 
 
-def _gradients(elements: Elements, chosen: np.ndarray) -> sp.csr_array:
+def _build_gradient_matrix(elements: Elements, chosen: np.ndarray) -> sp.csr_array:
     """Build the matrix from displacements (3N,) to gradients (9 k q,) in some elements (k,), row by row."""
     table, slope = elements.table[chosen], elements.gradient[chosen]
     count, points, most = slope.shape[:3]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError
-from .partial_files import STALE, list_partials, remove_left_overs, to_partial_path
+from .partial_files import STALE_SECONDS, list_partials, remove_left_overs, to_partial_path
 
 
 def explain_error(error: OSError) -> str:
@@ -18,7 +18,7 @@ def explain_error(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
 
 
-def check_output(path: str | Path, suffix: str, stale: float = STALE, sweep: bool = True) -> Path:
+def check_output(path: str | Path, suffix: str, stale: float = STALE_SECONDS, sweep: bool = True) -> Path:
     """Return a path that can be written, with its folder created; called before long work, so that no result is lost.
 
     Left-overs of killed runs with the same output are removed; `sweep` False saves listing a folder with very many
@@ -212,18 +212,17 @@ def check_disk_space(path: str | Path, size: int, largest: int | None = None) ->
     free = shutil.disk_usage(existing).free
     if free < size:
         raise InputError(
-            f"{path}: needs {_megabytes(size)}, and the disk has {_megabytes(free)} left. Free space, or choose "
-            "another folder."
+            f"{path}: needs {_to_mb(size)}, and the disk has {_to_mb(free)} left. Free space, or choose another folder."
         )
-    allowed, largest = _longest_file(), size if largest is None else largest
+    allowed, largest = _get_max_file_size(), size if largest is None else largest
     if allowed is not None and allowed < largest:
         raise InputError(
-            f"{path}: needs a file of {_megabytes(largest)}, but files are limited to {_megabytes(allowed)} here. "
+            f"{path}: needs a file of {_to_mb(largest)}, but files are limited to {_to_mb(allowed)} here. "
             "Raise the limit (`ulimit -f`)."
         )
 
 
-def _longest_file() -> int | None:
+def _get_max_file_size() -> int | None:
     """Return the maximum size of a file of this process [bytes]; None: no limit."""
     try:
         import resource
@@ -236,5 +235,5 @@ def _longest_file() -> int | None:
 REMEDY = "Choose another folder, or free space there."  # Ends messages on failed writes.
 
 
-def _megabytes(size: int) -> str:
+def _to_mb(size: int) -> str:
     return f"{size / 1e6:,.1f} MB"

@@ -10,9 +10,9 @@ import warp as wp
 
 from .device import Device, forward_kernel
 
-EXACT = 4  # Batches up to this size have workspaces of exactly their width: their L-BFGS history is handed on.
+MAX_EXACT = 4  # Batches up to this size have workspaces of exactly their width: their L-BFGS history is handed on.
 # Widths of workspaces on CUDA; larger ones are multiples of the last. Arrays of these widths are kept for graphs.
-WIDTHS = (*range(1, EXACT + 1), *(share * 2**k for k in range(5, 13) for share in (2, 3)), 16384)
+WIDTHS = (*range(1, MAX_EXACT + 1), *(share * 2**k for k in range(5, 13) for share in (2, 3)), 16384)
 CHUNK = 64  # Rows that one thread sums before its atomic addition to the column's total.
 
 
@@ -245,7 +245,7 @@ def gather_columns(
     if out is None:
         out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
     gather, _ = build_moving_kernels(x.dtype)
-    device.launch(gather, _flat(out).shape, [_flat(x), index], [_flat(out)])
+    device.launch(gather, _flatten_rows(out).shape, [_flatten_rows(x), index], [_flatten_rows(out)])
     return out
 
 
@@ -255,8 +255,8 @@ def scatter_columns(
     """Copy x (..., k), or `some` (k,) columns of it, to some columns (k,) of out (..., b)."""
     _, scatter = build_moving_kernels(x.dtype)
     some = np.arange(x.shape[-1]) if some is None else some
-    inputs = [_flat(x), _index(device, some), _index(device, columns)]
-    device.launch(scatter, (_flat(x).shape[0], len(some)), inputs, [_flat(out)])
+    inputs = [_flatten_rows(x), _index(device, some), _index(device, columns)]
+    device.launch(scatter, (_flatten_rows(x).shape[0], len(some)), inputs, [_flatten_rows(out)])
 
 
 def unstack_columns(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
@@ -270,7 +270,7 @@ def _index(device: Device, columns: np.ndarray | wp.array) -> wp.array:
     return columns if isinstance(columns, wp.array) else device.upload(columns, wp.int32)
 
 
-def _flat(x: wp.array) -> wp.array:
+def _flatten_rows(x: wp.array) -> wp.array:
     """Return a view (rows, b) of x (..., b)."""
     return x.reshape((int(np.prod(x.shape[:-1])), x.shape[-1]))
 

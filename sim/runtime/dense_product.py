@@ -13,10 +13,10 @@ from .threads import limit_to_one_thread
 
 def build_product(matrix: np.ndarray, device: Device, rough: bool = False) -> Callable[[wp.array, wp.array], None]:
     """Build (x, out) -> out (m, b) = matrix (m, n) x (n, b); `rough` lets CUDA round values to eight bits."""
-    return _on_cuda(matrix, device, rough) if device.on_cuda else _on_cpu(matrix, device)
+    return _build_cuda_product(matrix, device, rough) if device.on_cuda else _build_cpu_product(matrix, device)
 
 
-def _on_cpu(matrix: np.ndarray, device: Device) -> Callable[[wp.array, wp.array], None]:
+def _build_cpu_product(matrix: np.ndarray, device: Device) -> Callable[[wp.array, wp.array], None]:
     kept = matrix.astype(device.precision)
 
     def multiply(x: wp.array, out: wp.array) -> None:
@@ -27,7 +27,7 @@ def _on_cpu(matrix: np.ndarray, device: Device) -> Callable[[wp.array, wp.array]
     return multiply
 
 
-def _on_cuda(matrix: np.ndarray, device: Device, rough: bool) -> Callable[[wp.array, wp.array], None]:
+def _build_cuda_product(matrix: np.ndarray, device: Device, rough: bool) -> Callable[[wp.array, wp.array], None]:
     import torch
 
     kind = torch.bfloat16 if rough else wp.dtype_to_torch(device.scalar)

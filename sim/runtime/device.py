@@ -22,7 +22,7 @@ forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 """`wp.kernel` without adjoint, which is not used, and launched without grid-stride loop, which saves registers."""
 
 STDERR = 2  # File descriptor of the error output.
-EVERY = "all"
+ALL_GPUS = "all"
 """Name of all GPUs in a list of devices."""
 
 SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}  # Warp's scalar types.
@@ -95,17 +95,17 @@ def find_device(name: str, precision: Precision) -> Device:
     InputError
         A device that this machine does not have, or several of them.
     """
-    if "," in name or name == EVERY:
+    if "," in name or name == ALL_GPUS:
         raise InputError(
             f"{name!r} names several devices, but only one is allowed here: choose "
-            f"{' or '.join(['auto', *_present()])}."
+            f"{' or '.join(['auto', *_list_devices()])}."
         )
-    present = _present()
+    present = _list_devices()
     if name == "auto":
         name = "cuda:0" if "cuda:0" in present else "cpu"
     alias = "cuda:0" if name == "cuda" else name
     if alias not in present:
-        why = _no_card() if alias.startswith("cuda") else ""
+        why = _explain_no_gpu() if alias.startswith("cuda") else ""
         raise InputError(f"there is no device {name!r} here{why}: choose {' or '.join(['auto', *present])}.")
     return Device(alias, precision)
 
@@ -121,19 +121,19 @@ def parse_device_names(words: str) -> tuple[str, ...]:
         A device that this machine does not have, "all" without GPUs or with other names, an empty name, CPU and GPUs
         together.
     """
-    if words.strip() == EVERY:
-        cards = tuple(name for name in _present() if name.startswith("cuda"))
+    if words.strip() == ALL_GPUS:
+        cards = tuple(name for name in _list_devices() if name.startswith("cuda"))
         if not cards:
             raise InputError(
-                f"'all' means every GPU, and there is none here{_no_card()}: choose auto, or name devices separated by "
+                f"'all' means every GPU, and there is none here{_explain_no_gpu()}: choose auto, or name devices separated by "
                 "commas, as in cpu,cpu."
             )
         return cards
     asked = [name.strip() for name in words.split(",")]
-    if EVERY in asked:
+    if ALL_GPUS in asked:
         raise InputError(f"{words!r} lists devices together with 'all', which means every GPU: give 'all' alone.")
     if not any(asked):
-        raise InputError(f"{words!r} names no device: choose auto, or {' or '.join(_present())}.")
+        raise InputError(f"{words!r} names no device: choose auto, or {' or '.join(_list_devices())}.")
     if not all(asked):
         raise InputError(f"{words!r} contains an empty device name: remove the comma, or add a name.")
     names = tuple(find_device(name, "float32").name for name in asked)
@@ -144,7 +144,7 @@ def parse_device_names(words: str) -> tuple[str, ...]:
     return names
 
 
-def _present() -> list[str]:
+def _list_devices() -> list[str]:
     _start_warp()
     return [device.alias for device in wp.get_devices()]
 
@@ -172,5 +172,5 @@ def _start_warp() -> None:
         os.write(STDERR, b"No CUDA GPU found: using the CPU.\n")
 
 
-def _no_card() -> str:
+def _explain_no_gpu() -> str:
     return "" if wp.is_cuda_available() else ", as no NVIDIA driver with a GPU was found"

@@ -10,20 +10,20 @@ from pathlib import Path
 from ..errors import InputError
 
 # Maximum inflation of deflate (.npz, .nii.gz, .vtu, HDF5): a file that declares more is invalid.
-INFLATION = 1032
+MAX_INFLATION = 1032
 # Allowed inflated size of a small bzip2 file [bytes], which has no such maximum: 512 x 512 x 512 voxels of 16 bits.
-LITTLE = 2**28
+BZIP2_ALLOWANCE = 2**28
 # Maximum size of one array [bytes]: quadratic tetrahedra (10 numbers of 8 bytes) of the finest brain meshes in use, 10
 # million, take 0.8 GB.
-LARGEST_ARRAY = 2 * 1024**3
+MAX_ARRAY_BYTES = 2 * 1024**3
 # Maximum inflated size of a model file's arrays [bytes]: the shipped file, of five models, has 0.04 GB.
-LARGEST_MODEL = 2 * 1024**3
+MAX_MODEL_BYTES = 2 * 1024**3
 # Maximum inflated size of a video's ground truth [bytes]: an hour at 25 images/s of 500 tumour vertices has 0.5 GB.
-LARGEST_FILM = 2**29
+MAX_TRUTH_BYTES = 2**29
 # Maximum size of a model file's text header [bytes]: the shipped one has 0.02 MB.
-LARGEST_HEADER = 16 * 1024**2
-FARTHEST = 10.0  # Largest coordinate in or near a head [m].
-MOST_VOXELS = 2**29  # Maximum number of voxels of a volume: that of a head of 200 mm at 0.25 mm.
+MAX_HEADER_BYTES = 16 * 1024**2
+MAX_COORDINATE = 10.0  # Largest coordinate in or near a head [m].
+MAX_VOXELS = 2**29  # Maximum number of voxels of a volume: that of a head of 200 mm at 0.25 mm.
 
 
 @dataclass(frozen=True)

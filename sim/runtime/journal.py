@@ -22,15 +22,15 @@ from typing import Any, BinaryIO, TypeVar
 from ..errors import InputError
 from .atomic_files import explain_error, write_atomically
 
-MARK = b"sulcus\r\n"  # First bytes of every record.
+RECORD_MARK = b"sulcus\r\n"  # First bytes of every record.
 # Header of a record: mark, group, first row, length of the payload that follows, digest of all but the mark.
-HEAD = struct.Struct("<8s8sQQ16s")
+RECORD_HEADER = struct.Struct("<8s8sQQ16s")
 # Group of the first record, which describes the run; its digest has no key, so that another run can read it.
-RUN = "run"
+RUN_GROUP = "run"
 Batch = tuple[str, int]  # Group and first row.
 Held = bytes | mmap.mmap  # Contents of a journal.
 R = TypeVar("R")
-LONGEST = 1 << 16
+MAX_DESCRIPTION_BYTES = 1 << 16
 """Maximum number of bytes that are read for a description."""
 
 
@@ -67,7 +67,7 @@ class Journal:
                 f"{self._path}: cannot be extended ({explain_error(error)}). Free space there, then run the "
                 "same command again to resume."
             ) from error
-        self._places[batch] = start, HEAD.size + len(payload)
+        self._places[batch] = start, RECORD_HEADER.size + len(payload)
 
     def read(self, batch: Batch) -> bytes:
         """Return the payload of a record.
@@ -80,12 +80,12 @@ class Journal:
         start, size = self._places[batch]
         self._file.seek(start)
         record = self._file.read(size)
-        if _proved(record, 0, self._key) != batch:
+        if _verify_record(record, 0, self._key) != batch:
             raise InputError(
                 f"{self._path}: rows from {batch[1]} on of `{batch[0]}` are corrupted: run the same command again to "
                 "recompute them."
             )
-        return record[HEAD.size :]
+        return record[RECORD_HEADER.size :]
 
     def append(self, row: Any) -> None:
         """Append a dataclass of plain numbers and texts as the next row; InputError as `add`."""
@@ -111,7 +111,7 @@ def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
     DamageWarning
         Damaged records, which are left out.
     """
-    opening = _record((RUN, 0), json.dumps(dict(stated)).encode(), b"")
+    opening = _record((RUN_GROUP, 0), json.dumps(dict(stated)).encode(), b"")
     key = hashlib.sha256(opening).digest()
     if not path.exists():
         with write_atomically(path, path.suffix) as draft:
@@ -122,24 +122,24 @@ def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
         raise InputError(f"{path}: cannot be opened ({explain_error(error)}). Delete it.") from error
     with file:
         _lock(path, file)
-        yield Journal(path, file, key, _taken_up(path, file, opening, key, stated))
+        yield Journal(path, file, key, _restore_records(path, file, opening, key, stated))
 
 
 def run_of(path: Path) -> dict[str, str]:
     """Return the description of the run that a journal belongs to; empty if it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
-        head = file.read(LONGEST)
-        if _proved(head, 0, b"") == (RUN, 0):
-            return json.loads(_payload(head))
+        head = file.read(MAX_DESCRIPTION_BYTES)
+        if _verify_record(head, 0, b"") == (RUN_GROUP, 0):
+            return json.loads(_get_payload(head))
     return {}
 
 
-def _payload(held: Held) -> bytes:
+def _get_payload(held: Held) -> bytes:
     """Return the payload of the first record, which must be valid."""
-    return held[HEAD.size : HEAD.size + HEAD.unpack(held[: HEAD.size])[3]]
+    return held[RECORD_HEADER.size : RECORD_HEADER.size + RECORD_HEADER.unpack(held[: RECORD_HEADER.size])[3]]
 
 
-def _taken_up(
+def _restore_records(
     path: Path, file: BinaryIO, opening: bytes, key: bytes, stated: Mapping[str, str]
 ) -> dict[Batch, tuple[int, int]]:
     """Return start and size of the valid records, and truncate the file after the last."""
@@ -148,9 +148,9 @@ def _taken_up(
         raise InputError(foreign)
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as held:
         whole = held[: len(opening)] == opening
-        if not whole and _proved(held, 0, b"") == (RUN, 0):
-            check_same_description(path, json.loads(_payload(held)), stated)
-        places, damaged = _records(held, len(opening), key)
+        if not whole and _verify_record(held, 0, b"") == (RUN_GROUP, 0):
+            check_same_description(path, json.loads(_get_payload(held)), stated)
+        places, damaged = _find_records(held, len(opening), key)
     if not whole and not places:
         raise InputError(foreign)
     end = max((start + size for start, size in places.values()), default=len(opening))
@@ -187,53 +187,53 @@ def check_same_description(
             )
 
 
-def _records(held: Held, start: int, key: bytes) -> tuple[dict[Batch, tuple[int, int]], list[tuple[int, str]]]:
+def _find_records(held: Held, start: int, key: bytes) -> tuple[dict[Batch, tuple[int, int]], list[tuple[int, str]]]:
     """Return start and size of the valid records from `start` on; start and name of the invalid ones."""
     places: dict[Batch, tuple[int, int]] = {}
     damaged: list[tuple[int, str]] = []
     while start < len(held):
-        batch = _proved(held, start, key)
+        batch = _verify_record(held, start, key)
         if batch is None:
             damaged.append((start, _name(held, start)))
-            following = held.find(MARK, start + 1)
+            following = held.find(RECORD_MARK, start + 1)
             start = len(held) if following < 0 else following
         else:
-            size = HEAD.size + HEAD.unpack(held[start : start + HEAD.size])[3]
+            size = RECORD_HEADER.size + RECORD_HEADER.unpack(held[start : start + RECORD_HEADER.size])[3]
             places[batch] = start, size
             start += size
     return places, damaged
 
 
 def _record(batch: Batch, payload: bytes, key: bytes) -> bytes:
-    head = HEAD.pack(MARK, batch[0].encode(), batch[1], len(payload), b"")[len(MARK) : -16]
-    return MARK + head + _digest(head, payload, key) + payload
+    head = RECORD_HEADER.pack(RECORD_MARK, batch[0].encode(), batch[1], len(payload), b"")[len(RECORD_MARK) : -16]
+    return RECORD_MARK + head + _compute_digest(head, payload, key) + payload
 
 
-def _proved(held: Held, start: int, key: bytes) -> Batch | None:
+def _verify_record(held: Held, start: int, key: bytes) -> Batch | None:
     """Return the batch of the record at `start`, or None if there is no valid record with this key."""
-    head = held[start : start + HEAD.size]
-    if len(head) < HEAD.size:
+    head = held[start : start + RECORD_HEADER.size]
+    if len(head) < RECORD_HEADER.size:
         return None
-    mark, group, first, length, digest = HEAD.unpack(head)
-    end = start + HEAD.size + length
-    if mark != MARK or end > len(held):
+    mark, group, first, length, digest = RECORD_HEADER.unpack(head)
+    end = start + RECORD_HEADER.size + length
+    if mark != RECORD_MARK or end > len(held):
         return None
-    if _digest(head[len(MARK) : -16], held[start + HEAD.size : end], key) != digest:
+    if _compute_digest(head[len(RECORD_MARK) : -16], held[start + RECORD_HEADER.size : end], key) != digest:
         return None
     return group.rstrip(b"\0").decode(), first
 
 
 def _name(held: Held, start: int) -> str:
     """Return the name of a damaged record, if it can be read."""
-    head = held[start : start + HEAD.size]
-    if len(head) == HEAD.size and head.startswith(MARK):
-        _, group, first, _, _ = HEAD.unpack(head)
+    head = held[start : start + RECORD_HEADER.size]
+    if len(head) == RECORD_HEADER.size and head.startswith(RECORD_MARK):
+        _, group, first, _, _ = RECORD_HEADER.unpack(head)
         if group.rstrip(b"\0").isalpha():
             return f"rows from {first} on of `{group.rstrip(bytes(1)).decode()}`"
     return "rows with an unreadable number"
 
 
-def _digest(head: bytes, payload: bytes, key: bytes) -> bytes:
+def _compute_digest(head: bytes, payload: bytes, key: bytes) -> bytes:
     state = hashlib.sha256(key + head)  # fast, by instructions of the processor
     state.update(payload)
     return state.digest()[:16]

@@ -13,9 +13,9 @@ from tempfile import TemporaryFile, gettempdir, mkdtemp
 
 from ..errors import InputError
 
-VARIABLE = "WARP_CACHE_PATH"  # Environment variable with Warp's folder.
-NAME = "sulcus-kernels"  # Prefix of the temporary folder.
-REMEDY = f"Set {VARIABLE} to a folder that can be written."  # Ends the messages below.
+CACHE_VARIABLE = "WARP_CACHE_PATH"  # Environment variable with Warp's folder.
+FOLDER_PREFIX = "sulcus-kernels"  # Prefix of the temporary folder.
+REMEDY = f"Set {CACHE_VARIABLE} to a folder that can be written."  # Ends the messages below.
 
 
 def ensure_writable_cache() -> None:
@@ -28,21 +28,21 @@ def ensure_writable_cache() -> None:
     InputError
         No temporary folder can be written either.
     """
-    usual = _usual_folder()
+    usual = _get_default_folder()
     if _is_writable(usual):
         return
     try:
-        folder = _private_folder()
+        folder = _create_private_folder()
     except OSError as error:
         raise InputError(f"{usual}: kernels cannot be compiled there, nor in a temporary folder. {REMEDY}") from error
-    os.environ[VARIABLE] = str(folder)
+    os.environ[CACHE_VARIABLE] = str(folder)
     warnings.warn(f"{usual} cannot be written: kernels are compiled into {folder}. {REMEDY}", stacklevel=1)
 
 
-def _usual_folder() -> Path:
+def _get_default_folder() -> Path:
     """Return Warp's default folder."""
     number = version("warp-lang")
-    if chosen := os.environ.get(VARIABLE):
+    if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen).absolute() / number
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", "~")).expanduser() / "NVIDIA" / "warp" / "Cache" / number
@@ -64,7 +64,7 @@ def _is_writable(folder: Path) -> bool:
     return True
 
 
-def _private_folder() -> Path:
+def _create_private_folder() -> Path:
     """Create a folder that only this user can access: the same in later runs, unless another user took its name.
 
     Raises
@@ -73,11 +73,11 @@ def _private_folder() -> Path:
         No folder can be created.
     """
     own = os.getuid() if hasattr(os, "getuid") else 0
-    folder = Path(gettempdir()) / f"{NAME}-{own}"
+    folder = Path(gettempdir()) / f"{FOLDER_PREFIX}-{own}"
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     found = folder.lstat()
     private = sys.platform == "win32" or (found.st_uid == own and stat.S_IMODE(found.st_mode) == 0o700)
     if stat.S_ISDIR(found.st_mode) and private and _is_writable(folder):
         return folder
-    return Path(mkdtemp(prefix=f"{NAME}-"))
+    return Path(mkdtemp(prefix=f"{FOLDER_PREFIX}-"))

@@ -15,8 +15,8 @@ from .device import Device
 # Solver arrays at the peak [columns of 3N]: L-BFGS pairs, columns being moved, vectors of the elimination around it.
 # Arrays counted on the CPU, 2026-11-24: at most 46 with multigrid (19,508 and 26,452 nodes, smoothed).
 WORK_COLUMNS = 60
-ANSWER_COPIES = 3  # Copies of the result on the host while batches are joined, in double precision.
-COARSER = "take a coarser mesh, or a larger machine."  # Remedy if not even one load fits.
+RESULT_COPIES = 3  # Copies of the result on the host while batches are joined, in double precision.
+MESH_REMEDY = "take a coarser mesh, or a larger machine."  # Remedy if not even one load fits.
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ def measure_free_bytes(device: Device, budget: MemoryBudget = MemoryBudget()) ->
 def measure_host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
     """Measure free memory of the host and its control group [bytes]; unlimited if neither reports it."""
     found = [2**62]
-    for line in _lines(Path("/proc/meminfo")):
+    for line in _read_lines(Path("/proc/meminfo")):
         if line.startswith("MemAvailable:"):
             found.append(1024 * int(line.split()[1]))
-    most, used, parts = (_lines(budget.group / name) for name in ("memory.max", "memory.current", "memory.stat"))
+    most, used, parts = (_read_lines(budget.group / name) for name in ("memory.max", "memory.current", "memory.stat"))
     if most and used and most[0].strip().isdigit():
         # Cached files count as used, but are released on demand.
         cached = sum(int(line.split()[1]) for line in parts if line.startswith("inactive_file "))
@@ -84,14 +84,14 @@ def check_fits(
     """
     column = estimate_column_bytes(rows, device)
     free = measure_host_bytes(budget)  # read once: Linux takes almost a millisecond to count
-    each, host = ANSWER_COPIES * 8 * rows, budget.share * free
+    each, host = RESULT_COPIES * 8 * rows, budget.share * free
     answers, alone = each * count, 0 if device.on_cuda else column
     if answers + alone > host:
         fitting = int((host - alone) / each)
         raise InputError(
             f"the results of {count} loads take about {format_gigabytes(answers)}, "
             f"and {format_gigabytes(host)} are free: "
-            + (f"solve at most {fitting} at a time." if fitting > 0 else COARSER)
+            + (f"solve at most {fitting} at a time." if fitting > 0 else MESH_REMEDY)
         ) from MemoryError()
     available = measure_free_bytes(device) if device.on_cuda else free
     room = budget.share * available + held - (0 if device.on_cuda else answers)
@@ -99,7 +99,7 @@ def check_fits(
     taken = column * find_workspace_width(device, columns)
     if taken > room:
         fitting = find_widest_workspace(device, int(room / column))
-        remedy = f"a --batch of {fitting} fits." if fitting > 0 else COARSER
+        remedy = f"a --batch of {fitting} fits." if fitting > 0 else MESH_REMEDY
         raise InputError(
             f"a batch of {columns} loads takes about {format_gigabytes(taken)}, and {format_gigabytes(max(room, 0.0))} "
             f"are free: {remedy}"
@@ -116,7 +116,7 @@ def format_gigabytes(amount: float) -> str:
     return f"{amount / 2**30:.3g} GiB"
 
 
-def _lines(path: Path) -> list[str]:
+def _read_lines(path: Path) -> list[str]:
     try:
         return path.read_text().splitlines()
     except OSError:

@@ -12,10 +12,10 @@ import numpy as np
 
 from ..errors import InputError
 
-LOCKED = "Close it there, then give the same command again."
+LOCK_REMEDY = "Close it there, then give the same command again."
 """Remedy for a file that another program has open."""
 
-CUT_OFF = re.compile(r"truncated file: eof = (\d+),.* stored_eof = (\d+)")
+TRUNCATION_PATTERN = re.compile(r"truncated file: eof = (\d+),.* stored_eof = (\d+)")
 """Pattern of HDF5's message on a truncated file: its size, and the size it should have [bytes]."""
 
 
@@ -56,12 +56,12 @@ def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
             raise
         raise InputError(f"{path}: {error}") from error
     except BlockingIOError as error:
-        raise InputError(f"{path}: is locked: another program has it open for writing. {LOCKED}") from error
+        raise InputError(f"{path}: is locked: another program has it open for writing. {LOCK_REMEDY}") from error
     except (Exception, SystemExit) as error:  # a damaged file may cause any exception
-        raise InputError(f"{path}: cannot be read as {kind}: {_reason(error)}. {remedy}") from error
+        raise InputError(f"{path}: cannot be read as {kind}: {_describe_reason(error)}. {remedy}") from error
 
 
-def _reason(error: BaseException) -> str:
+def _describe_reason(error: BaseException) -> str:
     """Return the reason in plain words, not those of a library."""
     match error:
         case MemoryError():
@@ -74,6 +74,6 @@ def _reason(error: BaseException) -> str:
             return "it is no text in UTF-8"
         case EOFError():
             return "it ends too early"
-        case OSError() if found := CUT_OFF.search(str(error)):
+        case OSError() if found := TRUNCATION_PATTERN.search(str(error)):
             return f"it is cut off: {found[1]} of {found[2]} bytes"
     return "it is damaged, or of another kind"

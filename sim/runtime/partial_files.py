@@ -12,14 +12,14 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-STALE = 24 * 3600.0
+STALE_SECONDS = 24 * 3600.0
 """Age [s] after which another machine's unfinished file is a left-over: active runs write every few minutes."""
 
 
 def remove_left_overs(
     folder: Path,
     name: str | None = None,
-    stale: float = STALE,
+    stale: float = STALE_SECONDS,
     kept: Callable[[str], bool] = lambda wanted: False,
 ) -> None:
     """Remove unfinished files of dead processes of this machine in a folder, and old ones of other machines.
@@ -33,13 +33,17 @@ def remove_left_overs(
     kept
         Function that returns True if the unfinished file for a name stays, because a run may resume from it.
     """
-    form = _partial_form(name)
+    form = _build_name_pattern(name)
     try:
         for left in list(folder.iterdir()):
             found = form.fullmatch(left.name)
             if found is None or kept(found[3]):
                 continue
-            dead = not _alive(int(found[2])) if found[1] == _host() else time.time() - left.stat().st_mtime > stale
+            dead = (
+                not _is_process_alive(int(found[2]))
+                if found[1] == _compute_host_id()
+                else time.time() - left.stat().st_mtime > stale
+            )
             if dead and left.is_dir():
                 shutil.rmtree(left, ignore_errors=True)
             elif dead:
@@ -48,7 +52,7 @@ def remove_left_overs(
         return
 
 
-def _host() -> str:
+def _compute_host_id() -> str:
     """Return an identifier of 8 characters for the machine: process numbers are valid on one machine only."""
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
@@ -60,21 +64,21 @@ def to_unfinished_path(path: Path) -> Path:
 
 def to_partial_path(path: Path) -> Path:
     """Return the hidden name under which this process writes `path`, a file or a folder; see `remove_left_overs`."""
-    return path.with_name(f".sulcus-{_host()}-{os.getpid()}-{path.name}")
+    return path.with_name(f".sulcus-{_compute_host_id()}-{os.getpid()}-{path.name}")
 
 
 def list_partials(path: Path) -> list[Path]:
     """List the hidden names under which any process of any machine writes `path`, or has left it unfinished."""
-    form = _partial_form(path.name)
+    form = _build_name_pattern(path.name)
     return sorted(left for left in path.parent.glob(f".sulcus-*-{glob.escape(path.name)}") if form.fullmatch(left.name))
 
 
-def _partial_form(name: str | None) -> re.Pattern[str]:
+def _build_name_pattern(name: str | None) -> re.Pattern[str]:
     """Build the pattern of hidden names: machine, process, and final name; None: any name."""
     return re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-({'.+' if name is None else re.escape(name)})")
 
 
-def _alive(process: int) -> bool:
+def _is_process_alive(process: int) -> bool:
     """Return True if a process with this number runs, or if that cannot be determined."""
     if os.name != "posix" or process == os.getpid():
         return True

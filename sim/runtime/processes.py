@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 from ..errors import InputError
 
 Task = TypeVar("Task")
-PATIENCE = 5.0  # Maximum time for a process to end after it has closed its pipe [s].
-VISIBLE = "CUDA_VISIBLE_DEVICES"
+EXIT_TIMEOUT = 5.0  # Maximum time for a process to end after it has closed its pipe [s].
+VISIBLE_VARIABLE = "CUDA_VISIBLE_DEVICES"
 """Environment variable with the GPUs that a process can use."""
 
 
@@ -44,7 +44,7 @@ def start_process(
     The `variables` are in its environment before it imports anything.
     """
     process = get_context("spawn").Process(target=_run, args=(target, given), name=name, daemon=True)
-    with _environment(variables or {}), _interrupts_ignored():
+    with _set_environment(variables or {}), _ignore_interrupts():
         process.start()
     return process
 
@@ -63,7 +63,7 @@ def process_pool(devices: Sequence[str], make: Callable[..., Any], *given: Any) 
         A process that was killed.
     """
     with ExitStack() as closing:
-        children = [_started(device, make, given, closing) for device in devices]
+        children = [_start_child(device, make, given, closing) for device in devices]
         for child in children:
             _receive(child)
         yield tuple(children)
@@ -77,7 +77,7 @@ def map_apart(function: Callable[[Task], Any], tasks: Sequence[Task], count: int
     InputError, LostError
         See `map_unordered`.
     """
-    with process_pool(["cpu"] * min(count, len(tasks)), _second, function) as children:
+    with process_pool(["cpu"] * min(count, len(tasks)), _return_given, function) as children:
         yield from map_unordered(children, _call, tasks)
 
 
@@ -156,9 +156,9 @@ def _receive(child: Child) -> Any:
     try:
         answer = child.pipe.recv()
     except (EOFError, ConnectionResetError):
-        child.process.join(PATIENCE)
+        child.process.join(EXIT_TIMEOUT)
         raise LostError(
-            f"the process on {child.device} was ended{_why(child.process.exitcode)}. If that happens again, give "
+            f"the process on {child.device} was ended{_note_exit(child.process.exitcode)}. If that happens again, give "
             f"--device one {child.device} less."
         ) from None
     if not isinstance(answer, Exception):
@@ -176,11 +176,11 @@ def to_gpu_variables(device: str) -> dict[str, str]:
     kind, _, number = device.partition(":")
     if kind != "cuda":
         return {}
-    cards = os.environ.get(VISIBLE, "")
-    return {VISIBLE: cards.split(",")[int(number or 0)] if cards else number or "0"}
+    cards = os.environ.get(VISIBLE_VARIABLE, "")
+    return {VISIBLE_VARIABLE: cards.split(",")[int(number or 0)] if cards else number or "0"}
 
 
-def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], closing: ExitStack) -> Child:
+def _start_child(device: str, make: Callable[..., Any], given: tuple[Any, ...], closing: ExitStack) -> Child:
     ours, theirs = Pipe()
     variables = to_gpu_variables(device)
     own = "cuda:0" if variables else device
@@ -192,7 +192,7 @@ def _started(device: str, make: Callable[..., Any], given: tuple[Any, ...], clos
 
 
 @contextmanager
-def _environment(more: Mapping[str, str]) -> Iterator[None]:
+def _set_environment(more: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables during the block."""
     before = {name: os.environ.get(name) for name in more}
     os.environ.update(more)
@@ -207,7 +207,7 @@ def _environment(more: Mapping[str, str]) -> Iterator[None]:
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
+def _ignore_interrupts() -> Iterator[None]:
     """Ignore Ctrl-C during the block: a process started in it inherits this."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -228,14 +228,14 @@ def _end(child: Child) -> None:
 def _serve(pipe: Any, device: str, make: Callable[..., Any], given: tuple[Any, ...]) -> None:
     """Call `make`, then run tasks until the pipe closes; exceptions are sent as results."""
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        made = _tried(make, device, *given)
+        made = _try_call(make, device, *given)
         pipe.send(made if isinstance(made, Exception) else None)
         while True:
             work, task = pipe.recv()
-            pipe.send(_tried(work, made, task))
+            pipe.send(_try_call(work, made, task))
 
 
-def _second(device: str, given: Any) -> Any:
+def _return_given(device: str, given: Any) -> Any:
     return given
 
 
@@ -243,7 +243,7 @@ def _call(function: Callable[[Task], Any], task: Task) -> Any:
     return function(task)
 
 
-def _tried(function: Callable[..., Any], *given: Any) -> Any:
+def _try_call(function: Callable[..., Any], *given: Any) -> Any:
     """Return the result of a function, or the exception that it raises, with its traceback as a note."""
     try:
         return function(*given)
@@ -265,7 +265,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _why(code: int | None) -> str:
+def _note_exit(code: int | None) -> str:
     """Return how a process ended, in brackets."""
     if code is None or code == 0:
         return ""

@@ -17,7 +17,7 @@ _lock, _inside = Lock(), []
 
 
 @cache
-def _loaded() -> ThreadpoolController:
+def _get_controller() -> ThreadpoolController:
     """Return the controller of the loaded libraries, cached: finding them takes 1 ms, limiting them 0.01 ms."""
     return ThreadpoolController()
 
@@ -30,7 +30,7 @@ def limit_to_one_thread() -> Iterator[None]:
     whatever other threads do.
     """
     with _lock:
-        _inside.append(_inside[0] if _inside else _loaded().limit(limits=1, user_api="blas"))
+        _inside.append(_inside[0] if _inside else _get_controller().limit(limits=1, user_api="blas"))
     try:
         yield
     finally:
@@ -74,7 +74,7 @@ def run_together(tasks: Sequence[Task]) -> None:
     """
     ended: SimpleQueue[BaseException | None] = SimpleQueue()
     for number, task in enumerate(tasks[1:]):
-        _waiting(number).put((task, ended))
+        _get_queue(number).put((task, ended))
     try:
         tasks[0]()
     finally:
@@ -84,7 +84,7 @@ def run_together(tasks: Sequence[Task]) -> None:
 
 
 @cache
-def _waiting(number: int) -> SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]:
+def _get_queue(number: int) -> SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]:
     """Return the queue of the thread with this number."""
     queue: SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]] = SimpleQueue()
     Thread(target=_serve, args=(queue,), name=f"sulcus {number}", daemon=True).start()
@@ -93,7 +93,7 @@ def _waiting(number: int) -> SimpleQueue[tuple[Task, SimpleQueue[BaseException |
 
 # A forked process inherits the queues without their threads.
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_waiting.cache_clear)
+    os.register_at_fork(after_in_child=_get_queue.cache_clear)
 
 
 def _serve(queue: SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]) -> None:

@@ -22,13 +22,13 @@ from ..minimisers.lbfgs_state import LbfgsState, Workspace, allocate_memory, all
 from ..runtime.columns import get_warp_width, summed
 from ..runtime.device import Device, forward_kernel
 
-FRAME_EVALUATIONS = 60  # Maximum residual evaluations of a frame: a tool that moves smoothly needs fewer.
+MAX_FRAME_EVALUATIONS = 60  # Maximum residual evaluations of a frame: a tool that moves smoothly needs fewer.
 # Steps within which a frame must converge for its model of strained tissue to be kept: a new one costs twenty steps.
-SERVED = 12
-GIVEN = 8  # Length of the input: point (3) and radius [m], force (3) [N], extrapolation factor.
+MAX_SERVED_STEPS = 12
+INPUT_SIZE = 8  # Length of the input: point (3) and radius [m], force (3) [N], extrapolation factor.
 # Slots of the output before the displacements; from SUMS on, the four sums of the footprint.
 STATUS, STEPS, RESIDUAL, INVERTED, SUMS = 0, 1, 2, 3, 4
-HEAD = 8  # Number of these slots.
+HEADER_SIZE = 8  # Number of these slots.
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class FrameKernels:
 @cache
 def build_kernels(device: Device) -> FrameKernels:
     """Build the kernels for a device's scalar type, for one load case."""
-    scalar, most, m, head, lanes = device.scalar, FRAME_EVALUATIONS, PAIRS, HEAD, get_warp_width(device)
+    scalar, most, m, head, lanes = device.scalar, MAX_FRAME_EVALUATIONS, PAIRS, HEADER_SIZE, get_warp_width(device)
 
     @forward_kernel(module="unique")
     def pull(
@@ -196,8 +196,8 @@ class CapturedFrame:
         self._past = problem.device.allocate(problem.rows, 1)
         name = problem.device.name
         self._tried, self._going, self._inverted = (wp.zeros(1, dtype=wp.int32, device=name) for _ in range(3))
-        self._given, self._up = self._both_sides(GIVEN)
-        self._out, self._down = self._both_sides(HEAD + problem.rows)
+        self._given, self._up = self._allocate_pair(INPUT_SIZE)
+        self._out, self._down = self._allocate_pair(HEADER_SIZE + problem.rows)
         self._imprint = skin.build_footprints(wp.array(ptr=self._given.ptr, dtype=wp.vec4d, shape=(1,), device=name))
         self._graph: wp.Graph | None = None
 
@@ -221,7 +221,7 @@ class CapturedFrame:
     ) -> None:
         """Load another state: displacements u (3N, 1) [m], the ones before them, and the L-BFGS history, if any."""
         columns = self._workspace.columns
-        self._know(bent)
+        self._load_updated_model(bent)
         columns["u"].assign(u)
         self._past.assign(u if past is None else past)
         for name in ("s", "w", "known"):
@@ -232,11 +232,11 @@ class CapturedFrame:
 
     def update_model(self, steps: float) -> None:
         """Recompute the model of strained tissue at the solution, if this took more than `SERVED` steps."""
-        if self.part is not None and steps > SERVED:
-            self._know(update_model_at(self.part, self._device, self._workspace.columns["u"]))
+        if self.part is not None and steps > MAX_SERVED_STEPS:
+            self._load_updated_model(update_model_at(self.part, self._device, self._workspace.columns["u"]))
             self._workspace.columns["known"].zero_()  # curvature pairs are valid for their own model only
 
-    def _know(self, bent: UpdatedModel | None) -> None:
+    def _load_updated_model(self, bent: UpdatedModel | None) -> None:
         if self._knowing is not None:
             self.bent = bent
             self._knowing.load(bent)
@@ -252,17 +252,17 @@ class CapturedFrame:
         if self._graph is not None:
             wp.capture_launch(self._graph)
         else:
-            self._once()
+            self._launch_frame()
         if device.on_cuda:
             wp.synchronize_stream(wp.get_stream(device.name))
             # Modules that a capture cannot load are loaded once a step has been taken.
             if self._graph is None and self._down.numpy()[STEPS] > 0:
                 with wp.ScopedCapture(device.name, force_module_load=False) as capture:
-                    self._once()
+                    self._launch_frame()
                 self._graph = capture.graph
         return self._down.numpy()
 
-    def _once(self) -> None:
+    def _launch_frame(self) -> None:
         a, k, device, imprint = self._workspace.columns, build_kernels(self._device), self._device, self._imprint
         wp.copy(self._given, self._up)
         for kind, array in self._before.moved.items():
@@ -287,7 +287,7 @@ class CapturedFrame:
         inputs = [self._workspace.columns["status"]]
         self._device.launch(build_kernels(self._device).look, (1,), inputs, [self._tried, self._going])
 
-    def _both_sides(self, count: int) -> tuple[wp.array, wp.array]:
+    def _allocate_pair(self, count: int) -> tuple[wp.array, wp.array]:
         """Allocate `count` values on the device, and as many in pinned host memory for direct transfer."""
         there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
         return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

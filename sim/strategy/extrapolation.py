@@ -16,9 +16,9 @@ from ..arguments import is_all_finite
 from ..loads import Loads, Pushed
 
 # Warm-start keys: loads of the solution and of the one before (B, 2, 7); displacements (B, 3N) [m] of the latter.
-PUSHES, BEFORE = "pushes", "before"
-BACK = -1.0  # Lower bound of a: back to the solution before.
-ON = 2.0  # Upper bound of a: twice the last step.
+PUSHES_KEY, BEFORE_KEY = "pushes", "before"
+MIN_FACTOR = -1.0  # Lower bound of a: back to the solution before.
+MAX_FACTOR = 2.0  # Upper bound of a: twice the last step.
 
 
 def as_pushes(loads: Loads) -> np.ndarray | None:
@@ -43,15 +43,15 @@ def compute_shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.
     square = (way * way).sum(axis=1)
     known = size.all(axis=0) & (square > 0.0)
     share = (further * way).sum(axis=1) / np.where(known, square, 1.0)
-    return np.where(known, share.clip(BACK, ON), 0.0)
+    return np.where(known, share.clip(MIN_FACTOR, MAX_FACTOR), 0.0)
 
 
 def has_warm_state(warm: Mapping[str, Any], last: np.ndarray) -> bool:
     """Return True if the warm-start data hold the state before the solutions (3N, B), with finite values."""
-    if BEFORE not in warm or PUSHES not in warm:
+    if BEFORE_KEY not in warm or PUSHES_KEY not in warm:
         return False
-    fits = warm[BEFORE].shape == last.T.shape and warm[PUSHES].shape == (last.shape[1], 2, 7)
-    return fits and is_all_finite(warm[BEFORE]) and is_all_finite(warm[PUSHES])
+    fits = warm[BEFORE_KEY].shape == last.T.shape and warm[PUSHES_KEY].shape == (last.shape[1], 2, 7)
+    return fits and is_all_finite(warm[BEFORE_KEY]) and is_all_finite(warm[PUSHES_KEY])
 
 
 def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
@@ -59,8 +59,8 @@ def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -
     now = as_pushes(loads)
     if now is None or not has_warm_state(warm, last):
         return last
-    came, before = warm[PUSHES][:, 0], warm[PUSHES][:, 1]
-    return last + compute_shares(now, came, before) * (last - warm[BEFORE].T)
+    came, before = warm[PUSHES_KEY][:, 0], warm[PUSHES_KEY][:, 1]
+    return last + compute_shares(now, came, before) * (last - warm[BEFORE_KEY].T)
 
 
 def compute_directions(
@@ -69,6 +69,6 @@ def compute_directions(
     """Collect the warm-start entries of solutions to pushes (B, 7); they started from the solutions `last` (3N, B)."""
     if now is None:
         return {}
-    if last is None or PUSHES not in warm or warm[PUSHES].shape != (len(now), 2, 7):
-        return {PUSHES: np.stack([now, now], axis=1)}
-    return {PUSHES: np.stack([now, warm[PUSHES][:, 0]], axis=1), BEFORE: last.T}
+    if last is None or PUSHES_KEY not in warm or warm[PUSHES_KEY].shape != (len(now), 2, 7):
+        return {PUSHES_KEY: np.stack([now, now], axis=1)}
+    return {PUSHES_KEY: np.stack([now, warm[PUSHES_KEY][:, 0]], axis=1), BEFORE_KEY: last.T}

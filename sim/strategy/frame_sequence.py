@@ -24,15 +24,15 @@ from ..discretisation.term import Cases
 from ..loads import Loads
 from ..local_solvers.strained_descent import build_strained_part
 from ..local_solvers.strained_frame import UpdatedModel, restore_updated_model
-from ..minimisers.lbfgs import LEARNT, restore_history, to_rows_first
+from ..minimisers.lbfgs import HISTORY_KEYS, restore_history, to_rows_first
 from ..minimisers.lbfgs_kernels import DONE
 from ..minimisers.lbfgs_state import LbfgsState
-from .captured_frame import HEAD, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, CapturedFrame
-from .extrapolation import BEFORE, PUSHES, as_pushes, compute_directions, compute_shares, has_warm_state
+from .captured_frame import HEADER_SIZE, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, CapturedFrame
+from .extrapolation import BEFORE_KEY, PUSHES_KEY, as_pushes, compute_directions, compute_shares, has_warm_state
 from .strategy import Strategy
 
 # Cyclic permutations, left and right, for a cross product in a fifth of the time of NumPy's.
-TURNED, BACK = np.array([1, 2, 0]), np.array([2, 0, 1])
+YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class Kept(Mapping[str, Any]):
@@ -52,7 +52,7 @@ class Kept(Mapping[str, Any]):
         """Copy to the host what is still on the device."""
         with self._lock:
             if self.state is not None:
-                self._own |= {name: to_rows_first(self.state.columns[name]) for name in LEARNT}
+                self._own |= {name: to_rows_first(self.state.columns[name]) for name in HISTORY_KEYS}
                 self._own |= {} if self.bent is None else self.bent.learnt
                 self.state = None
 
@@ -100,10 +100,10 @@ class FrameSequence:
         self._problem, self._inversion, self._frame, self._lock = problem, inversion, frame, lock
         self._source = source
         self._nodes = np.arange(problem.rows // 3)
-        self._last: Callable[[], Deformation | None] = _gone
+        self._last: Callable[[], Deformation | None] = _return_none
         # Warm-start data whose history is in the frame's present state, and in the state that it started from.
-        self._here: Callable[[], Kept | None] = _gone
-        self._there: Callable[[], Kept | None] = _gone
+        self._here: Callable[[], Kept | None] = _return_none
+        self._there: Callable[[], Kept | None] = _return_none
 
     def solve_frame(self, loads: Loads, start: Deformation, guess: Callable[[], np.ndarray]) -> Deformation | None:
         """Solve for a push from a start.
@@ -126,19 +126,19 @@ class FrameSequence:
         self._make_way()
         way = compute_directions(now, last, start.warm)
         share = (
-            compute_shares(now, way[PUSHES][:, 1], start.warm[PUSHES][:, 1])[0]
+            compute_shares(now, way[PUSHES_KEY][:, 1], start.warm[PUSHES_KEY][:, 1])[0]
             if has_warm_state(start.warm, last)
             else 0.0
         )
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
-        self._last = self._here = _gone
+        self._last = self._here = _return_none
         found = self._frame.push(point, radius, force, share)
         if found[STATUS] != DONE or self._inversion.find_doubtful(found[INVERTED]):
             return None
         self._frame.update_model(found[STEPS])
         warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
-        displacement = found[HEAD:].reshape(1, -1, 3).copy()
+        displacement = found[HEADER_SIZE:].reshape(1, -1, 3).copy()
         displacement.setflags(write=False)  # a later start uses the copy on the device
         inverted, fields = found[INVERTED : INVERTED + 1].astype(int), self._diagnostics.compute_strains(self._frame.u)
         outcome = self._diagnostics.mark_outcomes(np.array([Outcome.CONVERGED]), inverted, fields["strained"])
@@ -149,7 +149,7 @@ class FrameSequence:
             iterations=found[STEPS : STEPS + 1].astype(int),
             residual=found[RESIDUAL : RESIDUAL + 1].copy(),
             time=loads.times,
-            reaction=np.concatenate([force, arm[TURNED] * force[BACK] - arm[BACK] * force[TURNED]]).reshape(1, 1, 6),
+            reaction=np.concatenate([force, arm[YZX] * force[ZXY] - arm[ZXY] * force[YZX]]).reshape(1, 1, 6),
             warm=warm,
             cost=Cost({"equilibrium": time.perf_counter() - clock}),
             reached=np.ones(1),
@@ -171,12 +171,12 @@ class FrameSequence:
         here = self._here()
         if here is not None:
             here.copy_to_host()
-        self._last = self._here = _gone
-        past = start.warm[BEFORE].T if has_warm_state(start.warm, last) else None
-        self._frame.take(last, past, restore_history(cases, len(last)), self._bent(start.warm))
+        self._last = self._here = _return_none
+        past = start.warm[BEFORE_KEY].T if has_warm_state(start.warm, last) else None
+        self._frame.take(last, past, restore_history(cases, len(last)), self._get_updated_model(start.warm))
         return True
 
-    def _bent(self, warm: Mapping[str, Any]) -> UpdatedModel | None:
+    def _get_updated_model(self, warm: Mapping[str, Any]) -> UpdatedModel | None:
         if isinstance(warm, Kept):
             return warm.bent
         part = self._frame.part
@@ -202,5 +202,5 @@ def build_frame_sequence(
     return FrameSequence(problem, inversion, frame, diagnostics, lock, source)
 
 
-def _gone() -> None:
+def _return_none() -> None:
     """Return None: no solution is on the device."""

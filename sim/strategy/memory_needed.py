@@ -14,7 +14,7 @@ from ..linalg.preconditioner import Preconditioning
 from ..runtime.columns import find_widest_workspace, find_workspace_width
 from ..runtime.device import Device, find_device
 from ..runtime.memory import (
-    COARSER,
+    MESH_REMEDY,
     MemoryBudget,
     choose_batch_size,
     estimate_column_bytes,
@@ -22,10 +22,10 @@ from ..runtime.memory import (
     measure_free_bytes,
 )
 
-PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900}
+BYTES_PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900}
 """Memory per node in single precision [bytes]: element tables and multigrid levels. The
 arrays were counted on the CPU, on 49,239 nodes (p1, smoothed) and 123,508 (p2), 2026-11-24."""
-FIXED = 2**30
+FIXED_BYTES = 2**30
 """Memory of library buffers, kernels and the last multigrid level [bytes], approximate."""
 BUDGET = MemoryBudget()
 """Default share of a GPU's memory."""
@@ -81,7 +81,7 @@ class Needed:
             return self
         fitting = find_widest_workspace(self.device, int((room - self.kept) / self.column))
         fits = self.set_up <= room and fitting > 0
-        raise InputError(f"{self}: {f'a --batch of {fitting} fits.' if fits else COARSER}")
+        raise InputError(f"{self}: {f'a --batch of {fitting} fits.' if fits else MESH_REMEDY}")
 
 
 def estimate_needed(
@@ -107,7 +107,7 @@ def estimate_needed(
         return None
     space = discretise(anatomy.mesh, element)
     free = measure_free_bytes(where) // share
-    inverted = _inverted(_unknowns(space, anatomy), where)
+    inverted = _find_invertible(_list_unknowns(space, anatomy), where)
     return compute_needed(space, where, inverted, batch, loads, free)
 
 
@@ -122,8 +122,8 @@ def compute_needed(
 ) -> Needed:
     """Compute the memory for a discretisation whose preconditioner inverts `inverted` unknowns, with `free` bytes."""
     rows, width = 3 * space.count, wp.types.type_size_in_bytes(device.scalar)
-    tables = FIXED + PER_NODE[space.element] * space.count * width // 4
-    taken, left = _inverse_bytes(inverted, device)
+    tables = FIXED_BYTES + BYTES_PER_NODE[space.element] * space.count * width // 4
+    taken, left = _estimate_inverse_bytes(inverted, device)
     column = estimate_column_bytes(rows, device)
     if batch is None:
         batch = choose_batch_size(rows, device, free - tables - left, budget)
@@ -132,13 +132,13 @@ def compute_needed(
     )
 
 
-def _unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
+def _list_unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
     """List the numbers of unknowns that a preconditioner may invert, largest first: of all nodes, or of the corners."""
     corners = int((~anatomy.held).sum())
     return (int((~space.extend_held(anatomy.held)).sum()), corners) if space.element == "p2" else (corners,)
 
 
-def _inverted(unknowns: tuple[int, ...], device: Device) -> int:
+def _find_invertible(unknowns: tuple[int, ...], device: Device) -> int:
     """Return the largest of these numbers that the GPU can invert, else the size of the last multigrid level."""
     from ..linalg.dense_inverse import can_invert
 
@@ -146,7 +146,7 @@ def _inverted(unknowns: tuple[int, ...], device: Device) -> int:
     return next((count for count in unknowns if can_invert(count, device)), last)
 
 
-def _inverse_bytes(unknowns: int, device: Device) -> tuple[int, int]:
+def _estimate_inverse_bytes(unknowns: int, device: Device) -> tuple[int, int]:
     """Estimate the memory of a dense inverse [bytes]: peak during construction, and afterwards."""
     from ..linalg.block_inverse import exchange_bytes
     from ..linalg.dense_inverse import estimate_inverse_bytes

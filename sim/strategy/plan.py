@@ -21,15 +21,15 @@ from ..linalg.preconditioner import is_exact, name_of
 from ..local_solvers.batch_elimination import BatchElimination, build_batch_elimination, has_small_opening
 from ..local_solvers.clamped_elimination import ClampedElimination
 from ..local_solvers.strained_descent import StrainedDescent, build_strained_part
-from .captured_frame import FRAME_EVALUATIONS
+from .captured_frame import MAX_FRAME_EVALUATIONS
 
 Alone = ClampedElimination | StrainedDescent
 """Local solver for a single load."""
-WORTH = 16  # Load cases from which the set-up of a shared local subproblem pays.
-EVALUATIONS = 60  # Maximum residual evaluations before Newton-CG on the CPU.
+MIN_SHARED_CASES = 16  # Load cases from which the set-up of a shared local subproblem pays.
+MAX_EVALUATIONS = 60  # Maximum residual evaluations before Newton-CG on the CPU.
 # The same on CUDA, where a small batch costs almost as much as one load case, so that Newton-CG comes late.
-EVALUATIONS_ON_CUDA = 800
-FEWEST = 10  # With a smaller budget of outer iterations only Newton-CG is used: its steps are longer.
+MAX_CUDA_EVALUATIONS = 800
+MIN_OUTER_ITERATIONS = 10  # With a smaller budget of outer iterations only Newton-CG is used: its steps are longer.
 
 
 class SolverStep(Enum):
@@ -81,7 +81,7 @@ class SolverPlan:
 
     def choose_local(self, count: int) -> SolverStep | None:
         """Return the local solver that is tried first for `count` loads together, if any."""
-        return self.many if count >= WORTH else self.single if count == 1 else None
+        return self.many if count >= MIN_SHARED_CASES else self.single if count == 1 else None
 
     def list_steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
         """List the solvers for `count` loads together, in order; `imposed` if the loads prescribe motion."""
@@ -103,7 +103,7 @@ class SolverPlan:
             lines.append(f"Every load is solved by {SolverStep.NEWTON.value}, in at most {self.outer} iterations.")
         else:
             if self.many:
-                lines.append(f"Batches of {WORTH} loads and more begin with {self.many.value}.")
+                lines.append(f"Batches of {MIN_SHARED_CASES} loads and more begin with {self.many.value}.")
             if self.single:
                 lines.append(f"A single load begins with {self.single.value}.")
             lines.append(f"{SolverStep.LBFGS.value} takes what is left, in at most {self.evaluations} evaluations.")
@@ -150,9 +150,9 @@ def plan_for(
         one = len(problem.barriers) == 1 and isinstance(problem.barriers[0], Local)
         contact = SolverStep.CONTACT if one and alike else SolverStep.NEWTON
     following = cuda and exact and elastic and can_follow(space, accuracy) and wp.is_conditional_graph_supported()
-    quick = not problem.steep and not problem.barriers and accuracy.outer >= FEWEST
+    quick = not problem.steep and not problem.barriers and accuracy.outer >= MIN_OUTER_ITERATIONS
     single, contact = None if single in avoid else single, SolverStep.NEWTON if contact in avoid else contact
-    most = EVALUATIONS_ON_CUDA if cuda else EVALUATIONS
+    most = MAX_CUDA_EVALUATIONS if cuda else MAX_EVALUATIONS
     most = most if accuracy.evaluations is None else min(most, accuracy.evaluations)
     return SolverPlan(
         preconditioner=name_of(preconditioner),
@@ -160,7 +160,7 @@ def plan_for(
         single=single,
         contact=contact,
         quick=quick and most > 0 and SolverStep.LBFGS not in avoid,
-        frames=following and most >= FRAME_EVALUATIONS and SolverStep.FRAME not in avoid,
+        frames=following and most >= MAX_FRAME_EVALUATIONS and SolverStep.FRAME not in avoid,
         strained=strained,
         evaluations=most,
         outer=accuracy.outer,
@@ -171,7 +171,7 @@ def plan_for(
 
 def can_follow(space: Discretisation, accuracy: Accuracy) -> bool:
     """Return True if frames can be captured: nodes are mesh vertices, and the iteration budget admits L-BFGS."""
-    return not len(space.edges) and accuracy.outer >= FEWEST
+    return not len(space.edges) and accuracy.outer >= MIN_OUTER_ITERATIONS
 
 
 def build_local_solvers(

@@ -30,7 +30,7 @@ class LoadStepping:
     patience: int = 4
 
 
-STEPPING = LoadStepping()  # Default.
+LOAD_STEPPING = LoadStepping()  # Default.
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class GapContinuation:
     nearly: float = 0.1
 
 
-GAPS = GapContinuation()  # Default.
+GAP_CONTINUATION = GapContinuation()  # Default.
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from ..linalg.pcg import Preconditioner
 from ..local_solvers.batch_elimination import BatchElimination
 from ..local_solvers.contact_descent import ContactDescent
 from ..local_solvers.contact_preconditioner import build_contact_preconditioner
-from ..local_solvers.strained_part import ON_CARD
+from ..local_solvers.strained_part import CUDA_STRAIN_LIMITS
 from ..minimisers.lbfgs import Lbfgs, restore_history
 from ..minimisers.lbfgs_kernels import DONE, NOT_FINITE
 from ..minimisers.newton import find_equilibrium
@@ -29,9 +29,9 @@ from ..runtime.columns import gather_columns, scatter_columns
 from ..runtime.device import Device
 from ..runtime.views import run_in_order, to_host, view
 from .plan import Alone, SolverPlan, SolverStep
-from .stepping import GAPS, STEPPING, GapContinuation, LoadStepping, Shares
+from .stepping import GAP_CONTINUATION, LOAD_STEPPING, GapContinuation, LoadStepping, Shares
 
-NOTHING: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS history.
+EMPTY_HISTORY: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS history.
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +94,8 @@ class Strategy:
     plan: SolverPlan
     near: Callable[[], BatchElimination | None] = lambda: None
     alone: Alone | None = None
-    stepping: LoadStepping = STEPPING
-    gaps: GapContinuation = GAPS
+    stepping: LoadStepping = LOAD_STEPPING
+    gaps: GapContinuation = GAP_CONTINUATION
 
     @cached_property
     def lbfgs(self) -> Lbfgs:
@@ -110,7 +110,7 @@ class Strategy:
         (barrier,) = self.problem.barriers
         assert isinstance(barrier, Local)
         found = ContactDescent(self.problem, self.preconditioner, barrier)
-        return replace(found, strains=ON_CARD, replays=True) if self.problem.device.on_cuda else found
+        return replace(found, strains=CUDA_STRAIN_LIMITS, replays=True) if self.problem.device.on_cuda else found
 
     def get_local_solver(self, count: int) -> BatchElimination | Alone | None:
         """Return the local solver for `count` loads, if there is one."""
@@ -139,32 +139,32 @@ class Strategy:
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
         if not guesses:
-            answer, astray = self._whole(cases), np.zeros(count, bool)
+            answer, astray = self._solve_whole_load(cases), np.zeros(count, bool)
         else:
-            acts = self._acts(count)
-            guess, astray = self._upright([np.where(acts, one, 0.0) for one in guesses])
+            acts = self._find_loaded_cases(count)
+            guess, astray = self._select_guesses([np.where(acts, one, 0.0) for one in guesses])
             started = guess.any(axis=0)
-            learnt = NOTHING if astray.any() else restore_history(cases, problem.rows)
+            learnt = EMPTY_HISTORY if astray.any() else restore_history(cases, problem.rows)
             if problem.barriers and astray.any():
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
-            answer = self._whole(cases, device.upload(np.where(astray, 0.0, guess)), learnt)
-            lost = np.where(answer.good, self.inversion.find_doubtful(answer.inverted), self._lost(answer))
+            answer = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), learnt)
+            lost = np.where(answer.good, self.inversion.find_doubtful(answer.inverted), self._find_unsolved(answer))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
                 some = replace(cases.select(again), anew=np.ones(len(again), bool))
                 problem.begin(some)
-                answer.put(again, self._whole(some), device)
+                answer.put(again, self._solve_whole_load(some), device)
         answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
-        lost = np.flatnonzero(self._lost(answer))
+        lost = np.flatnonzero(self._find_unsolved(answer))
         if len(lost):
-            found = self._in_steps(cases.select(lost), answer, lost)
+            found = self._raise_load(cases.select(lost), answer, lost)
             astray[lost] |= found.reached > answer.reached[lost]
             answer.put(lost, found, device)
         return replace(answer, gone=answer.reached, anew=astray) if problem.barriers else answer
 
-    def _acts(self, count: int) -> np.ndarray:
+    def _find_loaded_cases(self, count: int) -> np.ndarray:
         """Return the cases (b,) of the begun batch on which a force or imposed motion acts in the undeformed state."""
         rest = self.problem.device.allocate(self.problem.rows, count)
         loud = wp.zeros_like(rest)
@@ -177,15 +177,15 @@ class Strategy:
             acts = np.logical_or.reduce([acts, *(term.find_buried(rest) for term in self.problem.barriers)])
         return acts | self.problem.compute_gap(rest)[1] if self.problem.constraint.imposes else acts
 
-    def _rested(self, start: wp.array) -> wp.array:
+    def _mask_idle(self, start: wp.array) -> wp.array:
         """Return the start (3N, b) [m], zero where no load acts: a float32 descent would not reach zero."""
-        acts = self._acts(start.shape[1])
+        acts = self._find_loaded_cases(start.shape[1])
         if not acts.all():
             with run_in_order(self.problem.device):
                 view(start := wp.clone(start))[:, ~acts] = 0.0
         return start
 
-    def _upright(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def _select_guesses(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Select each case's first guess (3N, B) [m] with the fewest inverted elements; which cases (B,) have none."""
         device = self.problem.device
         guess, inverted = guesses[0], self.inversion.count(device.upload(guesses[0]))
@@ -195,12 +195,12 @@ class Strategy:
                 guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
         return guess, self.inversion.find_doubtful(inverted)
 
-    def _lost(self, answer: SolverResult) -> np.ndarray:
+    def _find_unsolved(self, answer: SolverResult) -> np.ndarray:
         """Return the cases (B,) that another solver may solve; at round-off none comes closer to equilibrium."""
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
-    def _whole(
-        self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = NOTHING
+    def _solve_whole_load(
+        self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = EMPTY_HISTORY
     ) -> SolverResult:
         """Solve for the whole load of the begun batch: local solvers, L-BFGS, Newton, each from the last one's end.
 
@@ -212,11 +212,11 @@ class Strategy:
         imposed = problem.constraint.imposes or (start is not None and bool(problem.compute_gap(start)[1].any()))
         start = device.allocate(problem.rows, count) if start is None else start
         if problem.barriers:
-            return self._moved(cases, start)
+            return self._move_tools(cases, start)
         if problem.paced:  # history would not help the next frame
             learnt = None
         if SolverStep.LBFGS not in self.plan.list_steps(count, imposed):
-            return self._thorough(start, self.accuracy.outer)
+            return self._run_newton(start, self.accuracy.outer)
         near = self.get_local_solver(count)
         descents = [(self.lbfgs, learnt)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
@@ -230,7 +230,7 @@ class Strategy:
             left -= int(found.steps.max(initial=0))
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == NOT_FINITE] = Outcome.CONVERGED, Outcome.NOT_FINITE
-            answer.put(index, self._answer(found.u, outcome, found.steps, found.residual, 0), device)
+            answer.put(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
             gained = found.learnt
             index = index[found.left]
             if len(index) == 0:
@@ -238,10 +238,10 @@ class Strategy:
             problem.begin(cases.select(index))
             start = gather_columns(device, found.u, found.left)
         else:
-            answer.put(index, self._thorough(start, self.accuracy.outer), device)
+            answer.put(index, self._run_newton(start, self.accuracy.outer), device)
         return replace(answer, learnt=gained)
 
-    def _touching(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
+    def _solve_contact(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Solve for cases whose tools have moved by `gaps` times their gap: separate contact solver, then Newton.
 
         On the CPU Newton takes them one by one, because the contact preconditioner is for a single case.
@@ -249,12 +249,12 @@ class Strategy:
         problem, touch, device = self.problem, self.contact, self.problem.device
         problem.begin(cases)
         if touch is None or problem.constraint.imposes or problem.compute_gap(start)[1].any():
-            return self._closed(cases, start, outer, gaps)
-        start, count, few = self._rested(start), len(cases.loads), min(self.gaps.alone, outer)
+            return self._close_gaps(cases, start, outer, gaps)
+        start, count, few = self._mask_idle(start), len(cases.loads), min(self.gaps.alone, outer)
         found = touch.descend(start, np.full(count, self.accuracy.tolerance), few)
         outcome = np.full(count, Outcome.BUDGET, object)
         outcome[found.status == DONE] = Outcome.CONVERGED
-        answer = self._answer(found.u, outcome, found.steps, found.residual, 0)
+        answer = self._build_result(found.u, outcome, found.steps, found.residual, 0)
 
         def batched(rows: np.ndarray) -> Sequence[np.ndarray]:
             return [rows][: len(rows)] if device.on_cuda else list(rows[:, None])
@@ -262,13 +262,15 @@ class Strategy:
         near = np.flatnonzero(~answer.good & (found.residual <= self.gaps.nearly))
         for some in batched(near):
             problem.begin(cases.select(some))
-            answer.put(some, self._thorough(gather_columns(device, found.u, some), few), device)
+            answer.put(some, self._run_newton(gather_columns(device, found.u, some), few), device)
         left = np.flatnonzero(~answer.good)
         for some in batched(left):
-            answer.put(some, self._closed(cases.select(some), gather_columns(device, start, some), outer, gaps), device)
+            answer.put(
+                some, self._close_gaps(cases.select(some), gather_columns(device, start, some), outer, gaps), device
+            )
         return answer
 
-    def _closed(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
+    def _close_gaps(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Solve by Newton for cases whose tools have moved by `gaps` times their gap, which is widened, then closed.
 
         In a narrow gap nodes would be pushed out of the tool, and enter it again, one by one; a wide gap guides them.
@@ -279,27 +281,27 @@ class Strategy:
             self.problem.begin(cases)
             for term in self.problem.barriers:
                 term.widen(float(times))
-            found = self._thorough(self._rested(start), outer, max(self.gaps.tolerance, self.accuracy.tolerance))
+            found = self._run_newton(self._mask_idle(start), outer, max(self.gaps.tolerance, self.accuracy.tolerance))
             start, iterations, linear = found.u, iterations + found.iterations, linear + found.linear_iterations
         self.problem.begin(cases)
-        found = self._thorough(self._rested(start), outer)
+        found = self._run_newton(self._mask_idle(start), outer)
         linear += found.linear_iterations
         return replace(found, iterations=iterations + found.iterations, linear_iterations=linear)
 
-    def _thorough(self, start: wp.array, outer: int, tolerance: float | None = None) -> SolverResult:
+    def _run_newton(self, start: wp.array, outer: int, tolerance: float | None = None) -> SolverResult:
         """Solve the begun batch by Newton, in at most `outer` iterations."""
         newton = NewtonCG(self._touched, self.accuracy.inner)
         accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
         found = find_equilibrium(self.problem, newton, start, accuracy)
-        return self._answer(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
+        return self._build_result(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
 
-    def _answer(
+    def _build_result(
         self, u: wp.array, outcome: np.ndarray, steps: np.ndarray, residual: np.ndarray, linear_iterations: int
     ) -> SolverResult:
         reached = np.array([ended.good for ended in outcome], float)
         return SolverResult(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
 
-    def _in_steps(self, cases: Cases, failed: SolverResult, index: np.ndarray) -> SolverResult:
+    def _raise_load(self, cases: Cases, failed: SolverResult, index: np.ndarray) -> SolverResult:
         """Raise the load from the undeformed state in adaptive steps; return the equilibrium at the largest fraction.
 
         The cases are the rows `index` (k,) of `failed`, whose result stays where no larger fraction is found.
@@ -311,7 +313,7 @@ class Strategy:
             return replace(part, loads=part.loads.scale(share), share=share)
 
         start = device.allocate(problem.rows, len(index))
-        found = self._by_steps(cases, start, raised, self.stepping.first, self.accuracy.steps)
+        found = self._solve_in_steps(cases, start, raised, self.stepping.first, self.accuracy.steps)
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
         none = np.flatnonzero(found.reached <= failed.reached[index])
@@ -319,7 +321,7 @@ class Strategy:
         found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
-    def _moved(self, cases: Cases, start: wp.array) -> SolverResult:
+    def _move_tools(self, cases: Cases, start: wp.array) -> SolverResult:
         """Move the tools from start (3N, b), where they were, in steps of the allowed length.
 
         An undeformed mesh on which nothing acts where the tools end is the solution, whatever they met on their path.
@@ -329,19 +331,19 @@ class Strategy:
             return replace(part, share=share)
 
         device, count, most = self.problem.device, len(cases.loads), self.accuracy.steps
-        acting = np.flatnonzero(self._acts(count))
+        acting = np.flatnonzero(self._find_loaded_cases(count))
         if len(acting) == count:
-            return self._by_steps(cases, start, moved, 1.0, most)
+            return self._solve_in_steps(cases, start, moved, 1.0, most)
         none, every = np.zeros(count, int), np.full(count, Outcome.CONVERGED, object)
         answer = SolverResult(
             device.allocate(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0
         )
         if len(acting):
             part = gather_columns(device, start, acting)
-            answer.put(acting, self._by_steps(cases.select(acting), part, moved, 1.0, most), device)
+            answer.put(acting, self._solve_in_steps(cases.select(acting), part, moved, 1.0, most), device)
         return answer
 
-    def _by_steps(
+    def _solve_in_steps(
         self,
         cases: Cases,
         start: wp.array,
@@ -372,7 +374,7 @@ class Strategy:
                 break
             aim, gone = shares.propose_shares(rows)
             left -= int(shorter[rows].any())
-            found = self._touching(aimed(cases.select(rows), aim), gather_columns(device, u, rows), outer, gone)
+            found = self._solve_contact(aimed(cases.select(rows), aim), gather_columns(device, u, rows), outer, gone)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
             shares.take(rows, aim, good)
@@ -382,9 +384,9 @@ class Strategy:
             answer.iterations[rows] += found.iterations
             answer.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
             answer = replace(answer, linear_iterations=answer.linear_iterations + found.linear_iterations)
-        return self._arrived(cases, aimed, answer)
+        return self._finish(cases, aimed, answer)
 
-    def _arrived(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], answer: SolverResult) -> SolverResult:
+    def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], answer: SolverResult) -> SolverResult:
         """Finish cases after their last step, in place: mark those that tools pierce, and those that fell short."""
         problem, u, outcome, reached = self.problem, answer.u, answer.outcome, answer.reached
         short = np.flatnonzero(reached < 1.0)

@@ -33,8 +33,8 @@ class NoMotionStep:
 
 # Steps from this length on [s] use the static preconditioner. The brain in its skull oscillates at 1 Hz or faster, so
 # that inertia is then less than a thousandth of its stiffness.
-LONGEST = 8.0
-KEPT = 3  # Preconditioners that are cached; each is as large as the static one.
+MAX_DYNAMIC_STEP = 8.0
+MAX_PRECONDITIONERS = 3  # Preconditioners that are cached; each is as large as the static one.
 
 
 def quantise(steps: np.ndarray) -> np.ndarray:
@@ -42,7 +42,7 @@ def quantise(steps: np.ndarray) -> np.ndarray:
 
     Steps of `LONGEST` or more become infinite; zero steps stay zero.
     """
-    within = (steps > 0.0) & (steps < LONGEST)
+    within = (steps > 0.0) & (steps < MAX_DYNAMIC_STEP)
     powers = np.exp2(np.round(np.log2(np.where(within, steps, 1.0))))
     return np.where(within, powers, np.where(steps > 0.0, np.inf, 0.0))
 

@@ -20,7 +20,7 @@ from .laws.law import Law
 from .state_source import StateSource
 
 # Step of finite differences in the displacement gradient.
-BEND = 1e-3
+GRADIENT_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +98,9 @@ class ElasticTerm:
             _Part(
                 first,
                 stop - first,
-                [_rows(array, first, stop) for array in shape],
-                _rows(weight, first, stop),
-                _rows(constants, first, stop),
+                [_slice_rows(array, first, stop) for array in shape],
+                _slice_rows(weight, first, stop),
+                _slice_rows(constants, first, stop),
             )
             for first, stop in pairwise(ends)
         ]
@@ -190,10 +190,10 @@ class ElasticTerm:
         """Return second-order tensors as `Strained.second_order`, by fourth-order central differences of the stress."""
         elements, (law, coefficients) = self._rest[0], self._tissue
         tissues, kind = np.unique(coefficients, axis=0, return_inverse=True)
-        one = _single(elements)
+        one = _build_unit_element(elements)
         unit = np.eye(9)
         both = (unit[:, None] + unit).reshape(-1, 9)
-        size = BEND * np.concatenate([both, -both, 2.0 * both, -2.0 * both, np.zeros((1, 9))])
+        size = GRADIENT_STEP * np.concatenate([both, -both, 2.0 * both, -2.0 * both, np.zeros((1, 9))])
         # u of node k + 1 is column k of the displacement gradient
         u = np.zeros((3 * one.nodes, len(size)))
         u[3:12] = size.reshape(-1, 3, 3).transpose(2, 1, 0).reshape(9, -1)
@@ -204,7 +204,7 @@ class ElasticTerm:
             term.add_gradient(self._device.upload(u), out)
             stress = out.numpy()[3:12].reshape(3, 3, -1).transpose(2, 1, 0).reshape(-1, 9)
             up, down, above, below = np.split(stress[:-1], 4)
-            whole = (16.0 * (up + down) - (above + below) - 30.0 * stress[-1]) / (24.0 * BEND**2)
+            whole = (16.0 * (up + down) - (above + below) - 30.0 * stress[-1]) / (24.0 * GRADIENT_STEP**2)
             whole = whole.reshape(9, 9, 9)  # P2(a + b, a + b), indexed by a and b
             own = 0.25 * whole[np.arange(9), np.arange(9)]
             tensors.append(0.5 * (whole - own[:, None] - own).transpose(2, 0, 1))
@@ -226,7 +226,7 @@ class ElasticTerm:
     def raise_strain(self, some: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
         """Raise `out` to the elements' strain, as `Strained.raise_strain`."""
         inputs = [u, columns, *self._shape]
-        self._of_some(self._strain_kernels.strain, some, inputs, out, np.maximum)
+        self._launch_on_some(self._strain_kernels.strain, some, inputs, out, np.maximum)
 
     def add_stiffening(
         self, some: wp.array, u: wp.array, columns: wp.array, least: wp.array, place: wp.array, out: wp.array
@@ -234,9 +234,9 @@ class ElasticTerm:
         """Add the elements' stiffness increments, as `Strained.add_stiffening`."""
         coefficients = self._numbers.get_array(u.shape[1]) if self._sources else self._constants
         inputs = [u, columns, least, place, *self._shape, self._weight, coefficients]
-        self._of_some(self._strain_kernels.stiffen, some, inputs, out, np.add)
+        self._launch_on_some(self._strain_kernels.stiffen, some, inputs, out, np.add)
 
-    def _of_some(self, kernel: wp.Kernel, some: wp.array, inputs: list, out: wp.array, joined: np.ufunc) -> None:
+    def _launch_on_some(self, kernel: wp.Kernel, some: wp.array, inputs: list, out: wp.array, joined: np.ufunc) -> None:
         """Launch a kernel on some elements (k,) in parallel blocks with separate outputs, and combine these."""
         if not len(some):
             return
@@ -258,7 +258,7 @@ class ElasticTerm:
         kernel = self._kernels.bound_step
         if kernel is not None:
             bounds = [out, *(wp.clone(out) for _ in self._parts[1:])]
-            self._each(kernel, lambda part: [u, du, *part.shape], bounds, u.shape[1])
+            self._launch_on_blocks(kernel, lambda part: [u, du, *part.shape], bounds, u.shape[1])
             for bound in bounds[1:]:
                 np.minimum(out.numpy(), bound.numpy(), out=out.numpy())
 
@@ -268,7 +268,7 @@ class ElasticTerm:
             return None
         strains = self._strains.get_array(u.shape[1])
         outputs = [strains[part.first : part.first + part.count] for part in self._parts]
-        self._each(self._kernels.measure, lambda part: [u, *part.shape], outputs, u.shape[1])
+        self._launch_on_blocks(self._kernels.measure, lambda part: [u, *part.shape], outputs, u.shape[1])
         kept = [source.end(self._cases, strains) for source in reversed(self._sources)]
         return next((memory for memory in kept if memory is not None), None)
 
@@ -281,11 +281,11 @@ class ElasticTerm:
             own = part.coefficients if numbers is None else numbers[part.first : part.first + part.count]
             return [*inputs, *part.shape, part.weight, own]
 
-        self._each(kernel, all_inputs, sums, columns)
+        self._launch_on_blocks(kernel, all_inputs, sums, columns)
         for total in sums[1:]:
             np.add(out.numpy(), total.numpy(), out=out.numpy())
 
-    def _each(
+    def _launch_on_blocks(
         self, kernel: wp.Kernel, inputs: Callable[[_Part], list], outputs: Sequence[wp.array], columns: int
     ) -> None:
         """Launch a kernel on all blocks in parallel, each with a separate output."""
@@ -297,7 +297,7 @@ class ElasticTerm:
         )
 
 
-def _single(elements: Elements) -> Elements:
+def _build_unit_element(elements: Elements) -> Elements:
     """Return one element of unit volume, with node and point counts as these and unit edge vectors from node 0."""
     points, most = elements.gradient.shape[1:3]
     slope = np.zeros((1, points, most, 3))
@@ -308,6 +308,6 @@ def _single(elements: Elements) -> Elements:
     return Elements(table, slope, weight, 4, np.zeros(1, int), mark, size)
 
 
-def _rows(array: wp.array, first: int, stop: int) -> wp.array:
+def _slice_rows(array: wp.array, first: int, stop: int) -> wp.array:
     """Return a view of some rows; an empty array unchanged."""
     return array[first:stop] if len(array) else array

@@ -11,7 +11,7 @@ from .laws.invariants import cofactor
 from .laws.law import Law
 
 # Minimum J after a step, as a fraction of J before: bounds the logarithm and its second derivative.
-VOLUME_KEPT = 0.1
+MIN_VOLUME_RATIO = 0.1
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     stress, stress_change, density = law.stress, law.stress_change, law.energy
-    kept = VOLUME_KEPT
+    kept = MIN_VOLUME_RATIO
     functions = build_functions(law, device, size, count)
     gradient_of, at, at_rest, numbers = functions.gradient, functions.at, functions.at_rest, functions.numbers
 

@@ -94,14 +94,14 @@ def sum_by_node(table: np.ndarray, values: np.ndarray, count: int) -> np.ndarray
 
 # Corners of the part below the plane lie on edges of the tetrahedron, whose corners are sorted by height: (i, j) is the
 # intersection of the plane with edge i-j, and (i, i) is corner i. Keys: number of corners below the plane.
-ENDS = {
+CUT_CORNERS = {
     1: np.array([[0, 0], [0, 1], [0, 2], [0, 3]]),
     2: np.array([[0, 0], [0, 2], [0, 3], [1, 1], [1, 2], [1, 3]]),
     3: np.array([[0, 0], [1, 1], [2, 2], [0, 3], [1, 3], [2, 3]]),
 }
 # A prism between the triangles 0, 1, 2 and 3, 4, 5 consists of three tetrahedra.
 PRISM = np.array([[0, 1, 2, 5], [0, 1, 4, 5], [0, 3, 4, 5]])
-PARTS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}  # tetrahedra of the part, by number of corners below
+PART_TETS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}  # tetrahedra of the part, by number of corners below
 
 
 def cut_below_plane(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -115,14 +115,14 @@ def cut_below_plane(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     corner, sorted_height = np.eye(4)[order], np.take_along_axis(height, order, axis=1)
     under = (height < 0.0).sum(axis=1)
     owners, parts = [np.zeros(0, int)], [np.zeros((0, 4, 4))]
-    for count, ends in ENDS.items():
+    for count, ends in CUT_CORNERS.items():
         mine = np.flatnonzero(under == count)
         low, high = ends.T
         below, above = sorted_height[mine][:, low], sorted_height[mine][:, high]
         whole_way = np.where(low == high, 1.0, below - above)
         way = np.where(low == high, 0.0, below / whole_way)[:, :, None]
         points = (1.0 - way) * corner[mine][:, low] + way * corner[mine][:, high]
-        found = points[:, PARTS[count]]
+        found = points[:, PART_TETS[count]]
         owners.append(np.repeat(mine, found.shape[1]))
         parts.append(found.reshape(-1, 4, 4))
     return np.concatenate(owners), np.concatenate(parts)

@@ -15,8 +15,8 @@ from ..runtime.device import Device, forward_kernel
 
 # Mass fractions of a quadratic tetrahedron's nodes: diagonal of the consistent mass matrix, scaled to the total mass.
 # Row sums would be negative at corners.
-CORNER = 1.0 / 36.0  # each corner
-MIDDLE = 4.0 / 27.0  # each midpoint
+CORNER_SHARE = 1.0 / 36.0  # each corner
+MIDPOINT_SHARE = 4.0 / 27.0  # each midpoint
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def compute_lumped_mass(density: float, space: Discretisation) -> np.ndarray:
     """
     every = np.ones(len(space.table), bool)
     quadratic = space.table.shape[1] == 10
-    share = np.repeat([CORNER, MIDDLE], [4, 6]) if quadratic else np.full(4, 0.25)
+    share = np.repeat([CORNER_SHARE, MIDPOINT_SHARE], [4, 6]) if quadratic else np.full(4, 0.25)
     volume = space.mesh.volumes
     if quadratic:
         volume = build_quadratic_elements(space.nodes, space.table, every).weight.sum(axis=1)
@@ -138,7 +138,7 @@ class InertiaTerm:
         steps, count = cases.steps, len(cases.loads)
         self._cases = cases
         drift = steps / (1.0 + self._damping * steps)
-        aim = self._start(cases) + drift[:, None, None] * self._velocity(cases)
+        aim = self._start(cases) + drift[:, None, None] * self._get_velocities(cases)
         passes = np.where(steps > 0.0, steps, np.inf)
         self._weight.get_array(count).assign(1.0 / passes**2 + self._damping / passes)
         self._aim.get_array(count).assign(np.ascontiguousarray(aim.reshape(count, 3 * len(self._masses)).T))
@@ -187,14 +187,14 @@ class InertiaTerm:
         now = u.numpy().astype(np.float64).T.reshape(u.shape[1], len(self._masses), 3)
         steps = self._cases.steps[:, None, None]
         passes = np.where(steps > 0.0, steps, np.inf)
-        return np.where(steps > 0.0, (now - self._start(self._cases)) / passes, self._velocity(self._cases))
+        return np.where(steps > 0.0, (now - self._start(self._cases)) / passes, self._get_velocities(self._cases))
 
     def _start(self, cases: Cases) -> np.ndarray:
         """Return the displacement (B, N, 3) [m] at the start of the step."""
         still = np.zeros((len(cases.loads), len(self._masses), 3))
         return still if cases.displacement is None else cases.displacement
 
-    def _velocity(self, cases: Cases) -> np.ndarray:
+    def _get_velocities(self, cases: Cases) -> np.ndarray:
         """Return the velocities (B, N, 3) [m/s] at the start of the step."""
         return cases.get_past(self.name, (len(self._masses), 3))
 

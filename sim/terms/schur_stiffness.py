@@ -45,12 +45,12 @@ class Exterior:
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """Add the energy: E += u . F u / 2."""
-        x, force = self._multiplied(u)
+        x, force = self._multiply_rows(u)
         add_dots(self._device, combine_columns(self._device, x, -0.5, x, x), force, out)
 
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """Add the gradient: f += F u."""
-        _, force = self._multiplied(u)
+        _, force = self._multiply_rows(u)
         add_rows(self._device, force, self._rows, out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
@@ -81,7 +81,7 @@ class Exterior:
     def end(self, u: wp.array) -> None:
         """Return None: the exterior has no history."""
 
-    def _multiplied(self, u: wp.array) -> tuple[wp.array, wp.array]:
+    def _multiply_rows(self, u: wp.array) -> tuple[wp.array, wp.array]:
         """Return rows (m, b) of u and F times them, in a workspace reused for batches of the same width."""
         shape = (len(self._rows), u.shape[1])
         if u.shape[1] not in self._rooms:

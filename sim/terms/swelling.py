@@ -136,14 +136,14 @@ class Swelling:
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
         """Write r at every point."""
-        inputs = [self._swells, self._wider(cases), first]
+        inputs = [self._swells, self._compute_linear_strain(cases), first]
         self._device.launch(build_kernels(self._device).fill, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> None:
         """Replace strains by their elastic part, for the memory of inner sources; swelling has none."""
-        inputs = [self._swells, self._wider(cases)]
+        inputs = [self._swells, self._compute_linear_strain(cases)]
         self._device.launch(build_kernels(self._device).shrink, strains.shape, inputs, [strains])
 
-    def _wider(self, cases: Cases) -> wp.array:
+    def _compute_linear_strain(self, cases: Cases) -> wp.array:
         """Return r (b,), accurate for small theta too."""
         return self._device.upload(np.expm1(np.log1p(self._theta(cases.loads.times)) / 3.0))

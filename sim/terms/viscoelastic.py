@@ -32,7 +32,7 @@ from .laws.isochoric_split import split_of
 from .laws.law import Law
 
 # components of a symmetric tensor
-SIX = 6
+TENSOR_COMPONENTS = 6
 
 
 @cache
@@ -40,7 +40,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
     """Return the law on `count` coefficients that also takes f - 1 and components xx, yy, zz, yz, zx, xy of A [Pa]."""
     scalar, mat = device.scalar, device.matrix
     parts = split_of(law, device)
-    inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + SIX))
+    inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + TENSOR_COMPONENTS))
     own_energy, own_stress, own_change = parts.energy, parts.stress, parts.stress_change
 
     @wp.func
@@ -83,7 +83,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
     def at_rest(c: whole):
         """Return coefficients without relaxation or overstress."""
         k = c
-        for i in range(count, count + 1 + SIX):
+        for i in range(count, count + 1 + TENSOR_COMPONENTS):
             k[i] = scalar(0.0)
         return k
 
@@ -104,7 +104,7 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     overstress = split_of(law, device).overstress
-    six = SIX
+    six = TENSOR_COMPONENTS
 
     @forward_kernel(module="unique")
     def fade(
@@ -173,7 +173,7 @@ class Prony:
         Device of the arrays.
     """
 
-    count = 1 + SIX
+    count = 1 + TENSOR_COMPONENTS
 
     def __init__(
         self, name: str, law: Law, coefficients: np.ndarray, pairs: Sequence[Pairs], points: int, device: Device
@@ -186,7 +186,7 @@ class Prony:
         most = max(map(len, pairs))
         filled = np.array([(*row, *[(0.0, 1.0)] * (most - len(row))) for row in pairs]).reshape(-1, most, 2)
         self._series = [device.upload(filled[:, :, 0]), device.upload(filled[:, :, 1])]
-        self.width = SIX * (most + 1)
+        self.width = TENSOR_COMPONENTS * (most + 1)
         self._shape = len(coefficients) * points, self.width
 
     def build_law(self, inner: Law, count: int) -> Law:
@@ -196,16 +196,16 @@ class Prony:
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
         """Write f - 1 and A at every point."""
         self._device.launch(
-            self._kernels.fade, (*out.shape[:2], out.shape[3]), [*self._series, *self._since(cases), first], [out]
+            self._kernels.fade, (*out.shape[:2], out.shape[3]), [*self._series, *self._get_history(cases), first], [out]
         )
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray:
         """Return the updated S and H_i."""
         out = self._device.allocate(len(cases.loads), *self._shape)
-        inputs = [*self._series, *self._since(cases), self._coefficients, strains]
+        inputs = [*self._series, *self._get_history(cases), self._coefficients, strains]
         self._device.launch(self._kernels.advance, strains.shape, inputs, [out])
         return out.numpy()
 
-    def _since(self, cases: Cases) -> list[wp.array]:
+    def _get_history(self, cases: Cases) -> list[wp.array]:
         """Return time steps (b,) [s] and the previous history (b, points, 6 (n + 1))."""
         return [self._device.upload(cases.steps), self._device.upload(cases.get_past(self._name, self._shape))]

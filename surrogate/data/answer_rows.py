@@ -12,20 +12,20 @@ from sim.deformation import Deformation, Outcome
 from sim.effects import Elasticity
 from sim.material import read_tissue_json, to_tissue_json
 
-BRAIN = "tissue"
+TISSUE_KEY = "tissue"
 """Provenance key of the brain's tissue. A region of the same tissue as the brain has no entry."""
-TUMOUR, REGION = "tumour's tissue", "tissue of region "
+TUMOUR_KEY, REGION_KEY = "tumour's tissue", "tissue of region "
 """Provenance key of the tumour's tissue; prefix of another region's key, before its label."""
 # HDF5 type of an outcome's name, as long as the longest.
 NAME_TYPE = f"S{max(len(outcome.name) for outcome in Outcome)}"
 
-CHECKSUM = np.dtype("<u4")  # HDF5 type of a row's CRC-32.
+CHECKSUM_TYPE = np.dtype("<u4")  # HDF5 type of a row's CRC-32.
 
 
 def describe_tissue_source(tissue: Elasticity) -> dict[str, str]:
     """Return the provenance entries of this tissue; none for a brain without law."""
-    stated = {} if tissue.default is None else {BRAIN: to_tissue_json(tissue.default)}
-    return stated | {_key(label): to_tissue_json(tissue.regions[label]) for label in sorted(tissue.regions)}
+    stated = {} if tissue.default is None else {TISSUE_KEY: to_tissue_json(tissue.default)}
+    return stated | {_to_key(label): to_tissue_json(tissue.regions[label]) for label in sorted(tissue.regions)}
 
 
 def read_tissue_statement(stated: Mapping[str, str]) -> Elasticity:
@@ -36,20 +36,20 @@ def read_tissue_statement(stated: Mapping[str, str]) -> Elasticity:
     InputError
         A text that is not a tissue.
     """
-    numbers = (key.removeprefix(REGION) for key in stated if key.startswith(REGION))
+    numbers = (key.removeprefix(REGION_KEY) for key in stated if key.startswith(REGION_KEY))
     labels = {TUMOUR_LABEL, *(int(number) for number in numbers if number.lstrip("-").isdecimal())}
-    regions = {label: read_tissue_json(stated[_key(label)]) for label in sorted(labels) if _key(label) in stated}
-    return Elasticity(read_tissue_json(stated[BRAIN]), regions)
+    regions = {label: read_tissue_json(stated[_to_key(label)]) for label in sorted(labels) if _to_key(label) in stated}
+    return Elasticity(read_tissue_json(stated[TISSUE_KEY]), regions)
 
 
 def find_first_tissue(statements: Iterable[Mapping[str, str]]) -> Elasticity | None:
     """Return `read_tissue_statement` of the first provenance that contains the brain's; None without one."""
-    stated = next((one for one in statements if BRAIN in one), None)
+    stated = next((one for one in statements if TISSUE_KEY in one), None)
     return None if stated is None else read_tissue_statement(stated)
 
 
-def _key(label: int) -> str:
-    return TUMOUR if label == TUMOUR_LABEL else f"{REGION}{label}"
+def _to_key(label: int) -> str:
+    return TUMOUR_KEY if label == TUMOUR_LABEL else f"{REGION_KEY}{label}"
 
 
 def get_row_type(vertices: int, tools: int = 0) -> np.dtype:
@@ -85,7 +85,7 @@ def to_rows(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
 
 def compute_row_checksums(rows: np.ndarray) -> np.ndarray:
     """Compute CRC-32 (B,) uint32 of the bytes of each row."""
-    return np.array([zlib.crc32(row.data) for row in rows.view(np.uint8).reshape(len(rows), -1)], CHECKSUM)
+    return np.array([zlib.crc32(row.data) for row in rows.view(np.uint8).reshape(len(rows), -1)], CHECKSUM_TYPE)
 
 
 def format_row_numbers(rows: np.ndarray) -> str:

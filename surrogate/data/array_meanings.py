@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import h5py
 
-TITLE = (  # Description of the whole file.
+FILE_DESCRIPTION = (  # Description of the whole file.
     "Results of a finite-element solver to loads of a tool on a brain. anatomy/ is the body; loads/CAUSE/ are the "
     "loads, one row each; `answers/` has the result of each load, row by row; unit/ has responses to unit forces. SI "
     "units; coordinates are the anatomy's own, in RAS (x to the right, y to the front, z up)."
 )
-GROUPS = {  # Descriptions of the file's groups.
+GROUP_DESCRIPTIONS = {  # Descriptions of the file's groups.
     "anatomy": "The body in its rest configuration, and how it is held. `digest` is a hash of all arrays here.",
     "loads": "What the tool does, one row a load case. `digest` is a hash of all arrays here.",
     "answers": "The static result for each row of loads/.",
@@ -19,7 +19,7 @@ GROUPS = {  # Descriptions of the file's groups.
     "along x, then y, then z. They are scaled from 1e-6 N, and superpose. Empty where the loads are poses.",
 }
 CASE, VERTEX, RAS = "load case", "mesh vertex, as the rows of anatomy/nodes", "x, y, z (RAS)"  # Names of array axes.
-CHECKED = (  # Meaning of the checksums.
+CHECKSUM_MEANING = (  # Meaning of the checksums.
     "zlib.crc32 of the row's bytes, little-endian and in this order: displacement, outcome (padded with zeros), "
     "iterations, residual, and reaction where there is one"
 )
@@ -46,7 +46,7 @@ _ROWS = {  # Meanings of the arrays that have one row per load case or unit forc
     "residual": Meaning(
         "1", CASE, "norm of the forces left over, over that of the largest of elasticity, load and hold"
     ),
-    "checksum": Meaning("1", CASE, CHECKED),
+    "checksum": Meaning("1", CASE, CHECKSUM_MEANING),
 }
 MEANINGS = {  # Meanings of all arrays, by their path in the file.
     "anatomy/nodes": Meaning("m", f"vertex; {RAS}", "positions at rest"),
@@ -95,7 +95,7 @@ MEANINGS = {  # Meanings of all arrays, by their path in the file.
 
 def explain(file: h5py.File) -> None:
     """Write the description of every array and group to its attributes."""
-    for name, text in GROUPS.items():
+    for name, text in GROUP_DESCRIPTIONS.items():
         file.require_group(name).attrs["meaning"] = text
 
     def each(name: str, item: h5py.Group | h5py.Dataset) -> None:

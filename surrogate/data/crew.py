@@ -92,13 +92,13 @@ def open_solvers(asked: LazyFem, devices: Sequence[str], said: Callable[[str], o
     """
     if len(devices) == 1:
         own = replace(asked, device=devices[0])
-        _demand([own.needed], said)
+        _check_all_fit([own.needed], said)
         yield Solver(own, *describe_fem_task(own, None))
         return
     most, own = max(devices.count(name) for name in devices), -(-asked.loads // len(devices))
     with process_pool(devices, place_on_device, replace(asked, share=most, loads=own)) as children:
         none = [None] * len(devices)
-        _demand(run_on_each(children, estimate_memory, none), said)
+        _check_all_fit(run_on_each(children, estimate_memory, none), said)
         elements, words, batches = zip(*run_on_each(children, describe_fem_task, none), strict=True)
         batch = min(batches)
         if asked.batch is None and devices[0].startswith("cuda"):
@@ -130,7 +130,7 @@ def choose_even_batch(most: int, loads: int, devices: int) -> int:
     return max(1, -(-loads // (max(rounds, 1) * devices)))
 
 
-def _demand(needed: Sequence[Needed | None], said: Callable[[str], object]) -> None:
+def _check_all_fit(needed: Sequence[Needed | None], said: Callable[[str], object]) -> None:
     for each in dict.fromkeys(map(str, filter(None, needed))):
         said(f"{each}.")
     for each in filter(None, needed):

@@ -22,7 +22,7 @@ from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh, compute_digest
 from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Touching
-from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
+from sim.runtime.file_limits import MAX_ARRAY_BYTES, MAX_INFLATION
 from sim.runtime.outside_files import read_as, to_path
 from sim.runtime.partial_files import to_unfinished_path
 from sim.tools import BuiltIn, read_tool_statement
@@ -34,12 +34,12 @@ CAUSES: dict[str, type[Cause]] = {  # Types of loads that a data set may contain
     kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture, Touching)
 }
 FORMAT = "sulcus data 2"  # Name and version of the file format.
-UNCHECKED = "sulcus data 1"  # Format without checksums, with flags of the finished rows: can be read, but not resumed.
+OLD_FORMAT = "sulcus data 1"  # Format without checksums, with flags of the finished rows: can be read, but not resumed.
 MESH = ("nodes", "tets", "region", "middles")  # Names of a mesh's arrays; linear meshes have no `middles`.
-SEAL = "digest of these attributes"  # Attribute that contains the hash of all other texts.
-CHUNK = 256  # Number of rows read at once.
-FARTHEST = 1.0  # Largest valid displacement [body lengths].
-FAINTEST = 1e-3  # Force that cannot cause a displacement of FARTHEST [N], to check unit responses.
+SEAL_ATTRIBUTE = "digest of these attributes"  # Attribute that contains the hash of all other texts.
+CHUNK_ROWS = 256  # Number of rows read at once.
+MAX_DISPLACEMENT = 1.0  # Largest valid displacement [body lengths].
+CHECK_FORCE = 1e-3  # Force that cannot cause a displacement of FARTHEST [N], to check unit responses.
 REMEDY = "Make it with `sulcus simulate`."  # Remedy in error messages.
 
 
@@ -126,7 +126,7 @@ class Dataset:
         InputError
             Damaged rows, or impossible displacements.
         """
-        return self._rows("answers", nodes, self.good, 1.0)
+        return self._read_rows("answers", nodes, self.good, 1.0)
 
     def read_reaction(self) -> np.ndarray | None:
         """Read the force [N] and moment [N m] that each tool exerts, (n, tools, 6); None if not available.
@@ -142,12 +142,12 @@ class Dataset:
             if "answers/reaction" not in file:
                 return None
             rows = [
-                read_rows(file, "answers", len(self.anatomy.mesh.nodes), first, first + CHUNK)
-                for first in range(0, len(self.loads), CHUNK)
+                read_rows(file, "answers", len(self.anatomy.mesh.nodes), first, first + CHUNK_ROWS)
+                for first in range(0, len(self.loads), CHUNK_ROWS)
             ]
         lost = np.flatnonzero(~np.concatenate([whole for _, whole in rows]))
         if len(lost):
-            raise InputError(_damaged(self.path, lost, "answers"))
+            raise InputError(_format_damaged(self.path, lost, "answers"))
         found = np.concatenate([each["reaction"] for each, _ in rows])
         return found if np.isfinite(found[self.good]).all() else None
 
@@ -159,23 +159,23 @@ class Dataset:
         InputError
             See `displacement`.
         """
-        return self._rows("unit", nodes, self.unit_good, FAINTEST)
+        return self._read_rows("unit", nodes, self.unit_good, CHECK_FORCE)
 
-    def _rows(self, group: str, nodes: np.ndarray, good: np.ndarray, force: float) -> np.ndarray:
+    def _read_rows(self, group: str, nodes: np.ndarray, good: np.ndarray, force: float) -> np.ndarray:
         """Read some vertices' displacements, and check that `good` rows move less than possible under a `force`."""
         size = float(np.linalg.norm(np.ptp(self.anatomy.mesh.nodes, axis=0)))
         chosen, damaged, absurd = [], [], []
         with read_as(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
-            for first in range(0, max(len(good), 1), CHUNK):
-                rows, whole = read_rows(file, group, len(self.anatomy.mesh.nodes), first, first + CHUNK)
+            for first in range(0, max(len(good), 1), CHUNK_ROWS):
+                rows, whole = read_rows(file, group, len(self.anatomy.mesh.nodes), first, first + CHUNK_ROWS)
                 field = rows["displacement"]
-                far = np.abs(field).max(axis=(1, 2)) > FARTHEST * size / force
+                far = np.abs(field).max(axis=(1, 2)) > MAX_DISPLACEMENT * size / force
                 damaged.append(first + np.flatnonzero(~whole | ~np.isfinite(field).all(axis=(1, 2))))
-                absurd.append(first + np.flatnonzero(far & good[first : first + CHUNK]))
+                absurd.append(first + np.flatnonzero(far & good[first : first + CHUNK_ROWS]))
                 chosen.append(field[:, nodes])
         lost, strange = np.concatenate(damaged), np.concatenate(absurd)
         if len(lost):
-            raise InputError(_damaged(self.path, lost, group))
+            raise InputError(_format_damaged(self.path, lost, group))
         if len(strange):
             raise InputError(
                 f"{self.path}: {format_row_numbers(strange)} of `{group}` move by more than the body measures, "
@@ -188,7 +188,7 @@ class Dataset:
     seconds, displacement, reaction = estimate_seconds, read_displacement, read_reaction
 
 
-def _damaged(path: Path, lost: np.ndarray, group: str) -> str:
+def _format_damaged(path: Path, lost: np.ndarray, group: str) -> str:
     return (
         f"{path}: {format_row_numbers(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: "
         "it solves those alone; "
@@ -215,7 +215,7 @@ def read_dataset(path: str | Path) -> Dataset:
         raise InputError(f"{path}: no such file; {remedy}.")
     with read_as(path, "a data set", REMEDY), h5py.File(path, "r") as file:
         stated = read_provenance(file)
-        if stated.get("format") not in (FORMAT, UNCHECKED):
+        if stated.get("format") not in (FORMAT, OLD_FORMAT):
             raise InputError(
                 f"{path}: is HDF5, but not a data set that this version knows, {FORMAT!r}: make one with "
                 "`sulcus simulate`."
@@ -226,7 +226,7 @@ def read_dataset(path: str | Path) -> Dataset:
             raise InputError(f"{path}: `unit/node` are not the open cortex's nodes: it is damaged. Simulate again.")
         for group, rows in (("answers", len(loads)), ("unit", 3 * len(nodes))):
             read_stored(file, f"{group}/displacement", "f", (rows, len(anatomy.mesh.nodes), 3))
-            if stated["format"] == UNCHECKED and not read_stored(file, f"{group}/done", "b", (rows,))[:].all():
+            if stated["format"] == OLD_FORMAT and not read_stored(file, f"{group}/done", "b", (rows,))[:].all():
                 raise InputError(f"{path}: rows of `{group}` are not done, so it was never finished. Simulate again.")
         return Dataset(
             path,
@@ -249,14 +249,14 @@ def read_provenance(file: h5py.File) -> dict[str, str]:
         Texts that do not match the stored digest.
     """
     stated = {name: str(value) for name, value in file.attrs.items()}
-    if stated.get("format") == FORMAT and stated.pop(SEAL, None) != compute_texts_digest(stated):
+    if stated.get("format") == FORMAT and stated.pop(SEAL_ATTRIBUTE, None) != compute_texts_digest(stated):
         raise InputError(f"{file.filename}: what it states of itself was changed after it was written: simulate again.")
     return stated
 
 
 def write_provenance(file: h5py.File, stated: Mapping[str, str]) -> None:
     """Store the provenance in a file."""
-    file.attrs.update({**stated, SEAL: compute_texts_digest(stated)})
+    file.attrs.update({**stated, SEAL_ATTRIBUTE: compute_texts_digest(stated)})
 
 
 def compute_texts_digest(stated: Mapping[str, str]) -> str:
@@ -276,7 +276,7 @@ def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int)
         rows[name] = read_stored(file, f"{group}/{name}", kinds, (len(displacement),))[here]
     if tools:
         rows["reaction"] = read_stored(file, f"{group}/reaction", "f")[here]
-    if file.attrs["format"] == UNCHECKED:
+    if file.attrs["format"] == OLD_FORMAT:
         return rows, np.ones(len(rows), bool)
     return rows, compute_row_checksums(rows) == read_stored(file, f"{group}/checksum", "u", (len(displacement),))[here]
 
@@ -341,7 +341,7 @@ def read_loads(file: h5py.File) -> Loads:
         if f"loads/{name}" in file
     )
     loads = Loads(causes, read_stored(file, "loads/time", "f")[:])
-    if file.attrs.get("format") != UNCHECKED and file["loads"].attrs["digest"] != compute_loads_digest(loads):
+    if file.attrs.get("format") != OLD_FORMAT and file["loads"].attrs["digest"] != compute_loads_digest(loads):
         raise InputError(f"{file.filename}: the loads inside were changed after they were written: simulate again.")
     return loads
 
@@ -360,7 +360,7 @@ def read_outcomes(file: h5py.File, group: str) -> tuple[Outcome, ...]:
 
 
 def read_stored(
-    file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...] | None = None, largest: int = LARGEST_ARRAY
+    file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...] | None = None, largest: int = MAX_ARRAY_BYTES
 ) -> h5py.Dataset:
     """Return an array in the file, of one of the NumPy `kinds`, and of a shape if given (None: any length).
 
@@ -388,7 +388,7 @@ def read_stored(
         want = " x ".join("n" if length is None else str(length) for length in expected)
         measured = " x ".join(map(str, found.shape))
         raise InputError(f"{file.filename}: `{name}` measures {measured}, not {want}: it is damaged. {REMEDY}")
-    most = INFLATION * max(Path(file.filename).stat().st_size, 4096)  # a file that is being written has no size yet
+    most = MAX_INFLATION * max(Path(file.filename).stat().st_size, 4096)  # a file that is being written has no size yet
     if found.nbytes > most or (shape is None and found.nbytes > largest):
         raise InputError(f"{file.filename}: `{name}` declares more than such a file holds: it is damaged. {REMEDY}")
     return found

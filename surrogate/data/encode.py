@@ -58,7 +58,7 @@ def compute_tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     if isinstance(pushed, Indented):
         x, first, second = pushed.axes[:, :, 0], *np.triu_indices(3)
         found += [pushed.axes[:, :, 2], x[:, first] * x[:, second]]
-    return np.column_stack([*found, *_relaxed(pushed)])
+    return np.column_stack([*found, *_list_relaxation(pushed)])
 
 
 def compute_core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
@@ -77,10 +77,10 @@ def compute_core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     middle = pushed.point + pushed.force + pushed.offset
     axes = pushed.axes[:, :, 0], pushed.axes[:, :, 2]
     found = [pushed.point, direction, magnitude, pushed.footprint, middle, *axes]
-    return np.column_stack([*found, *_relaxed(pushed)])
+    return np.column_stack([*found, *_list_relaxation(pushed)])
 
 
-def _relaxed(pushed: Pushed) -> list[np.ndarray]:
+def _list_relaxation(pushed: Pushed) -> list[np.ndarray]:
     """Return the relaxed share of tissue (B,), if it relaxes: a list of one, or of none."""
     known = get_relaxation(pushed)
     return [] if known is None else [known]

@@ -17,12 +17,14 @@ from sim.errors import InputError
 from sim.loads import Loads
 from sim.material import Pairs, read_tissue_json
 
-BROUGHT = 1.0
+APPROACH_TIME = 1.0
 """Maximum time that a tool takes to arrive [s]."""
-HISTORY = f"the tool came within {BROUGHT:g} s, or within the load's time if that is shorter, and stayed until then"
+HISTORY = (
+    f"the tool came within {APPROACH_TIME:g} s, or within the load's time if that is shorter, and stayed until then"
+)
 """Description of the rows of such a data set."""
-SOONEST = 0.05  # Smallest sampled time [s].
-LATEST = 100.0  # Largest sampled time [s].
+MIN_TIME = 0.05  # Smallest sampled time [s].
+MAX_TIME = 100.0  # Largest sampled time [s].
 
 
 def sample_times(count: int, seed: int) -> np.ndarray:
@@ -31,7 +33,7 @@ def sample_times(count: int, seed: int) -> np.ndarray:
     Scenes last a few seconds; slower relaxation matters for a tool that stays.
     """
     source = np.random.Generator(np.random.Philox(key=[seed, 1]))
-    return SOONEST * (LATEST / SOONEST) ** source.random(count)
+    return MIN_TIME * (MAX_TIME / MIN_TIME) ** source.random(count)
 
 
 def get_relaxation_series(effects: Iterable[Effect]) -> Pairs:
@@ -45,8 +47,8 @@ def solve_histories(deformer: Deformer, loads: Loads) -> Deformation:
 
     A tool without an equilibrium in the first step is not held further, and its result has that outcome.
     """
-    first = deformer.deform(Loads(loads.causes, np.minimum(loads.times, BROUGHT)))
-    stay = np.flatnonzero([good.good for good in first.outcome] & (loads.times > BROUGHT))
+    first = deformer.deform(Loads(loads.causes, np.minimum(loads.times, APPROACH_TIME)))
+    stay = np.flatnonzero([good.good for good in first.outcome] & (loads.times > APPROACH_TIME))
     if not len(stay):
         return replace(first, time=loads.times)
     last = deformer.deform(loads.select(stay), start=first.select(stay))
@@ -60,7 +62,7 @@ def compute_unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
 
     As in the FEM's time steps: load that arrives within a step acts for half of it.
     """
-    coming = np.minimum(times, BROUGHT)
+    coming = np.minimum(times, APPROACH_TIME)
     g, tau = np.array(series).T
     return g * np.exp(-(times - 0.5 * coming)[:, None] / tau)
 

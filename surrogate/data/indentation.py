@@ -17,9 +17,9 @@ from sim.tools import Ball, BuiltIn, Capsule, Core, compute_extent, get_core, na
 from .cortex_patch import Patch
 from .tool_loads import build_axes_about
 
-ON_IT = 1e-6  # Distance of a point from the surface below which the surface's normal is used [m].
-APART = 1.0  # Spacing of a core's sample points [radii].
-ALONG = 6  # Number of samples along a rod from its end.
+SURFACE_TOLERANCE = 1e-6  # Distance of a point from the surface below which the surface's normal is used [m].
+SAMPLE_SPACING = 1.0  # Spacing of a core's sample points [radii].
+MAX_ROD_SAMPLES = 6  # Number of samples along a rod from its end.
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +93,11 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     """
     pose, core = get_poses(loads, tool), get_core(tool)
     foot = pose[:, :3, 3] + pose[:, :3, :3] @ (core.centre - [0.0, 0.0, core.half[2]])
-    at = np.einsum("bij,kj->bki", pose[:, :3, :3], _places(core)) + pose[:, None, :3, 3]
-    near, off = _off(patch, np.concatenate([foot, at.reshape(-1, 3)]))
+    at = np.einsum("bij,kj->bki", pose[:, :3, :3], _sample_core(core)) + pose[:, None, :3, 3]
+    near, off = _compute_signed_distances(patch, np.concatenate([foot, at.reshape(-1, 3)]))
     point, distance = near[: len(pose)], off[: len(pose)]
     inward = patch.find_normals(point)
-    on_it = np.abs(distance) < ON_IT
+    on_it = np.abs(distance) < SURFACE_TOLERANCE
     direction = np.where(on_it[:, None], inward, (point - foot) / np.where(on_it, 1.0, distance)[:, None])
     if isinstance(tool, Ball):
         depth = np.maximum(core.radius - distance, 0.0)
@@ -112,19 +112,19 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     return Indented(point, force, wide, axes, middle - point - force)
 
 
-def _off(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compute_signed_distances(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the nearest places (n, 3) on the undeformed cortex to points (n, 3), and their signed distances (n,) [m]."""
     near = patch.skin.find_nearest(points, np.full(len(points), np.inf))[0]
     away = near - points
     return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.find_normals(near)))
 
 
-def _places(core: Core) -> np.ndarray:
+def _sample_core(core: Core) -> np.ndarray:
     """Sample points (k, 3) [m] of a core in the tool's frame, border included; of a rod, near its lower end."""
-    steps = np.ceil(2.0 * core.half / (APART * core.radius)).astype(int)
+    steps = np.ceil(2.0 * core.half / (SAMPLE_SPACING * core.radius)).astype(int)
     low, high = core.centre - core.half, core.centre + core.half
-    if steps[2] > ALONG:
-        steps[2], high[2] = ALONG, low[2] + ALONG * APART * core.radius
+    if steps[2] > MAX_ROD_SAMPLES:
+        steps[2], high[2] = MAX_ROD_SAMPLES, low[2] + MAX_ROD_SAMPLES * SAMPLE_SPACING * core.radius
     axes = [np.linspace(first, last, count + 1) for first, last, count in zip(low, high, steps, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 

@@ -25,12 +25,12 @@ from sim.runtime.processes import LostError
 from sim.runtime.timing import listen_to_stages, time_stage
 from sim.runtime.versions import get_version
 
-from .answer_rows import CHECKSUM, compute_row_checksums, get_row_type
-from .array_meanings import TITLE, explain
+from .answer_rows import CHECKSUM_TYPE, compute_row_checksums, get_row_type
+from .array_meanings import FILE_DESCRIPTION, explain
 from .cortex_patch import open_patch
 from .dataset import (
     FORMAT,
-    UNCHECKED,
+    OLD_FORMAT,
     compute_loads_digest,
     read_embedded,
     read_loads,
@@ -45,10 +45,10 @@ from .tasks import LoadBatch, SolverPool, count_posed_tools, solve_batches
 
 STAGES = {"unit": "unit responses", "answers": "loads"}  # Names of the file's groups in reports of their seconds.
 # Lower and upper bound of the HDF5 version: from v108 on, metadata of arrays have checksums.
-READERS = ("v108", "v108")
-UNTIMED = "not known"  # same width as a number
-RATES = {"unit": "seconds a unit response", "answers": "seconds a load"}  # Provenance keys of the solver's rates.
-OF_ITS_MAKING = ("date", *RATES.values())
+HDF5_VERSIONS = ("v108", "v108")
+UNKNOWN_RATE = "not known"  # same width as a number
+RATE_KEYS = {"unit": "seconds a unit response", "answers": "seconds a load"}  # Provenance keys of the solver's rates.
+CREATION_KEYS = ("date", *RATE_KEYS.values())
 """Provenance entries that differ each time a data set is made."""
 T = TypeVar("T")  # Type of the solved rows.
 
@@ -161,11 +161,11 @@ def simulate(
     finished: set[Batch] = set()
     work = SimulationWork(deformer.anatomy, loads, nodes, batch)
     if path.exists():
-        before = _earlier(path, stated, loads)
+        before = _read_earlier_loads(path, stated, loads)
         if len(before) > len(loads):
             work = SimulationWork(deformer.anatomy, before, nodes, batch)
-        finished = _whole_batches(path, work)
-        if not partial.exists() and not set(work.batches) - finished and _same_body(path, work):
+        finished = _find_whole_batches(path, work)
+        if not partial.exists() and not set(work.batches) - finished and _has_same_body(path, work):
             return SimulatedRows()
     size = sum(work.get_row_type(group).itemsize * rows for group, rows in work.counts.items())
     held = partial.stat().st_size if partial.exists() else 0
@@ -177,7 +177,7 @@ def simulate(
         except LostError as error:
             raise InputError(f"{error} What was solved is kept: the same command resumes.") from error
         with time_stage(STAGES["answers"]):
-            _write(path, work, {**stated, **_rates(path, solved, seconds)}, journal)
+            _write(path, work, {**stated, **_compute_rates(path, solved, seconds)}, journal)
     partial.unlink(missing_ok=True)
     return SimulatedRows(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
 
@@ -211,7 +211,7 @@ def _fill(
     return solved
 
 
-def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
+def _compute_rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
     """Compute the wall time per solve [s] of each newly solved kind; other kinds keep the value of the finished file.
 
     All texts have the same width, so that the file size does not depend on the number of runs.
@@ -221,23 +221,23 @@ def _rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) 
         with h5py.File(path, "r") as file:
             before = read_provenance(file)
     rates = {}
-    for name, words in RATES.items():
+    for name, words in RATE_KEYS.items():
         if solved[name]:
             rates[words] = f"{seconds[STAGES[name]] / solved[name]:.3e}"
         else:
-            rates[words] = before.get(words, UNTIMED)
+            rates[words] = before.get(words, UNKNOWN_RATE)
     return rates
 
 
 def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal: Journal) -> None:
     """Write the data set: batches of the journal, and those of the finished file that it replaces."""
-    with write_stream_atomically(path, path.suffix) as stream, h5py.File(stream, "w", libver=READERS) as file:
+    with write_stream_atomically(path, path.suffix) as stream, h5py.File(stream, "w", libver=HDF5_VERSIONS) as file:
         facts = {
-            "title": TITLE,
+            "title": FILE_DESCRIPTION,
             "length_unit": "m",
             "force_unit": "N",
             "frame": "RAS",
-            "tool": _tool(work.loads, stated),
+            "tool": _describe_tool(work.loads, stated),
             "compression": "none: packed, displacements are a sixth smaller",
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "sulcus version": get_version("sulcus"),
@@ -253,24 +253,24 @@ def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal:
             (name, item): group.create_dataset(item, (rows, *kind.shape), kind.base)
             for name, rows in work.counts.items()
             for group in [file.create_group(name)]
-            for item, kind in [*kinds(name), ("checksum", CHECKSUM)]
+            for item, kind in [*kinds(name), ("checksum", CHECKSUM_TYPE)]
         }
         file["unit/node"] = np.repeat(work.nodes, 3)
         explain(file)
 
         def taken(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
             kind = work.get_row_type(batch[0])
-            rows = np.frombuffer(journal.read(batch), kind) if batch in journal else _kept(path, work, batch)
+            rows = np.frombuffer(journal.read(batch), kind) if batch in journal else _read_kept_rows(path, work, batch)
             return rows, compute_row_checksums(rows)
 
-        for batch, (rows, sums) in _ahead(taken, work.batches):
+        for batch, (rows, sums) in _compute_ahead(taken, work.batches):
             here = slice(batch[1], batch[1] + len(rows))
             for item, _ in kinds(batch[0]):
                 arrays[batch[0], item][here] = rows[item]
             arrays[batch[0], "checksum"][here] = sums
 
 
-def _ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
+def _compute_ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
     """Yield the result of each batch, in order; a second thread computes the next meanwhile."""
     with ThreadPoolExecutor(1) as maker:
         coming = [maker.submit(made, batch) for batch in batches[:1]]
@@ -281,33 +281,33 @@ def _ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tup
             yield batch, ready
 
 
-def _kept(path: Path, work: SimulationWork, batch: Batch) -> np.ndarray:
+def _read_kept_rows(path: Path, work: SimulationWork, batch: Batch) -> np.ndarray:
     """Read a batch's rows from a finished file, checked again for damage."""
     with h5py.File(path, "r") as before:
-        rows, good = _batch(before, work, batch)
+        rows, good = _read_batch(before, work, batch)
     if not good.all():
         raise InputError(f"{path}: corrupted rows were found: run the command again to recompute them.")
     return rows
 
 
-def _tool(loads: Loads, stated: Mapping[str, str]) -> str:
+def _describe_tool(loads: Loads, stated: Mapping[str, str]) -> str:
     """Describe the tool or force in a sentence."""
     if loads.get(Touching) is None:
         return "a force on a round footprint that stays with the tissue: see loads/Pushed"
     return f"the rigid tool {stated.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
 
-def _batch(file: h5py.File, work: SimulationWork, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+def _read_batch(file: h5py.File, work: SimulationWork, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
     """Read a batch's rows from a finished file, and the mask of undamaged rows."""
     rows = work.list_rows(batch)
     return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
 
 
-def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
+def _read_earlier_loads(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
     """Read the loads of a finished file; check that they and `loads` share their first rows, and the provenance."""
     with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
         recorded = read_provenance(file)
-        if recorded.get("format") == UNCHECKED:
+        if recorded.get("format") == OLD_FORMAT:
             raise InputError(f"{path}: is of an earlier version, whose files do not go on: choose another --out.")
         check_same_description(path, recorded, stated, "made", "")
         before = read_loads(file)
@@ -317,7 +317,7 @@ def _earlier(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
     return before
 
 
-def _same_body(path: Path, work: SimulationWork) -> bool:
+def _has_same_body(path: Path, work: SimulationWork) -> bool:
     """Return True if the body in a finished file is undamaged."""
     with h5py.File(path, "r") as file:
         try:
@@ -326,7 +326,7 @@ def _same_body(path: Path, work: SimulationWork) -> bool:
             return False
 
 
-def _whole_batches(path: Path, work: SimulationWork) -> set[Batch]:
+def _find_whole_batches(path: Path, work: SimulationWork) -> set[Batch]:
     """Return the batches that a finished file holds undamaged.
 
     A last short batch is excluded, unless it is the last again: it would have been solved in another batch.
@@ -337,7 +337,7 @@ def _whole_batches(path: Path, work: SimulationWork) -> set[Batch]:
         for batch in work.batches:
             numbers = work.list_rows(batch)
             if numbers[-1] < rows[batch[0]] and (rows[batch[0]] == work.counts[batch[0]] or len(numbers) == work.batch):
-                good = _batch(file, work, batch)[1]
+                good = _read_batch(file, work, batch)[1]
                 damaged += [f"row {row} of `{batch[0]}`" for row in numbers[~good]]
                 held |= {batch} if good.all() else set()
     if damaged:

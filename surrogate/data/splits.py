@@ -13,14 +13,14 @@ from .cortex_patch import Patch, find_nearest
 from .encode import split_forces
 from .tool_loads import find_perpendiculars, spread
 
-FEWEST = 6  # Minimum number of held-out discs.
-MOST = 200  # Maximum number of candidate positions for the discs' centres.
-SHARE = 0.15  # Share of the patch's area that the discs should cover.
-APART = 4  # One of this many loads is set aside from every split to calibrate bounds.
-MOST_APART = 2000  # Maximum number of loads set aside to calibrate bounds.
-RADII = (6e-3, 5e-3, 4e-3, 3e-3, 2e-3, 1e-3)  # Candidate radii of the discs, the default first [m].
-SECTORS = 8  # Number of sectors, of which two opposite ones are held out.
-UPRIGHT = 10.0  # Angle to the normal below which a force is in no sector [deg].
+MIN_DISCS = 6  # Minimum number of held-out discs.
+MAX_POSITIONS = 200  # Maximum number of candidate positions for the discs' centres.
+HELD_OUT_SHARE = 0.15  # Share of the patch's area that the discs should cover.
+CALIBRATION_STRIDE = 4  # One of this many loads is set aside from every split to calibrate bounds.
+MAX_CALIBRATION_LOADS = 2000  # Maximum number of loads set aside to calibrate bounds.
+DISC_RADII = (6e-3, 5e-3, 4e-3, 3e-3, 2e-3, 1e-3)  # Candidate radii of the discs, the default first [m].
+SECTOR_COUNT = 8  # Number of sectors, of which two opposite ones are held out.
+MIN_SECTOR_ANGLE = 10.0  # Angle to the normal below which a force is in no sector [deg].
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +78,20 @@ def leave_discs_out(points: np.ndarray, patch: Patch) -> DiscSplit:
     InputError
         Fewer than seven positions.
     """
-    order = spread(points, MOST) if len(points) else np.zeros(0, int)
-    if len(order) < FEWEST + 1:
+    order = spread(points, MAX_POSITIONS) if len(points) else np.zeros(0, int)
+    if len(order) < MIN_DISCS + 1:
         raise InputError(
-            f"the loads that converged have {len(order)} positions, too few to leave {FEWEST} discs out: simulate more."
+            f"the loads that converged have {len(order)} positions, too few to leave {MIN_DISCS} discs out: simulate more."
         )
-    splits = [_discs(points, points[order], patch, radius) for radius in RADII]
+    splits = [_build_discs(points, points[order], patch, radius) for radius in DISC_RADII]
     fewest = min(splits, key=lambda split: split.test.mean())
     return next((split for split in splits if split.test.mean() <= 0.5), fewest)
 
 
-def _discs(points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
-    split = _split(points, candidates[:FEWEST], patch, radius)
-    for count in range(FEWEST + 1, len(candidates)):
-        if split.share >= SHARE:
+def _build_discs(points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
+    split = _split(points, candidates[:MIN_DISCS], patch, radius)
+    for count in range(MIN_DISCS + 1, len(candidates)):
+        if split.share >= HELD_OUT_SHARE:
             break
         more = _split(points, candidates[:count], patch, radius)
         if more.test.mean() > 0.5:
@@ -141,14 +141,17 @@ def leave_sectors_out(pushed: Pushed, patch: Patch) -> Sectors:
     force = split_forces(pushed)[1]
     angle = np.arctan2(force @ second, force @ first) % (2.0 * np.pi)
     # The first sector is centred on `first`, so that a lattice of directions starting there is not cut at its edge.
-    sector = np.rint(angle * SECTORS / (2.0 * np.pi)).astype(int) % SECTORS
-    tilted = force @ axis < np.cos(np.radians(UPRIGHT))
-    left_out = tilted & (sector % (SECTORS // 2) == 0)
+    sector = np.rint(angle * SECTOR_COUNT / (2.0 * np.pi)).astype(int) % SECTOR_COUNT
+    tilted = force @ axis < np.cos(np.radians(MIN_SECTOR_ANGLE))
+    left_out = tilted & (sector % (SECTOR_COUNT // 2) == 0)
     if not left_out.any() or left_out.all():
         raise InputError(
             f"of {len(force)} loads {int(left_out.sum())} point into the directions to leave out: simulate more, or "
             "loads of more directions."
         )
     return Sectors(
-        np.stack([first, -first]), np.pi / SECTORS, np.where(left_out, sector // (SECTORS // 2), -1), 2.0 / SECTORS
+        np.stack([first, -first]),
+        np.pi / SECTOR_COUNT,
+        np.where(left_out, sector // (SECTOR_COUNT // 2), -1),
+        2.0 / SECTOR_COUNT,
     )

@@ -13,14 +13,14 @@ from sim.material import BRAIN
 
 from .cortex_patch import Patch, find_nearest, open_patch
 
-ATTEMPTS = 2000  # Maximum number of draws of a load.
-BLOCK = 8192  # Number of loads sampled together: more only take memory.
-NUMBERS = 8  # Number of random numbers of a load in each attempt.
-DEEPEST = 15e-3  # Largest depth of a tool [m]: beyond, it perforates.
-HARDEST = 8e3  # Largest mean contact pressure [Pa]: beyond, a tool perforates; tissue harm begins at 2.7-4 kPa.
+MAX_ATTEMPTS = 2000  # Maximum number of draws of a load.
+BLOCK_LOADS = 8192  # Number of loads sampled together: more only take memory.
+NUMBERS_PER_LOAD = 8  # Number of random numbers of a load in each attempt.
+MAX_DEPTH = 15e-3  # Largest depth of a tool [m]: beyond, it perforates.
+MAX_PRESSURE = 8e3  # Largest mean contact pressure [Pa]: beyond, a tool perforates; tissue harm begins at 2.7-4 kPa.
 # E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) estimates a load's depth before it is solved.
 PLANE_MODULUS = BRAIN.young / (1.0 - BRAIN.poisson**2)
-LATTICE = 200  # Number of radii and of forces of a tool at which its nominal loads are counted.
+LATTICE_SIZE = 200  # Number of radii and of forces of a tool at which its nominal loads are counted.
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class ToolLoads:
     name: str
     footprint: tuple[float, float]
     force: tuple[float, float]
-    pressure: tuple[float, float] = (0.0, HARDEST)
-    depth: float = DEEPEST
+    pressure: tuple[float, float] = (0.0, MAX_PRESSURE)
+    depth: float = MAX_DEPTH
     cone: float = np.pi / 4.0
     even: bool = False
 
@@ -71,7 +71,7 @@ TOOLS = {  # Ranges of loads of common tools, by name.
 # Stress test of the solver, not surgery: 1 N on 3 mm would be a flat punch 40 mm deep.
 BRUTAL = ToolLoads("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
 PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)  # Names of all presets.
-BEYOND_TISSUE = ("seed", BRUTAL.name)
+OVERLOAD_PRESETS = ("seed", BRUTAL.name)
 """Presets whose loads strain tissue beyond measurements on brain: their equilibria are stored all the same."""
 
 
@@ -94,24 +94,24 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
         raise InputError(f"a count of {count} with seed {seed} draws nothing: give --count >= 1 and --seed >= 0.")
     patch = open_patch(anatomy)
     if preset == "seed":
-        return _published(anatomy, patch, count, seed)
+        return _build_published_loads(anatomy, patch, count, seed)
     tools = list(TOOLS.values()) if preset == "mixed" else [{**TOOLS, BRUTAL.name: BRUTAL}[preset]]
-    rows = _in_blocks(tools, patch, count, seed)
+    rows = _sample_in_blocks(tools, patch, count, seed)
     return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
 
 
 def sample_pushes(tool: ToolLoads, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample positions of a tool, and its unit directions, (count, 3) each: as `draw`, for any force."""
     free = replace(tool, pressure=(0.0, np.inf), depth=np.inf)
-    rows = _in_blocks([free], patch, count, seed)
+    rows = _sample_in_blocks([free], patch, count, seed)
     return rows[:, :3], rows[:, 3:6] / np.linalg.norm(rows[:, 3:6], axis=1, keepdims=True)
 
 
-def _in_blocks(tools: list[ToolLoads], patch: Patch, count: int, seed: int) -> np.ndarray:
+def _sample_in_blocks(tools: list[ToolLoads], patch: Patch, count: int, seed: int) -> np.ndarray:
     """Sample point [m], force [N] and footprint [m] of each load: (count, 7)."""
     key = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
-    blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
-    return np.concatenate([_drawn(tools, patch, key, block) for block in blocks])
+    blocks = [range(first, min(first + BLOCK_LOADS, count)) for first in range(0, count, BLOCK_LOADS)]
+    return np.concatenate([_sample_block(tools, patch, key, block) for block in blocks])
 
 
 def compute_rejected_share(preset: str) -> float:
@@ -120,7 +120,7 @@ def compute_rejected_share(preset: str) -> float:
     No model is trained on them. Zero for other presets.
     """
     tools = {**{name: [tool] for name, tool in TOOLS.items()}, "mixed": list(TOOLS.values())}.get(preset, [])
-    middles = (np.arange(LATTICE) + 0.5) / LATTICE
+    middles = (np.arange(LATTICE_SIZE) + 0.5) / LATTICE_SIZE
     first, second = (axis.ravel() for axis in np.meshgrid(middles, middles))
     shares = [
         1.0
@@ -143,34 +143,34 @@ def describe_rejected(preset: str) -> str:
     )
 
 
-def _drawn(tools: list[ToolLoads], patch: Patch, key: int, block: range) -> np.ndarray:
+def _sample_block(tools: list[ToolLoads], patch: Patch, key: int, block: range) -> np.ndarray:
     """Sample point [m], force [N] and footprint [m] of each load of a block: (n, 7)."""
-    kind = (len(tools) * _uniform(key, 0, block)[:, -1]).astype(int)
+    kind = (len(tools) * _generate_uniform(key, 0, block)[:, -1]).astype(int)
     out = np.zeros((len(block), 7))
     for number, tool in enumerate(tools):
         rows = np.flatnonzero(kind == number)
-        out[rows] = _drawn_of(tool, patch, key, block, rows)
+        out[rows] = _sample_tool(tool, patch, key, block, rows)
     return out
 
 
-def _uniform(key: int, attempt: int, block: range) -> np.ndarray:
+def _generate_uniform(key: int, attempt: int, block: range) -> np.ndarray:
     """Generate numbers (n, NUMBERS) in [0, 1) of each load of a block.
 
     Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": its counter gives any load's numbers
     without those before.
     """
     source = np.random.Philox(key=np.array([key, attempt], np.uint64))
-    source.advance(block.start * NUMBERS // 4)  # each count gives four numbers
-    return np.random.Generator(source).random((len(block), NUMBERS))
+    source.advance(block.start * NUMBERS_PER_LOAD // 4)  # each count gives four numbers
+    return np.random.Generator(source).random((len(block), NUMBERS_PER_LOAD))
 
 
-def _drawn_of(tool: ToolLoads, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
+def _sample_tool(tool: ToolLoads, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
     """Sample as `_drawn`, for one tool and some rows (k,) of the block: loads that do not fit are sampled again."""
     out, waiting = np.zeros((len(block), 7)), rows
-    for attempt in range(ATTEMPTS):
+    for attempt in range(MAX_ATTEMPTS):
         if not len(waiting):
             return out[rows]
-        uniform = _uniform(key, attempt, block)[waiting]
+        uniform = _generate_uniform(key, attempt, block)[waiting]
         footprint = interpolate_ends(tool.footprint, uniform[:, 0])
         force = (
             interpolate_ends(tool.force, uniform[:, 1])
@@ -181,11 +181,11 @@ def _drawn_of(tool: ToolLoads, patch: Patch, key: int, block: range, rows: np.nd
         point, normal = patch.place(uniform[fits, 2:5])
         inside = patch.compute_edge_distance(point) >= footprint[fits]
         fits, point, normal = fits[inside], point[inside], normal[inside]
-        direction = _within_cone(normal, tool.cone, uniform[fits, 5:7])
+        direction = _sample_in_cone(normal, tool.cone, uniform[fits, 5:7])
         out[waiting[fits]] = np.column_stack([point, force[fits, None] * direction, footprint[fits]])
         waiting = np.delete(waiting, fits)
     raise InputError(
-        f"in {ATTEMPTS} draws no {tool.name} of radius {1e3 * tool.footprint[0]:g}-{1e3 * tool.footprint[1]:g} mm "
+        f"in {MAX_ATTEMPTS} draws no {tool.name} of radius {1e3 * tool.footprint[0]:g}-{1e3 * tool.footprint[1]:g} mm "
         "fitted into the open cortex: widen the --craniotomy, or choose a smaller tool with --preset."
     )
 
@@ -195,7 +195,7 @@ def interpolate_ends(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray
     return ends[0] + (ends[1] - ends[0]) * uniform
 
 
-def _within_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
+def _sample_in_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
     """Sample unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
     cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
     around = (2.0 * np.pi * uniform[:, 1])[:, None]
@@ -216,14 +216,14 @@ def build_axes_about(shaft: np.ndarray) -> np.ndarray:
     return np.stack([*find_perpendiculars(shaft), shaft], axis=2)
 
 
-POSITIONS = 11  # Number of positions of the published loads.
-DIRECTIONS = 30  # Number of directions of the published loads.
-MAGNITUDES = np.linspace(0.10, 1.05, 20)  # Forces of the published loads [N].
+POSITION_COUNT = 11  # Number of positions of the published loads.
+DIRECTION_COUNT = 30  # Number of directions of the published loads.
+PUBLISHED_FORCES = np.linspace(0.10, 1.05, 20)  # Forces of the published loads [N].
 PUBLISHED_FOOTPRINT = 7e-3  # Radius of the area of one free surface node of the published mesh [m].
 PUBLISHED_CONE = np.pi / 3.0  # Largest angle between a published force and the inward normal [rad].
 
 
-def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
+def _build_published_loads(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
     """Build the published loads: 11 positions 20-28 mm from the tumour's centre x 30 directions x 20 sizes, shuffled.
 
     The authors do not print their directions: a spherical Fibonacci lattice within 60 degrees of the inward normal
@@ -241,15 +241,18 @@ def _published(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
             f"No node at 20-28 mm lies {1e3 * PUBLISHED_FOOTPRINT:g} mm inside its rim: make the anatomy with --preset "
             "seed, or choose another --preset here."
         )
-    near = near[spread(patch.points[near], POSITIONS)]
-    golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(DIRECTIONS) / (2.0 * np.pi)
-    lattice = np.column_stack([(np.arange(DIRECTIONS) + 0.5) / DIRECTIONS, golden % 1.0])
+    near = near[spread(patch.points[near], POSITION_COUNT)]
+    golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(DIRECTION_COUNT) / (2.0 * np.pi)
+    lattice = np.column_stack([(np.arange(DIRECTION_COUNT) + 0.5) / DIRECTION_COUNT, golden % 1.0])
     direction = np.array(
-        [_within_cone(np.broadcast_to(patch.inward[node], (DIRECTIONS, 3)), PUBLISHED_CONE, lattice) for node in near]
+        [
+            _sample_in_cone(np.broadcast_to(patch.inward[node], (DIRECTION_COUNT, 3)), PUBLISHED_CONE, lattice)
+            for node in near
+        ]
     )
-    whole = np.random.default_rng(seed).permutation(len(near) * DIRECTIONS * len(MAGNITUDES))[:count]
-    position, way, magnitude = np.unravel_index(whole, (len(near), DIRECTIONS, len(MAGNITUDES)))
-    force = MAGNITUDES[magnitude, None] * direction[position, way]
+    whole = np.random.default_rng(seed).permutation(len(near) * DIRECTION_COUNT * len(PUBLISHED_FORCES))[:count]
+    position, way, magnitude = np.unravel_index(whole, (len(near), DIRECTION_COUNT, len(PUBLISHED_FORCES)))
+    force = PUBLISHED_FORCES[magnitude, None] * direction[position, way]
     return Loads((Pushed(patch.points[near[position]], force, np.full(len(whole), PUBLISHED_FOOTPRINT)),))
 
 

@@ -15,16 +15,18 @@ from sim.tools import Ball, BuiltIn, Capsule, Spatula, compute_distances, comput
 from .cortex_patch import Patch, build_barycentric_lattice, open_patch
 from .tool_loads import TOOLS, build_axes_about, draw, find_perpendiculars, interpolate_ends, sample_pushes
 
-ROUND = ("palpation", "bipolar", "dissector")  # Presets that a ball can represent.
-SHALLOW = 0.05  # Smallest depth as a share of the tool's radius.
-DEEP = 0.9  # Largest depth of a ball as a share of its radius: deeper, a ball without shaft would be swallowed.
-ROD = 2.0  # Largest depth of a rod [radii].
-BLADE = 2.0 / 3.0  # Largest depth of a blade [widths].
-LEAN = np.radians(20.0)  # Largest tilt of a blade [rad].
-TOUCHES = 1e-6  # Distance that counts as contact when a tool is lowered [m].
-STEPS = 200  # Maximum number of steps when a tool is lowered.
-ROWS = 4  # Rows of surface sample points in a triangle when a tool is lowered.
-AROUND = 10e-3  # Lower bound of a third of the search radius round the tool [m].
+BALL_PRESETS = ("palpation", "bipolar", "dissector")  # Presets that a ball can represent.
+MIN_DEPTH_RATIO = 0.05  # Smallest depth as a share of the tool's radius.
+MAX_BALL_DEPTH = (
+    0.9  # Largest depth of a ball as a share of its radius: deeper, a ball without shaft would be swallowed.
+)
+MAX_ROD_DEPTH = 2.0  # Largest depth of a rod [radii].
+MAX_BLADE_DEPTH = 2.0 / 3.0  # Largest depth of a blade [widths].
+MAX_BLADE_TILT = np.radians(20.0)  # Largest tilt of a blade [rad].
+CONTACT_TOLERANCE = 1e-6  # Distance that counts as contact when a tool is lowered [m].
+MAX_STEPS = 200  # Maximum number of steps when a tool is lowered.
+SAMPLE_ROWS = 4  # Rows of surface sample points in a triangle when a tool is lowered.
+MIN_SEARCH_RADIUS = 10e-3  # Lower bound of a third of the search radius round the tool [m].
 
 
 def choose_ball(preset: str) -> Ball:
@@ -35,9 +37,9 @@ def choose_ball(preset: str) -> Ball:
     InputError
         A preset that is not one round tool.
     """
-    if preset not in ROUND:
+    if preset not in BALL_PRESETS:
         raise InputError(
-            f"no ball stands for the preset {preset}: choose one of {', '.join(ROUND)}, or give --blade or --capsule."
+            f"no ball stands for the preset {preset}: choose one of {', '.join(BALL_PRESETS)}, or give --blade or --capsule."
         )
     return Ball(0.5 * sum(TOOLS[preset].footprint))
 
@@ -67,19 +69,20 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: Built
         (pushed,) = draw(preset, anatomy, count, seed).get_all(Pushed)
         direction = pushed.force / np.linalg.norm(pushed.force, axis=1, keepdims=True)
         depth = interpolate_ends(
-            (SHALLOW * tool.radius, min(DEEP * tool.radius, TOOLS[preset].depth)), source.random(count)
+            (MIN_DEPTH_RATIO * tool.radius, min(MAX_BALL_DEPTH * tool.radius, TOOLS[preset].depth)),
+            source.random(count),
         )
         return Loads((compute_poses(tool, pushed.point, patch.find_normals(pushed.point), depth[:, None] * direction),))
     if isinstance(tool, Capsule):
-        room, deepest, cone = tool.radius, ROD * tool.radius, TOOLS[preset].cone
+        room, deepest, cone = tool.radius, MAX_ROD_DEPTH * tool.radius, TOOLS[preset].cone
     else:
-        room, deepest, cone = compute_extent(tool), BLADE * tool.width, LEAN
+        room, deepest, cone = compute_extent(tool), MAX_BLADE_DEPTH * tool.width, MAX_BLADE_TILT
     kind = replace(TOOLS[preset], name=type(tool).__name__, footprint=(room, room), cone=cone)
     point, direction = sample_pushes(kind, patch, count, seed)
     share = source.random((count, 2))
-    depth = interpolate_ends((SHALLOW * get_core(tool).radius, min(deepest, TOOLS[preset].depth)), share[:, 0])
-    rotation = _turned(-direction, 2.0 * np.pi * share[:, 1])
-    return Loads((_lowered(tool, patch, point, rotation, depth),))
+    depth = interpolate_ends((MIN_DEPTH_RATIO * get_core(tool).radius, min(deepest, TOOLS[preset].depth)), share[:, 0])
+    rotation = _build_rotations(-direction, 2.0 * np.pi * share[:, 1])
+    return Loads((_move_to_contact(tool, patch, point, rotation, depth),))
 
 
 def compute_poses(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarray) -> Touching:
@@ -92,14 +95,14 @@ def compute_poses(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.
     return Touching(pose)
 
 
-def _turned(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def _build_rotations(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Build rotations (B, 3, 3) whose z is `shaft` (B, 3), turned about it by angles (B,) [rad]."""
     first, second = find_perpendiculars(shaft)
     x = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
     return np.stack([x, np.cross(shaft, x), shaft], axis=2)
 
 
-def _lowered(
+def _move_to_contact(
     tool: Capsule | Spatula, patch: Patch, point: np.ndarray, rotation: np.ndarray, depth: np.ndarray
 ) -> Touching:
     """Lower a tool along its shaft over point (B, 3) until contact, and on by depth (B,) [m]; return the poses.
@@ -107,17 +110,17 @@ def _lowered(
     Each step is the distance to the surface's nearest point (Hart 1996, "Sphere tracing", Visual Comput. 12:527-545).
     The surface is sampled by `ROWS`^2 points a triangle.
     """
-    share = build_barycentric_lattice(ROWS)
+    share = build_barycentric_lattice(SAMPLE_ROWS)
     surface = np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
     reach, tree = compute_extent(tool), KDTree(surface)
     pose = np.tile(np.eye(4), (len(point), 1, 1, 1))
     pose[:, 0, :3, :3] = rotation
     for here, start, shaft, deep in zip(pose[:, 0], point, rotation[:, :, 2], depth, strict=True):
-        near = surface[tree.query_ball_point(start, 3.0 * max(reach, AROUND))]
+        near = surface[tree.query_ball_point(start, 3.0 * max(reach, MIN_SEARCH_RADIUS))]
         here[:3, 3] = start + reach * shaft
-        for _ in range(STEPS):
+        for _ in range(MAX_STEPS):
             room = float(compute_distances(tool, here, near).min())
-            if room < TOUCHES:
+            if room < CONTACT_TOLERANCE:
                 break
             here[:3, 3] -= room * shaft
         here[:3, 3] -= deep * shaft

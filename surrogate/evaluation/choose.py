@@ -50,18 +50,20 @@ def choose(offers: Sequence[Offer], within_mm: float | None = None, within_ms: f
     both = [offer for offer in exact if offer in fast]
     asked = " and ".join(bounds)
     if not both:
-        near = [f"the most accurate is {min(fast or offers, key=_error)}"] if within_mm is not None else []
-        near += [f"the fastest is {min(exact or offers, key=_time)}"] if within_ms is not None else []
+        near = [f"the most accurate is {min(fast or offers, key=_get_error)}"] if within_mm is not None else []
+        near += [f"the fastest is {min(exact or offers, key=_get_time)}"] if within_ms is not None else []
         raise InputError(f"no deformer here is within {asked}: {'; '.join(near)}. Allow more.")
-    taken, word = (min(both, key=_error), "most accurate") if within_mm is None else (min(both, key=_time), "fastest")
+    taken, word = (
+        (min(both, key=_get_error), "most accurate") if within_mm is None else (min(both, key=_get_time), "fastest")
+    )
     return ModelChoice(taken, f"{taken} is the {word} of {len(both)} deformers within {asked}, of {len(offers)} here")
 
 
-def _error(offer: Offer) -> tuple[float, float]:
+def _get_error(offer: Offer) -> tuple[float, float]:
     return offer.error_mm, offer.median_ms
 
 
-def _time(offer: Offer) -> tuple[float, float]:
+def _get_time(offer: Offer) -> tuple[float, float]:
     return offer.median_ms, offer.error_mm
 
 

@@ -14,7 +14,7 @@ from ..data.encode import split_forces
 from ..model.conformal import LEVELS
 from ..model.learned import Learned
 
-TENTHS = 10  # Number of classes of force for which coverage is reported.
+FORCE_CLASSES = 10  # Number of classes of force for which coverage is reported.
 Held = tuple[float | None, ...]
 """Share of loads within their bounds for each of `conformal.LEVELS`; None where bounds give no guarantee."""
 
@@ -63,10 +63,10 @@ def compute_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverag
     """
     if model.bounds is None:
         raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
-    _demand_tenths(loads)
+    _check_load_count(loads)
     answer = model.deform(loads, at=model.anatomy.tumour_nodes)
     worst = np.linalg.norm(answer.displacement - truth, axis=2).max(axis=1)
-    return _covered(model, loads, answer, worst, answer.bound)
+    return _measure_coverage(model, loads, answer, worst, answer.bound)
 
 
 def measure_distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
@@ -79,15 +79,15 @@ def measure_distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -
     """
     if model.tip is None or model.tip.bound is None:
         raise InputError("this model has no calibrated bound of its distance: train it again, with enough loads.")
-    _demand_tenths(loads)
+    _check_load_count(loads)
     answer = model.deform(loads, at=model.nodes)
     found = model.predict_distance(loads, answer)
-    return _covered(model, loads, answer, np.abs(found.value - truth), found.bound)
+    return _measure_coverage(model, loads, answer, np.abs(found.value - truth), found.bound)
 
 
-def _demand_tenths(loads: Loads) -> None:
-    if len(loads) < TENTHS:
-        raise InputError(f"{len(loads)} loads have no tenths: simulate at least {TENTHS}.")
+def _check_load_count(loads: Loads) -> None:
+    if len(loads) < FORCE_CLASSES:
+        raise InputError(f"{len(loads)} loads have no tenths: simulate at least {FORCE_CLASSES}.")
 
 
 def measure_held(error: np.ndarray, bound: np.ndarray) -> Held:
@@ -110,7 +110,7 @@ def format_held(held: Held) -> str:
 def measure_covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
     """Compute the coverage of errors (B,) [m] by bounds (2, B) [m], overall and by deciles of force (B,) [N]."""
     held = error <= bound[0]
-    by_force = np.array_split(np.argsort(force, kind="stable"), TENTHS)
+    by_force = np.array_split(np.argsort(force, kind="stable"), FORCE_CLASSES)
     return Coverage(
         len(error),
         measure_held(error, bound),
@@ -121,6 +121,8 @@ def measure_covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, ext
     )
 
 
-def _covered(model: Learned, loads: Loads, answer: Deformation, error: np.ndarray, bound: np.ndarray) -> Coverage:
+def _measure_coverage(
+    model: Learned, loads: Loads, answer: Deformation, error: np.ndarray, bound: np.ndarray
+) -> Coverage:
     force = split_forces(model.to_input(loads))[0]
     return measure_covered(force, error, bound, answer.outcome.count(Outcome.EXTRAPOLATED))

@@ -15,7 +15,7 @@ from sim.loads import Loads
 from sim.runtime.threads import limit_to_one_thread
 
 from ..model.learned import Learned
-from ..model.left_out import FEWEST_FOR_P999
+from ..model.left_out import MIN_LOADS_FOR_P999
 from .coverage import Held, format_held, measure_held
 
 
@@ -50,8 +50,8 @@ class SolveCounts:
         return self.loads + self.units + self.series
 
 
-WARM_UP = 10  # Number of loads solved before the timed ones.
-TIMED = 100  # Number of timed loads.
+WARM_UP_LOADS = 10  # Number of loads solved before the timed ones.
+TIMED_LOADS = 100  # Number of timed loads.
 T = TypeVar("T")  # Type of a deformer's input.
 
 
@@ -195,33 +195,36 @@ def score(
 
 def time_single_load(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
     """Measure the median wall time [us] of one load at a time."""
-    return 1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED)))
+    return 1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED_LOADS)))
 
 
 def time_model_alone(deformer: Deformer, loads: Loads) -> float | None:
     """Measure the median wall time [us] of a trained model alone, of one load at a time; None for other deformers."""
     if not isinstance(deformer, Learned):
         return None
-    single = [deformer.to_input(loads.select(slice(row, row + 1))) for row in np.arange(WARM_UP + TIMED) % len(loads)]
+    single = [
+        deformer.to_input(loads.select(slice(row, row + 1)))
+        for row in np.arange(WARM_UP_LOADS + TIMED_LOADS) % len(loads)
+    ]
     nodes = deformer.anatomy.tumour_nodes
     with limit_to_one_thread():
-        return 1e6 * float(np.median(_timed(lambda one: deformer.predict_motion(one, nodes), single)))
+        return 1e6 * float(np.median(_measure_times(lambda one: deformer.predict_motion(one, nodes), single)))
 
 
 def time_single_loads(deformer: Deformer, loads: Loads, nodes: np.ndarray, count: int) -> list[float]:
     """Measure wall times [s] of `count` solves of one load at a time, cycling through the loads, warm-up excluded."""
-    single = [loads.select(slice(row, row + 1)) for row in np.arange(WARM_UP + count) % len(loads)]
-    return _timed(lambda one: deformer.deform(one, at=nodes), single)
+    single = [loads.select(slice(row, row + 1)) for row in np.arange(WARM_UP_LOADS + count) % len(loads)]
+    return _measure_times(lambda one: deformer.deform(one, at=nodes), single)
 
 
-def _timed(answer: Callable[[T], object], single: Iterable[T]) -> list[float]:
+def _measure_times(answer: Callable[[T], object], single: Iterable[T]) -> list[float]:
     """Measure wall times [s] of one call after the other, without the warm-up."""
     seconds = []
     for one in single:
         begun = time.perf_counter()
         answer(one)
         seconds.append(time.perf_counter() - begun)
-    return seconds[WARM_UP:]
+    return seconds[WARM_UP_LOADS:]
 
 
 def find_best(scores: Sequence[Score]) -> Score:
@@ -238,9 +241,9 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
         "|      | us, result with bound"
     )
     rows = [
-        f"{row.name:<10}{row.mean_mm:7.4f} {row.p95_mm:7.4f} {_known(row.p999_mm, '7.4f')} {row.max_mm:7.4f} | "
-        f"{row.worst_mean_mm:7.4f} {row.worst_p95_mm:7.4f} {_known(row.worst_p999_mm, '7.4f')}    |"
-        f"{row.mean_percent:7.2f} {row.p95_percent:6.2f} {_known(row.p999_percent, '6.2f')} {row.max_percent:6.2f} |"
+        f"{row.name:<10}{row.mean_mm:7.4f} {row.p95_mm:7.4f} {_format_number(row.p999_mm, '7.4f')} {row.max_mm:7.4f} | "
+        f"{row.worst_mean_mm:7.4f} {row.worst_p95_mm:7.4f} {_format_number(row.worst_p999_mm, '7.4f')}    |"
+        f"{row.mean_percent:7.2f} {row.p95_percent:6.2f} {_format_number(row.p999_percent, '6.2f')} {row.max_percent:6.2f} |"
         f"{'' if row.bare_microseconds is None else f'{row.bare_microseconds:.0f}':>5} |{row.microseconds:5.0f}"
         for row in scores
     ]
@@ -248,11 +251,11 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
     fastest = min(scores, key=lambda row: row.microseconds)
     verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
     wins = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
-    few = [f"p99.9: not known from fewer than {FEWEST_FOR_P999} loads"] if scores[0].p999_mm is None else []
+    few = [f"p99.9: not known from fewer than {MIN_LOADS_FOR_P999} loads"] if scores[0].p999_mm is None else []
     return "\n".join([head, *rows, *few, wins if len(scores) > 1 else f"{best.name}: {verdict}", *_solve_lines(scores)])
 
 
-def _known(value: float | None, form: str) -> str:
+def _format_number(value: float | None, form: str) -> str:
     """Format a number, or a dash in its column."""
     return f"{'-':>{form.split('.')[0]}}" if value is None else f"{value:{form}}"
 
@@ -281,6 +284,6 @@ def spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
     return (
         float(values.mean()),
         float(p95),
-        float(p999) if len(values) >= FEWEST_FOR_P999 else None,
+        float(p999) if len(values) >= MIN_LOADS_FOR_P999 else None,
         float(values.max()),
     )

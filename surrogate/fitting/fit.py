@@ -17,14 +17,14 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.runtime.threads import limit_to_one_thread
 
-from ..locating.causes import LETS_GO, YOUNG, Group
+from ..locating.causes import SEPARATING_SKULL, YOUNG, Group
 from ..locating.ensemble import ACCURACY
 from ..locating.evidence import Evidence
 from ..locating.locator import Locator
 from ..locating.observation import to_evidence
 from ..locating.regions import Region
 from .frame import FORCE_SIGMA, ObservedFrame, Tool, check_frames, find_foot
-from .responses import FORCE, POISSONS, RATIOS, Responses, build_drained_loads, build_force_loads, solve_responses
+from .responses import POISSONS, RATIOS, TOOL_FORCE, Responses, build_drained_loads, build_force_loads, solve_responses
 from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 from .weighing import (
     factorise_errors,
@@ -40,15 +40,15 @@ EXPONENTS = (9.5, 19.0)
 """Candidate -m of Ogden's law, equally probable: tissue stiffens with indentation, so a dent alone gives no E."""
 YOUNGS = np.geomspace(300.0, 12000.0, 300)
 """Candidate Young's moduli [Pa] at small strain, equally probable."""
-TIMES = (0.6, 1.2, 2.2, 3.6, 5.5)  # Solved forces as multiples of the force that linear tissue would need.
+FORCE_MULTIPLES = (0.6, 1.2, 2.2, 3.6, 5.5)  # Solved forces as multiples of the force that linear tissue would need.
 # Ratio of the force on finer or quadratic meshes to that on a command's mesh, for the same dent: 1.08 to 1.16 on the
 # template (docs/notes/fit_experiments.md).
-SOFT = 1.11
-OFF = 0.45  # Standard deviation of the logarithm of a modulus due to further errors.
-ROUNDS = 3  # Number of iterations that recompute the errors from the estimated dent.
+MESH_FORCE_RATIO = 1.11
+MODULUS_DEVIATION = 0.45  # Standard deviation of the logarithm of a modulus due to further errors.
+ITERATIONS = 3  # Number of iterations that recompute the errors from the estimated dent.
 # Equally probable normal quantiles of a force reading [standard deviations].
-READINGS = np.array([-1.4, -0.7, 0.0, 0.7, 1.4])
-SAMPLES = 101  # Number of samples of a modulus.
+READING_QUANTILES = np.array([-1.4, -0.7, 0.0, 0.7, 1.4])
+MODULUS_SAMPLES = 101  # Number of samples of a modulus.
 
 
 def estimate_young_moduli(
@@ -74,38 +74,42 @@ def estimate_young_moduli(
     for done, number in enumerate(read):
         progress(done, len(read))
         evidence, own = to_evidence(anatomy, frames[number].observation), slice(columns[number], columns[number] + 3)
-        total += _weighed(anatomy, frames[number].tools[0], evidence, tissue, pressed, own, device)
+        total += _compute_log_likelihood(anatomy, frames[number].tools[0], evidence, tissue, pressed, own, device)
     progress(len(read), len(read))
     share = np.exp(total - total.max())
     step = float(np.log(YOUNGS[1] / YOUNGS[0]))
-    at = np.cumsum(gaussian_filter1d(share, OFF / step))
-    return np.exp(np.interp((np.arange(SAMPLES) + 0.5) / SAMPLES, at / at[-1], np.log(YOUNGS / SOFT)))
+    at = np.cumsum(gaussian_filter1d(share, MODULUS_DEVIATION / step))
+    return np.exp(
+        np.interp((np.arange(MODULUS_SAMPLES) + 0.5) / MODULUS_SAMPLES, at / at[-1], np.log(YOUNGS / MESH_FORCE_RATIO))
+    )
 
 
-def _weighed(
+def _compute_log_likelihood(
     anatomy: Anatomy, tool: Tool, evidence: Evidence, tissue: FittedTissue, pressed: Responses, own: slice, device: str
 ) -> np.ndarray:
     """Compute the log-likelihood of one force reading for each of `YOUNGS`."""
     name = max(tissue.skulls, key=lambda skull: tissue.skulls[skull])
-    skull, (_, poisson, _), (_, ratio, _) = "slide" if name == LETS_GO else name, tissue.poisson, tissue.ratio
+    skull, (_, poisson, _), (_, ratio, _) = "slide" if name == SEPARATING_SKULL else name, tissue.poisson, tissue.ratio
     nearest = int(np.abs(POISSONS - poisson).argmin()), int(np.abs(np.log(RATIOS / ratio)).argmin())
     lower, _ = factorise_errors(evidence)
     value = whiten_columns(lower, evidence.value)
     way = np.linalg.lstsq(
         whiten_columns(lower, predict_seen(pressed, skull, evidence)[nearest][own].T), value, rcond=None
     )[0]
-    force, direction = FORCE * float(np.linalg.norm(way)), way / np.linalg.norm(way)
+    force, direction = TOOL_FORCE * float(np.linalg.norm(way)), way / np.linalg.norm(way)
     reading = float(tool.force or 0.0)
     sigma = FORCE_SIGMA * reading if tool.sigma is None else tool.sigma
-    asked = np.log(YOUNG * np.maximum(reading + sigma * READINGS, 0.1 * reading)[:, None] / YOUNGS)
+    asked = np.log(YOUNG * np.maximum(reading + sigma * READING_QUANTILES, 0.1 * reading)[:, None] / YOUNGS)
     shapes, inside = [], []
     for exponent in EXPONENTS:
         group = Group(list(SKULLS).index(skull), skull, poisson, ratio, exponent, pressed.regions)
-        sizes, rows = _dents(anatomy, tool, group, evidence, pressed, force * np.array(TIMES), direction, device)
+        sizes, rows = _solve_dents(
+            anatomy, tool, group, evidence, pressed, force * np.array(FORCE_MULTIPLES), direction, device
+        )
         inside.append((asked >= np.log(sizes[0])) & (asked <= np.log(sizes[-1])))
         shapes.append(CubicSpline(np.log(sizes), rows)(np.clip(asked, *np.log(sizes[[0, -1]]))))
     shape, logs = np.stack(shapes), np.zeros(0)
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         off = whiten_columns(lower, (evidence.value - shape).reshape(-1, len(value)).T)
         logs = -0.5 * (off**2).sum(axis=0).reshape(shape.shape[:-1])
         logs = np.where(inside, logs, logs.min() - 50.0)
@@ -114,7 +118,7 @@ def _weighed(
     return np.asarray(logsumexp(logs, axis=(0, 1)))
 
 
-def _dents(
+def _solve_dents(
     anatomy: Anatomy, tool: Tool, group: Group, evidence: Evidence, pressed: Responses, sizes: np.ndarray,
     direction: np.ndarray, device: str,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip

@@ -14,20 +14,32 @@ from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points
 
-from ..locating.observation import FAR_NOW, Observation, to_evidence
+from ..locating.observation import FAR_DISTANCE_NOW, Observation, to_evidence
 from ..locating.observed_files import PLACE, SIGMA, read_columns
 
-RADIUS = 6e-3
+DEFAULT_RADIUS = 6e-3
 """Default radius of the disc on which a tool presses [m]."""
-RADII = (0.5e-3, 30e-3)  # Smallest and largest tool radius [m].
-HARDEST = 10.0  # Largest force of a tool on a brain [N].
+RADIUS_RANGE = (0.5e-3, 30e-3)  # Smallest and largest tool radius [m].
+MAX_FORCE = 10.0  # Largest force of a tool on a brain [N].
 FORCE_SIGMA = 0.1
 """Default standard deviation of a measured force, relative to it."""
-FRAME, WIDE, FORCE = "frame", "radius", "force"  # Column names: number of the frame, radius of the tool, force.
-ALLOWED = {  # Allowed columns after the position, and columns with optional cells.
-    (FRAME, *PLACE, *more) for more in ((), (WIDE,), (FORCE,), (WIDE, FORCE), (FORCE, SIGMA), (WIDE, FORCE, SIGMA))
+FRAME_COLUMN, RADIUS_COLUMN, FORCE_COLUMN = (
+    "frame",
+    "radius",
+    "force",
+)  # Column names: number of the frame, radius of the tool, force.
+ALLOWED_COLUMNS = {  # Allowed columns after the position, and columns with optional cells.
+    (FRAME_COLUMN, *PLACE, *more)
+    for more in (
+        (),
+        (RADIUS_COLUMN,),
+        (FORCE_COLUMN,),
+        (RADIUS_COLUMN, FORCE_COLUMN),
+        (FORCE_COLUMN, SIGMA),
+        (RADIUS_COLUMN, FORCE_COLUMN, SIGMA),
+    )
 }
-EMPTY = (WIDE, FORCE, SIGMA)  # Columns whose cells may be empty.
+OPTIONAL_COLUMNS = (RADIUS_COLUMN, FORCE_COLUMN, SIGMA)  # Columns whose cells may be empty.
 
 
 @dataclass(frozen=True)
@@ -45,7 +57,7 @@ class Tool:
     """
 
     tip: tuple[float, float, float]
-    radius: float = RADIUS
+    radius: float = DEFAULT_RADIUS
     force: float | None = None
     sigma: float | None = None
 
@@ -97,18 +109,20 @@ def _check(anatomy: Anatomy, tool: Tool) -> None:
     if not np.isfinite(numbers).all():
         raise InputError("a tool has a number that is not finite: leave it out.")
     away = float(np.linalg.norm(find_foot(anatomy, tool) - tool.tip))
-    if away > FAR_NOW:
+    if away > FAR_DISTANCE_NOW:
         raise InputError(
             f"a tool is {1e3 * away:.0f} mm from the open cortex, so that it cannot press on it: give millimetres, "
             "RAS, or leave it out."
         )
-    if not RADII[0] <= tool.radius <= RADII[1]:
+    if not RADIUS_RANGE[0] <= tool.radius <= RADIUS_RANGE[1]:
         raise InputError(
             f"a tool of radius {1e3 * tool.radius:g} mm presses on no disc of a brain: give "
-            f"{1e3 * RADII[0]:g} to {1e3 * RADII[1]:g} mm."
+            f"{1e3 * RADIUS_RANGE[0]:g} to {1e3 * RADIUS_RANGE[1]:g} mm."
         )
-    if tool.force is not None and not 0.0 < tool.force <= HARDEST:
-        raise InputError(f"a force of {tool.force:g} N is none of a tool on a brain: give newtons, up to {HARDEST:g}.")
+    if tool.force is not None and not 0.0 < tool.force <= MAX_FORCE:
+        raise InputError(
+            f"a force of {tool.force:g} N is none of a tool on a brain: give newtons, up to {MAX_FORCE:g}."
+        )
     if tool.sigma is not None and (tool.force is None or not tool.sigma > 0.0):
         raise InputError("a force's sigma needs a force, and is positive: give both in newtons, or neither.")
 
@@ -123,16 +137,19 @@ def read_tools(path: str | Path, frames: int) -> tuple[tuple[Tool, ...], ...]:
     InputError
         A file that is missing or not such a table; a frame that does not exist.
     """
-    columns = read_columns(path, ALLOWED, EMPTY)
+    columns = read_columns(path, ALLOWED_COLUMNS, OPTIONAL_COLUMNS)
     found: list[list[Tool]] = [[] for _ in range(frames)]
-    for row, number in enumerate(columns[FRAME]):
+    for row, number in enumerate(columns[FRAME_COLUMN]):
         if number not in range(1, frames + 1):
             raise InputError(
                 f"{path}: row {row + 2} is of frame {number:g}, but there are {frames}: they count from 1."
             )
         radius, force, sigma = (
-            None if name not in columns or np.isnan(columns[name][row]) else float(columns[name][row]) for name in EMPTY
+            None if name not in columns or np.isnan(columns[name][row]) else float(columns[name][row])
+            for name in OPTIONAL_COLUMNS
         )
         x, y, z = (1e-3 * float(columns[name][row]) for name in PLACE)
-        found[int(number) - 1].append(Tool((x, y, z), RADIUS if radius is None else 1e-3 * radius, force, sigma))
+        found[int(number) - 1].append(
+            Tool((x, y, z), DEFAULT_RADIUS if radius is None else 1e-3 * radius, force, sigma)
+        )
     return tuple(map(tuple, found))

@@ -19,7 +19,7 @@ from sim.fem import Fem
 from sim.geometry.tetmesh import compute_digest
 from sim.loads import Loads, Posture, Pushed
 
-from ..locating.causes import SPREAD, SUPINE, USUAL, build_linear_tissue, sample_directions
+from ..locating.causes import FORCE_RADIUS, SUPINE, USUAL_CAUSES, build_linear_tissue, sample_directions
 from ..locating.locator import find_observed_nodes
 from ..locating.regions import Region, build_tissue
 from ..model.kept_arrays import find_kept_path, keep_arrays
@@ -28,12 +28,12 @@ RATIOS = np.geomspace(0.4, 3.2, 4)
 """Candidate ratios of tumour to brain stiffness, for which FEM is solved."""
 POISSONS = np.array([0.45, 0.47, 0.4945])
 """Candidate Poisson's ratios of brain and tumour."""
-LINEAR = ("bonded", "slide")
+SOLVED_SKULLS = ("bonded", "slide")
 """Skulls for which FEM is solved; one that separates keeps contact under a tool, as sliding contact does."""
-FORCE = 0.01
+TOOL_FORCE = 0.01
 """Tool force along each axis [N]."""
-POSTURES = 6  # Number of head positions.
-LEVELS = (0.7, 0.4, 0.15)  # Shares of the remaining fluid in each head position.
+POSTURE_COUNT = 6  # Number of head positions.
+FLUID_LEVELS = (0.7, 0.4, 0.15)  # Shares of the remaining fluid in each head position.
 SEED = 5  # Random seed of the head positions.
 ACCURACY = Accuracy(tolerance=1e-3)  # Accuracy of the FEM results.
 
@@ -59,11 +59,13 @@ class Responses:
 
 def build_drained_loads(anatomy: Anatomy) -> Loads:
     """Build loads of drained fluid for sampled head positions."""
-    down = sample_directions(np.random.default_rng(SEED), open_cortex(anatomy).axis, replace(USUAL, drainages=POSTURES))
-    every = [(way, compute_fluid_level(anatomy.mesh.nodes, way, left)) for left in LEVELS for way in down]
+    down = sample_directions(
+        np.random.default_rng(SEED), open_cortex(anatomy).axis, replace(USUAL_CAUSES, drainages=POSTURE_COUNT)
+    )
+    every = [(way, compute_fluid_level(anatomy.mesh.nodes, way, left)) for left in FLUID_LEVELS for way in down]
     way, level = (np.array(each) for each in zip(*every, strict=True))
     middle = np.tile(open_cortex(anatomy).origin, (len(way), 1))
-    idle = Pushed(middle, np.zeros_like(middle), np.full(len(way), SPREAD))
+    idle = Pushed(middle, np.zeros_like(middle), np.full(len(way), FORCE_RADIUS))
     return Loads((idle, Posture(way, level, np.ones(len(way)))))
 
 
@@ -71,7 +73,7 @@ def build_force_loads(
     anatomy: Anatomy, point: np.ndarray, radius: np.ndarray, force: np.ndarray | None = None
 ) -> Loads:
     """Build forces (n, 3) [N] on discs round points (k, 3) with radii (k,) [m]; None: along each axis of each point."""
-    some = FORCE * np.tile(np.eye(3), (len(point), 1)) if force is None else force
+    some = TOOL_FORCE * np.tile(np.eye(3), (len(point), 1)) if force is None else force
     each, count = len(some) // len(point), len(some)
     pushed = Pushed(np.repeat(point, each, axis=0), some, np.repeat(radius, each))
     level = compute_fluid_level(anatomy.mesh.nodes, SUPINE, 1.0)
@@ -92,16 +94,18 @@ def solve_responses(
     `progress` receives the number of tissues done and their total.
     """
     nodes, found = find_observed_nodes(anatomy), []
-    every = list(product(LINEAR, POISSONS, RATIOS))
+    every = list(product(SOLVED_SKULLS, POISSONS, RATIOS))
     progress(0, len(every))
     for done, (skull, poisson, ratio) in enumerate(every, start=1):
-        found.append(_kept(anatomy, nodes, loads, (skull, float(poisson), float(ratio), regions), device, folder))
+        found.append(
+            _get_motions(anatomy, nodes, loads, (skull, float(poisson), float(ratio), regions), device, folder)
+        )
         progress(done, len(every))
-    whole = np.array(found).reshape(len(LINEAR), len(POISSONS), len(RATIOS), *found[0].shape)
-    return Responses(nodes, dict(zip(LINEAR, whole, strict=True)), regions)
+    whole = np.array(found).reshape(len(SOLVED_SKULLS), len(POISSONS), len(RATIOS), *found[0].shape)
+    return Responses(nodes, dict(zip(SOLVED_SKULLS, whole, strict=True)), regions)
 
 
-def _kept(
+def _get_motions(
     anatomy: Anatomy,
     nodes: np.ndarray,
     loads: Loads,

@@ -19,9 +19,9 @@ FINE_POISSONS = np.linspace(0.45, 0.4945, 13)
 """Poisson's ratios, equally probable a priori."""
 CLASSES = {"compressible": (0.0, 0.4725), "nearly incompressible": (0.4725, 0.5)}
 """Two classes of Poisson's ratio, equally probable a priori."""
-INTERVAL = (0.025, 0.5, 0.975)  # Probabilities of the reported quantiles: lower end, median, upper end.
-AS_WIDE = 0.85  # Log-width of an interval, relative to the prior's, above which it is uninformative.
-AS_PROBABLE = 0.15  # Largest difference of probabilities from the prior's below which they are uninformative.
+INTERVAL_PROBABILITIES = (0.025, 0.5, 0.975)  # Probabilities of the reported quantiles: lower end, median, upper end.
+MAX_WIDTH_RATIO = 0.85  # Log-width of an interval, relative to the prior's, above which it is uninformative.
+MIN_PROBABILITY_SHIFT = 0.15  # Largest difference of probabilities from the prior's below which they are uninformative.
 FORMAT = "sulcus tissue 1"  # Name and version of the file format.
 SUFFIX = ".tissue.json"  # Ending of the file, next to the anatomy.
 
@@ -50,7 +50,7 @@ class FittedTissue:
     @property
     def ratio(self) -> tuple[float, float, float]:
         """Stiffness of the tumour over the brain's: 2.5, 50 and 97.5 % quantiles."""
-        low, middle, high = np.exp(_quantiles(np.log(FINE_RATIOS), self.probability.sum(axis=(0, 1))))
+        low, middle, high = np.exp(_compute_quantiles(np.log(FINE_RATIOS), self.probability.sum(axis=(0, 1))))
         return float(low), float(middle), float(high)
 
     @property
@@ -68,7 +68,7 @@ class FittedTissue:
     @property
     def poisson(self) -> tuple[float, float, float]:
         """Poisson's ratio: quantiles as in `ratio`."""
-        low, middle, high = _quantiles(FINE_POISSONS, self.probability.sum(axis=(0, 2)))
+        low, middle, high = _compute_quantiles(FINE_POISSONS, self.probability.sum(axis=(0, 2)))
         return float(low), float(middle), float(high)
 
     @property
@@ -76,7 +76,7 @@ class FittedTissue:
         """Young's modulus of the brain at small strain [Pa]: quantiles as in `ratio`; None if no force was measured."""
         if not len(self.young):
             return None
-        low, middle, high = np.quantile(self.young, INTERVAL)
+        low, middle, high = np.quantile(self.young, INTERVAL_PROBABILITIES)
         return float(low), float(middle), float(high)
 
     @property
@@ -85,11 +85,11 @@ class FittedTissue:
         low, _, high = self.ratio
         found = (
             []
-            if np.log(high / low) < AS_WIDE * np.log(FINE_RATIOS[-1] / FINE_RATIOS[0])
+            if np.log(high / low) < MAX_WIDTH_RATIO * np.log(FINE_RATIOS[-1] / FINE_RATIOS[0])
             else ["the tumour's stiffness"]
         )
         for name, share in (("the skull", self.skulls), ("Poisson's ratio", self.classes)):
-            if max(abs(each - 1.0 / len(share)) for each in share.values()) < AS_PROBABLE:
+            if max(abs(each - 1.0 / len(share)) for each in share.values()) < MIN_PROBABILITY_SHIFT:
                 found.append(name)
         return [*found, *(["Young's modulus"] if self.stiffness is None else [])]
 
@@ -110,8 +110,8 @@ class FittedTissue:
     drawn = sample  # Former names, for one release.
 
 
-def _quantiles(values: np.ndarray, share: np.ndarray) -> np.ndarray:
-    return np.interp(INTERVAL, np.cumsum(share) - 0.5 * share, values)
+def _compute_quantiles(values: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return np.interp(INTERVAL_PROBABILITIES, np.cumsum(share) - 0.5 * share, values)
 
 
 def to_tissue_path(anatomy: str | Path) -> Path:

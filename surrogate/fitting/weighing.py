@@ -18,28 +18,28 @@ from ..locating.evidence import Evidence, compute_correlation
 from ..locating.locator import Locator
 from ..locating.prior import MotionPrior
 from .frame import ObservedFrame
-from .responses import LINEAR, Responses
+from .responses import SOLVED_SKULLS, Responses
 
 # Model error of linear tissue as a share of a point's motion, in the independent and in the correlated part.
-LACK = 0.05
-LACK_LENGTH = 10e-3  # Correlation length of the correlated part [m].
-LEAST = 0.1  # Lower bound of a point's motion in the model error, relative to the mean motion.
-SIZES = (0.3, 1.0, 3.0)  # Candidate sizes of motions, relative to the observation.
-COARSENED = 2.0  # Divisor of the log evidence of drained fluid.
-COARSENED_TOOLS = 8.0  # Divisor of the log evidence of tools, whose dents are nonlinear.
+MODEL_ERROR_SHARE = 0.05
+MODEL_ERROR_LENGTH = 10e-3  # Correlation length of the correlated part [m].
+MIN_MOTION_SHARE = 0.1  # Lower bound of a point's motion in the model error, relative to the mean motion.
+MOTION_SIZES = (0.3, 1.0, 3.0)  # Candidate sizes of motions, relative to the observation.
+EVIDENCE_DIVISOR = 2.0  # Divisor of the log evidence of drained fluid.
+TOOL_EVIDENCE_DIVISOR = 8.0  # Divisor of the log evidence of tools, whose dents are nonlinear.
 
 
 def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of a frame with drained fluid."""
     lower, seen = factorise_errors(evidence)
-    rows = {name: predict_seen(drained, name, evidence) for name in LINEAR}
+    rows = {name: predict_seen(drained, name, evidence) for name in SOLVED_SKULLS}
     own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
     lets_go = prior.project_shapes(*evidence.weights)[:, own].T
-    size = np.mean([_size(each) for each in rows.values()])
-    found = {name: _weighed(each / size, evidence, lower, seen) for name, each in rows.items()}
-    found["contact"] = _weighed((lets_go / _size(lets_go))[None, None], evidence, lower, seen)
-    shape = found[LINEAR[0]].shape
-    return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / COARSENED
+    size = np.mean([_compute_size(each) for each in rows.values()])
+    found = {name: _compute_log_evidence(each / size, evidence, lower, seen) for name, each in rows.items()}
+    found["contact"] = _compute_log_evidence((lets_go / _compute_size(lets_go))[None, None], evidence, lower, seen)
+    shape = found[SOLVED_SKULLS[0]].shape
+    return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / EVIDENCE_DIVISOR
 
 
 def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
@@ -49,12 +49,12 @@ def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -
     how they stiffen tissue.
     """
     lower, seen = factorise_errors(evidence)
-    rows = {name: predict_seen(pressed, name, evidence)[:, :, columns] for name in LINEAR}
-    size = np.mean([_size(each) for each in rows.values()])
-    found = {name: _weighed(each / size, evidence, lower, seen) for name, each in rows.items()}
+    rows = {name: predict_seen(pressed, name, evidence)[:, :, columns] for name in SOLVED_SKULLS}
+    size = np.mean([_compute_size(each) for each in rows.values()])
+    found = {name: _compute_log_evidence(each / size, evidence, lower, seen) for name, each in rows.items()}
     found = {name: logsumexp(each) - np.log(each.size) for name, each in found.items()}
     found["contact"] = found["slide"]
-    return np.array([found[name] for name in SKULLS])[:, None, None] / COARSENED_TOOLS
+    return np.array([found[name] for name in SKULLS])[:, None, None] / TOOL_EVIDENCE_DIVISOR
 
 
 def predict_seen(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
@@ -69,7 +69,7 @@ def predict_seen(responses: Responses, skull: str, evidence: Evidence) -> np.nda
     )
 
 
-def _size(rows: np.ndarray) -> float:
+def _compute_size(rows: np.ndarray) -> float:
     return float(np.sqrt((rows**2).sum(axis=-2).mean()))
 
 
@@ -82,12 +82,12 @@ def factorise_errors(evidence: Evidence, believed: np.ndarray | None = None) -> 
     value = evidence.value if believed is None else believed
     length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]
     seen = float(np.sqrt((value**2).mean()))
-    off = LACK * np.maximum(length, LEAST * np.sqrt(3.0) * seen)
+    off = MODEL_ERROR_SHARE * np.maximum(length, MIN_MOTION_SHARE * np.sqrt(3.0) * seen)
     axes = evidence.axis @ evidence.axis.T
     noise = (
         evidence.compute_noise()
         + np.outer(off, off)
-        * compute_correlation(compute_squared_distances(evidence.at, evidence.at), LACK_LENGTH)
+        * compute_correlation(compute_squared_distances(evidence.at, evidence.at), MODEL_ERROR_LENGTH)
         * axes
     )
     noise[np.diag_indices(len(noise))] += off**2
@@ -100,16 +100,16 @@ def whiten_columns(lower: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return solve_triangular(lower, columns, lower=True, check_finite=False)
 
 
-def _weighed(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
+def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
     """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m) of joint size 1."""
     motion = seen * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
     gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.value)
     logs = []
-    for times in SIZES:
+    for times in MOTION_SIZES:
         root = np.linalg.cholesky(np.eye(gram.shape[-1]) + times**2 * gram)
         half = np.linalg.solve(root, times * pull[..., None])[..., 0]
         logs.append(0.5 * (half**2).sum(axis=-1) - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1))
-    return logsumexp(logs, axis=0) - np.log(len(SIZES))
+    return logsumexp(logs, axis=0) - np.log(len(MOTION_SIZES))
 
 
 def find_unsupported(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple[np.ndarray, ...]:
@@ -132,11 +132,12 @@ def find_unsupported(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple
 def remove_points(frames: Sequence[ObservedFrame], left_out: Sequence[np.ndarray]) -> list[ObservedFrame]:
     """Remove points of given numbers (k,) from each frame of points with correspondences."""
     return [
-        _without(frame, numbers) if len(numbers) else frame for frame, numbers in zip(frames, left_out, strict=True)
+        _remove_points(frame, numbers) if len(numbers) else frame
+        for frame, numbers in zip(frames, left_out, strict=True)
     ]
 
 
-def _without(frame: ObservedFrame, numbers: np.ndarray) -> ObservedFrame:
+def _remove_points(frame: ObservedFrame, numbers: np.ndarray) -> ObservedFrame:
     seen = frame.observation
     assert seen.rest is not None
     kept = np.delete(np.arange(len(seen.now)), numbers)

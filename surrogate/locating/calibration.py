@@ -24,28 +24,28 @@ LEVEL = 0.95
 """Nominal coverage of ellipsoids."""
 RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 """Squared radius of the 95 % ellipsoid of a Gaussian [standard deviations^2]: chi-squared, 3 degrees of freedom."""
-TRIALS = 960  # Number of trials.
-NEAREST = 120  # Number of trials, nearest by `compute_likeness`, that calibrate an observation's covariance.
-UNLIKE = 1e3  # Feature offset that separates point clouds from corresponding points [log units].
-EXTENT = 4.0  # Weight of the extent feature.
+TRIAL_COUNT = 960  # Number of trials.
+NEAREST_TRIALS = 120  # Number of trials, nearest by `compute_likeness`, that calibrate an observation's covariance.
+CLOUD_OFFSET = 1e3  # Feature offset that separates point clouds from corresponding points [log units].
+EXTENT_WEIGHT = 4.0  # Weight of the extent feature.
 # Tolerance beyond the largest trial features [log units], so that 400 points, the maximum used, are covered.
-MARGIN = 0.05
-ALONE = (TOOL, DRAINAGE, SWELLING, OEDEMA)  # Causes that move the brain in a trial.
-POINTS = (20, 400)  # Range of a trial's number of points.
-COVER = (0.1, 1.0)  # Range of a trial's observed share of the open cortex.
-SOFTER = (0.7, 2.0)  # Range of a trial's tissue compliance relative to the ensemble.
-ERRORS = (0.05, 1.0)  # Range of a trial's point errors relative to `SIGMA`.
-SHIFTS = (0.05e-3, 3e-3)  # Range of a trial's rigid error along each axis [m].
-UNSHIFTED = 0.25  # Probability of no rigid error in a trial.
-LITTLE = 1e-3  # Lower bound of motion over error, so that its logarithm is finite.
-LEAST_SEEN = 0.5e-3  # Minimum RMS motion of the open cortex for a member to be used in a trial [m].
+FEATURE_TOLERANCE = 0.05
+SINGLE_CAUSES = (TOOL, DRAINAGE, SWELLING, OEDEMA)  # Causes that move the brain in a trial.
+POINT_COUNTS = (20, 400)  # Range of a trial's number of points.
+COVERED_SHARES = (0.1, 1.0)  # Range of a trial's observed share of the open cortex.
+COMPLIANCE_RATIOS = (0.7, 2.0)  # Range of a trial's tissue compliance relative to the ensemble.
+ERROR_RATIOS = (0.05, 1.0)  # Range of a trial's point errors relative to `SIGMA`.
+SHIFT_RANGE = (0.05e-3, 3e-3)  # Range of a trial's rigid error along each axis [m].
+NO_SHIFT_PROBABILITY = 0.25  # Probability of no rigid error in a trial.
+MIN_MOTION_RATIO = 1e-3  # Lower bound of motion over error, so that its logarithm is finite.
+MIN_MOTION = 0.5e-3  # Minimum RMS motion of the open cortex for a member to be used in a trial [m].
 
 
 def run_trials(
     ensemble: Ensemble,
     presses: Presses,
     progress: Callable[[int, int], object] = lambda done, total: None,
-    count: int = TRIALS,
+    count: int = TRIAL_COUNT,
 ) -> np.ndarray:
     """Run `count` trials: features (`compute_likeness`) and squared Mahalanobis error of each (k, 5).
 
@@ -62,11 +62,11 @@ def run_trials(
     fold, found = assign_held_out(ensemble), []
     if fold.max() < 0:
         raise InputError("no skull has two groups to try one by the other: give causes of several Poisson's ratios.")
-    large = compute_surface_motion(ensemble.anatomy, ensemble.motion) > LEAST_SEEN
+    large = compute_surface_motion(ensemble.anatomy, ensemble.motion) > MIN_MOTION
     for turn, numbers in enumerate(np.array_split(np.arange(count), fold.max() + 1)):
         prior, members = build_prior(ensemble, presses, fold != turn), np.flatnonzero((fold == turn) & large)
         for number in numbers:
-            observation, middle = _trial(ensemble, members, int(number), np.random.default_rng(number))
+            observation, middle = _simulate_trial(ensemble, members, int(number), np.random.default_rng(number))
             progress(int(number), count)
             try:
                 posterior, _ = match_and_update(prior, observation)
@@ -91,7 +91,7 @@ def assign_held_out(ensemble: Ensemble) -> np.ndarray:
 def compute_covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
     """Compute the factor on covariances for tumour-centroid ellipsoids to cover 95 % of similar trials."""
     away = ((tried[:, :-1] - compute_likeness(evidence)) ** 2).sum(axis=1)
-    square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST], -1])
+    square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST_TRIALS], -1])
     rank = min(int(np.ceil(LEVEL * (len(square) + 1))), len(square))
     return float(square[rank - 1] / RADIUS_SQUARED)
 
@@ -101,7 +101,7 @@ def is_within_trials(tried: np.ndarray, evidence: Evidence) -> bool:
     own = compute_likeness(evidence)
     alike = tried[tried[:, -2] == own[-1], :-1]
     within = len(alike) and (own >= alike.min(axis=0)).all()
-    return bool(within and (own[[0, 1, 3]] <= alike[:, [0, 1, 3]].max(axis=0) + MARGIN).all())
+    return bool(within and (own[[0, 1, 3]] <= alike[:, [0, 1, 3]].max(axis=0) + FEATURE_TOLERANCE).all())
 
 
 def compute_likeness(evidence: Evidence) -> np.ndarray:
@@ -114,28 +114,28 @@ def compute_likeness(evidence: Evidence) -> np.ndarray:
     first = np.unique(evidence.point, return_index=True)[1]
     count, at = len(first), evidence.at[first]
     seen = np.sqrt((evidence.value**2).sum() / count)
-    ratio = max(seen / np.hypot(np.median(evidence.sigma), evidence.shift), LITTLE)
+    ratio = max(seen / np.hypot(np.median(evidence.sigma), evidence.shift), MIN_MOTION_RATIO)
     extent = np.sqrt(((at - at.mean(axis=0)) ** 2).sum(axis=1).mean())
-    logs = np.log([ratio, count, extent]) * [1.0, 1.0, EXTENT]
-    return np.append(logs, UNLIKE * (not evidence.named))
+    logs = np.log([ratio, count, extent]) * [1.0, 1.0, EXTENT_WEIGHT]
+    return np.append(logs, CLOUD_OFFSET * (not evidence.named))
 
 
-def _trial(
+def _simulate_trial(
     ensemble: Ensemble, members: np.ndarray, number: int, random: np.random.Generator
 ) -> tuple[Observation, np.ndarray]:
     """Simulate the observation of one or two motions, and the true motion (3,) [m] of the tumour centroid."""
     anatomy = ensemble.anatomy
     here = members[ensemble.skull[members] == random.choice(np.unique(ensemble.skull[members]))]
-    several = np.intersect1d(ALONE, ensemble.kind[here])
+    several = np.intersect1d(SINGLE_CAUSES, ensemble.kind[here])
     causes = random.permutation(several)[: 1 + (number % 3 == 0)]
     chosen = [random.choice(here[ensemble.kind[here] == cause]) for cause in causes]
-    softer = np.exp(random.uniform(*np.log(SOFTER)))
+    softer = np.exp(random.uniform(*np.log(COMPLIANCE_RATIOS)))
     motion = softer * ensemble.motion[chosen].sum(axis=0, dtype=float)
     evidence = sample_seen_patch(
-        anatomy, motion, random, int(np.exp(random.uniform(*np.log(POINTS)))), random.uniform(*COVER)
+        anatomy, motion, random, int(np.exp(random.uniform(*np.log(POINT_COUNTS)))), random.uniform(*COVERED_SHARES)
     )
-    sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(ERRORS))))
-    shift = 0.0 if random.uniform() < UNSHIFTED else float(np.exp(random.uniform(*np.log(SHIFTS))))
+    sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(ERROR_RATIOS))))
+    shift = 0.0 if random.uniform() < NO_SHIFT_PROBABILITY else float(np.exp(random.uniform(*np.log(SHIFT_RANGE))))
     evidence = replace(evidence, sigma=sigma, shift=shift)
     off = np.linalg.cholesky(evidence.compute_noise()) @ random.standard_normal(len(evidence))
     way = random.standard_normal((2, 3))

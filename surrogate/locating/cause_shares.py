@@ -16,11 +16,11 @@ from .causes import KINDS
 from .posterior import Posterior
 from .prior import MotionPrior
 
-DRAWS = 400  # Number of posterior samples.
-BEYOND = 0.05  # Probability outside a share's interval at each end.
-KNOWN = 0.5  # Maximum width of the interval of a determined share.
-WORDS = {"swelling": "swelling or shrinking"}  # Names of causes whose share may be negative.
-LEAST_NAMED = 0.005  # Smallest share that is reported.
+SAMPLE_COUNT = 400  # Number of posterior samples.
+TAIL_PROBABILITY = 0.05  # Probability outside a share's interval at each end.
+MAX_INTERVAL_WIDTH = 0.5  # Maximum width of the interval of a determined share.
+CAUSE_NAMES = {"swelling": "swelling or shrinking"}  # Names of causes whose share may be negative.
+MIN_REPORTED_SHARE = 0.005  # Smallest share that is reported.
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class CauseShare:
     high: float
 
     def __str__(self) -> str:
-        named = " or ".join(WORDS.get(cause, cause) for cause in self.causes)
+        named = " or ".join(CAUSE_NAMES.get(cause, cause) for cause in self.causes)
         apart = "" if len(self.causes) == 1 else " (not separable)"
         return f"{named}{apart} {self.share:.0%} ({self.low:.0%} to {self.high:.0%})"
 
@@ -52,20 +52,20 @@ def group_cause_shares(drawn: np.ndarray) -> tuple[CauseShare, ...]:
     Among several finest groupings, the one with the smallest sum of interval widths is chosen.
     """
     ways = []
-    for groups in _partitions(range(drawn.shape[1])):
+    for groups in _generate_partitions(range(drawn.shape[1])):
         joint = np.stack([drawn[:, group].sum(axis=1) for group in groups], axis=1)
-        low, high = np.quantile(joint, (BEYOND, 1.0 - BEYOND), axis=0)
-        if (high - low <= KNOWN).all():
+        low, high = np.quantile(joint, (TAIL_PROBABILITY, 1.0 - TAIL_PROBABILITY), axis=0)
+        if (high - low <= MAX_INTERVAL_WIDTH).all():
             mean = joint.mean(axis=0)
             numbers = np.stack([mean, np.minimum(low, mean), np.maximum(high, mean)], axis=1).tolist()
             names = [tuple(KINDS[kind] for kind in group) for group in groups]
             made = [CauseShare(name, *each) for name, each in zip(names, numbers, strict=True)]
             ways.append((-len(groups), float((high - low).sum()), made))
     *_, best = min(ways, key=lambda way: way[:2])
-    return tuple(sorted((each for each in best if each.share > LEAST_NAMED), key=lambda each: -each.share))
+    return tuple(sorted((each for each in best if each.share > MIN_REPORTED_SHARE), key=lambda each: -each.share))
 
 
-def _partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
+def _generate_partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
     """Generate all partitions of items."""
     if not items:
         yield []
@@ -73,15 +73,15 @@ def _partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
     first, others = items[0], items[1:]
     for count in range(len(others) + 1):
         for some in combinations(others, count):
-            for groups in _partitions([item for item in others if item not in some]):
+            for groups in _generate_partitions([item for item in others if item not in some]):
                 yield [[first, *some], *groups]
 
 
 def compute_cause_shares(prior: MotionPrior, posterior: Posterior) -> np.ndarray:
     """Sample shares (n, kinds) of causes in the mean square motion of the open cortex from the posterior."""
-    ends = np.round(DRAWS * np.cumsum([answer.share for answer in posterior.answers])).astype(int)
-    normal = np.random.default_rng(0).standard_normal((DRAWS, len(prior.kind)))
-    squares, begin = np.zeros((DRAWS, len(KINDS))), 0
+    ends = np.round(SAMPLE_COUNT * np.cumsum([answer.share for answer in posterior.answers])).astype(int)
+    normal = np.random.default_rng(0).standard_normal((SAMPLE_COUNT, len(prior.kind)))
+    squares, begin = np.zeros((SAMPLE_COUNT, len(KINDS))), 0
     for answer, end in zip(posterior.answers, ends, strict=True):
         rows = np.flatnonzero(answer.rows < len(prior.kind))
         kind = prior.kind[answer.rows[rows]]

@@ -22,8 +22,8 @@ from .regions import Region, build_tissue
 KINDS = ("tool", "drainage", "swelling", "tumour swelling", "oedema")
 """Names of the causes of an ensemble."""
 TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA = range(len(KINDS))  # Numbers of the causes in `KINDS`.
-RISE = Wave(0.25, 0.0)  # Swelling is one rising wave; the second wave is zero.
-POINTS = 70  # Number of points on the open cortex where a tool acts.
+SWELLING_WAVE = Wave(0.25, 0.0)  # Swelling is one rising wave; the second wave is zero.
+TOOL_POINTS = 70  # Number of points on the open cortex where a tool acts.
 # Candidate tissues: Poisson's ratio of the brain, ratio of tumour to brain stiffness.
 TISSUES = ((0.45, 2.0), (0.49, 0.7))
 ACCURACY = Accuracy(tolerance=1e-3)  # Accuracy of the FEM results for tools.
@@ -77,10 +77,10 @@ class Causes:
     regions: tuple[Region, ...] = ()
 
 
-USUAL = Causes()  # Default causes.
+USUAL_CAUSES = Causes()  # Default causes.
 YOUNG = 3000.0  # Young's modulus at small strain [Pa]; motions are normalised in magnitude, so it hardly matters.
-SPREAD = 7e-3  # Radius of the disc on which a force acts on the cortex [m].
-LETS_GO = "contact"  # Skull model that separates from the brain.
+FORCE_RADIUS = 7e-3  # Radius of the disc on which a force acts on the cortex [m].
+SEPARATING_SKULL = "contact"  # Skull model that separates from the brain.
 SUPINE = np.array(Gravity().direction)  # Direction of gravity in the scan, as in `Gravity`.
 
 
@@ -117,69 +117,71 @@ class Group:
 
     def build_effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
         """Build the effects of the FEM, with up to these volume changes in these regions (None: all)."""
-        swells = Pulsation(Wave(RISE.frequency, max(map(abs, swelling))), RISE, regions)
-        tissue = build_tissue(self._tissue, self.poisson, self.ratio, self.regions)
+        swells = Pulsation(Wave(SWELLING_WAVE.frequency, max(map(abs, swelling))), SWELLING_WAVE, regions)
+        tissue = build_tissue(self._build_tissue, self.poisson, self.ratio, self.regions)
         return (tissue, Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells)
 
-    def _tissue(self, times: float, poisson: float) -> Ogden:
+    def _build_tissue(self, times: float, poisson: float) -> Ogden:
         """Build Ogden tissue `times` as stiff as the brain at small strain."""
         mu, lam = Material("neo-hookean", YOUNG * times, poisson).lame
         return Ogden(((2.0 * mu, -self.exponent),), lam + 2.0 * mu / 3.0)
 
 
-def build_groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Group, ...]:
+def build_groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES) -> tuple[Group, ...]:
     """Build groups with each skull and each Poisson's ratio; none if the anatomy has no skull.
 
     In each skull, tumour stiffness, exponent and oedema extent are stratified: one group in every part of each range.
     """
     made: list[Group] = []
     for number, skull in enumerate(SKULLS if anatomy.slide_normal.any() else ()):
-        some = [poisson for poisson in causes.poisson if skull != LETS_GO or poisson <= causes.poisson_let_go]
+        some = [poisson for poisson in causes.poisson if skull != SEPARATING_SKULL or poisson <= causes.poisson_let_go]
         random = np.random.default_rng([seed, number])
-        ratio, exponent = (_all_over(random, len(some), limits) for limits in (causes.stiffness, causes.exponent))
-        count = causes.reaches[skull == LETS_GO]
-        reach = np.reshape(_all_over(random, count * len(some), causes.reach), (len(some), count)).tolist()
+        ratio, exponent = (
+            _sample_stratified(random, len(some), limits) for limits in (causes.stiffness, causes.exponent)
+        )
+        count = causes.reaches[skull == SEPARATING_SKULL]
+        reach = np.reshape(_sample_stratified(random, count * len(some), causes.reach), (len(some), count)).tolist()
         for poisson, own_ratio, own_exponent, distances in zip(some, ratio, exponent, reach, strict=True):
             made.append(Group(len(made), skull, poisson, own_ratio, own_exponent, causes.regions, tuple(distances)))
     return tuple(made)
 
 
-def _all_over(random: np.random.Generator, count: int, limits: tuple[float, float]) -> list[float]:
+def _sample_stratified(random: np.random.Generator, count: int, limits: tuple[float, float]) -> list[float]:
     """Sample one number in each of `count` log-equal parts of a range, in random order."""
     low, high = np.log(limits)
     share = (random.permutation(count) + random.uniform(size=count)) / max(count, 1)
     return np.exp(low + share * (high - low)).tolist()
 
 
-def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> Loads:
+def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES) -> Loads:
     """Sample the tool loads of a group."""
-    count = causes.tools[group.skull == LETS_GO]
+    count = causes.tools[group.skull == SEPARATING_SKULL]
     pushed = draw("mixed", anatomy, count, seed * 1000 + group.number).get(Pushed)
     assert pushed is not None
-    return Loads((pushed, _posture(anatomy, np.tile(SUPINE, (count, 1)), 1.0)), np.zeros(count))
+    return Loads((pushed, _build_posture(anatomy, np.tile(SUPINE, (count, 1)), 1.0)), np.zeros(count))
 
 
 def build_swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
     """Build loads of these volume changes; `Group.build_effects` must have been given the same ones."""
     # The wave gives the time at which each volume change is reached.
-    time = np.arcsin(np.array(shares) / max(map(abs, shares))) / (2.0 * np.pi * RISE.frequency)
-    return Loads((_idle(anatomy, len(time)), _posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)
+    time = np.arcsin(np.array(shares) / max(map(abs, shares))) / (2.0 * np.pi * SWELLING_WAVE.frequency)
+    return Loads((_build_idle(anatomy, len(time)), _build_posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)
 
 
-def build_drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL) -> tuple[Loads, ...]:
+def build_drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES) -> tuple[Loads, ...]:
     """Build loads of drained fluid, level by level, for sampled head directions."""
     random = np.random.default_rng([seed, group.number, 1])
     down = sample_directions(random, open_cortex(anatomy).axis, causes)
-    idle = _idle(anatomy, len(down))
-    return tuple(Loads((idle, _posture(anatomy, down, left)), np.zeros(len(down))) for left in causes.levels)
+    idle = _build_idle(anatomy, len(down))
+    return tuple(Loads((idle, _build_posture(anatomy, down, left)), np.zeros(len(down))) for left in causes.levels)
 
 
-def _idle(anatomy: Anatomy, count: int) -> Pushed:
+def _build_idle(anatomy: Anatomy, count: int) -> Pushed:
     """Build `count` zero-force pushes, for loads without a tool."""
-    return Pushed(np.tile(open_cortex(anatomy).origin, (count, 1)), np.zeros((count, 3)), np.full(count, SPREAD))
+    return Pushed(np.tile(open_cortex(anatomy).origin, (count, 1)), np.zeros((count, 3)), np.full(count, FORCE_RADIUS))
 
 
-def _posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
+def _build_posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
     """Build postures with gravity along `down` (n, 3) and a share of the fluid left."""
     level = np.array([compute_fluid_level(anatomy.mesh.nodes, one, left) for one in down])
     return Posture(down, level, np.ones(len(down)))
@@ -216,9 +218,9 @@ def solve_presses(
 ) -> Presses:
     """Solve linear tissue under forces of 0.01 N on discs of 7 mm radius, for each of some skulls, with `regions`."""
     nodes = anatomy.mesh.nodes[np.unique(anatomy.open_surface)]
-    points = nodes[choose_spaced(nodes, POINTS)]
+    points = nodes[choose_spaced(nodes, TOOL_POINTS)]
     force = np.tile(0.01 * np.eye(3), (len(points), 1))
-    loads = Loads((Pushed(np.repeat(points, 3, axis=0), force, np.full(len(force), SPREAD)),))
+    loads = Loads((Pushed(np.repeat(points, 3, axis=0), force, np.full(len(force), FORCE_RADIUS)),))
     found: dict[str, list[np.ndarray]] = {name: [] for name in skulls}
     for name, (poisson, ratio) in product(skulls, TISSUES):
         effects = (build_tissue(build_linear_tissue, poisson, ratio, regions), Held(), SKULLS[name], ToolForce())

@@ -24,7 +24,7 @@ from .causes import (
     SWELLING,
     TOOL,
     TUMOUR_SWELLING,
-    USUAL,
+    USUAL_CAUSES,
     Causes,
     Group,
     build_drainages,
@@ -34,7 +34,7 @@ from .causes import (
 )
 
 ACCURACY = Accuracy(tolerance=3e-3)  # Relative solver tolerance far below observation errors.
-LEAST_MOTION = 2e-5  # Smallest RMS motion of the open cortex [m]: below it, a member is mainly round-off.
+MIN_MOTION = 2e-5  # Smallest RMS motion of the open cortex [m]: below it, a member is mainly round-off.
 
 
 def round_tumour(anatomy: Anatomy, reach: float) -> tuple[Anatomy, tuple[int, ...]]:
@@ -77,7 +77,7 @@ def solve_groups(
     anatomy: Anatomy,
     seed: int = 0,
     device: str = "auto",
-    causes: Causes = USUAL,
+    causes: Causes = USUAL_CAUSES,
     folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Ensemble:
@@ -98,7 +98,7 @@ def solve_groups(
     parts = []
     progress(0, len(made))
     for done, group in enumerate(made, start=1):
-        parts.append(_kept(anatomy, group, seed, device, causes, folder))
+        parts.append(_get_motions(anatomy, group, seed, device, causes, folder))
         progress(done, len(made))
     motion, kind = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     counts = [len(kinds) for _, kinds in parts]
@@ -107,7 +107,7 @@ def solve_groups(
     return Ensemble(anatomy, motion, kind, skull, number)
 
 
-def _kept(
+def _get_motions(
     anatomy: Anatomy, group: Group, seed: int, device: str, causes: Causes, folder: Path | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read the motions and kinds of a group from the folder, or compute and keep them; the key holds all inputs."""
@@ -124,7 +124,7 @@ def _kept(
 
 
 def solve_members(
-    anatomy: Anatomy, group: Group, seed: int = 0, device: str = "auto", causes: Causes = USUAL
+    anatomy: Anatomy, group: Group, seed: int = 0, device: str = "auto", causes: Causes = USUAL_CAUSES
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute motions (n, V, 3) float32 [m] and kinds (n,) of one group: converged ones that move the open cortex."""
     fem = Fem(anatomy, group.build_effects(causes.swellings), ACCURACY, device)
@@ -132,12 +132,12 @@ def solve_members(
     answers = [
         fem.deform(build_pushes(group, anatomy, seed, causes)),
         fem.deform(build_swellings(anatomy, causes.swellings)),
-        _swollen(anatomy, group, causes.tumour_swellings, tumour, device, fem),
+        _solve_swelling(anatomy, group, causes.tumour_swellings, tumour, device, fem),
     ]
     kind = [TOOL, SWELLING, TUMOUR_SWELLING]
     for reach in group.reach:
         body, marked = round_tumour(anatomy, reach)
-        answers.append(_swollen(body, group, causes.oedema, marked, device, fem))
+        answers.append(_solve_swelling(body, group, causes.oedema, marked, device, fem))
         kind.append(OEDEMA)
     last: Deformation | None = None
     for loads in build_drainages(group, anatomy, seed, causes):
@@ -147,13 +147,13 @@ def solve_members(
     motion = np.concatenate([answer.displacement for answer in answers])
     kind = np.repeat(kind, [len(answer) for answer in answers])
     good = np.array([outcome.good for answer in answers for outcome in answer.outcome])
-    good &= compute_surface_motion(anatomy, motion) > LEAST_MOTION
+    good &= compute_surface_motion(anatomy, motion) > MIN_MOTION
     if not good.any():
         raise InputError(f"no motion of group {group.number} ({group.skull}, nu {group.poisson:g}) converged.")
     return motion[good].astype(np.float32), kind[good]
 
 
-def _swollen(
+def _solve_swelling(
     anatomy: Anatomy, group: Group, shares: tuple[float, ...], regions: tuple[int, ...], device: str, fem: Fem
 ) -> Deformation:
     """Solve for given volume changes of some regions; the stiffness, and so its factor, is that of `fem`."""

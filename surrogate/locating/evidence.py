@@ -11,22 +11,24 @@ from sim.geometry.locate import Located
 
 from ..array_functions import compute_squared_distances
 
-WHITE = 0.3e-3  # Independent part of a point's non-rigid error [m].
-SMOOTH = 0.5e-3  # Spatially correlated part of a point's non-rigid error [m].
-SIGMA = float(np.hypot(WHITE, SMOOTH))
+INDEPENDENT_ERROR = 0.3e-3  # Independent part of a point's non-rigid error [m].
+CORRELATED_ERROR = 0.5e-3  # Spatially correlated part of a point's non-rigid error [m].
+SIGMA = float(np.hypot(INDEPENDENT_ERROR, CORRELATED_ERROR))
 """Standard deviation of a point's non-rigid error along each axis [m]: independent and correlated noise together."""
-LENGTH = 15e-3  # Correlation length of a point's correlated non-rigid error [m].
-LACK_WHITE = 0.08  # Independent model error of the shapes as a share of the observed motion.
-LACK_SMOOTH = 0.1  # Correlated model error of the shapes as a share of the observed motion.
-LACK_LENGTH = 5e-3  # Correlation length of the correlated model error [m].
-SHIFT = 0.8e-3
+CORRELATION_LENGTH = 15e-3  # Correlation length of a point's correlated non-rigid error [m].
+INDEPENDENT_MODEL_ERROR = 0.08  # Independent model error of the shapes as a share of the observed motion.
+CORRELATED_MODEL_ERROR = 0.1  # Correlated model error of the shapes as a share of the observed motion.
+MODEL_ERROR_LENGTH = 5e-3  # Correlation length of the correlated model error [m].
+SHIFT_ERROR = 0.8e-3
 """Default standard deviation of the rigid error (registration shift) along each axis [m]."""
-TURN = float(np.radians(0.3)) / SHIFT  # Rotation error about each axis per metre of registration shift [rad/m].
+TURN_PER_SHIFT = (
+    float(np.radians(0.3)) / SHIFT_ERROR
+)  # Rotation error about each axis per metre of registration shift [rad/m].
 
-SLIPPED = 10e-3  # Rigid error of a failed registration along each axis [m].
-LEAST_SHIFT = 1e-5  # Smallest rigid error of any registration along each axis [m].
+SLIPPED_ERROR = 10e-3  # Rigid error of a failed registration along each axis [m].
+MIN_SHIFT = 1e-5  # Smallest rigid error of any registration along each axis [m].
 
-SMALL = 48  # Block size: triangular matrices with fewer than twice this many rows are inverted directly.
+BLOCK_SIZE = 48  # Block size: triangular matrices with fewer than twice this many rows are inverted directly.
 (trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 
 
@@ -58,7 +60,7 @@ class Evidence:
     value: np.ndarray
     sigma: np.ndarray
     point: np.ndarray
-    shift: float = SHIFT
+    shift: float = SHIFT_ERROR
 
     def __len__(self) -> int:
         return len(self.value)
@@ -87,7 +89,7 @@ class Evidence:
     @property
     def rigid_scale(self) -> np.ndarray:
         """Standard deviations (6,) of the prior of a rigid error: translation [m], rotation [rad]."""
-        return max(self.shift, LEAST_SHIFT) * np.repeat([1.0, TURN], 3)
+        return max(self.shift, MIN_SHIFT) * np.repeat([1.0, TURN_PER_SHIFT], 3)
 
     @property
     def beyond(self) -> float:
@@ -97,15 +99,15 @@ class Evidence:
     @property
     def slip(self) -> float:
         """Standard deviation of the rigid error of a slipped registration, relative to the reported one."""
-        return max(SLIPPED / max(self.shift, LEAST_SHIFT), 1.0)
+        return max(SLIPPED_ERROR / max(self.shift, MIN_SHIFT), 1.0)
 
     def compute_noise(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of non-rigid errors, and of the shapes' model error for motions of `scale` [m]."""
-        share, square = (WHITE / SIGMA) ** 2, compute_squared_distances(self.at, self.at)
-        out = compute_correlation(square, LENGTH) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
-        out += compute_correlation(square, LACK_LENGTH) * (LACK_SMOOTH * scale) ** 2
+        share, square = (INDEPENDENT_ERROR / SIGMA) ** 2, compute_squared_distances(self.at, self.at)
+        out = compute_correlation(square, CORRELATION_LENGTH) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
+        out += compute_correlation(square, MODEL_ERROR_LENGTH) * (CORRELATED_MODEL_ERROR * scale) ** 2
         out *= self.axis @ self.axis.T
-        out[np.diag_indices(len(self))] += share * self.sigma**2 + (LACK_WHITE * scale) ** 2
+        out[np.diag_indices(len(self))] += share * self.sigma**2 + (INDEPENDENT_MODEL_ERROR * scale) ** 2
         return out
 
     @property
@@ -180,7 +182,7 @@ class Whitening:
 def invert_triangular(lower: np.ndarray) -> np.ndarray:
     """Invert a lower triangular matrix (n, n) by recursive halving: matrix products are fastest."""
     half = len(lower) // 2
-    if half < SMALL:
+    if half < BLOCK_SIZE:
         return trtri(lower.T, lower=0)[0].T
     found = np.zeros_like(lower)
     found[:half, :half] = invert_triangular(lower[:half, :half])
@@ -194,14 +196,14 @@ def compute_correlation(square: np.ndarray, length: float) -> np.ndarray:
     return np.exp(square * (-0.5 / length**2))
 
 
-def smooth_root(points: np.ndarray, length: float = LENGTH) -> np.ndarray:
+def smooth_root(points: np.ndarray, length: float = CORRELATION_LENGTH) -> np.ndarray:
     """Compute the factor (n, n) from independent noise at points (n, 3) [m] to smooth noise of variance 1."""
     value, vector = np.linalg.eigh(compute_correlation(compute_squared_distances(points, points), length))
     return vector * np.sqrt(np.maximum(value, 0.0))
 
 
 def build_motion_evidence(
-    place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT
+    place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT_ERROR
 ) -> Evidence:
     """Build evidence from undeformed points (n, 3) [m] and their motions (n, 3) [m]; three rows a point."""
     count = len(at)

@@ -22,21 +22,21 @@ from .prior import MotionPrior
 from .regions import Region
 from .rounds import match_and_update
 
-MOST_OUTLIERS = 0.35  # Largest share of outliers.
-MOST_SURPRISE = 2.5  # Largest `surprise` that a cause of the ensemble can explain.
+MAX_OUTLIER_SHARE = 0.35  # Largest share of outliers.
+MAX_SURPRISE = 2.5  # Largest `surprise` that a cause of the ensemble can explain.
 # Smallest log-odds of a registration slip against a motion for which a slip is assumed possible: in synthetic tests one
 # of 432 motions, and all slips of 8 to 20 mm along the cortex (docs/notes/locate_experiments.md).
-DOUBTFUL = -2.0
+MIN_SLIP_LOG_ODDS = -2.0
 # Smallest log-odds of a slip against a motion for which a warning names the slip. True motions have -7 in the median
 # (docs/notes/locate_experiments.md).
-ALIKE = -2.5
-WIDE = 2.0  # Ratio to the reported rigid error above which an estimated one counts as excessive.
-SWELLS = 0.5  # Share of swelling and oedema above which `OEDEMA_WORDS` is reported.
+WARNING_LOG_ODDS = -2.5
+MAX_RIGID_RATIO = 2.0  # Ratio to the reported rigid error above which an estimated one counts as excessive.
+SWELLING_SHARE = 0.5  # Share of swelling and oedema above which `OEDEMA_WORDS` is reported.
 OEDEMA_WORDS = (  # Warning for brains that swell.
     "The brain swells or shrinks, by what was seen. If that is oedema round the tumour alone, the tumour moves about "
     "half as far, and ellipsoids often miss it: look for it in the scan."
 )
-DRAWS = 4000  # Number of normal samples from which the 95 % radius is estimated.
+SAMPLE_COUNT = 4000  # Number of normal samples from which the 95 % radius is estimated.
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,9 @@ class Location:
     def is_registration_suspect(self) -> bool:
         """Return True if a wrong registration explains the observation nearly as well as a motion does."""
         found, checked = self.posterior, self.checked
-        return self.slipped or (not checked and found.evidence.beyond > WIDE and found.slipped >= ALIKE)
+        return self.slipped or (
+            not checked and found.evidence.beyond > MAX_RIGID_RATIO and found.slipped >= WARNING_LOG_ODDS
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -192,7 +194,7 @@ class Location:
             f"{self._rigid_words} would explain {self.rigid_alone.share:.0%}, with a brain at rest. The two cannot be "
             "distinguished. If such an error is possible, give it by --rigid."
         )
-        swells = self.causes["swelling"] + self.causes["oedema"] > SWELLS
+        swells = self.causes["swelling"] + self.causes["oedema"] > SWELLING_SHARE
         return tuple(said for said in (rigid if named else "", OEDEMA_WORDS if swells else "", self.doubt) if said)
 
     @property
@@ -256,19 +258,19 @@ class Locator:
             An observation that is too small, is elsewhere, or that no cause of the ensemble explains.
         """
         with limit_to_one_thread():  # products are small
-            return self._located(observation)
+            return self._locate_tumour(observation)
 
-    def _located(self, observation: Observation) -> Location:
+    def _locate_tumour(self, observation: Observation) -> Location:
         prior, count = self.prior, len(observation.now)
         prior.prepare()
         begun = time.perf_counter()
         found, near = match_and_update(prior, observation)
-        slipped = not observation.checked and _may_have_slipped(prior.anatomy, found)
+        slipped = not observation.checked and _is_slip_likely(prior.anatomy, found)
         if slipped:
             found, near = match_and_update(prior, observation, free=True)
         some = choose_points(count)
         outliers = np.union1d(np.setdiff1d(some, near), found.outliers[found.outliers < count])
-        _demand_explained(found, len(outliers), len(some))
+        _check_explained(found, len(outliers), len(some))
         found = replace(found, factor=compute_covering_factor(self.tried, found.evidence))
         return Location(
             prior=prior,
@@ -294,23 +296,23 @@ def find_observed_nodes(anatomy: Anatomy) -> np.ndarray:
 
 def compute_radius(covariance: np.ndarray) -> float:
     """Compute the radius [m] round the mean of a Gaussian, covariance (3, 3) [m^2], that holds 95 % of samples."""
-    drawn = _normal() @ np.linalg.cholesky(covariance).T
+    drawn = _sample_normal() @ np.linalg.cholesky(covariance).T
     return float(np.quantile(np.sqrt((drawn**2).sum(axis=1)), 0.95))
 
 
 @cache
-def _normal() -> np.ndarray:
+def _sample_normal() -> np.ndarray:
     """Sample standard normal numbers (DRAWS, 3) with a fixed seed."""
-    return np.random.default_rng(0).standard_normal((DRAWS, 3))
+    return np.random.default_rng(0).standard_normal((SAMPLE_COUNT, 3))
 
 
-def _may_have_slipped(anatomy: Anatomy, found: Posterior) -> bool:
+def _is_slip_likely(anatomy: Anatomy, found: Posterior) -> bool:
     """Return True if an excessive slip explains the observation nearly as well as a motion does, and is no sinking.
 
     A brain that sinks by a centimetre resembles a registration shift, but moves uniformly and mostly along the
     craniotomy's axis. A slip shifts it across, or turns it.
     """
-    if found.slipped < DOUBTFUL or found.evidence.beyond <= WIDE:
+    if found.slipped < MIN_SLIP_LOG_ODDS or found.evidence.beyond <= MAX_RIGID_RATIO:
         return False
     evidence, axis = found.evidence, open_cortex(anatomy).axis
     shift, turn = np.split(evidence.rigid_alone, 2)
@@ -319,7 +321,7 @@ def _may_have_slipped(anatomy: Anatomy, found: Posterior) -> bool:
     return bool((other**2).sum(axis=1).mean() > sunk**2)
 
 
-def _demand_explained(found: Posterior, outliers: int, points: int) -> None:
+def _check_explained(found: Posterior, outliers: int, points: int) -> None:
     """Check that the ensemble explains the observation.
 
     Raises
@@ -327,12 +329,12 @@ def _demand_explained(found: Posterior, outliers: int, points: int) -> None:
     InputError
         Too many outliers, or residuals larger than noise.
     """
-    if outliers > MOST_OUTLIERS * points:
+    if outliers > MAX_OUTLIER_SHARE * points:
         raise InputError(
             f"{outliers} of {points} points lie off the open cortex, or fit no motion of the others: check that "
             "they are of this brain. If they are less sure, raise sigma."
         )
-    if found.surprise > MOST_SURPRISE:
+    if found.surprise > MAX_SURPRISE:
         raise InputError(
             f"the observation fits no cause: point errors of {np.sqrt(found.surprise):.1f} times their sigma. "
             "Check units, frame (RAS) and sigma, or that nothing was cut out."

@@ -19,17 +19,17 @@ from sim.runtime.threads import limit_to_one_thread
 from sim.runtime.versions import get_version
 
 from ..model.npz_archive import Archive, compute_seal
-from .calibration import TRIALS, run_trials
-from .causes import KINDS, USUAL, Causes, solve_presses
+from .calibration import TRIAL_COUNT, run_trials
+from .causes import KINDS, USUAL_CAUSES, Causes, solve_presses
 from .ensemble import solve_groups
 from .locator import Locator
-from .prior import NOWHERE, PRESSED, MotionPrior, build_prior
+from .prior import NO_PLACE, TOOL_SKULLS, MotionPrior, build_prior
 from .regions import Region, check_regions
 
 FORMAT = "sulcus locator 6"  # Name and version of the file format.
 REMEDY = "Move it away, and `sulcus locate` makes it again."  # Remedy in error messages.
-LABELS = ("kind", "skull", "place")  # Arrays of numbers of causes, skulls and places, one per shape.
-ARRAYS = ("shape", *LABELS, "centre")  # Arrays of a file with the whole brain's shapes.
+NUMBER_ARRAYS = ("kind", "skull", "place")  # Arrays of numbers of causes, skulls and places, one per shape.
+ARRAYS = ("shape", *NUMBER_ARRAYS, "centre")  # Arrays of a file with the whole brain's shapes.
 
 
 def to_locator_path(anatomy: str | Path) -> Path:
@@ -50,7 +50,7 @@ def save_locator(path: str | Path, locator: Locator) -> None:
         "format": FORMAT, "anatomy": prior.anatomy.digest, "version": get_version("sulcus"), "kinds": KINDS,
         "whole": prior.nodes is None, "space": "RAS [m]", "regions": [asdict(one) for one in locator.regions],
     }  # fmt: skip
-    arrays = {name: getattr(prior, name) for name in _names(header)} | {"tried": locator.tried}
+    arrays = {name: getattr(prior, name) for name in _list_array_names(header)} | {"tried": locator.tried}
     header["seal"] = compute_seal(header, arrays)
     with write_atomically(path, ".npz") as unfinished:
         np.savez(unfinished, header=np.array(json.dumps(header)), **arrays)  # pyright: ignore[reportArgumentType]
@@ -73,13 +73,13 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
             raise InputError(f"{path}: was made for another anatomy: give that one, or another locator.")
         regions = tuple(Region(**one) for one in header.get("regions", ()))
         check_regions(regions, anatomy)
-        arrays = archive.read_sealed(header, [*_names(header), "tried"])
+        arrays = archive.read_sealed(header, [*_list_array_names(header), "tried"])
         _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
         return Locator(MotionPrior(anatomy, **arrays), tried, regions)
 
 
-def _names(header: dict[str, Any]) -> tuple[str, ...]:
+def _list_array_names(header: dict[str, Any]) -> tuple[str, ...]:
     """Return the array names of a prior that is complete, or restricted to some vertices."""
     return ARRAYS if header.get("whole", True) else (*ARRAYS, "nodes")
 
@@ -90,10 +90,10 @@ def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) ->
     nodes = arrays.get("nodes", every)
     fits = nodes.dtype.kind == "i" and np.array_equal(nodes, np.intersect1d(nodes, every))
     fits = fits and shape.ndim == 3 and shape.shape[1:] == (len(nodes), 3) and tried.ndim == 2 and tried.shape[1] == 5
-    fits = fits and all(arrays[name].shape == (len(shape),) for name in LABELS) and len(shape) and len(tried)
+    fits = fits and all(arrays[name].shape == (len(shape),) for name in NUMBER_ARRAYS) and len(shape) and len(tried)
     fits = fits and arrays["centre"].ndim == 2 and arrays["centre"].shape[1] == 3
-    limits = ((0, len(KINDS)), (0, len(SKULLS)), (NOWHERE, len(arrays["centre"])))
-    for name, (low, high) in zip(LABELS, limits, strict=True):
+    limits = ((0, len(KINDS)), (0, len(SKULLS)), (NO_PLACE, len(arrays["centre"])))
+    for name, (low, high) in zip(NUMBER_ARRAYS, limits, strict=True):
         fits = fits and arrays[name].dtype.kind == "i" and arrays[name].min() >= low and arrays[name].max() < high
     if not fits or not all(np.isfinite(arrays[name]).all() for name in ("shape", "centre", "tried")):
         raise InputError(f"{path}: has arrays that do not fit the anatomy. {REMEDY}")
@@ -103,10 +103,10 @@ def make_locator(
     anatomy: Anatomy,
     seed: int = 0,
     device: str = "auto",
-    causes: Causes = USUAL,
+    causes: Causes = USUAL_CAUSES,
     folder: Path | None = None,
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
-    count: int = TRIALS,
+    count: int = TRIAL_COUNT,
 ) -> Locator:
     """Build a locator of one anatomy. Finished groups of an interrupted run are read from `folder`.
 
@@ -122,7 +122,7 @@ def make_locator(
     check_regions(causes.regions, anatomy)
     ensemble = solve_groups(anatomy, seed, device, causes, folder, lambda done, total: progress("causes", done, total))
     progress("forces on the cortex", 0, 1)
-    presses = solve_presses(anatomy, tuple(dict.fromkeys(PRESSED.values())), device, causes.regions)
+    presses = solve_presses(anatomy, tuple(dict.fromkeys(TOOL_SKULLS.values())), device, causes.regions)
     with limit_to_one_thread():  # products are small
         tried = run_trials(ensemble, presses, lambda done, total: progress("trials", done, total), count)
     return Locator(build_prior(ensemble, presses), tried, causes.regions)

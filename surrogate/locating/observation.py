@@ -16,24 +16,24 @@ from sim.geometry.locate import Located, locate
 from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 
 from ..array_functions import compute_squared_distances
-from .evidence import SHIFT, SIGMA, Evidence, build_motion_evidence
+from .evidence import SHIFT_ERROR, SIGMA, Evidence, build_motion_evidence
 
-FEWEST = 6  # Minimum number of points, and of different places.
-THIN = 0.05  # Smallest ratio of the spread of points across a line to that along it.
-NEAR = 6e-3  # Largest distance of at least half of the points from the open cortex [m].
-FAR = 12e-3  # Largest distance of a point from the open cortex [m]; points beyond are outliers.
-NEAR_NOW = 18e-3  # NEAR for positions on the displaced surface [m]: drained brains sink by over a centimetre.
-FAR_NOW = 30e-3  # FAR for positions on the displaced surface, and for tool tips [m].
-ONE_PLACE = 1e-3  # Distance below which points count as one [m].
-FARTHEST = 1e6  # Largest coordinate [m].
-LONGEST_MOTION = 0.025  # Largest median motion of a brain [m].
-FARTHEST_OFF = 0.02  # Largest rigid error of a tracker [m].
-LEAST_SIGMA = 0.01e-3  # Smallest error of a point [m]: below, a file of millimetres has metres.
-STILL = 1e-9  # Smallest motion that is not zero [m].
+MIN_POINTS = 6  # Minimum number of points, and of different places.
+MIN_SPREAD_RATIO = 0.05  # Smallest ratio of the spread of points across a line to that along it.
+NEAR_DISTANCE = 6e-3  # Largest distance of at least half of the points from the open cortex [m].
+FAR_DISTANCE = 12e-3  # Largest distance of a point from the open cortex [m]; points beyond are outliers.
+NEAR_DISTANCE_NOW = 18e-3  # NEAR for positions on the displaced surface [m]: drained brains sink by over a centimetre.
+FAR_DISTANCE_NOW = 30e-3  # FAR for positions on the displaced surface, and for tool tips [m].
+PLACE_TOLERANCE = 1e-3  # Distance below which points count as one [m].
+MAX_COORDINATE = 1e6  # Largest coordinate [m].
+MAX_MOTION = 0.025  # Largest median motion of a brain [m].
+MAX_RIGID_ERROR = 0.02  # Largest rigid error of a tracker [m].
+MIN_SIGMA = 0.01e-3  # Smallest error of a point [m]: below, a file of millimetres has metres.
+MIN_MOTION = 1e-9  # Smallest motion that is not zero [m].
 # Largest median error [m]: with more, points give no information about motions of a few millimetres.
-LARGEST_SIGMA = 0.01
+MAX_SIGMA = 0.01
 # Likely unit errors: factor that brings the points to the cortex, hint to the user.
-UNITS = (  # Likely unit and axis errors: factor that brings the points to the cortex, hint to the user.
+UNIT_ERRORS = (  # Likely unit and axis errors: factor that brings the points to the cortex, hint to the user.
     (1.0, ""),
     (1e-3, "if they were a thousandth of that: files are in mm, arrays in metres"),
     (1e3, "if they were a thousand times of that: files are in mm, arrays in metres"),
@@ -42,9 +42,11 @@ UNITS = (  # Likely unit and axis errors: factor that brings the points to the c
     (25.4, "if they were 25.4 times of that: they look like inches"),
 )
 # Likely axis errors: signs of x, y and z that bring the points to the cortex, hint to the user.
-FRAMES = (((1.0, 1.0, 1.0), ""), ((-1.0, -1.0, 1.0), "if x and y were turned: they are LPS"))
-SPANS = 6.0  # Largest ratio of the span of points to that of the open cortex, and its inverse: beyond, units are wrong.
-MOST = 400
+FRAME_ERRORS = (((1.0, 1.0, 1.0), ""), ((-1.0, -1.0, 1.0), "if x and y were turned: they are LPS"))
+MAX_SPAN_RATIO = (
+    6.0  # Largest ratio of the span of points to that of the open cortex, and its inverse: beyond, units are wrong.
+)
+MAX_POINTS = 400
 """Maximum number of points used, spread over those given: more add nothing, as neighbours share errors."""
 
 
@@ -73,7 +75,7 @@ class Observation:
     rest: np.ndarray | None = None
     sigma: np.ndarray | None = None
     tips: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    rigid: float = SHIFT
+    rigid: float = SHIFT_ERROR
     checked: bool = False
 
     @property
@@ -96,17 +98,17 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
     _check(observation)
     some = choose_points(len(observation.now))
     if observation.rest is None:
-        where, near, far = observation.now[some], NEAR_NOW, FAR_NOW
+        where, near, far = observation.now[some], NEAR_DISTANCE_NOW, FAR_DISTANCE_NOW
     else:
-        where, near, far = observation.rest[some], NEAR, FAR
-    off = _off_surface(anatomy, where)
-    if _mostly_off(off, near):
-        raise InputError(_elsewhere(anatomy, where, float(np.median(off)), near))
-    _demand_spread(where, off <= far)
+        where, near, far = observation.rest[some], NEAR_DISTANCE, FAR_DISTANCE
+    off = _compute_surface_distances(anatomy, where)
+    if _is_mostly_far(off, near):
+        raise InputError(_describe_mismatch(anatomy, where, float(np.median(off)), near))
+    _check_spread(where, off <= far)
     if observation.rest is not None:
-        _demand_motions(np.linalg.norm(observation.now - observation.rest, axis=1)[some])
-    for number, away in enumerate(_off_surface(anatomy, observation.tips), start=1):
-        if away > FAR_NOW:
+        _check_motions(np.linalg.norm(observation.now - observation.rest, axis=1)[some])
+    for number, away in enumerate(_compute_surface_distances(anatomy, observation.tips), start=1):
+        if away > FAR_DISTANCE_NOW:
             raise InputError(
                 f"tip {number} is {1e3 * away:.0f} mm from the open cortex, so that it cannot touch it: give "
                 "millimetres, RAS, or leave it out."
@@ -117,7 +119,7 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
 
 def choose_points(count: int) -> np.ndarray:
     """Select the numbers (k,) of at most `MOST` points, evenly spread over `count`."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(int))
 
 
 def place_again(
@@ -146,12 +148,12 @@ def place_again(
         cloud, number = np.concatenate([observation.now[near], cloud]), np.concatenate([near, number])
         sigma = np.concatenate([observation.sigmas[near], sigma])
     if len(cloud):
-        along = _along_normals(anatomy, cloud, sigma, number, motion, bias)
+        along = _build_normal_rows(anatomy, cloud, sigma, number, motion, bias)
         parts.append(replace(along, shift=observation.rigid))
-    return parts[0] if len(parts) == 1 else _joined(parts)
+    return parts[0] if len(parts) == 1 else _join_evidence(parts)
 
 
-def _along_normals(
+def _build_normal_rows(
     anatomy: Anatomy,
     cloud: np.ndarray,
     sigma: np.ndarray,
@@ -175,7 +177,7 @@ def _along_normals(
     return Evidence(place, at, normal, value, sigma, number)
 
 
-def _joined(parts: list[Evidence]) -> Evidence:
+def _join_evidence(parts: list[Evidence]) -> Evidence:
     def joined(of, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: np.concatenate([getattr(of(part), name) for part in parts]) for name in names}
 
@@ -197,84 +199,84 @@ def _check(observation: Observation) -> None:
     if sigma.shape != (count,):
         raise InputError(f"{count} points have a sigma of shape {sigma.shape}: give one number for each point.")
     for name, array in {**arrays, "sigma": sigma}.items():
-        if not (np.abs(array) < FARTHEST).all():
+        if not (np.abs(array) < MAX_COORDINATE).all():
             raise InputError(
-                f"`{name}` has a value that is not finite, or beyond {FARTHEST:,.0f} m: leave such points out."
+                f"`{name}` has a value that is not finite, or beyond {MAX_COORDINATE:,.0f} m: leave such points out."
             )
-    if count < FEWEST:
-        raise InputError(f"{count} points say too little: give at least {FEWEST}, spread over the open cortex.")
+    if count < MIN_POINTS:
+        raise InputError(f"{count} points say too little: give at least {MIN_POINTS}, spread over the open cortex.")
     if not (sigma > 0.0).all():
         raise InputError("a sigma is not positive: give each point the standard deviation of its error [mm].")
-    if sigma.min() < LEAST_SIGMA:
+    if sigma.min() < MIN_SIGMA:
         raise InputError(
             f"a sigma is {1e3 * sigma.min():.2g} mm, which no tracker has: give each point the standard deviation of "
             "its error in millimetres, rather than metres."
         )
-    if np.median(sigma) > LARGEST_SIGMA:
+    if np.median(sigma) > MAX_SIGMA:
         raise InputError(
             f"half of the points have a sigma of {1e3 * np.median(sigma):.3g} mm or more, and so say nothing of a "
-            f"brain. Give standard deviations of up to {1e3 * LARGEST_SIGMA:g} mm, or leave these points out."
+            f"brain. Give standard deviations of up to {1e3 * MAX_SIGMA:g} mm, or leave these points out."
         )
-    if not 0.0 <= observation.rigid <= FARTHEST_OFF:
+    if not 0.0 <= observation.rigid <= MAX_RIGID_ERROR:
         raise InputError(
             f"a rigid error of {1e3 * observation.rigid:g} mm is none that a tracker has: give its standard deviation "
-            f"along each axis, from 0 to {1e3 * FARTHEST_OFF:g} mm."
+            f"along each axis, from 0 to {1e3 * MAX_RIGID_ERROR:g} mm."
         )
 
 
-def _demand_motions(length: np.ndarray) -> None:
+def _check_motions(length: np.ndarray) -> None:
     """Raise InputError for lengths (n,) [m] of motions beyond any brain's, or given in metres.
 
     Lengths of 0 are accepted: nothing moved.
     """
-    if np.median(length) > LONGEST_MOTION:
+    if np.median(length) > MAX_MOTION:
         raise InputError(
             f"half of the points move by more than {1e3 * np.median(length):.0f} mm, which no brain does: give motions "
             "in millimetres, rather than centimetres or new positions."
         )
-    if STILL < length.max() < 1e-3 * LONGEST_MOTION:
+    if MIN_MOTION < length.max() < 1e-3 * MAX_MOTION:
         raise InputError(
             f"no point moves by more than {1e3 * length.max():.2g} mm, below any noise: give motions in millimetres, "
             "rather than metres. If nothing moved, give zeros."
         )
 
 
-def _demand_spread(where: np.ndarray, near: np.ndarray) -> None:
+def _check_spread(where: np.ndarray, near: np.ndarray) -> None:
     """Raise InputError if points (n, 3) [m] have too few distinct positions, or those `near` (n,) are on a line."""
-    places = len(np.unique(np.round(where / ONE_PLACE), axis=0))
-    if places < FEWEST:
+    places = len(np.unique(np.round(where / PLACE_TOLERANCE), axis=0))
+    if places < MIN_POINTS:
         raise InputError(
-            f"{places} places a millimetre apart say too little: give {FEWEST} at least, spread over the open cortex."
+            f"{places} places a millimetre apart say too little: give {MIN_POINTS} at least, spread over the open cortex."
         )
     some = where[near]
     along, across, _ = np.linalg.svd(some - some.mean(axis=0), compute_uv=False)
-    if not across > THIN * along:
+    if not across > MIN_SPREAD_RATIO * along:
         raise InputError("the points lie on a line: spread them over the open cortex.")
 
 
-def _off_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
+def _compute_surface_distances(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     """Compute distances (n,) [m] from the open cortex; within `NEAR` of a vertex, from the nearest vertex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     away = np.sqrt(compute_squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
-    far = np.flatnonzero(away > NEAR)
+    far = np.flatnonzero(away > NEAR_DISTANCE)
     if len(far):
         away[far] = np.linalg.norm(find_closest_points(points[far], nodes[triangles]).point - points[far], axis=1)
     return away
 
 
-def _mostly_off(off: np.ndarray, near: float) -> bool:
+def _is_mostly_far(off: np.ndarray, near: float) -> bool:
     """Return True if more than half of distances (n,) [m] exceed `near` [m]."""
     return bool(np.count_nonzero(off > near) > 0.5 * len(off))
 
 
-def _elsewhere(anatomy: Anatomy, points: np.ndarray, off: float, near: float) -> str:
+def _describe_mismatch(anatomy: Anatomy, points: np.ndarray, off: float, near: float) -> str:
     """Describe why half of the points (n, 3) [m] may be at `off` from the open cortex, farther than `near` [m]."""
     start = f"half of the points lie more than {1e3 * off:.3g} mm from the open cortex"
-    for (scale, unit_meant), (turned, frame_meant) in product(UNITS, FRAMES):
-        if not _mostly_off(_off_surface(anatomy, scale * points * turned), near):
+    for (scale, unit_meant), (turned, frame_meant) in product(UNIT_ERRORS, FRAME_ERRORS):
+        if not _is_mostly_far(_compute_surface_distances(anatomy, scale * points * turned), near):
             meant = " and ".join(filter(None, (unit_meant, frame_meant)))
             return f"{start}, and would lie on it {meant}. Give mm and RAS."
     span, own = (float(np.linalg.norm(np.ptp(some, axis=0))) for some in (points, open_cortex(anatomy).corners))
-    if not own / SPANS < span < own * SPANS:
+    if not own / MAX_SPAN_RATIO < span < own * MAX_SPAN_RATIO:
         return f"{start}. They span {1e3 * span:.3g} mm, and it {1e3 * own:.3g} mm: check units. Give mm and RAS."
     return f"{start}: they are of another brain or frame. Give the scan's own RAS, in millimetres."

@@ -15,11 +15,11 @@ from .observation import Observation
 
 # Column names: position, motion, standard deviation.
 PLACE, MOTION, SIGMA = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma"
-NAMES = ("label", "name", "id")
+NAME_COLUMNS = ("label", "name", "id")
 """Columns that name a point; they are ignored."""
-MOST_ROWS = 1_000_000  # Maximum number of rows of a list of points.
-LONGEST_LINE = 1000  # Maximum number of characters of a line.
-LARGEST = 1e9  # Largest absolute value of a number.
+MAX_ROWS = 1_000_000  # Maximum number of rows of a list of points.
+MAX_LINE_LENGTH = 1000  # Maximum number of characters of a line.
+MAX_VALUE = 1e9  # Largest absolute value of a number.
 
 
 def read_observation(path: str | Path, tips: str | Path | None = None) -> Observation:
@@ -34,15 +34,15 @@ def read_observation(path: str | Path, tips: str | Path | None = None) -> Observ
         are not finite numbers or too large.
     """
     columns = read_columns(path, {(*PLACE, *MOTION), (*PLACE, *MOTION, SIGMA), PLACE, (*PLACE, SIGMA)})
-    touched = np.zeros((0, 3)) if tips is None else _points(read_columns(tips, {PLACE}), PLACE)
-    at = _points(columns, PLACE)
+    touched = np.zeros((0, 3)) if tips is None else _to_points(read_columns(tips, {PLACE}), PLACE)
+    at = _to_points(columns, PLACE)
     sigma = 1e-3 * columns[SIGMA] if SIGMA in columns else None
     if "dx" in columns:
-        return Observation(at + _points(columns, MOTION), at, sigma, touched)
+        return Observation(at + _to_points(columns, MOTION), at, sigma, touched)
     return Observation(at, None, sigma, touched)
 
 
-def _points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
+def _to_points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
     """Convert columns [mm] to points (n, 3) [m]."""
     return 1e-3 * np.column_stack([columns[name] for name in names])
 
@@ -71,15 +71,15 @@ def read_columns(
     with read_as(path, "a table of points", remedy):
         text = path.read_text(encoding="utf-8-sig")
     lines = text.splitlines()
-    if len(lines) > MOST_ROWS or any(len(line) > LONGEST_LINE for line in lines):
-        raise InputError(f"{path}: has more than {MOST_ROWS:,} rows, or longer ones than a list of points has.")
+    if len(lines) > MAX_ROWS or any(len(line) > MAX_LINE_LENGTH for line in lines):
+        raise InputError(f"{path}: has more than {MAX_ROWS:,} rows, or longer ones than a list of points has.")
     reader = csv.reader(lines)
     rows = [(reader.line_num, row) for row in reader if row]
     if not rows:
         raise InputError(f"{path}: is empty: give a table with the header {known}.")
     first = rows.pop(0)[1]
     header = tuple(cell.strip().lower() for cell in first)
-    wanted = set(header).difference(NAMES) if blank is None else set().union(*allowed).intersection(header)
+    wanted = set(header).difference(NAME_COLUMNS) if blank is None else set().union(*allowed).intersection(header)
     if wanted not in map(set, allowed) or len(set(header)) < len(header):
         raise InputError(
             f"{path}: its first line is {','.join(first)[:80]!r}: give the header {known}, with commas between."
@@ -100,6 +100,8 @@ def read_columns(
                 f"{path}: row {number} is {','.join(row)[:80]!r}, not {len(header)} numbers: mend or remove it."
             ) from error
         given = [name not in empty or (not gone and bool(cells[name].strip())) for name in names]
-        if not (np.abs(value[given]) < LARGEST).all():
-            raise InputError(f"{path}: row {number} has a number that is not finite, or above {LARGEST:g}: remove it.")
+        if not (np.abs(value[given]) < MAX_VALUE).all():
+            raise InputError(
+                f"{path}: row {number} has a number that is not finite, or above {MAX_VALUE:g}: remove it."
+            )
     return dict(zip(names, values.T, strict=True))

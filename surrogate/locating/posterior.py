@@ -19,17 +19,17 @@ from scipy.special import chdtrc, chdtri, logsumexp
 from sim.errors import InputError
 
 from .causes import OEDEMA, TOOL
-from .evidence import SHIFT, SLIPPED, Evidence, invert_triangular
-from .prior import RIGIDS, SETS, WITH_PLACE, Hypothesis, MotionPrior
+from .evidence import SHIFT_ERROR, SLIPPED_ERROR, Evidence, invert_triangular
+from .prior import CAUSE_SETS, PLACE_SETS, RIGID_RATIOS, Hypothesis, MotionPrior
 from .whitened import Equations, WhitenedSystem, add_places, whiten
 
-MOVED = 0.005  # Significance level of a motion, for each of three tests.
-IMPROBABLE = 1e-4  # Significance level of an outlier.
-FEWEST = 4  # Number of points up to which none is tested as an outlier.
+MOTION_SIGNIFICANCE = 0.005  # Significance level of a motion, for each of three tests.
+OUTLIER_SIGNIFICANCE = 1e-4  # Significance level of an outlier.
+MIN_INLIERS = 4  # Number of points up to which none is tested as an outlier.
 NO_TIPS, NO_ROWS = np.zeros((0, 3)), np.zeros(0, int)  # Empty arrays: no tool tips (0, 3), no rows (0,).
-COARSENED = 2.0  # Divisor of the log evidence, as model errors make hypotheses look too improbable.
-RIGID = -1  # Kind of the unknowns of the rigid error, next to the numbers of causes.
-MIXED = 24  # Maximum number of hypotheses in the mixture: the most probable ones.
+EVIDENCE_DIVISOR = 2.0  # Divisor of the log evidence, as model errors make hypotheses look too improbable.
+RIGID_KIND = -1  # Kind of the unknowns of the rigid error, next to the numbers of causes.
+MAX_HYPOTHESES = 24  # Maximum number of hypotheses in the mixture: the most probable ones.
 (potrs,) = get_lapack_funcs(("potrs",), dtype=np.float64)
 
 
@@ -49,10 +49,10 @@ def is_within_errors(posterior: Posterior) -> bool:
     found = np.linalg.lstsq(precision, gain, rcond=None)[0]
     together = found @ np.linalg.solve(whole, precision @ found)
     rest = ((white - rigid @ found) ** 2).sum()
-    if min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) <= MOVED:
+    if min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) <= MOTION_SIGNIFICANCE:
         return False
     still = 0.5 * (gain @ np.linalg.solve(whole, gain) - np.linalg.slogdet(whole)[1] - white @ white)
-    return bool(posterior.moving - still - whitening.logarithm < -np.log(MOVED))
+    return bool(posterior.moving - still - whitening.logarithm < -np.log(MOTION_SIGNIFICANCE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,14 +166,14 @@ class ObservedPrior:
     scale: float
     rows: WhitenedSystem
     odds: np.ndarray
-    slip: float = SLIPPED / SHIFT
+    slip: float = SLIPPED_ERROR / SHIFT_ERROR
     named: bool = True
 
     @property
     def slipped(self) -> float:
         """Log-odds of a slip, as in `Posterior`."""
         best = self.logs.max(axis=1)
-        return COARSENED * float(best[self._slips].max() - best[~self._slips].max())
+        return EVIDENCE_DIVISOR * float(best[self._slips].max() - best[~self._slips].max())
 
     @property
     def moving(self) -> float:
@@ -181,7 +181,7 @@ class ObservedPrior:
 
         Odds do not count: a tip gives no information on motion.
         """
-        logs = COARSENED * (self.logs - self.odds)[~self._slips]
+        logs = EVIDENCE_DIVISOR * (self.logs - self.odds)[~self._slips]
         logs, rows = logs[np.isfinite(logs)], self.rows
         return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.logarithm)
 
@@ -196,7 +196,7 @@ class ObservedPrior:
         Hypotheses of a slipped registration are included if it is `free`.
         """
         logs = self.logs if free else np.where(self._slips[:, None], -np.inf, self.logs)
-        best = np.argsort(-logs, axis=None, kind="stable")[: min(MIXED, np.isfinite(logs).sum())]
+        best = np.argsort(-logs, axis=None, kind="stable")[: min(MAX_HYPOTHESES, np.isfinite(logs).sum())]
         share = np.exp(logs.flat[best] - logs.flat[best[0]])
         share /= share.sum()
         found = []
@@ -214,25 +214,25 @@ class ObservedPrior:
         """
         # All hypotheses include tools all over the cortex and the rigid error, and each set extends an earlier one.
         rigid = (
-            self._equations()
+            self._build_equations()
             .eliminate_unknowns(TOOL)
-            .scale_unknowns(RIGID, np.minimum(RIGIDS, self.slip))
-            .eliminate_unknowns(RIGID)
+            .scale_unknowns(RIGID_KIND, np.minimum(RIGID_RATIOS, self.slip))
+            .eliminate_unknowns(RIGID_KIND)
         )
         found: dict[tuple[int, ...], Equations] = {}
-        extended = {some[:-1] for some in SETS}
-        evidence = np.full((*rigid.evidence.shape, len(SETS), len(self.odds)), -np.inf)
-        for number, some in enumerate(SETS):
+        extended = {some[:-1] for some in CAUSE_SETS}
+        evidence = np.full((*rigid.evidence.shape, len(CAUSE_SETS), len(self.odds)), -np.inf)
+        for number, some in enumerate(CAUSE_SETS):
             if OEDEMA in some and not self.named:
                 continue
             last = some not in extended
             here = found[some] = found[some[:-1]].eliminate_unknowns(some[-1], last) if some else rigid
             evidence[..., number, 0] = here.evidence
-        pressed = [number for number, some in enumerate(SETS) if some in WITH_PLACE and some in found]
-        evidence[..., pressed, 1:] = np.moveaxis(add_places([found[SETS[number]] for number in pressed]), 0, -2)
-        return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / COARSENED
+        pressed = [number for number, some in enumerate(CAUSE_SETS) if some in PLACE_SETS and some in found]
+        evidence[..., pressed, 1:] = np.moveaxis(add_places([found[CAUSE_SETS[number]] for number in pressed]), 0, -2)
+        return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / EVIDENCE_DIVISOR
 
-    def _equations(self) -> Equations:
+    def _build_equations(self) -> Equations:
         """Build the normal equations of all unknowns in each skull, each over its prior standard deviation."""
         shared, products = self.prior.together, self.rows.products
         skulls, places = len(shared.rows), shared.places
@@ -247,7 +247,7 @@ class ObservedPrior:
         table[..., *np.diag_indices(rows.shape[1])] += 1.0
         place = products[places[..., None], beside[:, :, None]] * self.scale * beside_size
         place[..., *np.diag_indices(places.shape[2])] += 1.0
-        return Equations(np.append(shared.kind, np.full(6, RIGID)), table, place, np.zeros(skulls))
+        return Equations(np.append(shared.kind, np.full(6, RIGID_KIND)), table, place, np.zeros(skulls))
 
     @property
     def _rigid(self) -> np.ndarray:
@@ -294,14 +294,14 @@ def condition_prior(
         some = evidence.select(kept)
         seen = build_observed_prior(prior, some, tips)
         answers = seen.compute_posteriors(free)
-        odd = _oddness(seen.rows, answers[0], some.point)
-        excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], IMPROBABLE)
-        if excess.max() <= 1.0 or len(excess) <= FEWEST:
+        odd = _compute_distances(seen.rows, answers[0], some.point)
+        excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], OUTLIER_SIGNIFICANCE)
+        if excess.max() <= 1.0 or len(excess) <= MIN_INLIERS:
             break
         kept &= ~np.isin(point, np.unique(some.point)[excess >= max(1.0, 0.5 * excess.max())])
-        if len(np.unique(point[kept])) < FEWEST:
+        if len(np.unique(point[kept])) < MIN_INLIERS:
             raise InputError(
-                f"of {len(np.unique(point))} points fewer than {FEWEST} agree on a motion: check that each has its own "
+                f"of {len(np.unique(point))} points fewer than {MIN_INLIERS} agree on a motion: check that each has its own "
                 "motion. If they are less sure, raise sigma."
             )
     unknown = np.zeros(len(prior.kind) + 6)
@@ -311,7 +311,7 @@ def condition_prior(
     return Posterior(some, answers, unknown, float(odd.sum() / len(some)), outliers, seen.slipped, seen.moving)
 
 
-def _oddness(rows: WhitenedSystem, answer: HypothesisResult, point: np.ndarray) -> np.ndarray:
+def _compute_distances(rows: WhitenedSystem, answer: HypothesisResult, point: np.ndarray) -> np.ndarray:
     """Compute square Mahalanobis distances (n,) of points from their leave-one-out predictions by one hypothesis."""
     data = len(rows.products) - 1
     precise = rows.apply_precision(np.append(answer.rows, data))

@@ -21,28 +21,28 @@ from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING, Presses, 
 from .ensemble import Ensemble, compute_surface_motion
 
 # Maximum number of shapes of each cause in each skull model.
-MOST = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}
-SMALLEST_SHARE = 1e-6  # Smallest share of the variance of one shape.
-PLACES = 30  # Number of places that one tool may press on.
-PLACE_SHAPES = 6  # Maximum number of shapes of each place.
-REACH = 6e-3  # Standard deviation of the weight of forces round a place [m].
+MAX_SHAPES = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}
+MIN_SHAPE_SHARE = 1e-6  # Smallest share of the variance of one shape.
+PLACE_COUNT = 30  # Number of places that one tool may press on.
+MAX_PLACE_SHAPES = 6  # Maximum number of shapes of each place.
+PLACE_DEVIATION = 6e-3  # Standard deviation of the weight of forces round a place [m].
 # Prior size of motions by cause, as a share of the observed motion. That of `TUMOUR_SWELLING` is with a swelling brain;
 # that of `TOOL` is of forces all over the cortex, which compensate for missing shapes.
-SIZE = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, OEDEMA: 1.0, TOOL: 0.15}
+CAUSE_SIZES = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, OEDEMA: 1.0, TOOL: 0.15}
 # Candidate rigid errors relative to the reported one (a sinking brain resembles one); inf: a slipped registration.
-RIGIDS = (0.1, 1.0, np.inf)
+RIGID_RATIOS = (0.1, 1.0, np.inf)
 # Skull whose tool shapes are used: one that separates keeps contact under a tool, so sliding contact applies.
-PRESSED = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
-BESIDE = (DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA)  # Causes other than tools.
+TOOL_SKULLS = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
+OTHER_CAUSES = (DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA)  # Causes other than tools.
 # Sets of causes other than tools that may act together.
-SETS = (
+CAUSE_SETS = (
     (), (DRAINAGE,), (SWELLING,), (OEDEMA,), (DRAINAGE, SWELLING), (SWELLING, OEDEMA),
     (DRAINAGE, SWELLING, TUMOUR_SWELLING),
 )  # fmt: skip
-WITH_PLACE = SETS[:6]  # Sets with which a tool may press on one place.
-NOWHERE = -1  # Place number of shapes that belong to no place.
-TOUCHED = 4e-3  # Standard deviation of the distance between a touching tip and the pressed place [m].
-UNTOUCHED = 0.05  # Probability that a touching tip presses on no place.
+PLACE_SETS = CAUSE_SETS[:6]  # Sets with which a tool may press on one place.
+NO_PLACE = -1  # Place number of shapes that belong to no place.
+TOUCH_DEVIATION = 4e-3  # Standard deviation of the distance between a touching tip and the pressed place [m].
+NO_PLACE_PROBABILITY = 0.05  # Probability that a touching tip presses on no place.
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class MotionPrior:
         InputError
             A vertex that is not among `nodes`.
         """
-        return self.shape[:, self._columns(nodes)]
+        return self.shape[:, self._find_columns(nodes)]
 
     def restrict(self, nodes: np.ndarray) -> MotionPrior:
         """Return this prior restricted to some vertices (k,); it raises InputError as `at` does.
@@ -152,7 +152,7 @@ class MotionPrior:
         flat = self.restrict_shapes(np.unique(self.anatomy.open_surface)).reshape(len(self.shape), -1).astype(float)
         return flat @ flat.T
 
-    def _columns(self, nodes: np.ndarray) -> np.ndarray:
+    def _find_columns(self, nodes: np.ndarray) -> np.ndarray:
         """Return the column numbers of vertices (k,) among the available ones."""
         if self.nodes is None:
             return nodes
@@ -171,7 +171,7 @@ class MotionPrior:
 
     def restrict_to_vertices(self, nodes: np.ndarray) -> np.ndarray:
         """Return the shapes (k, 3, r) float32 [m] at some vertices (k,); it raises InputError as `at` does."""
-        return self._by_vertex[self._columns(nodes)]
+        return self._by_vertex[self._find_columns(nodes)]
 
     def project_shapes(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Compute displacements (m, r) [m] of each shape, by vertices and weights as in `Evidence.weights`."""
@@ -183,37 +183,37 @@ class MotionPrior:
         if not len(tips):
             return np.zeros(1 + len(self.centre))
         away = ((self.centre[:, None] - tips) ** 2).sum(axis=2).min(axis=1)
-        return np.append(np.log(UNTOUCHED), -away / (2.0 * TOUCHED**2))
+        return np.append(np.log(NO_PLACE_PROBABILITY), -away / (2.0 * TOUCH_DEVIATION**2))
 
-    def _in_skull(self, number: int) -> tuple[dict[int, np.ndarray], np.ndarray]:
+    def _select_skull_rows(self, number: int) -> tuple[dict[int, np.ndarray], np.ndarray]:
         """Return rows by kind in a skull (tools: all over the cortex), and (p, q), those of a tool on each place."""
-        rows = {kind: np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in BESIDE}
-        pressed = (self.kind == TOOL) & (self.skull == list(SKULLS).index(PRESSED[list(SKULLS)[number]]))
+        rows = {kind: np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in OTHER_CAUSES}
+        pressed = (self.kind == TOOL) & (self.skull == list(SKULLS).index(TOOL_SKULLS[list(SKULLS)[number]]))
         places = [np.flatnonzero(pressed & (self.place == place)) for place in range(self.place.max() + 1)]
-        return rows | {TOOL: np.flatnonzero(pressed & (self.place == NOWHERE))}, np.array(places)
+        return rows | {TOOL: np.flatnonzero(pressed & (self.place == NO_PLACE))}, np.array(places)
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
         """Every set of causes in every skull, with a small, a reported and a slipped rigid error."""
         made = []
         for number in range(len(SKULLS)):
-            rows, places = self._in_skull(number)
-            for some, rigid in product(SETS, RIGIDS):
+            rows, places = self._select_skull_rows(number)
+            for some, rigid in product(CAUSE_SETS, RIGID_RATIOS):
                 own = [rows[kind] for kind in (*some, TOOL)]
-                size = np.repeat([SIZE[kind] for kind in (*some, TOOL)], [len(each) for each in own])
-                some_places = places if some in WITH_PLACE else places[:0]
+                size = np.repeat([CAUSE_SIZES[kind] for kind in (*some, TOOL)], [len(each) for each in own])
+                some_places = places if some in PLACE_SETS else places[:0]
                 made.append(Hypothesis(np.concatenate(own), size, rigid, some_places))
         return tuple(made)
 
     @cached_property
     def together(self) -> PriorTables:
         """Tables of the shapes that may act in each skull."""
-        found, places = zip(*map(self._in_skull, range(len(SKULLS))), strict=True)
+        found, places = zip(*map(self._select_skull_rows, range(len(SKULLS))), strict=True)
         rows, size, kinds = [], [], []
-        for kind in (TOOL, *BESIDE):
+        for kind in (TOOL, *OTHER_CAUSES):
             most = max(len(own[kind]) for own in found)
             rows.append([np.pad(own[kind], (0, most - len(own[kind]))) for own in found])
-            size.append([np.where(np.arange(most) < len(own[kind]), SIZE[kind], 0.0) for own in found])
+            size.append([np.where(np.arange(most) < len(own[kind]), CAUSE_SIZES[kind], 0.0) for own in found])
             kinds += most * [kind]
         return PriorTables(
             np.concatenate(rows, axis=1), np.concatenate(size, axis=1), np.array(kinds), np.array(places)
@@ -224,33 +224,35 @@ def build_prior(ensemble: Ensemble, presses: Presses, members: np.ndarray | None
     """Build the prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
     anatomy, parts = ensemble.anatomy, []
     chosen = np.ones(len(ensemble.kind), bool) if members is None else members
-    for kind, skull in product(BESIDE, range(len(SKULLS))):
+    for kind, skull in product(OTHER_CAUSES, range(len(SKULLS))):
         some = np.flatnonzero(chosen & (ensemble.kind == kind) & (ensemble.skull == skull))
         if len(some):
             shape = compute_principal_parts(
-                normalise_motions(anatomy, ensemble.motion[some]) / np.float32(np.sqrt(len(some))), MOST[kind]
+                normalise_motions(anatomy, ensemble.motion[some]) / np.float32(np.sqrt(len(some))), MAX_SHAPES[kind]
             )
-            parts.append((shape, kind, skull, NOWHERE))
-    centres = choose_spaced(presses.points, PLACES)
-    for name in dict.fromkeys(PRESSED.values()):
+            parts.append((shape, kind, skull, NO_PLACE))
+    centres = choose_spaced(presses.points, PLACE_COUNT)
+    for name in dict.fromkeys(TOOL_SKULLS.values()):
         skull, motion = list(SKULLS).index(name), presses.motion[name]
         parts.append(
             (
-                normalise_shapes(anatomy, compute_principal_parts(motion.reshape(-1, *motion.shape[-2:]), MOST[TOOL])),
+                normalise_shapes(
+                    anatomy, compute_principal_parts(motion.reshape(-1, *motion.shape[-2:]), MAX_SHAPES[TOOL])
+                ),
                 TOOL,
                 skull,
-                NOWHERE,
+                NO_PLACE,
             )
         )
         for place, centre in enumerate(centres):
             away = ((presses.points - presses.points[centre]) ** 2).sum(axis=1)
-            near = np.flatnonzero(away < (3.0 * REACH) ** 2)
-            weight = np.exp(-away[near] / (2.0 * REACH**2)).astype(np.float32)
+            near = np.flatnonzero(away < (3.0 * PLACE_DEVIATION) ** 2)
+            weight = np.exp(-away[near] / (2.0 * PLACE_DEVIATION**2)).astype(np.float32)
             some = motion[:, near] * weight[:, None, None, None]
             parts.append(
                 (
                     normalise_shapes(
-                        anatomy, compute_principal_parts(some.reshape(-1, *motion.shape[-2:]), PLACE_SHAPES)
+                        anatomy, compute_principal_parts(some.reshape(-1, *motion.shape[-2:]), MAX_PLACE_SHAPES)
                     ),
                     TOOL,
                     skull,
@@ -283,7 +285,7 @@ def compute_principal_parts(motion: np.ndarray, most: int) -> np.ndarray:
     flat = motion.reshape(len(motion), -1)
     value, vector = np.linalg.eigh((flat @ flat.T).astype(float))
     chosen = np.argsort(-value)[:most]
-    chosen = chosen[value[chosen] > SMALLEST_SHARE * value.sum()]
+    chosen = chosen[value[chosen] > MIN_SHAPE_SHARE * value.sum()]
     return (vector[:, chosen].T.astype(np.float32) @ flat).reshape(-1, *motion.shape[1:])
 
 

@@ -12,7 +12,7 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material, Tissue
 
-ALIKE = 1e-6  # Relative tolerance for equal stiffness ratios.
+RATIO_TOLERANCE = 1e-6  # Relative tolerance for equal stiffness ratios.
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def find_differing_regions(elasticity: Elasticity, known: tuple[Region, ...]) ->
     return tuple(
         label
         for label, (one, other) in sorted(pairs.items())
-        if one.poisson != other.poisson or not isclose(one.ratio, other.ratio, rel_tol=ALIKE)
+        if one.poisson != other.poisson or not isclose(one.ratio, other.ratio, rel_tol=RATIO_TOLERANCE)
     )
 
 

@@ -12,8 +12,8 @@ from .observation import Observation, place_again, to_evidence
 from .posterior import Posterior, condition_prior
 from .prior import MotionPrior
 
-ROUNDS = 6  # Maximum number of iterations of the posterior.
-STEADY = 0.2e-3  # Motion of the tumour's centroid below which the iteration ends [m].
+MAX_ITERATIONS = 6  # Maximum number of iterations of the posterior.
+CENTROID_TOLERANCE = 0.2e-3  # Motion of the tumour's centroid below which the iteration ends [m].
 
 
 def match_and_update(prior: MotionPrior, observation: Observation, free: bool = False) -> tuple[Posterior, np.ndarray]:
@@ -32,11 +32,11 @@ def match_and_update(prior: MotionPrior, observation: Observation, free: bool = 
     found = condition_prior(prior, evidence, tips, free)
     if observation.rest is None or len(tips):
         cortex, motion = np.unique(anatomy.open_surface), np.zeros_like(anatomy.mesh.nodes)
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ITERATIONS):
             motion[cortex] = np.tensordot(found.weight, prior.restrict_shapes(cortex), 1)
             evidence = place_again(anatomy, observation, near, motion, found.compute_bias)
             supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
             before, found = found, condition_prior(prior, evidence, tips[supported], free)
-            if np.linalg.norm((found.weight - before.weight) @ prior.middle) < STEADY:
+            if np.linalg.norm((found.weight - before.weight) @ prior.middle) < CENTROID_TOLERANCE:
                 break
     return found, near

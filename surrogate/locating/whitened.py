@@ -52,7 +52,7 @@ class Equations:
         here, there = (each[..., len(left) :].reshape(shape).swapaxes(-3, -2) for each in (rows, solved))
         place = self.place - here[..., :-1].swapaxes(-1, -2) @ there
         gain = (rows[..., -1] * solved[..., -1]).sum(axis=-1)
-        evidence = self.evidence + _logarithm(gain, block)
+        evidence = self.evidence + _compute_logarithm(gain, block)
         if last:
             return Equations(left[:0], rows[..., :0, len(left) :], place, evidence)
         table = rows[..., : len(left)].swapaxes(-1, -2) @ -solved
@@ -85,7 +85,7 @@ def add_places(several: Sequence[Equations]) -> np.ndarray:
     return found
 
 
-def _logarithm(gain: np.ndarray, block: np.ndarray) -> np.ndarray:
+def _compute_logarithm(gain: np.ndarray, block: np.ndarray) -> np.ndarray:
     return 0.5 * (gain - np.linalg.slogdet(block)[1])
 
 

@@ -31,16 +31,16 @@ from ..data.holding import get_relaxation_series
 from .learned import Learned
 
 # Effects that do nothing without a load of their kind: training may include them although a scene does not.
-ON_CALL = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, Gravity)}
-SAME = 1e-9  # Relative tolerance for equal tool sizes: 26 mm are 0.026 m or 1e-3 * 26.
+LOAD_EFFECTS = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, Gravity)}
+SIZE_TOLERANCE = 1e-9  # Relative tolerance for equal tool sizes: 26 mm are 0.026 m or 1e-3 * 26.
 # Training effects of models whose file does not give them.
-UNSAID = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
+DEFAULT_EFFECTS = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 
 
 def read_trained_effects(stated: Mapping[str, str]) -> frozenset[str]:
     """Return the names of the effects that a model was trained under, or a data set was made under, by its file."""
     if "effects" not in stated:
-        return UNSAID
+        return DEFAULT_EFFECTS
     with suppress(SyntaxError):
         match ast.parse(stated["effects"], mode="eval").body:  # `repr` of a tuple of effects
             case ast.Tuple(elts):
@@ -64,8 +64,8 @@ def find_rejection(model: Learned, effects: Iterable[Effect], element: str | Non
     effects = tuple(effects)
     trained, asked = read_trained_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
     if model.tool is not None:
-        here = tuple(tool for effect in effects for tool in _moved(effect))
-        if len(here) != 1 or not _alike(here[0], model.tool):
+        here = tuple(tool for effect in effects for tool in _get_moved_tools(effect))
+        if len(here) != 1 or not _is_same_tool(here[0], model.tool):
             tools = " and ".join(map(name_tool, here)) or "none that is moved"
             return f"it was trained on the poses of {name_tool(model.tool)}, and here is {tools}"
         asked = asked - {Retraction.__name__} | {ToolContact.__name__}
@@ -73,48 +73,48 @@ def find_rejection(model: Learned, effects: Iterable[Effect], element: str | Non
         others = ", ".join(sorted(asked - trained))
         return f"it was trained on what a tool's force does, and here is none{f', but {others}' if others else ''}"
     idle = set() if model.anatomy.slide_normal.any() else {"Bonded", "Slide"}
-    strange, missing = asked - trained - idle, trained - asked - ON_CALL - idle
+    strange, missing = asked - trained - idle, trained - asked - LOAD_EFFECTS - idle
     if not strange and not missing:
-        return _other_body(model, effects, element)
+        return _describe_body_change(model, effects, element)
     differences = [f"not under {', '.join(sorted(strange))}"] * bool(strange)
     differences += [f"never without {', '.join(sorted(missing))}"] * bool(missing)
     return f"it was trained under {', '.join(sorted(trained))}, {' and '.join(differences)}"
 
 
-def _alike(one: Tool, other: BuiltIn) -> bool:
+def _is_same_tool(one: Tool, other: BuiltIn) -> bool:
     """Return True if tools are of one kind and size, within round-off."""
     if not isinstance(one, BuiltIn) or type(one) is not type(other):
         return False
-    return bool(np.allclose(astuple(one), astuple(other), rtol=SAME, atol=0.0))
+    return bool(np.allclose(astuple(one), astuple(other), rtol=SIZE_TOLERANCE, atol=0.0))
 
 
-def _moved(effect: Effect) -> tuple[Tool, ...]:
+def _get_moved_tools(effect: Effect) -> tuple[Tool, ...]:
     """Return the tools that an effect moves by pose."""
     if isinstance(effect, Retraction):
         return (effect.blade,)
     return effect.tools if isinstance(effect, ToolContact) else ()
 
 
-def _other_series(trained: Elasticity, here: Elasticity) -> str | None:
+def _describe_series_change(trained: Elasticity, here: Elasticity) -> str | None:
     """Return the difference between the relaxation of tissues that are otherwise equal; None without one."""
     learned, asked = get_relaxation_series([trained]), get_relaxation_series([here])
     if learned == asked or here.default is None or replace(cast(Any, here.default), prony=learned) != trained.default:
         return None
-    return f"it learned from tissue that {_relaxes(learned)}, and here it {_relaxes(asked)}"
+    return f"it learned from tissue that {_format_series(learned)}, and here it {_format_series(asked)}"
 
 
-def _relaxes(series: Pairs) -> str:
+def _format_series(series: Pairs) -> str:
     """Describe a Prony series."""
     each = " and ".join(f"{100.0 * g:g} % in {tau:g} s" for g, tau in series)
     return f"relaxes by {each}" if each else "does not relax"
 
 
-def _other_body(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:
+def _describe_body_change(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:
     """Return the difference in tissue or element between a model's FEM and this one; None without one."""
     stated, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if "tissue" in stated and here is not None:
         trained = read_tissue_statement(stated)
-        if (series := _other_series(trained, here)) is not None:
+        if (series := _describe_series_change(trained, here)) is not None:
             return series
         if trained != here:
             return f"it learned from the tissue {trained}, and here it is {here}"

@@ -20,17 +20,17 @@ from ..regressors.protocol import compute_standardisation
 from .training_range import Measured, Outside
 
 LEVELS = (0.95, 0.99)  # Nominal coverage of the bounds.
-CLASS = 200  # Default minimum number of calibration loads in a class of force.
-CLASSES = 10  # Maximum number of classes of force.
-RIDGE = 1e-2  # Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
-LOAD = 4  # Number of features of the load itself: force, radius, angle, overhang. The others are its position.
-BENDS = 150  # Minimum number of errors for a quadratic scale: ten per term.
-FARTHEST = 4.0  # Limit of standardised features [standard deviations].
-LEAST = 1e-3  # Smallest error as a share of the mean error.
+CLASS_LOADS = 200  # Default minimum number of calibration loads in a class of force.
+MAX_CLASSES = 10  # Maximum number of classes of force.
+RIDGE_WEIGHT = 1e-2  # Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
+LOAD_FEATURES = 4  # Number of features of the load itself: force, radius, angle, overhang. The others are its position.
+MIN_QUADRATIC_ERRORS = 150  # Minimum number of errors for a quadratic scale: ten per term.
+FEATURE_LIMIT = 4.0  # Limit of standardised features [standard deviations].
+MIN_ERROR_SHARE = 1e-3  # Smallest error as a share of the mean error.
 GROWTH = 4.0  # Relative growth of a bound beyond the training range, per unit of `Outside.beyond`.
 # Default growth with the distance from the nearest training load, where no loads determine it [1/m].
 USUAL_GROWTH = 1e3
-MOST_GROWTH = 2e4  # Maximum growth with the distance from the nearest training load [1/m].
+MAX_GROWTH = 2e4  # Maximum growth with the distance from the nearest training load [1/m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Bound:
 
     def evaluate(self, features: np.ndarray, force: np.ndarray, outside: Outside) -> np.ndarray:
         """Compute bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N], and the loads' `outside`."""
-        scale = np.exp(_monomials(_standard(features, self.mean, self.deviation)) @ self.weights)
+        scale = np.exp(_compute_monomials(_normalise_features(features, self.mean, self.deviation)) @ self.weights)
         away = np.maximum(outside.away - self.near, 0.0)
         scale = scale * (1.0 + self.growth * away) * (1.0 + GROWTH * outside.beyond)
         return take_rows_of(np.searchsorted(self.edges, force), self.quantile.T).T * scale
@@ -74,7 +74,7 @@ def fit_bound(
     features: np.ndarray,
     force: np.ndarray,
     error: np.ndarray,
-    each: int = CLASS,
+    each: int = CLASS_LOADS,
     *,
     curved: bool = True,
     away: np.ndarray | float = 0.0,
@@ -100,16 +100,16 @@ def fit_bound(
         Distances (n,) [m] of the calibration loads from the nearest training load; growth of the bound with it [1/m].
     """
     mean, deviation = compute_standardisation(seen[0])
-    used = _used(len(mean), LOAD if curved and len(seen[1]) >= BENDS else 0)
-    design = _monomials(_standard(seen[0], mean, deviation))[:, used]
-    wanted = np.log(np.maximum(seen[1], max(LEAST * seen[1].mean(), np.finfo(float).tiny)))
-    penalty = RIDGE * len(design) * np.eye(design.shape[1])
+    used = _mask_monomials(len(mean), LOAD_FEATURES if curved and len(seen[1]) >= MIN_QUADRATIC_ERRORS else 0)
+    design = _compute_monomials(_normalise_features(seen[0], mean, deviation))[:, used]
+    wanted = np.log(np.maximum(seen[1], max(MIN_ERROR_SHARE * seen[1].mean(), np.finfo(float).tiny)))
+    penalty = RIDGE_WEIGHT * len(design) * np.eye(design.shape[1])
     penalty[0, 0] = 0.0  # the constant is free
     weights = np.zeros(len(used))
     weights[used] = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
-    scale = np.exp(_monomials(_standard(features, mean, deviation)) @ weights)
+    scale = np.exp(_compute_monomials(_normalise_features(features, mean, deviation)) @ weights)
     ratio = error / (scale * (1.0 + growth * away))
-    count = int(np.clip(len(ratio) // each, 1, CLASSES))
+    count = int(np.clip(len(ratio) // each, 1, MAX_CLASSES))
     edges = np.unique(np.quantile(force, np.arange(1, count) / count))
     edges = edges[edges < force.max()]  # equal forces are of one class
     count, member = len(edges) + 1, np.searchsorted(edges, force)
@@ -137,7 +137,7 @@ def fit_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.nd
 
     if not np.isfinite(compute_conformal_quantile(far[0], LEVELS[0])):
         return USUAL_GROWTH
-    least, most = 0.0, MOST_GROWTH
+    least, most = 0.0, MAX_GROWTH
     for _ in range(40):
         middle = 0.5 * (least + most)
         least, most = (middle, most) if larger(middle) else (least, middle)
@@ -160,16 +160,16 @@ def compute_conformal_quantile(ratio: np.ndarray, level: float) -> float:
     return float(np.sort(ratio)[rank - 1]) if rank <= len(ratio) else np.inf
 
 
-def _standard(features: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    return np.clip((features - mean) / deviation, -FARTHEST, FARTHEST)
+def _normalise_features(features: np.ndarray, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    return np.clip((features - mean) / deviation, -FEATURE_LIMIT, FEATURE_LIMIT)
 
 
-def _monomials(x: np.ndarray) -> np.ndarray:
+def _compute_monomials(x: np.ndarray) -> np.ndarray:
     """Compute monomials 1, x_i and x_i x_j of (B, f): (B, t)."""
     first, second = np.triu_indices(x.shape[1])
     return np.concatenate([np.ones_like(x[:, :1]), x, x[:, first] * x[:, second]], axis=1)
 
 
-def _used(count: int, curved: int) -> np.ndarray:
+def _mask_monomials(count: int, curved: int) -> np.ndarray:
     """Return the mask (t,) of fitted monomials: 1, x_i of the load, and x_i x_j of the first `curved` features."""
-    return np.concatenate([[True], np.arange(count) < LOAD, np.triu_indices(count)[1] < curved])
+    return np.concatenate([[True], np.arange(count) < LOAD_FEATURES, np.triu_indices(count)[1] < curved])

@@ -16,8 +16,8 @@ from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS
 from ..regressors.rigid_contact import RigidContact
 from .learned import Learned, ModelPart
-from .left_out import LIMIT, HeldOutError, find_handed_over
-from .tool_contact import HELD
+from .left_out import MAX_VERTEX_ERROR, HeldOutError, find_handed_over
+from .tool_contact import CONTACT_KEY
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Guarded:
 
     model: Learned
     fem: Deformer
-    limit: float = LIMIT
+    limit: float = MAX_VERTEX_ERROR
 
     def __post_init__(self) -> None:
         if self.model.series:
@@ -78,7 +78,7 @@ class Guarded:
         if at is None and good.all() and len(unsure) == len(loads):
             return solved
         pushed = self.model.tool is None
-        return _replaced(predicted, unsure[good], solved.select(np.flatnonzero(good)), pushed)
+        return _replace_rows(predicted, unsure[good], solved.select(np.flatnonzero(good)), pushed)
 
     def find_unreliable(self, predicted: Deformation) -> np.ndarray:
         """Return the mask (B,) of predictions that need FEM."""
@@ -112,7 +112,7 @@ def find_first_model(deformer: Deformer, answer: Deformation) -> Learned | None:
     return find_model(deformer) if answer.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
-def _replaced(predicted: Deformation, rows: np.ndarray, solved: Deformation, pushed: bool) -> Deformation:
+def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation, pushed: bool) -> Deformation:
     """Replace some `rows` (k,) of predictions by FEM solutions; the reaction of a push always comes from the load.
 
     The reaction of a pose is unknown in all rows if the model does not predict it.
@@ -146,7 +146,7 @@ def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> 
     InputError
         A model without a contact part, or without its tool's force; a result of another size.
     """
-    part = _contact_of(model)
+    part = _find_contact(model)
     if part is None:
         raise InputError("this model knows no forces of contact: train the learner contact or contact-gp on poses.")
     if answer.displacement.shape[:2] != (len(loads), len(model.nodes)):
@@ -156,7 +156,7 @@ def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> 
         )
     patch, mesh, contact = open_patch(model.anatomy), model.anatomy.mesh, part.regressor
     assert isinstance(contact, RigidContact)
-    held = answer.warm.get(HELD)
+    held = answer.warm.get(CONTACT_KEY)
     if held is None:
         held = contact.compute_warm_start(ENCODERS[part.encoder](patch, model.clip_to_range(model.to_input(loads))[1]))
     force = contact.compute_held_force(held).reshape(len(loads), -1, 3)
@@ -172,10 +172,10 @@ def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> 
 
 def has_tool_pressure(model: Learned) -> bool:
     """Return True if `compute_tool_pressure` is available for a model."""
-    return _contact_of(model) is not None
+    return _find_contact(model) is not None
 
 
-def _contact_of(model: Learned) -> ModelPart | None:
+def _find_contact(model: Learned) -> ModelPart | None:
     if model.force is None:
         return None
     return next((part for part in model.parts if isinstance(part.regressor, RigidContact)), None)

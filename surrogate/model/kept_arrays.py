@@ -15,7 +15,7 @@ from sim.runtime.versions import get_version
 
 from .npz_archive import Archive
 
-REMADE = "Delete it: it is computed again."
+REMEDY = "Delete it: it is computed again."
 """Remedy for a damaged cache file."""
 
 
@@ -48,8 +48,8 @@ def keep_arrays(
         A file that cannot be read, or that the check rejects.
     """
     if path is not None and path.exists():
-        with read_as(path, kind, REMADE), path.open("rb") as raw:
-            found = Archive(raw, REMADE).read_arrays(names)
+        with read_as(path, kind, REMEDY), path.open("rb") as raw:
+            found = Archive(raw, REMEDY).read_arrays(names)
             check(found)
             return found
     made = make()

@@ -30,15 +30,15 @@ from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound, compute_features
 from .left_out import LeftOut
-from .relaxation import MEMORY, Relaxed, follow_relaxation
+from .relaxation import MEMORY_KEY, Relaxed, follow_relaxation
 from .tip_distance import Distance, TipModel
 from .tool_contact import ForceModel, build_warm_encoders, collect_held_state, compute_wrench
 from .training_range import Envelope, Measured, Outside, measure_loads
 
 # Largest force or footprint relative to the training's. On the template FEM finds no equilibrium for three loads of
 # this size, and at twice the force the error of a prediction is up to 31 %.
-FARTHEST = 3.0
-STORED = 1e-6  # Rounding error of training points, stored in single precision [m].
+MAX_TRAINING_RATIO = 3.0
+STORED_TOLERANCE = 1e-6  # Rounding error of training points, stored in single precision [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ class Learned:
         known[self.nodes] = True
         return known
 
-    def _demand_answerable(self, pushed: Pushed, doubtful: np.ndarray) -> None:
+    def _check_in_range(self, pushed: Pushed, doubtful: np.ndarray) -> None:
         """Raise InputError for loads off the open cortex, or far beyond the training range.
 
         Checks only the `doubtful` (k,) rows: a load inside the training range is accepted, unless its radius is too
@@ -172,18 +172,18 @@ class Learned:
             (force, split_forces(pushed)[0], self.envelope.force),
             (("a footprint", 1e3, "mm"), pushed.footprint, self.envelope.footprint),
         ):
-            far = np.flatnonzero(size > FARTHEST * most)
+            far = np.flatnonzero(size > MAX_TRAINING_RATIO * most)
             if len(far):
                 raise InputError(
                     f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was trained on "
-                    f"{unit * most:.3g} {symbol} at most: give up to {FARTHEST:g} times that, or ask the finite "
+                    f"{unit * most:.3g} {symbol} at most: give up to {MAX_TRAINING_RATIO:g} times that, or ask the finite "
                     "elements."
                 )
         away = find_nearest(pushed.point[doubtful], self._patch.points)[1]
         if (away > pushed.footprint[doubtful]).any():  # away from nodes, but perhaps not from triangles
             self._patch.skin.check_tools_touch(pushed.point, pushed.footprint)
 
-    def _demand_known(self, nodes: np.ndarray) -> None:
+    def _check_nodes(self, nodes: np.ndarray) -> None:
         inside = (nodes >= 0) & (nodes < len(self._knows))
         strange = ~(inside & self._knows[np.where(inside, nodes, 0)])
         if strange.any():
@@ -215,28 +215,28 @@ class Learned:
                 f"{len(loads)} load cases."
             )
         begun = time.perf_counter()
-        pushed, past = self._followed(loads, start)
+        pushed, past = self._convert_loads(loads, start)
         nodes = self.nodes if at is None else check_whole_numbers("at", at)
-        self._demand_known(nodes)
+        self._check_nodes(nodes)
         with limit_to_one_thread() if len(loads) == 1 else nullcontext():
-            return self._summed(loads, pushed, nodes, begun, past, build_warm_encoders(self._regressors, start))
+            return self._sum_parts(loads, pushed, nodes, begun, past, build_warm_encoders(self._regressors, start))
 
-    def _summed(
+    def _sum_parts(
         self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: Relaxed | None,
         encoders: Mapping[str, Encoder],
     ) -> Deformation:  # fmt: skip
         """Sum the parts; the computation began at `begun` [s]."""
         known = measure_loads(self._patch, pushed)
         outside = self.envelope.locate_outside(pushed, known)
-        far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED
-        self._demand_answerable(pushed, np.flatnonzero(far | small))
+        far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED_TOLERANCE
+        self._check_in_range(pushed, np.flatnonzero(far | small))
         promised = self.compute_bounds(self.bounds, pushed, known, outside)
         if past is not None:
             far = far | past.strange
         motion = self.predict_motion(pushed, nodes, encoders)
         answer = build_prediction(motion, nodes, loads, far, begun, promised, self.source)
         if past is not None:
-            answer = replace(answer, memory={MEMORY: past.memory})
+            answer = replace(answer, memory={MEMORY_KEY: past.memory})
         if self.tool is not None:
             answer = replace(
                 answer, warm=collect_held_state(self._regressors, self._patch, self.clip_to_range(pushed)[1], encoders)
@@ -318,7 +318,7 @@ class Learned:
             Loads of another kind, or a result without the open cortex and the tumour.
         """
         # With the result of these very loads as start, no time passes.
-        pushed = self._followed(loads, answer)[0]
+        pushed = self._convert_loads(loads, answer)[0]
         if apart is None:
             if answer is None:
                 answer = self.deform(loads, at=self.nodes)
@@ -339,9 +339,9 @@ class Learned:
         InputError
             Loads of another kind.
         """
-        return self._followed(loads)[0]
+        return self._convert_loads(loads)[0]
 
-    def _followed(self, loads: Loads, start: Deformation | None = None) -> tuple[Pushed, Relaxed | None]:
+    def _convert_loads(self, loads: Loads, start: Deformation | None = None) -> tuple[Pushed, Relaxed | None]:
         """Convert loads as `asked`, from a start, and return the state of relaxation, if tissue relaxes."""
         if self.tool is None:
             return get_only_pushes(loads), None

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LIMIT = 0.2e-3
+MAX_VERTEX_ERROR = 0.2e-3
 """Limit of the maximum vertex error of the tumour, at 95 %, beyond which FEM is used instead of a model [m]."""
-LIMITS = (LIMIT, 0.1e-3, 0.05e-3, 0.02e-3, 0.01e-3, 0.0)
+VERTEX_ERROR_LIMITS = (MAX_VERTEX_ERROR, 0.1e-3, 0.05e-3, 0.02e-3, 0.01e-3, 0.0)
 """Candidate limits: a model gets the largest one that satisfies `MEAN` and `WORST`; with 0, FEM solves all loads."""
-MEAN = 0.01  # Largest mean error of a model without FEM fallback, as a share of the motion.
-WORST = 0.2e-3  # Largest 99.9th percentile of the vertex errors of a model without FEM fallback [m].
-FEWEST_FOR_P999 = 1000
+MAX_MEAN_ERROR = 0.01  # Largest mean error of a model without FEM fallback, as a share of the motion.
+MAX_P999_ERROR = 0.2e-3  # Largest 99.9th percentile of the vertex errors of a model without FEM fallback [m].
+MIN_LOADS_FOR_P999 = 1000
 """Minimum number of loads for a 99.9th percentile."""
 
 
@@ -37,12 +37,12 @@ class LeftOut:
     guarded: float
     p999: float | None
     solved: float
-    limit: float = LIMIT
+    limit: float = MAX_VERTEX_ERROR
 
     @property
     def enough(self) -> bool:
         """True if the model does not need FEM fallback."""
-        return _enough(self.mean, self.p999)
+        return _is_enough(self.mean, self.p999)
 
     def __str__(self) -> str:
         """Return a description of the errors."""
@@ -63,16 +63,18 @@ class HeldOutError:
     @property
     def weak(self) -> bool:
         """True if the model needs FEM fallback: by mean error, or by maximum vertex error if that is missing."""
-        return not (self.bound <= LIMIT if self.left_out is None else self.left_out.enough)
+        return not (self.bound <= MAX_VERTEX_ERROR if self.left_out is None else self.left_out.enough)
 
     def __str__(self) -> str:
         """Return a description of the errors and their limits."""
         if self.left_out is None:
-            return f"maximum error up to {1e3 * self.bound:.2g} mm in 95 % of loads (limit {1e3 * LIMIT:g} mm)"
-        mean = f"mean error {100 * self.left_out.mean:.2g} % of the motion (limit {100 * MEAN:g} %)"
+            return (
+                f"maximum error up to {1e3 * self.bound:.2g} mm in 95 % of loads (limit {1e3 * MAX_VERTEX_ERROR:g} mm)"
+            )
+        mean = f"mean error {100 * self.left_out.mean:.2g} % of the motion (limit {100 * MAX_MEAN_ERROR:g} %)"
         if self.left_out.p999 is None:
             return mean
-        return f"{mean}; 99.9th percentile {1e3 * self.left_out.p999:.2g} mm (limit {1e3 * WORST:g} mm)"
+        return f"{mean}; 99.9th percentile {1e3 * self.left_out.p999:.2g} mm (limit {1e3 * MAX_P999_ERROR:g} mm)"
 
 
 def find_handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndarray:
@@ -97,19 +99,19 @@ def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray
     outside
         Mask (B,) of loads outside the training range.
     """
-    share, left, solved, limit = distance.mean(axis=1) / motion, 0.0, outside, LIMIT
-    for limit in LIMITS:
+    share, left, solved, limit = distance.mean(axis=1) / motion, 0.0, outside, MAX_VERTEX_ERROR
+    for limit in VERTEX_ERROR_LIMITS:
         solved = find_handed_over(bound, outside, limit)
         left = float(np.where(solved, 0.0, share).mean())
-        if _enough(left, _p999(np.where(solved[:, None], 0.0, distance))):
+        if _is_enough(left, _compute_p999(np.where(solved[:, None], 0.0, distance))):
             break
-    return LeftOut(float(share.mean()), left, _p999(distance), float(solved.mean()), limit)
+    return LeftOut(float(share.mean()), left, _compute_p999(distance), float(solved.mean()), limit)
 
 
-def _p999(distance: np.ndarray) -> float | None:
+def _compute_p999(distance: np.ndarray) -> float | None:
     """Compute the 99.9th percentile of errors (B, n) [m]; None for fewer than `FEWEST_FOR_P999` loads."""
-    return float(np.percentile(distance, 99.9)) if len(distance) >= FEWEST_FOR_P999 else None
+    return float(np.percentile(distance, 99.9)) if len(distance) >= MIN_LOADS_FOR_P999 else None
 
 
-def _enough(mean: float, p999: float | None) -> bool:
-    return mean <= MEAN and (p999 is None or p999 <= WORST)
+def _is_enough(mean: float, p999: float | None) -> bool:
+    return mean <= MAX_MEAN_ERROR and (p999 is None or p999 <= MAX_P999_ERROR)

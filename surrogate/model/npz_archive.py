@@ -14,9 +14,9 @@ from numpy.lib import format as npy
 
 from sim.errors import InputError
 from sim.geometry.tetmesh import compute_digest
-from sim.runtime.file_limits import LARGEST_HEADER, LARGEST_MODEL
+from sim.runtime.file_limits import MAX_HEADER_BYTES, MAX_MODEL_BYTES
 
-LONGEST = 10_000  # Maximum size of an array's header [bytes].
+MAX_NPY_HEADER = 10_000  # Maximum size of an array's header [bytes].
 
 
 def compute_seal(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
@@ -42,7 +42,7 @@ class Archive:
     Every message ends with a `remedy`. Files of the wrong kind raise the exceptions of `zipfile` and NumPy.
     """
 
-    def __init__(self, file: BinaryIO, remedy: str = "", largest: int = LARGEST_MODEL) -> None:
+    def __init__(self, file: BinaryIO, remedy: str = "", largest: int = MAX_MODEL_BYTES) -> None:
         self._zip, self._remedy, self._largest = zipfile.ZipFile(file), remedy, largest
 
     def read_text(self, name: str) -> str:
@@ -53,8 +53,8 @@ class Archive:
         InputError
             A text that is longer than allowed.
         """
-        self._demand([name], LARGEST_HEADER)
-        return str(self._array(name))
+        self._check_names([name], MAX_HEADER_BYTES)
+        return str(self._read_array(name))
 
     def read_arrays(self, names: Iterable[str]) -> dict[str, np.ndarray]:
         """Read arrays by name.
@@ -65,8 +65,8 @@ class Archive:
             Arrays that are missing, or larger in total than allowed.
         """
         wanted = sorted(set(names))
-        self._demand(wanted, self._largest)
-        return {name: self._array(name) for name in wanted}
+        self._check_names(wanted, self._largest)
+        return {name: self._read_array(name) for name in wanted}
 
     def read_by_digest(self, digests: Iterable[str]) -> dict[str, np.ndarray]:
         """Read arrays that are stored under the digest of their content.
@@ -79,7 +79,7 @@ class Archive:
         found = self.read_arrays(digests)
         for name, array in found.items():
             if compute_digest(array) != name:
-                raise self._damaged(f"its array {name!r} has another digest")
+                raise self._build_error(f"its array {name!r} has another digest")
         return found
 
     def read_sealed(self, header: Mapping[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
@@ -92,30 +92,30 @@ class Archive:
         """
         found = self.read_arrays(names)
         if compute_seal(header, found) != header["seal"]:
-            raise self._damaged("its header and arrays do not have the digest that it states")
+            raise self._build_error("its header and arrays do not have the digest that it states")
         return found
 
-    def _damaged(self, reason: str) -> InputError:
+    def _build_error(self, reason: str) -> InputError:
         return InputError(f"{reason}: it is damaged. {self._remedy}".rstrip())
 
-    def _demand(self, names: list[str], most: int) -> None:
+    def _check_names(self, names: list[str], most: int) -> None:
         held = {info.filename: info for info in self._zip.infolist()}
         missing = [name for name in names if f"{name}.npy" not in held]
         if missing:
-            raise self._damaged(f"lacks the array {missing[0]!r}")
+            raise self._build_error(f"lacks the array {missing[0]!r}")
         size = sum(held[f"{name}.npy"].file_size for name in names)
         if size > most:
             reason = f"has arrays of {size / 1e6:,.0f} MB: {most / 1e6:,.0f} MB are the most that are read."
             raise InputError(f"{reason} {self._remedy}".rstrip())
 
-    def _array(self, name: str) -> np.ndarray:
+    def _read_array(self, name: str) -> np.ndarray:
         info = self._zip.getinfo(f"{name}.npy")
         with self._zip.open(info) as member:
             # The size is given here and in the archive: memory is allocated only if both agree.
             version = npy.read_magic(member)
             read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-            shape, _, kind = read(member, max_header_size=LONGEST)
+            shape, _, kind = read(member, max_header_size=MAX_NPY_HEADER)
             if kind.hasobject or math.prod(shape) * kind.itemsize > info.file_size:
-                raise self._damaged(f"its array {name!r} is not what it says")
+                raise self._build_error(f"its array {name!r} is not what it says")
         with self._zip.open(info) as member:
-            return cast(np.ndarray, npy.read_array(member, allow_pickle=False, max_header_size=LONGEST))
+            return cast(np.ndarray, npy.read_array(member, allow_pickle=False, max_header_size=MAX_NPY_HEADER))

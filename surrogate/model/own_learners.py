@@ -13,9 +13,9 @@ from sim.errors import InputError
 from ..data.encode import ENCODERS, Encoder
 from ..regressors.protocol import Regressor
 
-GROUP = "sulcus.learners"
+ENTRY_POINT_GROUP = "sulcus.learners"
 """Entry-point group of packages that provide learners, by the learner's name."""
-RESERVED = frozenset(
+RESERVED_NAMES = frozenset(
     [
         "ann",
         "contact",
@@ -32,7 +32,7 @@ RESERVED = frozenset(
     ]
 )
 """Names of built-in learners."""
-PLAYERS = frozenset(["auto", "fem", "guarded"])
+PLAYER_NAMES = frozenset(["auto", "fem", "guarded"])
 """Names of deformers that are not learners."""
 
 
@@ -44,7 +44,7 @@ class Own:
     regressor: type[Regressor]
 
 
-OWN: dict[str, Own] = {}  # User-defined learners, by name.
+OWN_LEARNERS: dict[str, Own] = {}  # User-defined learners, by name.
 K = TypeVar("K", bound=type[Regressor])  # Type of a registered class.
 
 
@@ -67,9 +67,11 @@ def register_learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K]
         missing = [what for what in ("fit", "predict", "state", "restored") if not hasattr(kind, what)]
         if missing:
             raise InputError(f"the learner {name} has no {', '.join(missing)}: see surrogate.Regressor.")
-        if name in RESERVED | PLAYERS or (name in OWN and _file(OWN[name].regressor) != _file(kind)):
+        if name in RESERVED_NAMES | PLAYER_NAMES or (
+            name in OWN_LEARNERS and _get_file(OWN_LEARNERS[name].regressor) != _get_file(kind)
+        ):
             raise InputError(f"the name {name!r} is taken: give the learner another.")
-        OWN[name] = Own(encoder, kind)
+        OWN_LEARNERS[name] = Own(encoder, kind)
         return kind
 
     return register
@@ -83,24 +85,24 @@ def find_own(name: str) -> Own | None:
     InputError
         A package that cannot be imported, or that registers no learner of its entry point's name.
     """
-    if name in OWN:
-        return OWN[name]
-    for point in entry_points(group=GROUP, name=name):
+    if name in OWN_LEARNERS:
+        return OWN_LEARNERS[name]
+    for point in entry_points(group=ENTRY_POINT_GROUP, name=name):
         try:
             point.load()
         except Exception as error:
             raise InputError(f"the learner {name} of {point.value} cannot be loaded ({error}).") from error
-        if name not in OWN:
+        if name not in OWN_LEARNERS:
             raise InputError(f"{point.value} registers no learner called {name}: let it say @learner({name!r}).")
-        return OWN[name]
+        return OWN_LEARNERS[name]
     return None
 
 
 def name_of(kind: type) -> str | None:
     """Return the name under which a class was registered."""
-    return next((name for name, own in OWN.items() if own.regressor is kind), None)
+    return next((name for name, own in OWN_LEARNERS.items() if own.regressor is kind), None)
 
 
-def _file(kind: type) -> str | None:
+def _get_file(kind: type) -> str | None:
     """Return the file of a class: an edited file may register its learner again."""
     return getattr(sys.modules.get(kind.__module__), "__file__", None)

@@ -21,10 +21,10 @@ from sim.material import Pairs
 from ..data.encode import split_forces
 from ..data.holding import compute_unfaded
 
-MEMORY = "relaxation"
+MEMORY_KEY = "relaxation"
 """Key in `Deformation.memory`: depth [m], position of first contact [m], then each h [m]; (B, 4 + pairs)."""
-BACK = 0.02  # Limit of the training: a tool moving back makes h negative by at most this share of g d.
-SLID = 0.5  # Limit of the training: a tool slides by at most this share of its footprint's radius.
+MAX_BACK_SHARE = 0.02  # Limit of the training: a tool moving back makes h negative by at most this share of g d.
+MAX_SLIDE_SHARE = 0.5  # Limit of the training: a tool slides by at most this share of its footprint's radius.
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +70,8 @@ def follow_relaxation(
     depth, (g, tau) = split_forces(pushed)[0], np.array(series).T
     if start is None:
         left = compute_unfaded(series, times) * depth[:, None]
-        return _relaxed(g, pushed, depth, pushed.point, left, shallowest)
-    past = start.memory.get(MEMORY)
+        return _compute_relaxed(g, pushed, depth, pushed.point, left, shallowest)
+    past = start.memory.get(MEMORY_KEY)
     if past is None or past.shape != (len(depth), 4 + len(series)):
         raise InputError(
             "the start does not say how far the tissue has relaxed: start from this model's own result, or from none."
@@ -82,16 +82,16 @@ def follow_relaxation(
     half = np.exp(-steps[:, None] / (2.0 * tau))
     left = half * (half * past[:, 4:] + g * (depth - past[:, 0])[:, None])
     first = np.where((past[:, 0] > 0.0)[:, None], past[:, 1:4], pushed.point)
-    return _relaxed(g, pushed, depth, first, left, shallowest)
+    return _compute_relaxed(g, pushed, depth, first, left, shallowest)
 
 
-def _relaxed(
+def _compute_relaxed(
     g: np.ndarray, pushed: Pushed, depth: np.ndarray, first: np.ndarray, left: np.ndarray, shallowest: float
 ) -> Relaxed:
     """Compute the state from h (B, n) [m] of each pair, and the tools' positions of first contact (B, 3) [m]."""
     touching = depth > 0.0
     share = (g - left / np.where(touching, depth, 1.0)[:, None]).sum(axis=1)
-    back = (left < -BACK * g * np.maximum(depth, shallowest)[:, None]).any(axis=1)
-    slid = np.linalg.norm(pushed.point - first, axis=1) > SLID * pushed.footprint
+    back = (left < -MAX_BACK_SHARE * g * np.maximum(depth, shallowest)[:, None]).any(axis=1)
+    slid = np.linalg.norm(pushed.point - first, axis=1) > MAX_SLIDE_SHARE * pushed.footprint
     memory = np.column_stack([depth, first, left])
     return Relaxed(np.clip(np.where(touching, share, 0.0), 0.0, g.sum()), back | (slid & touching), memory)

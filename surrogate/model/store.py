@@ -77,7 +77,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
         "anatomy": digests.pop(),
         "space": "RAS [m]",
         "versions": {name: get_version(name) for name in ("sulcus", "numpy")},
-        "models": {name: _described(model, put) for name, model in models.items()},
+        "models": {name: _describe_model(model, put) for name, model in models.items()},
     }
     header["seal"] = compute_seal(header, {})  # array names are their digests
     with write_atomically(path, ".npz") as partial:
@@ -98,7 +98,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
     with read_as(path, "a model", REMEDY), path.open("rb") as raw:
         archive = Archive(raw, REMEDY)
-        header = _header(archive)
+        header = _read_header(archive)
         if header["format"] != FORMAT:
             raise InputError(f"{path}: has the format {str(header['format'])[:40]!r}, not {FORMAT!r}: train it again.")
         if header["anatomy"] != anatomy.digest:
@@ -106,8 +106,8 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
                 f"{path}: was trained on the anatomy {str(header['anatomy'])[:40]}, but this one is {anatomy.digest}: "
                 "use the mesh that it was made for, or run `sulcus simulate` and `sulcus train` for this one."
             )
-        arrays = archive.read_by_digest(_keys(header["models"].values()))
-        models = {name: _rebuilt(description, arrays, anatomy) for name, description in header["models"].items()}
+        arrays = archive.read_by_digest(_list_array_keys(header["models"].values()))
+        models = {name: _rebuild_model(description, arrays, anatomy) for name, description in header["models"].items()}
         for name, model in models.items():
             check_model_state(name, model)
         return models
@@ -121,8 +121,8 @@ def read_reported_errors(path: str | Path) -> dict[str, HeldOutError]:
     InputError
         A file that is missing, or not a model file of this project.
     """
-    with _described_in(path) as header:
-        return {name: HeldOutError(about["bound"], _left_out(about)) for name, about in header["models"].items()}
+    with _open_header(path) as header:
+        return {name: HeldOutError(about["bound"], _read_left_out(about)) for name, about in header["models"].items()}
 
 
 def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
@@ -135,21 +135,21 @@ def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None
     InputError
         See `read_reported_errors`; an invalid tissue.
     """
-    with _described_in(path) as header:
+    with _open_header(path) as header:
         if header["anatomy"] != anatomy.digest:
             return None
         return find_first_tissue(about["training"] for about in header["models"].values())
 
 
 @contextmanager
-def _described_in(path: str | Path) -> Iterator[dict[str, Any]]:
+def _open_header(path: str | Path) -> Iterator[dict[str, Any]]:
     """Open the header of a model file; errors within the block are reported with the file's name."""
     path = to_path(path)
     with read_as(path, "a model", REMEDY), path.open("rb") as raw:
-        yield _header(Archive(raw, REMEDY))
+        yield _read_header(Archive(raw, REMEDY))
 
 
-def _header(archive: Archive) -> dict[str, Any]:
+def _read_header(archive: Archive) -> dict[str, Any]:
     """Read the header of a model file; older files have no seal."""
     header = json.loads(archive.read_text("header"))
     if "seal" in header:
@@ -157,13 +157,13 @@ def _header(archive: Archive) -> dict[str, Any]:
     return header
 
 
-def _left_out(description: dict[str, Any]) -> LeftOut | None:
+def _read_left_out(description: dict[str, Any]) -> LeftOut | None:
     """Read the errors on held-out cortex; None for older files."""
     stated = description.get("left_out")
     return None if stated is None else LeftOut(**stated)
 
 
-def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
+def _list_array_keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
     """Yield the names of all arrays that models refer to."""
     for description in descriptions:
         for part in description["parts"]:
@@ -175,14 +175,14 @@ def _keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
             yield from (named or {}).values()
 
 
-def _own_name(regressor: Fitted) -> str:
+def _get_own_name(regressor: Fitted) -> str:
     name = name_of(type(regressor))
     if name is None:
         raise InputError(f"{type(regressor).__name__} was never registered: see surrogate.learner.")
     return name
 
 
-def _kind(name: str) -> type[Fitted]:
+def _find_type(name: str) -> type[Fitted]:
     """Return the class named in a model file: a built-in one, or one that the user has registered or installed."""
     if name in FITTED:
         return FITTED[name]
@@ -195,11 +195,11 @@ def _kind(name: str) -> type[Fitted]:
     return own.regressor
 
 
-def _described(model: Learned, put: Any) -> dict[str, Any]:
+def _describe_model(model: Learned, put: Any) -> dict[str, Any]:
     parts = [
         {
             "encoder": part.encoder,
-            **_described_regressor(part.regressor, put),
+            **_describe_regressor(part.regressor, put),
             "nodes": put(part.basis.nodes),
             "modes": put(part.basis.modes),
         }
@@ -213,30 +213,30 @@ def _described(model: Learned, put: Any) -> dict[str, Any]:
         "bounds": _put_bound(model.bounds, put),
         "training": dict(model.training),
         "tool": None if model.tool is None else repr(model.tool),
-        "tip": None if model.tip is None else _described_tip(model.tip, put),
+        "tip": None if model.tip is None else _describe_tip(model.tip, put),
         "left_out": None if model.left_out is None else asdict(model.left_out),
-        "force": None if model.force is None else _described_force(model.force, put),
+        "force": None if model.force is None else _describe_force(model.force, put),
     }
 
 
-def _described_regressor(regressor: Fitted, put: Any) -> dict[str, Any]:
+def _describe_regressor(regressor: Fitted, put: Any) -> dict[str, Any]:
     names = {kind: name for name, kind in FITTED.items()}
     state = {name: put(array) for name, array in regressor.state().items()}
-    return {"regressor": names.get(type(regressor)) or _own_name(regressor), "state": state}
+    return {"regressor": names.get(type(regressor)) or _get_own_name(regressor), "state": state}
 
 
-def _rebuilt_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Fitted:
+def _rebuild_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Fitted:
     state = {name: arrays[key] for name, key in description["state"].items()}
     check_finite_state(state)
-    return _kind(description["regressor"]).restored(state)
+    return _find_type(description["regressor"]).restored(state)
 
 
-def _described_force(force: ForceModel, put: Any) -> dict[str, Any]:
-    learned = None if force.learned is None else _described_regressor(force.learned, put)
+def _describe_force(force: ForceModel, put: Any) -> dict[str, Any]:
+    learned = None if force.learned is None else _describe_regressor(force.learned, put)
     return {"encoder": force.encoder, "learned": learned, "bound": _put_bound(force.bound, put)}
 
 
-def _rebuilt_force(
+def _rebuild_force(
     description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], reach: float
 ) -> ForceModel | None:
     if description is None:
@@ -244,32 +244,32 @@ def _rebuilt_force(
     learned = description["learned"]
     return ForceModel(
         description["encoder"],
-        None if learned is None else _rebuilt_regressor(learned, arrays),
-        _rebuilt_bound(description["bound"], arrays, reach),
+        None if learned is None else _rebuild_regressor(learned, arrays),
+        _rebuild_bound(description["bound"], arrays, reach),
     )
 
 
-def _described_tip(tip: TipModel, put: Any) -> dict[str, Any]:
+def _describe_tip(tip: TipModel, put: Any) -> dict[str, Any]:
     known = tip.correction
     correction = None if known is None else {name: put(array) for name, array in known.state().items()}
     return {"correction": correction, "bound": _put_bound(tip.bound, put)}
 
 
-def _rebuilt_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], reach: float) -> TipModel | None:
+def _rebuild_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], reach: float) -> TipModel | None:
     if description is None:
         return None
     known = description["correction"]
     state = {} if known is None else {name: arrays[key] for name, key in known.items()}
     check_finite_state(state)
     correction = None if known is None else Gp.restored(state)
-    return TipModel(correction, _rebuilt_bound(description["bound"], arrays, reach))
+    return TipModel(correction, _rebuild_bound(description["bound"], arrays, reach))
 
 
 def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
     return None if bound is None else {name: put(array) for name, array in vars(bound).items()}
 
 
-def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray], reach: float) -> Bound | None:
+def _rebuild_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray], reach: float) -> Bound | None:
     """Rebuild a bound; those of older files grow only beyond the training loads' reach; their profile is ignored."""
     if names is None:
         return None
@@ -277,11 +277,11 @@ def _rebuilt_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray
     return Bound(**(older | {name: arrays[key] for name, key in names.items() if name != "profile"}))
 
 
-def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
+def _rebuild_model(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:
     parts = []
     for part in description["parts"]:
         basis = Basis(arrays[part["nodes"]], arrays[part["modes"]])
-        parts.append(ModelPart(part["encoder"], _rebuilt_regressor(part, arrays), basis))
+        parts.append(ModelPart(part["encoder"], _rebuild_regressor(part, arrays), basis))
     envelope = dict(description["envelope"])
     envelope["points"] = arrays[envelope["points"]]
     for name in ("force", "footprint"):
@@ -291,11 +291,11 @@ def _rebuilt(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anat
         parts=tuple(parts),
         envelope=Envelope(**envelope),
         bound=description["bound"],
-        bounds=_rebuilt_bound(description["bounds"], arrays, envelope["reach"]),
+        bounds=_rebuild_bound(description["bounds"], arrays, envelope["reach"]),
         training=description["training"],
         # Missing in older files.
         tool=read_tool_statement(description.get("tool"), description.get("ball")),
-        tip=_rebuilt_tip(description.get("tip"), arrays, envelope["reach"]),
-        left_out=_left_out(description),
-        force=_rebuilt_force(description.get("force"), arrays, envelope["reach"]),
+        tip=_rebuild_tip(description.get("tip"), arrays, envelope["reach"]),
+        left_out=_read_left_out(description),
+        force=_rebuild_force(description.get("force"), arrays, envelope["reach"]),
     )

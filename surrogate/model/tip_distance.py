@@ -14,8 +14,8 @@ from ..regressors.force_series import add_pressing
 from ..regressors.gp import Gp
 from .conformal import Bound
 
-ROWS = 300  # Maximum number of training loads that fit the Gaussian process's lengths.
-MOST = 2000  # Maximum number of training loads that condition the Gaussian process.
+MAX_LENGTH_LOADS = 300  # Maximum number of training loads that fit the Gaussian process's lengths.
+MAX_CONDITIONING_LOADS = 2000  # Maximum number of training loads that condition the Gaussian process.
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +71,6 @@ def fit_correction(patch: Patch, pushed: Pushed, off: np.ndarray) -> Gp | None:
     some = magnitude > 0.0
     if not some.any():
         return None
-    return Gp(rows=ROWS, most=MOST).fit(
+    return Gp(rows=MAX_LENGTH_LOADS, most=MAX_CONDITIONING_LOADS).fit(
         compute_correction_features(patch, pushed)[some], (off[some] / magnitude[some])[:, None]
     )

@@ -52,13 +52,13 @@ def compute_wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.nda
     return np.concatenate([force, moment], axis=1)[:, None]
 
 
-HELD = "where a blade touches"
+CONTACT_KEY = "where a blade touches"
 """Key of the contact in the warm data of a result: rows of `RigidContact.compute_warm_start`."""
 
 
 def build_warm_encoders(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping[str, Encoder]:
     """Return encoders that start rods and blades from the contact stored in `start`, if there is one."""
-    contact, held = _contact(regressors), None if start is None else start.warm.get(HELD)
+    contact, held = _find_contact(regressors), None if start is None else start.warm.get(CONTACT_KEY)
     if contact is None or held is None or held.shape[1:] != (contact.held_width,) or not np.isfinite(held).all():
         return ENCODERS
     core = ENCODERS["core"]
@@ -73,10 +73,10 @@ def collect_held_state(
     regressors: Sequence[Fitted], patch: Patch, asked: Pushed, encoders: Mapping[str, Encoder]
 ) -> dict[str, np.ndarray]:
     """Return the contact to store with a result for the next warm start: rows (B, h), or nothing."""
-    contact = _contact(regressors)
-    return {} if contact is None else {HELD: contact.compute_warm_start(encoders["core"](patch, asked))}
+    contact = _find_contact(regressors)
+    return {} if contact is None else {CONTACT_KEY: contact.compute_warm_start(encoders["core"](patch, asked))}
 
 
-def _contact(regressors: Sequence[Fitted]) -> RigidContact | None:
+def _find_contact(regressors: Sequence[Fitted]) -> RigidContact | None:
     """Return the contact regressor of a rod or a blade; a ball's search is short."""
     return next((each for each in regressors if isinstance(each, RigidContact) and len(each.core)), None)

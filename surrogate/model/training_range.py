@@ -16,7 +16,7 @@ from ..data.encode import split_forces
 from ..data.indentation import Indented
 
 # Tolerance of lengths [m], angles [rad] and relative forces, so that round-off puts no training load outside.
-SLACK = 1e-6
+RANGE_TOLERANCE = 1e-6
 
 
 class Measured(NamedTuple):
@@ -97,16 +97,16 @@ class Envelope:
         away = np.sqrt(compute_squared_distances(pushed.point, self.points).min(axis=1))
         beyond = np.stack(
             [
-                1e3 * (overhang - self.overhang - SLACK),
-                np.where(magnitude == 0.0, 0.0, angle - self.angle - SLACK),
-                magnitude / self.force[1] - 1.0 - SLACK,
-                magnitude / (self.line_force * pushed.footprint) - 1.0 - SLACK,
-                self.footprint[0] / pushed.footprint - 1.0 - SLACK,
-                pushed.footprint / self.footprint[1] - 1.0 - SLACK,
+                1e3 * (overhang - self.overhang - RANGE_TOLERANCE),
+                np.where(magnitude == 0.0, 0.0, angle - self.angle - RANGE_TOLERANCE),
+                magnitude / self.force[1] - 1.0 - RANGE_TOLERANCE,
+                magnitude / (self.line_force * pushed.footprint) - 1.0 - RANGE_TOLERANCE,
+                self.footprint[0] / pushed.footprint - 1.0 - RANGE_TOLERANCE,
+                pushed.footprint / self.footprint[1] - 1.0 - RANGE_TOLERANCE,
             ]
         )
         beyond = np.maximum(beyond.max(axis=0), 0.0)
-        return Outside(away, beyond, np.maximum(beyond, 1e3 * (away - self.reach - SLACK)))
+        return Outside(away, beyond, np.maximum(beyond, 1e3 * (away - self.reach - RANGE_TOLERANCE)))
 
 
 def compute_training_range(patch: Patch, trained: Pushed) -> Envelope:
@@ -114,7 +114,7 @@ def compute_training_range(patch: Patch, trained: Pushed) -> Envelope:
     magnitude, angle, overhang = measure_loads(patch, trained)
     return Envelope(
         trained.point.astype(np.float32),
-        _reach(trained.point),
+        _compute_reach(trained.point),
         float(overhang.max()),
         float(angle.max()),
         (float(magnitude.min()), float(magnitude.max())),
@@ -123,7 +123,7 @@ def compute_training_range(patch: Patch, trained: Pushed) -> Envelope:
     )
 
 
-def _reach(point: np.ndarray) -> float:
+def _compute_reach(point: np.ndarray) -> float:
     """Compute the largest distance [m] of a point (n, 3) from its nearest neighbour: zero for a single point."""
     if len(point) < 2:
         return 0.0

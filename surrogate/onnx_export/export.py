@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # Regressors whose formulas use only operations that a wire supports.
 TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series, ForcePairs)
 FORMAT = "sulcus onnx 1"  # Version of the names, shapes and meanings of inputs, outputs and metadata.
-TEXT = (  # Description in the ONNX file.
+DESCRIPTION = (  # Description in the ONNX file.
     "Displacements of a brain under a pressing tool, and how far they may be off, as sulcus learned them from finite "
     "elements. Loads are not checked: give finite numbers and positive radii. Research only; not a medical device."
 )
@@ -103,7 +103,7 @@ def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelPr
     sheet.add_output(
         sheet.add_constant(rest), Port("rest", np.float32, rest.shape, "where the vertices `nodes` lie [m], RAS")
     )
-    return sheet.build_model(name, TEXT, get_version("sulcus"), _notes(name, model))
+    return sheet.build_model(name, DESCRIPTION, get_version("sulcus"), _build_metadata(name, model))
 
 
 def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False) -> None:
@@ -119,7 +119,7 @@ def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False
         partial.write_bytes(graph.SerializeToString())
 
 
-def _notes(name: str, model: Learned) -> dict[str, str]:
+def _build_metadata(name: str, model: Learned) -> dict[str, str]:
     """Return the metadata: units, levels, and all provenance of the training."""
     return {
         **model.training,

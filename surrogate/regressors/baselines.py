@@ -17,7 +17,7 @@ import numpy as np
 from ..array_functions import compute_squared_distances
 from .protocol import Stored, compute_standardisation
 
-RANK = 1e-9  # Smallest singular value relative to the largest: below is round-off.
+RANK_TOLERANCE = 1e-9  # Smallest singular value relative to the largest: below is round-off.
 
 
 @dataclass(eq=False)
@@ -43,7 +43,7 @@ class Pcr(Stored):
         self.mean_, self.offset_ = X.mean(axis=0), Y.mean(axis=0)
         components, size, axes = np.linalg.svd(X - self.mean_, full_matrices=False)
         kept = 1 + int(np.searchsorted(np.cumsum(size**2), self.share * np.sum(size**2)))
-        kept = min(kept, int(np.sum(size > RANK * size[0])))
+        kept = min(kept, int(np.sum(size > RANK_TOLERANCE * size[0])))
         # Components are orthogonal: each has its own least-squares problem.
         slopes = components[:, :kept].T @ (Y - self.offset_) / size[:kept, None]
         self.map_ = axes[:kept].T @ slopes

@@ -16,18 +16,20 @@ from sim.errors import InputError
 from ..array_functions import Rounded, find_columns_in_use, multiply_rows, predict_in_chunks, take_rows_of
 from .gp import Gp
 
-ORDERS = 3  # Order of the power series in the force.
+MAX_ORDER = 3  # Order of the power series in the force.
 # Indices of the direction components in each product, by order: 3, 6 and 10 products.
-FACTORS = [np.array(list(combinations_with_replacement(range(3), order))).T for order in range(1, ORDERS + 1)]
-SPANS = (slice(0, 3), slice(3, 9), slice(9, 19))  # Columns of the products of each order.
-TERMS = SPANS[-1].stop  # Number of products of all orders.
-STENCIL = 3  # Number of radii of an interpolating parabola.
-BESIDE = 1e-2  # Height equivalent to a barycentric coordinate of -1 [m].
-FAINT = 0.4  # Share of the largest training force, below which the remainder is smaller than the table's own errors.
+FACTORS = [np.array(list(combinations_with_replacement(range(3), order))).T for order in range(1, MAX_ORDER + 1)]
+ORDER_COLUMNS = (slice(0, 3), slice(3, 9), slice(9, 19))  # Columns of the products of each order.
+TERM_COUNT = ORDER_COLUMNS[-1].stop  # Number of products of all orders.
+STENCIL_SIZE = 3  # Number of radii of an interpolating parabola.
+HEIGHT_EQUIVALENT = 1e-2  # Height equivalent to a barycentric coordinate of -1 [m].
+SMALL_FORCE_SHARE = (
+    0.4  # Share of the largest training force, below which the remainder is smaller than the table's own errors.
+)
 # Rounding step of the Gaussian process's dual coefficients at the largest force [m]: a third of the file size.
 DUAL_STEP = 2e-6
-FEATURES = 9  # Number of features: `compute_tool_features`, and force over radius.
-FLAT = 1e-6  # Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
+FEATURE_COUNT = 9  # Number of features: `compute_tool_features`, and force over radius.
+FLAT_TOLERANCE = 1e-6  # Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
 
 
 def compute_forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -75,15 +77,15 @@ class Series:
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""
-        return predict_in_chunks(self._predicted, X)
+        return predict_in_chunks(self._compute_prediction, X)
 
-    def _predicted(self, X: np.ndarray) -> np.ndarray:
-        place, share = self._located(X[:, :3])
-        radius, weight = self._between_radii(X[:, 7])
+    def _compute_prediction(self, X: np.ndarray) -> np.ndarray:
+        place, share = self._locate_places(X[:, :3])
+        radius, weight = self._interpolate_radii(X[:, 7])
         count = place.shape[1] * radius.shape[1]
         row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(-1, count)
         factor = (share[:, :, None] * weight[:, None]).reshape(-1, 1, count).astype(np.float32)
-        mixed = (factor @ take_rows_of(row, self.table)).reshape(-1, TERMS, len(self.table.step) // TERMS)
+        mixed = (factor @ take_rows_of(row, self.table)).reshape(-1, TERM_COUNT, len(self.table.step) // TERM_COUNT)
         return (compute_forms(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
@@ -114,10 +116,10 @@ class Series:
         """Frames as one matrix (4, 4 S)."""
         return np.ascontiguousarray(self._frames.transpose(2, 1, 0).reshape(4, -1))
 
-    def _located(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _locate_places(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find six places (B, 6) of the triangle nearest to each point (B, 3) [m], and their weights (B, 6)."""
         local = (point @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
-        miss = np.absolute(local[:, 3]) - BESIDE * np.minimum(local[:, :3].min(axis=1), 0.0)
+        miss = np.absolute(local[:, 3]) - HEIGHT_EQUIVALENT * np.minimum(local[:, :3].min(axis=1), 0.0)
         best = miss.argmin(axis=1)
         frame = take_rows_of(best, self._frames[:, :3])
         corner = np.maximum(np.einsum("bij,bj->bi", frame[:, :, :3], point) + frame[:, :, 3], 0.0)
@@ -125,9 +127,9 @@ class Series:
         share = [corner * (2.0 * corner - 1.0), 4.0 * corner[:, [1, 2, 0]] * corner[:, [2, 0, 1]]]
         return take_rows_of(best, self.triangles), np.concatenate(share, axis=1)
 
-    def _between_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _interpolate_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return radii (B, k) and weights (B, k): the parabola through the three radii about each radius (B,) [m]."""
-        width = min(STENCIL, len(self.radii))
+        width = min(STENCIL_SIZE, len(self.radii))
         inside = np.clip(radius, self.radii[0], self.radii[-1])
         first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - width)
         index = first[:, None] + np.arange(width)
@@ -151,16 +153,16 @@ class Remainder:
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Fit to `compute_tool_features` X (n, 8) and remainders Y (n, r)."""
-        self.faint_ = np.array(FAINT * X[:, 6].max())
-        self.gp_ = Gp().fit(add_pressing(X), Y / self._unit(X))
+        self.faint_ = np.array(SMALL_FORCE_SHARE * X[:, 6].max())
+        self.gp_ = Gp().fit(add_pressing(X), Y / self._compute_unit(X))
         strongest = X[[X[:, 6].argmax()]]
-        step = np.exp2(np.floor(np.log2(DUAL_STEP / (strongest[0, 6] * self._unit(strongest).item()))))
+        step = np.exp2(np.floor(np.log2(DUAL_STEP / (strongest[0, 6] * self._compute_unit(strongest).item()))))
         self.gp_.dual_ = (np.rint(self.gp_.dual_ / step) * step).astype(np.float32)
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""
-        return (self.gp_.predict(add_pressing(X)) * self._unit(X)).astype(np.float32)
+        return (self.gp_.predict(add_pressing(X)) * self._compute_unit(X)).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the Gaussian process's state, and `faint` [N]."""
@@ -174,9 +176,9 @@ class Remainder:
         model.gp_ = Gp.restored({name: array for name, array in state.items() if name != "faint"})
         return model
 
-    def _unit(self, X: np.ndarray) -> np.ndarray:
+    def _compute_unit(self, X: np.ndarray) -> np.ndarray:
         """Return the units (n, 1) [N^3] of rows."""
-        return X[:, 6:7] ** ORDERS + self.faint_**ORDERS
+        return X[:, 6:7] ** MAX_ORDER + self.faint_**MAX_ORDER
 
 
 def add_pressing(X: np.ndarray) -> np.ndarray:
@@ -201,9 +203,9 @@ class ForcePairs:
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of `compute_rooted_shares` (B, 3 m)."""
-        return predict_in_chunks(self._predicted, X)
+        return predict_in_chunks(self._compute_prediction, X)
 
-    def _predicted(self, X: np.ndarray) -> np.ndarray:
+    def _compute_prediction(self, X: np.ndarray) -> np.ndarray:
         used = find_columns_in_use(X)
         row = self._rows[used[:, None], used]
         row = row[row >= 0]
@@ -257,7 +259,7 @@ def fill_table(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> n
     known = points[~left_out]
     middle, length = known.mean(axis=0), np.ptp(points, axis=0).max()
     _, size, axes = np.linalg.svd(known - middle, full_matrices=False)
-    axes = axes[size > FLAT * max(size[0], np.finfo(float).tiny)]
+    axes = axes[size > FLAT_TOLERANCE * max(size[0], np.finfo(float).tiny)]
 
     def at(where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         tail = np.column_stack([np.ones(len(where)), (where - middle) @ axes.T / length])

@@ -17,8 +17,8 @@ from sim.runtime.threads import limit_to_one_thread
 from ..array_functions import compute_squared_distances
 from .protocol import Stored, compute_standardisation
 
-LENGTHS = (0.05, 1e3)  # Bounds of the lengths [standard deviations of a feature].
-NOISE = (1e-8, 1.0)  # Bounds of the noise relative to the variance of an output.
+LENGTH_BOUNDS = (0.05, 1e3)  # Bounds of the lengths [standard deviations of a feature].
+NOISE_BOUNDS = (1e-8, 1.0)  # Bounds of the noise relative to the variance of an output.
 START_LENGTH = 3.0  # Initial length [standard deviations of a feature].
 START_NOISE = 1e-4  # Initial noise relative to the variance of an output.
 
@@ -69,7 +69,7 @@ class Gp(Stored):
                     args=(x[: self.rows], y[: self.rows, loudest] / spread[loudest]),
                     jac=True,
                     method="L-BFGS-B",
-                    bounds=[*[tuple(np.log(LENGTHS))] * X.shape[1], tuple(np.log(NOISE))],
+                    bounds=[*[tuple(np.log(LENGTH_BOUNDS))] * X.shape[1], tuple(np.log(NOISE_BOUNDS))],
                     options={"maxiter": 100},
                 )
             start = fitted.x
@@ -92,15 +92,15 @@ class Gp(Stored):
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
-        return (compute_matern(self._distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
+        return (compute_matern(self._compute_distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
 
     def predict_deviation(self, X: np.ndarray) -> np.ndarray:
         """Predict the posterior standard deviation (B,), noise included, relative to that of the prior."""
-        near = compute_matern(self._distance(X))
+        near = compute_matern(self._compute_distance(X))
         known = solve_triangular(self._factor[0], near.T, lower=True, check_finite=False)
         return np.sqrt(np.maximum(1.0 - np.einsum("nb,nb->b", known, known), 0.0) + self.noise_)
 
-    def _distance(self, X: np.ndarray) -> np.ndarray:
+    def _compute_distance(self, X: np.ndarray) -> np.ndarray:
         return np.sqrt(compute_squared_distances((X - self.mean_) / (self.deviation_ * self.length_), self.seen_))
 
     @cached_property

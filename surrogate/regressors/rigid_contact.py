@@ -29,31 +29,31 @@ from sim.tools import Ball
 if TYPE_CHECKING:
     from sim.discretisation.nearest_places import PlacedBox
 
-THICKER = 0.5 * ToolContact((Ball(1.0),)).gap  # Mean gap that FEM keeps between tissue and tool [m].
-REACH = 1.5  # Distance from a tool's core within which facets are contact candidates [radii].
-TOLERANCE = 1e-6  # Penetration tolerance of a ball [m].
-SETTLED = 3.0  # Smallest motion that continues the contact search [tolerances].
-MOST = 60  # Maximum number of iterations of the contact search.
-STRIDE = 0.5  # Step of a rod or a blade on its path [radii], so that tissue stays before it.
-COARSER = 1e-5  # Penetration tolerance of a rod or a blade [m].
+MEAN_GAP = 0.5 * ToolContact((Ball(1.0),)).gap  # Mean gap that FEM keeps between tissue and tool [m].
+CANDIDATE_DISTANCE = 1.5  # Distance from a tool's core within which facets are contact candidates [radii].
+BALL_TOLERANCE = 1e-6  # Penetration tolerance of a ball [m].
+MIN_SEARCH_MOTION = 3.0  # Smallest motion that continues the contact search [tolerances].
+MAX_ITERATIONS = 60  # Maximum number of iterations of the contact search.
+PATH_STEP = 0.5  # Step of a rod or a blade on its path [radii], so that tissue stays before it.
+ROD_TOLERANCE = 1e-5  # Penetration tolerance of a rod or a blade [m].
 # Number of iterations at intermediate steps: more change the result by less than its error, in twice the time.
-PASSING = 3
-MOST_HELD = 128  # Maximum number of contact points stored for a warm start: the strongest.
+PATH_ITERATIONS = 3
+MAX_STORED_POINTS = 128  # Maximum number of contact points stored for a warm start: the strongest.
 # Number of iterations after which constraints without force stay, so that there are no cycles. Until then they are
 # dropped, which is faster.
-FORGETFUL = 15
+DROPPING_ITERATIONS = 15
 # Compliance of a point relative to the nodes' mean, below which it counts as bone, which the tool enters: no force, or
 # an unbounded one, would keep it out.
-LEAST = 0.02
+MIN_COMPLIANCE = 0.02
 # LAPACK's factorisation and solves: the problems are so small that a wrapper takes longer than the work.
-FACTORED, SOLVED_BY, SOLVED = get_lapack_funcs(("potrf", "trtrs", "posv"), dtype=np.float64)
-TURNS = 10  # Maximum number of exchanges of the active set.
-ENTERED = 1e-8  # Penetration of an inactive point that is tolerated [m].
+FACTORISE, SOLVE_TRIANGULAR, SOLVE_POSITIVE = get_lapack_funcs(("potrf", "trtrs", "posv"), dtype=np.float64)
+MAX_EXCHANGES = 10  # Maximum number of exchanges of the active set.
+INACTIVE_TOLERANCE = 1e-8  # Penetration of an inactive point that is tolerated [m].
 # Candidate regularisations relative to the mean diagonal, as points of neighbouring facets on a common edge coincide.
 # The first one that gives a positive definite matrix in single precision is used.
-APART = (1e-6, 1e-5, 1e-4)
-LYING = 8  # Number of features of a ball.
-STANDING = 17  # Number of features of a rod or a blade.
+REGULARISATIONS = (1e-6, 1e-5, 1e-4)
+BALL_FEATURES = 8  # Number of features of a ball.
+ROD_FEATURES = 17  # Number of features of a rod or a blade.
 
 
 @dataclass(eq=False)
@@ -98,7 +98,7 @@ class RigidContact:
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of features (B, f), whose force is depth [m]."""
         found = self.compute_linear(X)
-        return (found * (self._terms(X)[:, : len(self.line)] @ self.line)).astype(np.float32)
+        return (found * (self._compute_terms(X)[:, : len(self.line)] @ self.line)).astype(np.float32)
 
     def compute_linear(self, X: np.ndarray) -> np.ndarray:
         """Compute the coefficients (B, r) for linear tissue."""
@@ -110,27 +110,27 @@ class RigidContact:
 
     def predict_force(self, X: np.ndarray) -> np.ndarray:
         """Predict the force (B, 3) [N/m] that the tool exerts, per metre of depth; `grip` must have been fitted."""
-        return self._resultant(X) * (self._terms(X) @ self.grip)[:, None]
+        return self._compute_resultant(X) * (self._compute_terms(X) @ self.grip)[:, None]
 
     @property
     def held_width(self) -> int:
         """Number of columns of `held`."""
-        return self._width + len(self.compliance) + 4 * MOST_HELD
+        return self._width + len(self.compliance) + 4 * MAX_STORED_POINTS
 
     def compute_warm_start(self, X: np.ndarray) -> np.ndarray:
         """Return poses of rods or blades, forces and contact points (B, h): a warm start for the next pose."""
-        return np.hstack([X[:, : self._width], self._found(X)])
+        return np.hstack([X[:, : self._width], self._find_contact(X)])
 
     def compute_held_force(self, held: np.ndarray) -> np.ndarray:
         """Extract the forces (B, 3 k) [N] from rows of `held`."""
         return held[:, self._width : self._width + len(self.compliance)]
 
-    def _terms(self, X: np.ndarray) -> np.ndarray:
+    def _compute_terms(self, X: np.ndarray) -> np.ndarray:
         """Compute the terms of lines (B, 2), or for relaxing tissue (B, 4)."""
-        depth, relaxed = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]]), self._parted(X)[1]
+        depth, relaxed = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]]), self._split_features(X)[1]
         return np.hstack([depth, relaxed * depth]) if relaxed.shape[1] else depth
 
-    def _parted(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _split_features(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Split features: pose of the tool, relaxed share, and `held`; the last two may be empty."""
         more = X[:, self._width :]
         relaxed, held = np.split(more, [more.shape[1] % self.held_width], axis=1)
@@ -139,28 +139,28 @@ class RigidContact:
     @property
     def _width(self) -> int:
         """Number of features of the tool's pose."""
-        return STANDING if len(self.core) else LYING
+        return ROD_FEATURES if len(self.core) else BALL_FEATURES
 
-    def _resultant(self, X: np.ndarray) -> np.ndarray:
+    def _compute_resultant(self, X: np.ndarray) -> np.ndarray:
         """Compute the tool's force (B, 3) [N/m] on linear tissue, per metre of depth."""
         whole = self.compute_nodal_forces(X).reshape(len(X), -1, 3).sum(axis=1)
         return whole / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
 
     def compute_nodal_forces(self, X: np.ndarray) -> np.ndarray:
         """Compute the tool's forces (B, 3 k) [N] on linear tissue at the nodes that it may touch."""
-        return self._found(X)[:, : len(self.compliance)]
+        return self._find_contact(X)[:, : len(self.compliance)]
 
-    def _found(self, X: np.ndarray) -> np.ndarray:
+    def _find_contact(self, X: np.ndarray) -> np.ndarray:
         """Compute forces (B, 3 k) [N], then triangles and barycentric coordinates (4,) of the contact points, or -1."""
-        stands, _, held = self._parted(X)
+        stands, _, held = self._split_features(X)
         X = np.ascontiguousarray(np.hstack([stands, held]))
         asked, (known, found) = X.tobytes(), self._last
         if asked == known:
             return found
-        out = np.zeros((len(X), len(self.compliance) + 4 * MOST_HELD))
+        out = np.zeros((len(X), len(self.compliance) + 4 * MAX_STORED_POINTS))
         with limit_to_one_thread():
             for row in np.flatnonzero(X[:, 6] > 0.0):
-                out[row] = self._pressed(*self._way(X[row]))
+                out[row] = self._solve_contact(*self._compute_path(X[row]))
         out.flags.writeable = False
         self._last = asked, out
         return out
@@ -170,12 +170,12 @@ class RigidContact:
 
         `exerted` (B, 3) [N/m] is the tool's force per metre of depth, if available.
         """
-        found, terms = self.compute_linear(X), self._terms(X)
+        found, terms = self.compute_linear(X), self._compute_terms(X)
         line = np.zeros((terms.shape[1], found.shape[1]))
         for each in np.unique(alike):
             mine = alike == each
-            line[:, mine] = _line(terms, found[:, mine], Y[:, mine])[:, None]
-        grip = self.grip if exerted is None else _line(terms, self._resultant(X), exerted)
+            line[:, mine] = _fit_line(terms, found[:, mine], Y[:, mine])[:, None]
+        grip = self.grip if exerted is None else _fit_line(terms, self._compute_resultant(X), exerted)
         return replace(self, line=line, grip=grip)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -192,7 +192,7 @@ class RigidContact:
         """Centres (S, 3) and radii (S,) [m] of the triangles' bounding balls."""
         return compute_bounding_balls(self.points[self.triangles])
 
-    def _way(self, x: np.ndarray) -> tuple[list[PlacedBox], float, np.ndarray | None]:
+    def _compute_path(self, x: np.ndarray) -> tuple[list[PlacedBox], float, np.ndarray | None]:
         """Compute the tool's path for a row of features, its radius [m], and a row of `_found`, or None.
 
         The path starts at the previous pose, if that is nearer than the first contact; then the row is the result
@@ -203,48 +203,48 @@ class RigidContact:
 
         point, direction, depth, radius = x[:3], x[3:6], x[6], x[7]
         if not len(self.core):
-            return [PlacedBox(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + THICKER, None
-        there, stride = self._standing(x), STRIDE * self.core[3]
+            return [PlacedBox(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + MEAN_GAP, None
+        there, stride = self._place_box(x), PATH_STEP * self.core[3]
         steps, last = int(np.ceil(depth / stride)), x[self._width :]
         if len(last) and last[6] > 0.0:
-            begun = self._standing(last)
+            begun = self._place_box(last)
             far = np.linalg.norm(there.corners - begun.corners, axis=1).max()
             if (few := int(np.ceil(far / stride))) < steps:
                 back = begun.middle - there.middle
                 ways = [there.move((1.0 - k / few) * back) for k in range(1, few + 1)] or [there]
-                return [begun, *ways], self.core[3] + THICKER, last[self._width :]
+                return [begun, *ways], self.core[3] + MEAN_GAP, last[self._width :]
         ways = [(k / steps - 1.0) * depth * direction for k in range(1, steps + 1)]
-        return [there.move(way) for way in ways], self.core[3] + THICKER, None
+        return [there.move(way) for way in ways], self.core[3] + MEAN_GAP, None
 
-    def _standing(self, x: np.ndarray) -> PlacedBox:
+    def _place_box(self, x: np.ndarray) -> PlacedBox:
         from sim.discretisation.nearest_places import PlacedBox
 
         axes = np.column_stack([x[11:14], np.cross(x[14:17], x[11:14]), x[14:17]])
         return PlacedBox(x[8:11], axes, self.core[:3])
 
-    def _pressed(self, stations: list[PlacedBox], radius: float, begun: np.ndarray | None) -> np.ndarray:
+    def _solve_contact(self, stations: list[PlacedBox], radius: float, begun: np.ndarray | None) -> np.ndarray:
         """Solve the contact of a tool of a radius [m] at the last of the stations of its path: a row of `_found`.
 
         begun is the result at the first of them; None: no contact before.
         """
         from sim.discretisation.nearest_places import Nearest
 
-        facets, nodes, table, rows = self._touchable(stations, radius)
+        facets, nodes, table, rows = self._select_facets(stations, radius)
         nearest = Nearest(len(facets))
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
-        least, own = LEAST * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
-        tolerance = COARSER if len(self.core) else TOLERANCE
+        least, own = MIN_COMPLIANCE * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
+        tolerance = ROD_TOLERANCE if len(self.core) else BALL_TOLERANCE
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
         facet, share, bears = np.zeros(0, int), np.zeros((0, 3)), np.zeros(0)
         if begun is not None:
             stations, moved = stations[1:], (compliance @ begun[rows]).reshape(-1, 3)
-            places = begun[len(self.compliance) :].reshape(MOST_HELD, 4)
+            places = begun[len(self.compliance) :].reshape(MAX_STORED_POINTS, 4)
             places = places[np.isin(places[:, 0], facets)]
             facet, share = np.searchsorted(facets, places[:, 0]), places[:, 1:]
         for station in stations:
             settled = begun is None
-            for iteration in range(MOST if station is stations[-1] else PASSING):
+            for iteration in range(MAX_ITERATIONS if station is stations[-1] else PATH_ITERATIONS):
                 corners = (self.points[nodes] + moved)[table]
                 near = nearest.to(station, corners)
                 entered = np.flatnonzero(near.distance < radius - tolerance)
@@ -259,24 +259,24 @@ class RigidContact:
                 lever = np.zeros((len(facet), len(nodes), 3))
                 lever[np.arange(len(facet))[:, None], table[facet]] = share[:, :, None] * normal[:, None]
                 lever = lever.reshape(len(facet), -1)
-                bears = _bearing(lever @ compliance @ lever.T, radius - distance + lever @ moved.ravel())
+                bears = _compute_bearing_forces(lever @ compliance @ lever.T, radius - distance + lever @ moved.ravel())
                 force = bears @ lever
                 last, moved = moved, (compliance @ force).reshape(-1, 3)
-                kept = (bears > 0.0) | (iteration >= FORGETFUL)
+                kept = (bears > 0.0) | (iteration >= DROPPING_ITERATIONS)
                 facet, share, bears = facet[kept], share[kept], bears[kept]
-                settled = bool(np.abs(moved - last).max() < SETTLED * tolerance)
-        whole, places = np.zeros(len(self.compliance)), np.full((MOST_HELD, 4), -1.0)
+                settled = bool(np.abs(moved - last).max() < MIN_SEARCH_MOTION * tolerance)
+        whole, places = np.zeros(len(self.compliance)), np.full((MAX_STORED_POINTS, 4), -1.0)
         whole[rows] = force
-        strongest = np.argsort(-bears)[:MOST_HELD]
+        strongest = np.argsort(-bears)[:MAX_STORED_POINTS]
         places[: len(strongest)] = np.column_stack([facets[facet], share])[strongest]
         return np.concatenate([whole, places.ravel()])
 
-    def _touchable(
+    def _select_facets(
         self, stations: list[PlacedBox], radius: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Select facets (S,) within reach of a tool; return their nodes (n,), positions (S, 3), compliance rows."""
         around, wide = self._rounds
-        reach = REACH * radius
+        reach = CANDIDATE_DISTANCE * radius
         far = wide + reach + np.linalg.norm(stations[0].half)
         ends = [stations[k] for k in sorted({0, len(stations) // 2, len(stations) - 1})]
         some = np.flatnonzero(np.any([np.linalg.norm(around - each.middle, axis=1) < far for each in ends], axis=0))
@@ -286,13 +286,13 @@ class RigidContact:
         return some[near], nodes, table, (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
-def _line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _fit_line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Fit the factor (k,), a sum of terms (B, k), of rows `found` (B, r) to `wanted` (B, r) by least squares."""
     factor = np.einsum("br,br->b", found, wanted) / np.square(found).sum(axis=1)
     return np.linalg.lstsq(terms, factor, rcond=None)[0]
 
 
-def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _compute_bearing_forces(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Compute least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain semi-definite.
 
     Block pivoting: most points stay active. Those with tension are released, and released ones that are penetrated
@@ -304,21 +304,21 @@ def _bearing(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     if not count:
         return wanted
     mean = np.trace(gain) / count
-    for apart in APART:
+    for apart in REGULARISATIONS:
         firm = gain + apart * mean * np.eye(count)
         bearing = np.ones(count, bool)
-        for _ in range(TURNS):
+        for _ in range(MAX_EXCHANGES):
             free, bears = np.flatnonzero(bearing), np.zeros(count)
-            _, bears[free], failed = SOLVED(firm[np.ix_(free, free)], wanted[free])
+            _, bears[free], failed = SOLVE_POSITIVE(firm[np.ix_(free, free)], wanted[free])
             if failed:
                 break
-            wrong = np.where(bearing, bears < 0.0, wanted - firm @ bears > ENTERED)
+            wrong = np.where(bearing, bears < 0.0, wanted - firm @ bears > INACTIVE_TOLERANCE)
             if not wrong.any():
                 return bears
             bearing ^= wrong
             if not bearing.any():
                 break
-        lower, failed = FACTORED(firm, lower=True)
+        lower, failed = FACTORISE(firm, lower=True)
         if not failed:
-            return nnls(lower.T, SOLVED_BY(lower, wanted, lower=True)[0])[0]
+            return nnls(lower.T, SOLVE_TRIANGULAR(lower, wanted, lower=True)[0])[0]
     raise np.linalg.LinAlgError("places that a tool touches do not give way")

@@ -17,16 +17,16 @@ from ..data.indentation import add_relaxation, to_indentation
 from ..data.splits import DiscSplit
 from ..evaluation.coverage import Coverage, measure_covered
 from ..evaluation.score import compute_force_errors, compute_point_errors
-from ..model.conformal import CLASS, Bound, compute_features, fit_bound, fit_growth
+from ..model.conformal import CLASS_LOADS, Bound, compute_features, fit_bound, fit_growth
 from ..model.learned import Learned, get_only_pushes
 from ..model.relaxation import follow_relaxation
-from ..model.tip_distance import MOST, TipModel, fit_correction
+from ..model.tip_distance import MAX_CONDITIONING_LOADS, TipModel, fit_correction
 from ..model.training_range import Measured, Outside, measure_loads
 from .examples import Examples
 from .expansion import Expansion
 
-SCALE = 3  # One in this many calibration loads fits the scale of a bound; the others fit its quantiles.
-ENOUGH = CLASS  # Number of calibration loads below which all fit the quantiles.
+SCALE_STRIDE = 3  # One in this many calibration loads fits the scale of a bound; the others fit its quantiles.
+MIN_SCALE_LOADS = CLASS_LOADS  # Number of calibration loads below which all fit the quantiles.
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,10 @@ def compute_distance_errors(model: Learned, known: KnownDistances) -> np.ndarray
 
 def add_correction(model: Learned, patch: Patch, known: KnownDistances) -> Learned:
     """Add a correction of distances to a model, trained on its training loads or some of them."""
-    plain, some = replace(model, tip=TipModel()), known.select(slice(None, None, -(-len(known.loads) // MOST)))
+    plain, some = (
+        replace(model, tip=TipModel()),
+        known.select(slice(None, None, -(-len(known.loads) // MAX_CONDITIONING_LOADS))),
+    )
     off = some.distance - plain.predict_distance(some.loads).value
     return replace(model, tip=TipModel(fit_correction(patch, model.to_input(some.loads), off)))
 
@@ -71,12 +74,12 @@ class BoundFit:
     curved: bool
 
 
-TUMOUR = BoundFit(CLASS, True)  # Settings of the bound of the tumour.
+TUMOUR_FIT = BoundFit(CLASS_LOADS, True)  # Settings of the bound of the tumour.
 # Settings of the bound of the tip distance. The tip sometimes snaps through with the cortex, so that the tail of its
 # errors grows with the force: classes are as small as a 99 % bound allows, and the scale's logarithm is linear.
-TIP = BoundFit(100, False)
-FORCE = BoundFit(CLASS, True)  # Settings of the bound of the force of a tool moved by pose.
-WAYS = {"tumour": TUMOUR, "tip": TIP, "force": FORCE}  # Settings of all bounds, by name.
+TIP_FIT = BoundFit(100, False)
+FORCE_FIT = BoundFit(CLASS_LOADS, True)  # Settings of the bound of the force of a tool moved by pose.
+BOUND_FITS = {"tumour": TUMOUR_FIT, "tip": TIP_FIT, "force": FORCE_FIT}  # Settings of all bounds, by name.
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +136,8 @@ def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = N
     One in `SCALE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
     guarantee. With fewer than `ENOUGH` loads all calibrate, and its scale follows the errors of `seen`, if given.
     """
-    if seen is None or len(near.error) >= ENOUGH:
-        fits = _fits(near)
+    if seen is None or len(near.error) >= MIN_SCALE_LOADS:
+        fits = _select_scale_loads(near)
         seen, near = near.select(fits), near.select(~fits)
     known = near.features, near.force, near.error
     return fit_bound(
@@ -144,12 +147,12 @@ def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = N
 
 def compute_growth(near: Missed, far: Missed, way: BoundFit) -> float:
     """Compute the growth [1/m] with which a bound has equal coverage `far` from training loads and near them."""
-    return fit_growth(*_over_plain(near, far, way))
+    return fit_growth(*_compute_relative_errors(near, far, way))
 
 
 def compute_held_out_bounds(model: Learned, near: Missed, far: Missed, split: DiscSplit, way: BoundFit) -> np.ndarray:
     """Compute bounds (2, B) [m] of loads on held-out discs, each with the growth estimated from the other discs."""
-    known, (ratio, away) = _over_plain(near, far, way)
+    known, (ratio, away) = _compute_relative_errors(near, far, way)
     disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
     for each in np.unique(disc):
         here = disc == each
@@ -164,18 +167,18 @@ def measure_coverage_by(bound: np.ndarray, far: Missed) -> Coverage:
     return measure_covered(far.force, far.error, bound, int(far.extrapolated.sum()))
 
 
-def _over_plain(near: Missed, far: Missed, way: BoundFit) -> list[tuple[np.ndarray, np.ndarray]]:
+def _compute_relative_errors(near: Missed, far: Missed, way: BoundFit) -> list[tuple[np.ndarray, np.ndarray]]:
     """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
     plain = bound_by(near, way, 0.0)
     return [
         (each.error / plain.evaluate(each.features, each.force, each.outside.here)[0], each.outside.away)
-        for each in (near.select(~_fits(near)), far)
+        for each in (near.select(~_select_scale_loads(near)), far)
     ]
 
 
-def _fits(near: Missed) -> np.ndarray:
+def _select_scale_loads(near: Missed) -> np.ndarray:
     """Select the loads that fit the scale: (B,) bool."""
-    return np.arange(len(near.error)) % SCALE == 0
+    return np.arange(len(near.error)) % SCALE_STRIDE == 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +265,7 @@ def read_solutions(data: Dataset, shared: Expansion) -> TrainingSolutions:
             "table: simulate again with a looser --tolerance."
         )
     loads = data.loads.select(np.flatnonzero(data.good))
-    pushed, nodes = _asked(data, loads, shared.patch), shared.tumour
+    pushed, nodes = _convert_loads(data, loads, shared.patch), shared.tumour
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
     tumour = data.read_displacement(nodes)[data.good]
@@ -274,7 +277,7 @@ def read_solutions(data: Dataset, shared: Expansion) -> TrainingSolutions:
     return TrainingSolutions(loads, pushed, shared.patch, nodes, tumour, cortex, distances, force)
 
 
-def _asked(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
+def _convert_loads(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
     """Convert loads of a data set to a model's input, like `Learned.to_input`."""
     if data.tool is not None:
         pushed, series = to_indentation(loads, data.tool, patch), read_series(data.provenance)

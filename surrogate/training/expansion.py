@@ -30,30 +30,30 @@ from ..data.dataset import Dataset
 from ..data.encode import Basis, compute_nodal_shares, reduce, split_forces
 from ..data.tool_loads import spread
 from ..model.applicability import read_trained_skull
-from ..model.kept_arrays import REMADE
+from ..model.kept_arrays import REMEDY
 from ..model.learned import ModelPart, get_only_pushes
 from ..model.npz_archive import Archive
-from ..regressors.force_series import FACTORS, SPANS, ForcePairs, Series, fill_table
+from ..regressors.force_series import FACTORS, ORDER_COLUMNS, ForcePairs, Series, fill_table
 from ..regressors.protocol import Linear
 from ..regressors.rigid_contact import RigidContact
 from .examples import Examples, compute_residual_responses
 from .fem_tables import add_edge_midpoints, choose_radii, condense_contact, find_disc_nodes, join_bases, tabulate
 
-COARSE = (1e-3, 60)  # Truncation tolerance and maximum number of modes of a model's basis.
+COARSE_BASIS = (1e-3, 60)  # Truncation tolerance and maximum number of modes of a model's basis.
 # Truncation tolerance and maximum number of modes of the series beyond the exact orders, 2 % of the motion.
-ADDED = (5e-3, 160)
+ADDED_BASIS = (5e-3, 160)
 TABLE_TOLERANCE = 1e-4  # Truncation tolerance of the compliance matrix.
-SECOND = 3e-3  # Truncation tolerance of the second order's modes: 0.1 % of the motion.
-WIDE = (1e-5, 192)  # Truncation tolerance and maximum number of modes of the series' table.
-FEW = 40  # Number of places, far apart, that span the series' table.
+SECOND_ORDER_TOLERANCE = 3e-3  # Truncation tolerance of the second order's modes: 0.1 % of the motion.
+WIDE_BASIS = (1e-5, 192)  # Truncation tolerance and maximum number of modes of the series' table.
+TABLE_PLACES = 40  # Number of places, far apart, that span the series' table.
 # Models that use the contact on linear tissue; the second is trained on its residual.
-TOUCHED = ("contact", "contact-gp")
-EXPANDED = ("series", "series-gp")  # Models that use the power series; the second is trained on its residual.
+CONTACT_MODELS = ("contact", "contact-gp")
+SERIES_MODELS = ("series", "series-gp")  # Models that use the power series; the second is trained on its residual.
 # Rounding of the second order's table relative to its largest entry. On the template this and SERIES_STEP move the
 # tumour's worst vertex by at most 0.01 mm in 95 % of loads, a ninth of the model's error.
 PAIR_STEP = 1e-3
 SERIES_STEP = 2e-3  # Rounding of the series' tables relative to their largest motion at the largest force.
-STRIP = 1536  # Number of motion components that are read at once: limits memory.
+STRIP_SIZE = 1536  # Number of motion components that are read at once: limits memory.
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ class Expansion:
 
         With as many modes as the unit responses need.
         """
-        return tuple(self._compliance(nodes) for nodes in self._known)
+        return tuple(self._build_compliance(nodes) for nodes in self._known)
 
     @cached_property
     def pairs(self) -> ModelPart:
@@ -168,7 +168,7 @@ class Expansion:
             # Footprints across the edge press on nodes beyond the open cortex. For others the exact parts leave no
             # residual.
             every = fill_table(self.places, added @ (wide.modes @ basis.modes.T), left_out)
-            for order in SPANS[: len(parts)]:
+            for order in ORDER_COLUMNS[: len(parts)]:
                 every[inside, order] = 0.0
             step = SERIES_STEP * (np.abs(every).max(axis=(0, 1, 3)) * unit).max() / unit
             found.append(Series.round_table(self.patch.points, triangles, self.radii, every, step))
@@ -180,7 +180,7 @@ class Expansion:
         known, found = self.tabulated, []
         for table, parts, wide in zip(known.tables, self.exact, known.bases, strict=True):
             added = table.copy()
-            for part, order, form_of in zip(parts, SPANS, (_linear_form, _square_form), strict=False):
+            for part, order, form_of in zip(parts, ORDER_COLUMNS, (_compute_linear_form, _square_form), strict=False):
                 met = form_of(part, self._unit_shares) @ (part.basis.modes @ wide.modes.T)
                 added[:, :, order] -= met.reshape(added[:, :, order].shape)
             found.append(added)
@@ -207,7 +207,7 @@ class Expansion:
         contact, bases = condense_contact(self.build_fem(), self._known, self.data.tool)
         return contact, bases, time.perf_counter() - begun
 
-    def _compliance(self, nodes: np.ndarray) -> ModelPart:
+    def _build_compliance(self, nodes: np.ndarray) -> ModelPart:
         response = self.data.compute_unit_response(nodes)
         basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
         return ModelPart("nodal", Linear().fit(np.eye(len(response)), round_to_half(basis.encode(response))), basis)
@@ -222,9 +222,9 @@ class Expansion:
             Data without a tissue.
         """
         if self.kept is not None and self.kept.exists():
-            with read_as(self.kept, "a table of the series", REMADE), self.kept.open("rb") as raw:
+            with read_as(self.kept, "a table of the series", REMEDY), self.kept.open("rb") as raw:
                 modes = [f"modes{k}" for k in range(len(self._known))]
-                file = Archive(raw, REMADE).read_arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
+                file = Archive(raw, REMEDY).read_arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
                 bases = [Basis(nodes, file[name]) for name, nodes in zip(modes, self._known, strict=True)]
                 pair_basis = Basis(self.tumour, file["second_modes"])
                 return Tabulated(
@@ -233,7 +233,7 @@ class Expansion:
         begun = time.perf_counter()
         fem = self.build_fem()
         bases, table, anew = self._tabulate(fem)
-        pairs, second, pair_basis = self._paired(fem, bases[0])
+        pairs, second, pair_basis = self._compute_pairs(fem, bases[0])
         seconds = time.perf_counter() - begun if anew else np.nan
         found = Tabulated(bases, table, pairs, second, pair_basis, seconds)
         if self.kept is not None:
@@ -243,7 +243,7 @@ class Expansion:
                 np.savez(partial, seconds=np.array(found.seconds), **arrays)  # pyright: ignore[reportArgumentType]
         return found
 
-    def _paired(self, fem: Fem, basis: Basis) -> tuple[np.ndarray, np.ndarray, Basis]:
+    def _compute_pairs(self, fem: Fem, basis: Basis) -> tuple[np.ndarray, np.ndarray, Basis]:
         """Compute pairs within one footprint, the tumour's second order of each, and a basis of modes for it."""
         near = find_disc_nodes(self.patch, float(self.radii[-1]))
         if 4.5 * near.sum() > self.most_pairs:
@@ -252,7 +252,7 @@ class Expansion:
         nodes = self.patch.nodes
         units = fem.build_reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
         pairs, table = compute_second_order(fem.problem, units.answers, reading.answers, near)
-        turn = reduce(basis.nodes, table, SECOND, len(basis.modes)).modes
+        turn = reduce(basis.nodes, table, SECOND_ORDER_TOLERANCE, len(basis.modes)).modes
         return pairs, table @ turn.T, Basis(basis.nodes, round_to_half(turn @ basis.modes))
 
     def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray, bool]:
@@ -261,17 +261,17 @@ class Expansion:
         The last value is True if the whole table was computed now.
         """
         count = len(self.places)
-        few = np.sort(spread(self.places, FEW))
+        few = np.sort(spread(self.places, TABLE_PLACES))
         every, motions = np.concatenate(self._known), []
-        for first in range(0, 3 * len(every), STRIP):
-            components = np.eye(3 * len(every))[first : first + STRIP].reshape(-1, len(every), 3)
+        for first in range(0, 3 * len(every), STRIP_SIZE):
+            components = np.eye(3 * len(every))[first : first + STRIP_SIZE].reshape(-1, len(every), 3)
             reading = fem.build_reading(every, components)
             motions.append(tabulate(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
         cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
         parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
         # The cortex's first order is given by its compliance.
-        orders = (SPANS, SPANS[1:])
-        bases = [_spanned(*each) for each in zip(self._known, parts, orders, strict=False)]
+        orders = (ORDER_COLUMNS, ORDER_COLUMNS[1:])
+        bases = [_build_wide_basis(*each) for each in zip(self._known, parts, orders, strict=False)]
         whole = join_bases(bases)
         reading = fem.build_reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
         table = np.empty((count, *parts[0].shape[1:3], reading.count), np.float32)
@@ -346,7 +346,7 @@ class Tabulated:
         return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
 
 
-def _linear_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
+def _compute_linear_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
     """Compute coefficients (n, 3, r) of unit forces with shares (n, 3, 3 m)."""
     return part.regressor.predict(shares.reshape(-1, shares.shape[2])).reshape(*shares.shape[:2], -1)
 
@@ -361,8 +361,8 @@ def _square_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
     return np.stack(both, axis=1)
 
 
-def _spanned(nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice]) -> Basis:
+def _build_wide_basis(nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice]) -> Basis:
     """Compute the wide basis of motions (F, R, 19, 3 n) of vertices (n,), with equal weight for each of some orders."""
     rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in orders]
     tiny = np.finfo(np.float32).tiny
-    return reduce(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *WIDE)
+    return reduce(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *WIDE_BASIS)

@@ -17,11 +17,11 @@ from sim.tools import Ball, BuiltIn, get_core
 from ..array_functions import compute_squared_distances
 from ..data.cortex_patch import Patch
 from ..data.encode import Basis, reduce
-from ..regressors.force_series import FACTORS, ORDERS, STENCIL, TERMS
+from ..regressors.force_series import FACTORS, MAX_ORDER, STENCIL_SIZE, TERM_COUNT
 from ..regressors.rigid_contact import RigidContact
 
-STRIP = 64  # Number of nodes whose unit responses are computed together: limits memory.
-TOLERANCE = 1e-4  # Truncation tolerance of a basis, as a share of the unit responses.
+STRIP_NODES = 64  # Number of nodes whose unit responses are computed together: limits memory.
+BASIS_TOLERANCE = 1e-4  # Truncation tolerance of a basis, as a share of the unit responses.
 
 
 def condense_contact(
@@ -36,7 +36,7 @@ def condense_contact(
     nodes, triangles = np.unique(surface, return_inverse=True)
     response = compute_unit_responses(fem, nodes, np.concatenate([nodes, *parts]))
     compliance, *answers = np.split(response, np.cumsum([len(nodes), *map(len, parts[:-1])]), axis=1)
-    bases = [reduce(some, each, TOLERANCE, len(each)) for some, each in zip(parts, answers, strict=True)]
+    bases = [reduce(some, each, BASIS_TOLERANCE, len(each)) for some, each in zip(parts, answers, strict=True)]
     coefficients = np.hstack([basis.encode(each) for basis, each in zip(bases, answers, strict=True)])
     rows = 3 * len(nodes)
     contact = RigidContact(
@@ -45,12 +45,12 @@ def condense_contact(
         compliance.reshape(rows, rows),
         coefficients,
         np.repeat([[1.0], [0.0]], coefficients.shape[1], axis=1),
-        core=np.zeros(0) if tool is None or isinstance(tool, Ball) else _sizes(tool),
+        core=np.zeros(0) if tool is None or isinstance(tool, Ball) else _get_sizes(tool),
     )
     return contact, bases
 
 
-def _sizes(tool: BuiltIn) -> np.ndarray:
+def _get_sizes(tool: BuiltIn) -> np.ndarray:
     """Return the half sizes of a tool's core, and its radius (4,) [m]."""
     core = get_core(tool)
     return np.append(core.half, core.radius)
@@ -65,22 +65,22 @@ def join_bases(bases: list[Basis]) -> Basis:
 def compute_unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Compute displacements (3 n, k, 3) float32 [m/N] of vertices `at` (k,) by small unit forces on `nodes` (n,)."""
     found = []
-    for first in range(0, len(nodes), STRIP):
-        some = nodes[first : first + STRIP]
+    for first in range(0, len(nodes), STRIP_NODES):
+        some = nodes[first : first + STRIP_NODES]
         answers = fem.build_reading(some, np.eye(3 * len(some)).reshape(-1, len(some), 3)).answers
         found.append(answers.reshape(len(answers), -1, 3)[:, at].astype(np.float32))
     return np.concatenate(found)
 
 
-RATIO = 1.5  # Maximum ratio of neighbouring radii.
+MAX_RADIUS_RATIO = 1.5  # Maximum ratio of neighbouring radii.
 
 
 def choose_radii(least: float, greatest: float) -> np.ndarray:
     """Compute radii [m] at which to tabulate footprints from `least` to `greatest`: one, or at least three."""
     if greatest <= least * (1.0 + 1e-9):
         return np.array([least])
-    steps = int(np.ceil(np.log(greatest / least) / np.log(RATIO)))
-    return np.geomspace(least, greatest, max(STENCIL, steps + 1))
+    steps = int(np.ceil(np.log(greatest / least) / np.log(MAX_RADIUS_RATIO)))
+    return np.geomspace(least, greatest, max(STENCIL_SIZE, steps + 1))
 
 
 def tabulate(
@@ -96,7 +96,7 @@ def tabulate(
     Each has r components, by `reading`; `progress` receives places done and their total. Places in the `journal` are
     not solved again.
     """
-    table = np.empty((len(places), len(radii), TERMS, reading.count), np.float32)
+    table = np.empty((len(places), len(radii), TERM_COUNT, reading.count), np.float32)
     some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))
     left = []
     for number, row in enumerate(table):
@@ -110,7 +110,7 @@ def tabulate(
         point = np.repeat(here, 3 * len(radii), axis=0)
         force = np.tile(np.eye(3), (len(here) * len(radii), 1))
         loads = Loads((Pushed(point, force, np.tile(np.repeat(radii, 3), len(here))),))
-        table[rows] = fem.compute_series(loads, ORDERS, reading, 3).reshape(len(here), *table.shape[1:])
+        table[rows] = fem.compute_series(loads, MAX_ORDER, reading, 3).reshape(len(here), *table.shape[1:])
         if journal is not None:
             for number in rows:
                 journal.add(("row", number), table[number].tobytes())

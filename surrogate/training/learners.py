@@ -20,12 +20,12 @@ from ..model.learned import ModelPart
 from ..model.own_learners import find_own, name_of
 from ..model.tool_contact import ForceModel
 from ..regressors.baselines import Ann, Pcr, Svr
-from ..regressors.force_series import TERMS, Remainder
+from ..regressors.force_series import TERM_COUNT, Remainder
 from ..regressors.gp import Gp
 from ..regressors.protocol import Fitted, RegressorFactory
 from ..regressors.rigid_contact import RigidContact
 from .examples import Examples, compute_residual_responses
-from .expansion import ADDED, COARSE, EXPANDED, TOUCHED, Expansion
+from .expansion import ADDED_BASIS, COARSE_BASIS, CONTACT_MODELS, SERIES_MODELS, Expansion
 from .fem_tables import join_bases
 
 
@@ -54,8 +54,8 @@ class SharedInputs:
     @cached_property
     def series(self) -> tuple[ModelPart, ...]:
         """Contribution of the FEM series beyond compliance, at the tumour and at the cortex, if there is more."""
-        bases = self.expansion.build_bases(self.basis_from, ADDED, COARSE)
-        found = self.expansion.build_series(bases, self._left_out(self.expansion.places))
+        bases = self.expansion.build_bases(self.basis_from, ADDED_BASIS, COARSE_BASIS)
+        found = self.expansion.build_series(bases, self._mask_left_out(self.expansion.places))
         return tuple(ModelPart("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
     def solve_counts(self, name: str, examples: Examples) -> SolveCounts:
@@ -63,32 +63,32 @@ class SharedInputs:
         known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
         seconds = [data.estimate_seconds("load", loads)]
-        of_tumour = name in ("linear", "residual", *EXPANDED)
+        of_tumour = name in ("linear", "residual", *SERIES_MODELS)
         if data.tool is None and (len(known.cortex) or of_tumour):
             units = len(data.unit_good)
-            inside = 3 * of_tumour * int(self._left_out(known.patch.points).sum())
+            inside = 3 * of_tumour * int(self._mask_left_out(known.patch.points).sum())
             seconds.append(data.estimate_seconds("unit response", units))
-        if name in TOUCHED:
+        if name in CONTACT_MODELS:
             contact, _, took = known.contact
-            units, inside = contact.points.size, 3 * int(self._left_out(contact.points).sum())
+            units, inside = contact.points.size, 3 * int(self._mask_left_out(contact.points).sum())
             seconds.append(took)
-        if name in EXPANDED:
-            places = int((~self._left_out(known.places)).sum())
-            series = places * len(known.radii) * TERMS
+        if name in SERIES_MODELS:
+            places = int((~self._mask_left_out(known.places)).sum())
+            series = places * len(known.radii) * TERM_COUNT
             took = known.tabulated.seconds * places / len(known.places)
             seconds.append(took if np.isfinite(took) else None)
         total = None if None in seconds else float(sum(filter(None, seconds)))
         return SolveCounts(loads, units, series, inside, total)
 
-    def _left_out(self, points: np.ndarray) -> np.ndarray:
+    def _mask_left_out(self, points: np.ndarray) -> np.ndarray:
         return np.zeros(len(points), bool) if self.split is None else self.split.is_covered(points)
 
 
-CENTRES = 6  # Number of discs, far apart, that inner fits hold out.
-SHARE = 0.2  # Share of the loads in the held-out discs of inner fits.
-FEWEST = 40  # Minimum number of loads for a selection of settings.
-MOST = 600  # Maximum number of loads used for a selection of settings.
-STRONGEST = 8  # Number of outputs, the strongest, used for a selection of settings.
+INNER_DISCS = 6  # Number of discs, far apart, that inner fits hold out.
+INNER_SHARE = 0.2  # Share of the loads in the held-out discs of inner fits.
+MIN_SELECTION_LOADS = 40  # Minimum number of loads for a selection of settings.
+MAX_SELECTION_LOADS = 600  # Maximum number of loads used for a selection of settings.
+SELECTION_OUTPUTS = 8  # Number of outputs, the strongest, used for a selection of settings.
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,11 @@ class Tuned:
 
     def find_best(self, X: np.ndarray, Y: np.ndarray) -> int:
         """Return the index of the settings with the smallest squared error on the discs; deterministic."""
-        if len(X) < FEWEST or len(self.settings) == 1:
+        if len(X) < MIN_SELECTION_LOADS or len(self.settings) == 1:
             return 0
-        X, Y = X[:MOST], Y[:MOST]
+        X, Y = X[:MAX_SELECTION_LOADS], Y[:MAX_SELECTION_LOADS]
         left_out = find_inner_discs(X[:, :3])
-        strongest = Y[:, np.sort(np.argsort(-Y.std(axis=0), kind="stable")[:STRONGEST])]
+        strongest = Y[:, np.sort(np.argsort(-Y.std(axis=0), kind="stable")[:SELECTION_OUTPUTS])]
         errors = []
         for make in self.settings:
             model = make().fit(X[~left_out], strongest[~left_out])
@@ -125,31 +125,33 @@ class Tuned:
 
 def find_inner_discs(points: np.ndarray) -> np.ndarray:
     """Return the mask (n,) of points in discs round `CENTRES` of the points (n, 3), far from each other."""
-    distance = find_nearest(points, points[spread(points, CENTRES)])[1]
-    return distance <= np.quantile(distance, SHARE)
+    distance = find_nearest(points, points[spread(points, INNER_DISCS)])[1]
+    return distance <= np.quantile(distance, INNER_SHARE)
 
 
 # Candidate networks, the default first: units in a layer and weight decay.
-ANN = tuple(partial(Ann, hidden, decay) for hidden in (64, 128) for decay in (1e-2, 3e-3))
+ANN_CANDIDATES = tuple(partial(Ann, hidden, decay) for hidden in (64, 128) for decay in (1e-2, 3e-3))
 # Candidate support vector regressions, the default first: C and epsilon [quartile ranges].
-SVR = tuple(partial(Svr, c, tube) for c in (1.0 / 1.349, 10.0, 100.0) for tube in (1.0 / 13.49, 1e-2, 3e-3, 1e-3))
+SVR_CANDIDATES = tuple(
+    partial(Svr, c, tube) for c in (1.0 / 1.349, 10.0, 100.0) for tube in (1.0 / 13.49, 1e-2, 3e-3, 1e-3)
+)
 # Encoder and regressor of each model type but the compliance matrix; principal components are those of the nodal
 # forces.
-LEARNT: dict[str, tuple[str, Callable[[], RegressorFactory]]] = {
+LEARNED_MODELS: dict[str, tuple[str, Callable[[], RegressorFactory]]] = {
     "pcr": ("nodal", Pcr),
-    "ann": ("tool", partial(Tuned, ANN)),
-    "svr": ("tool", partial(Tuned, SVR)),
+    "ann": ("tool", partial(Tuned, ANN_CANDIDATES)),
+    "svr": ("tool", partial(Tuned, SVR_CANDIDATES)),
     "gp": ("tool", Gp),
-    "residual": ("tool", partial(Tuned, ANN)),
+    "residual": ("tool", partial(Tuned, ANN_CANDIDATES)),
 }
-POSED = ("gp", "ann", "svr")  # Model types for poses: the tool's position replaces its force.
+POSE_MODELS = ("gp", "ann", "svr")  # Model types for poses: the tool's position replaces its force.
 
 
 def fit_parts(name: str, inputs: SharedInputs, examples: Examples) -> tuple[ModelPart, ...]:
     """Fit the summands of one model type to examples: for the tumour, and for the remaining open cortex."""
     known = inputs.expansion
-    trained = partial(_trained, known.patch, examples.loads)
-    if name in EXPANDED:
+    trained = partial(_fit_part, known.patch, examples.loads)
+    if name in SERIES_MODELS:
         added = inputs.series
         exact = [part for parts in known.exact for part in parts]
         if name == "series":
@@ -159,17 +161,17 @@ def fit_parts(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Mode
         return (*exact, *added, *left)
     if name == "linear":
         return known.tables
-    if name in TOUCHED:
-        contact, left = _touched(known, examples)
+    if name in CONTACT_MODELS:
+        contact, left = _fit_contact(known, examples)
         if name == "contact":
             return (contact,)
-        return (contact, *(trained(LEARNT["gp"], (), nodes, rest) for nodes, rest in left))
+        return (contact, *(trained(LEARNED_MODELS["gp"], (), nodes, rest) for nodes, rest in left))
     if known.data.tool is not None:
         both = ((known.tumour, examples.tumour), (known.cortex, examples.cortex))
-        return tuple(trained(_learnt(name), (), nodes, truth) for nodes, truth in both if len(nodes))
+        return tuple(trained(_find_model_type(name), (), nodes, truth) for nodes, truth in both if len(nodes))
     tumour, *cortex = known.tables
     before = (tumour,) if name == "residual" else ()
-    learnt = trained(_learnt(name), before, known.tumour, examples.tumour)
+    learnt = trained(_find_model_type(name), before, known.tumour, examples.tumour)
     return (*before, learnt, *cortex)
 
 
@@ -179,7 +181,7 @@ def fit_force_model(name: str, parts: Sequence[ModelPart], patch: Patch, example
         return None
     if name == "contact":
         return ForceModel()
-    encoder, make = LEARNT["gp"] if name in TOUCHED else _learnt(name)
+    encoder, make = LEARNED_MODELS["gp"] if name in CONTACT_MODELS else _find_model_type(name)
     X = ENCODERS[encoder](patch, examples.loads)
     left = examples.force / split_forces(examples.loads)[0][:, None]
     for part in parts:
@@ -191,16 +193,16 @@ def fit_force_model(name: str, parts: Sequence[ModelPart], patch: Patch, example
     return ForceModel(encoder, learned)
 
 
-def _learnt(name: str) -> tuple[str, Callable[[], RegressorFactory]]:
+def _find_model_type(name: str) -> tuple[str, Callable[[], RegressorFactory]]:
     """Return encoder and regressor of a model type, user-defined ones included."""
-    if name in LEARNT:
-        return LEARNT[name]
+    if name in LEARNED_MODELS:
+        return LEARNED_MODELS[name]
     own = find_own(name)
     assert own is not None, name  # checked by the caller
     return own.encoder, own.regressor
 
 
-def _touched(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tuple[np.ndarray, np.ndarray]]]:
+def _fit_contact(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tuple[np.ndarray, np.ndarray]]]:
     """Fit the contact on stiffening tissue to examples; return its part, and its residuals: vertices, (B, n, 3) [m]."""
     contact, bases, _ = known.contact
     encoder = "core" if len(contact.core) else "tool"
@@ -214,7 +216,7 @@ def _touched(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tupl
     return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 
 
-def _trained(
+def _fit_part(
     patch: Patch,
     loads: Pushed,
     kind: tuple[str, Callable[[], RegressorFactory]],
@@ -224,7 +226,7 @@ def _trained(
 ) -> ModelPart:
     """Fit a part to the residual of `truth` (B, n, 3) [m] after parts `before`: `on` a basis, or on vertices (n,)."""
     response = compute_residual_responses(before, patch, loads, truth)
-    basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE)
+    basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE_BASIS)
     encoder, make = kind
     X, Y = ENCODERS[encoder](patch, loads), basis.encode(response)
     regressor = make().fit(X, Y)

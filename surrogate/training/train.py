@@ -12,18 +12,18 @@ from sim.runtime.timing import time_stage
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
-from ..data.splits import APART, MOST_APART, DiscSplit, leave_discs_out
-from ..evaluation.coverage import TENTHS, Coverage
+from ..data.splits import CALIBRATION_STRIDE, MAX_CALIBRATION_LOADS, DiscSplit, leave_discs_out
+from ..evaluation.coverage import FORCE_CLASSES, Coverage
 from ..evaluation.score import ForceScore, Score, score, score_forces
 from ..model.conformal import LEVELS, USUAL_GROWTH, compute_conformal_quantile
 from ..model.learned import Learned, ModelPart
 from ..model.left_out import measure_held_out
-from ..model.own_learners import OWN, find_own
+from ..model.own_learners import OWN_LEARNERS, find_own
 from ..model.tip_distance import TipModel
 from ..model.tool_contact import ForceModel
 from ..model.training_range import Envelope, compute_training_range
 from .bounds import (
-    WAYS,
+    BOUND_FITS,
     ModelErrors,
     TrainingSolutions,
     add_correction,
@@ -35,12 +35,12 @@ from .bounds import (
     read_solutions,
 )
 from .examples import Examples
-from .expansion import EXPANDED, TOUCHED, Expansion
-from .learners import LEARNT, POSED, SharedInputs, fit_force_model, fit_parts
+from .expansion import CONTACT_MODELS, SERIES_MODELS, Expansion
+from .learners import LEARNED_MODELS, POSE_MODELS, SharedInputs, fit_force_model, fit_parts
 
-LEARNERS = ("linear", *LEARNT, *EXPANDED)  # Model types for pushes.
-OF_POSES = (*TOUCHED, *POSED)  # Model types for poses.
-FEWEST_APART = 19  # Minimum number of calibration loads for a 95 % bound.
+LEARNERS = ("linear", *LEARNED_MODELS, *SERIES_MODELS)  # Model types for pushes.
+POSE_LEARNERS = (*CONTACT_MODELS, *POSE_MODELS)  # Model types for poses.
+MIN_CALIBRATION_LOADS = 19  # Minimum number of calibration loads for a 95 % bound.
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +69,8 @@ class Trained:
 def list_learners(data: Dataset) -> tuple[str, ...]:
     """Return the model types that a data set can train: series and contact need FEM of a known tissue."""
     stated = "tissue" in data.provenance
-    kinds = LEARNERS if data.tool is None else OF_POSES
-    return tuple(name for name in kinds if stated or name not in (*EXPANDED, *TOUCHED))
+    kinds = LEARNERS if data.tool is None else POSE_LEARNERS
+    return tuple(name for name in kinds if stated or name not in (*SERIES_MODELS, *CONTACT_MODELS))
 
 
 def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
@@ -81,10 +81,10 @@ def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
     InputError
         No name, an unknown one, or one of the other kind of data.
     """
-    kinds, others, held = (OF_POSES, LEARNERS, "poses") if of_poses else (LEARNERS, OF_POSES, "pushes")
+    kinds, others, held = (POSE_LEARNERS, LEARNERS, "poses") if of_poses else (LEARNERS, POSE_LEARNERS, "pushes")
     unknown = [name for name in names if name not in (*kinds, *others) and find_own(name) is None]
     if unknown or not names:
-        allowed = ", ".join((*kinds, *OWN))
+        allowed = ", ".join((*kinds, *OWN_LEARNERS))
         raise InputError(
             f"no learner is called {', '.join(unknown) or 'nothing'}: choose from {allowed}; "
             "a file with one of your own is named by --plugin."
@@ -139,19 +139,19 @@ def train(
         answers = read_solutions(data, shared)
     apart = np.zeros(len(answers.loads), bool)
     if split is None:
-        apart[len(apart) - min(len(apart) // APART, MOST_APART) :] = True
-        split = _without(leave_discs_out(answers.pushed.point[~apart], answers.patch), apart)
-    chosen = [_first(split.train, most), *([_first(~apart, most)] if apart.any() else [])]
+        apart[len(apart) - min(len(apart) // CALIBRATION_STRIDE, MAX_CALIBRATION_LOADS) :] = True
+        split = _extend_split(leave_discs_out(answers.pushed.point[~apart], answers.patch), apart)
+    chosen = [_select_first(split.train, most), *([_select_first(~apart, most)] if apart.any() else [])]
     fits = [_fit_of(answers, rows, shared, left) for rows, left in zip(chosen, (split, None), strict=False)]
     results = {}
     for name in wanted:
-        results[name] = _learn(name, data, answers, split, apart, fits)
+        results[name] = _train_and_score(name, data, answers, split, apart, fits)
         progress(name)
     return Trained(
         models={name: each.model for name, each in results.items()},
         scores=tuple(each.score for each in results.values()),
         split=split,
-        motion=float(_motion(answers, split.test).mean()),
+        motion=float(_compute_motion(answers, split.test).mean()),
         calibrated=int(apart.sum()),
         training_loads=int(fits[-1].rows.sum()),
         left_out={name: each.left_out for name, each in results.items() if each.left_out},
@@ -194,7 +194,7 @@ def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, lef
     )
 
 
-def _learn(
+def _train_and_score(
     name: str, data: Dataset, answers: TrainingSolutions, split: DiscSplit, apart: np.ndarray, fits: Sequence[Fit]
 ) -> Result:
     """Fit one model type outside the discs and score it inside, then fit it to all loads not used for calibration."""
@@ -213,19 +213,19 @@ def _learn(
         model = replace(
             model, bound=min(compute_conformal_quantile(far.tumour.error, LEVELS[0]), float(far.tumour.error.max()))
         )
-    growth = dict.fromkeys(WAYS, USUAL_GROWTH)
+    growth = dict.fromkeys(BOUND_FITS, USUAL_GROWTH)
     of_tumour = of_tip = None
     promised, beside = None, apart & ~split.is_covered(answers.pushed.point)
-    if beside.sum() >= 2 * FEWEST_APART and len(test) >= TENTHS:
+    if beside.sum() >= 2 * MIN_CALIBRATION_LOADS and len(test) >= FORCE_CLASSES:
         with time_stage("calibrate"):
             near, there = answers.compute_errors(model, beside).list_available(), far.list_available()
-            growth = {way: compute_growth(near[way], there[way], WAYS[way]) for way in near}
-            bound = {way: compute_held_out_bounds(model, near[way], there[way], split, WAYS[way]) for way in near}
+            growth = {way: compute_growth(near[way], there[way], BOUND_FITS[way]) for way in near}
+            bound = {way: compute_held_out_bounds(model, near[way], there[way], split, BOUND_FITS[way]) for way in near}
             of_tumour, of_tip = (
                 measure_coverage_by(bound["tumour"], far.tumour),
                 measure_coverage_by(bound["tip"], far.tip),
             )
-            motion = _motion(answers, split.test)
+            motion = _compute_motion(answers, split.test)
             model = replace(
                 model, left_out=measure_held_out(distance, motion, bound["tumour"][0], far.tumour.extrapolated)
             )
@@ -234,14 +234,14 @@ def _learn(
     if far.force is not None and answers.force is not None:
         forces = score_forces(far.force.error, answers.force[split.test], promised)
     if apart.any():
-        model = _fitted_on_all(name, model, answers, fits[1])
-    if apart.sum() >= FEWEST_APART:
+        model = _fit_on_all(name, model, answers, fits[1])
+    if apart.sum() >= MIN_CALIBRATION_LOADS:
         with time_stage("calibrate"):
-            model = _calibrated(model, answers.compute_errors(model, apart), growth, far)
+            model = _add_bounds(model, answers.compute_errors(model, apart), growth, far)
     return Result(model, scored, of_tumour, of_tip, forces)
 
 
-def _fitted_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: Fit) -> Learned:
+def _fit_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: Fit) -> Learned:
     """Fit the model to further loads, with a correction of its distances if it had one."""
     parts, force = fit.fit_parts(name, answers.patch)
     fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
@@ -251,10 +251,12 @@ def _fitted_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: F
         return add_correction(fitted, answers.patch, answers.distances.select(fit.rows))
 
 
-def _calibrated(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
+def _add_bounds(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
     """Add bounds, calibrated on errors `near` training loads, to a model; they grow by `growth` [1/m] towards `far`."""
     seen = far.list_available()
-    bounds = {way: bound_by(here, WAYS[way], growth[way], seen[way]) for way, here in near.list_available().items()}
+    bounds = {
+        way: bound_by(here, BOUND_FITS[way], growth[way], seen[way]) for way, here in near.list_available().items()
+    }
     tip, force = model.tip or TipModel(), model.force
     return replace(
         model,
@@ -264,17 +266,17 @@ def _calibrated(model: Learned, near: ModelErrors, growth: Mapping[str, float], 
     )
 
 
-def _motion(answers: TrainingSolutions, rows: np.ndarray) -> np.ndarray:
+def _compute_motion(answers: TrainingSolutions, rows: np.ndarray) -> np.ndarray:
     """Compute the tumour's mean displacement [m] under selected rows (B,) bool."""
     return np.linalg.norm(answers.tumour[rows], axis=2).mean(axis=1)
 
 
-def _first(rows: np.ndarray, most: int | None) -> np.ndarray:
+def _select_first(rows: np.ndarray, most: int | None) -> np.ndarray:
     """Select the first `most` of rows (B,) bool."""
     return rows if most is None else rows & (np.cumsum(rows) <= most)
 
 
-def _without(split: DiscSplit, apart: np.ndarray) -> DiscSplit:
+def _extend_split(split: DiscSplit, apart: np.ndarray) -> DiscSplit:
     """Extend a split of the rows that are not `apart` (B,) to all rows."""
     disc = np.full(len(apart), -2)
     disc[~apart] = split.disc

@@ -27,7 +27,7 @@ from .datasheet import MARK, NAME, get_template_notice, has_template, write_data
 TABLE = "episodes.csv"  # File name of the table of episodes.
 NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)
 """Files of a card."""
-MOST_EPISODES = 5000
+MAX_COMPARED_EPISODES = 5000
 """Number of episodes above which a run does not write the card automatically: each takes 20 to 50 ms."""
 # Text of the licence file.
 LICENCE = f"""# Licence of this data set
@@ -107,10 +107,10 @@ def keep_card(
     changed
         True if episodes were made, or failed, since the card was written.
     """
-    if not numbers or not (changed or _differs(folder, {to_episode_name(number) for number in numbers})):
+    if not numbers or not (changed or _is_outdated(folder, {to_episode_name(number) for number in numbers})):
         return None
-    if len(numbers) > MOST_EPISODES:
-        return f"No data sheet of more than {MOST_EPISODES} episodes: `sulcus convert {folder} --to card` writes it."
+    if len(numbers) > MAX_COMPARED_EPISODES:
+        return f"No data sheet of more than {MAX_COMPARED_EPISODES} episodes: `sulcus convert {folder} --to card` writes it."
     try:
         write_card(folder, progress=progress)
     except (InputError, OSError) as error:  # the episodes of the run are unaffected
@@ -118,10 +118,10 @@ def keep_card(
     return None
 
 
-def _differs(folder: Path, names: set[str]) -> bool:
+def _is_outdated(folder: Path, names: set[str]) -> bool:
     """Return True if a folder's card lists other episodes than these; for many, sizes are not compared."""
     listed = list_card_files(folder) if has_card(folder) else {}
-    if listed.keys() != names or len(names) > MOST_EPISODES:
+    if listed.keys() != names or len(names) > MAX_COMPARED_EPISODES:
         return listed.keys() != names
     return any((folder / name).stat().st_size != size for name, size in listed.items())
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.errors import InputError
 
-from ..reading.contents import LONGEST_TEXT, EpisodeContents
+from ..reading.contents import MAX_TEXT_BYTES, EpisodeContents
 from ..reading.schema import PICTURES
 from ..reading.windows import read_numbers
 
@@ -27,7 +27,7 @@ TASKS = {  # Descriptions of tasks, by family.
     "drain": "Drain fluid and turn the head, while the brain sinks.",
     "debulk": "Resect the tumour in steps.",
 }
-HELD_OUT = 10  # One in this many bodies (or episodes, if there are fewer bodies) is held out.
+HELD_OUT_STRIDE = 10  # One in this many bodies (or episodes, if there are fewer bodies) is held out.
 
 
 def describe_task(contents: EpisodeContents) -> str:
@@ -41,15 +41,15 @@ def mark_held_out(episodes: Sequence[EpisodeContents]) -> list[bool]:
     Of two to nine episodes, the last one is held out.
     """
     bodies = list(dict.fromkeys(str(one.said.get("anatomy")) for one in episodes))
-    if len(bodies) < HELD_OUT:
-        every = min(HELD_OUT, max(len(episodes), 2))
+    if len(bodies) < HELD_OUT_STRIDE:
+        every = min(HELD_OUT_STRIDE, max(len(episodes), 2))
         return [number % every == every - 1 for number in range(len(episodes))]
-    out = set(bodies[HELD_OUT - 1 :: HELD_OUT])
+    out = set(bodies[HELD_OUT_STRIDE - 1 :: HELD_OUT_STRIDE])
     return [str(one.said.get("anatomy")) in out for one in episodes]
 
 
-UNEVEN = 1e-4  # Largest deviation of the time between frames from the mean [s].
-BLOCK = 64  # Number of frames held in memory at once.
+TIME_STEP_TOLERANCE = 1e-4  # Largest deviation of the time between frames from the mean [s].
+BLOCK_FRAMES = 64  # Number of frames held in memory at once.
 NUMBERS = (
     "force", "force_read", "tip", "contact", "distance", "K", "T_camera_world", "T_camera_world_tracked",
     "T_world_tool_tracked", "tumour_predicted",
@@ -100,7 +100,7 @@ def compute_frame_rate(contents: EpisodeContents, time: np.ndarray) -> float:
         Frames that are not evenly spaced, or fewer than two.
     """
     steps = np.diff(time)
-    if not len(steps) or not steps.mean() > 0.0 or np.abs(steps - steps.mean()).max() > UNEVEN:
+    if not len(steps) or not steps.mean() > 0.0 or np.abs(steps - steps.mean()).max() > TIME_STEP_TOLERANCE:
         raise InputError(f"{contents.path}: its frames are not evenly spaced in time: leave it out.")
     return round(1.0 / float(steps.mean()), 6)
 
@@ -132,7 +132,7 @@ def read_per_frame(file: h5py.File, contents: EpisodeContents, name: str) -> np.
 
 def split_into_blocks(frames: int) -> Iterator[range]:
     """All frames, `BLOCK` at a time."""
-    return (range(start, min(start + BLOCK, frames)) for start in range(0, frames, BLOCK))
+    return (range(start, min(start + BLOCK_FRAMES, frames)) for start in range(0, frames, BLOCK_FRAMES))
 
 
 def name_axes(name: str) -> list[str] | None:
@@ -186,7 +186,7 @@ def collect_texts(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
     found = {}
     for number, home in enumerate(homes):
         for path in (home / SHEET, home / LICENCE):
-            if path.is_file() and not path.is_symlink() and path.stat().st_size <= LONGEST_TEXT:
+            if path.is_file() and not path.is_symlink() and path.stat().st_size <= MAX_TEXT_BYTES:
                 name = path.name if len(homes) == 1 else f"{path.stem}_{number}{path.suffix}"
                 found[name] = path.read_text(encoding="utf-8", errors="replace")
     return found

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from typing import Any
 
 # Standards that the file conforms to.
-CONFORMS = ("http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0")
+STANDARDS = ("http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0")
 LICENCE = "https://creativecommons.org/licenses/by/4.0/"  # Address of the licence.
 # Terms of the Croissant vocabulary without a type.
-PLAIN = (
+UNTYPED_TERMS = (
     "arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "extract", "field", "fileProperty",
     "fileObject", "fileSet", "format", "includes", "isArray", "isLiveDataset", "jsonPath", "key", "md5", "parentField",
     "path", "recordSet", "references", "regex", "repeated", "replace", "samplingRate", "separator", "source",
@@ -31,7 +31,7 @@ CONTEXT: Mapping[str, Any] = {
     "examples": {"@id": "cr:examples", "@type": "@json"},
     "description": {"@container": "@language"},
     "name": {"@container": "@language"},
-    **{name: f"cr:{name}" for name in PLAIN},
+    **{name: f"cr:{name}" for name in UNTYPED_TERMS},
 }
 """The specification's own context."""
 COLUMNS: Mapping[str, tuple[str, str]] = {
@@ -73,7 +73,7 @@ def build_croissant_metadata(
         "@type": "sc:Dataset",
         "name": name,
         "description": description,
-        "conformsTo": list(CONFORMS),
+        "conformsTo": list(STANDARDS),
         "license": LICENCE,
         "version": "1.0.0",
         "citeAs": f"{name}: simulated surgery, made by its authors with sulcus, {date}. CC BY 4.0.",
@@ -109,13 +109,13 @@ def build_croissant_metadata(
                 "name": "episodes",
                 "description": "The episodes.",
                 "key": {"@id": "episodes/file"},
-                "field": [_field(column, table) for column in COLUMNS],
+                "field": [_build_field(column, table) for column in COLUMNS],
             }
         ],
     }
 
 
-def _field(column: str, table: str) -> dict[str, Any]:
+def _build_field(column: str, table: str) -> dict[str, Any]:
     kind, meaning = COLUMNS[column]
     return {
         "@type": "cr:Field",

@@ -13,7 +13,7 @@ from ..reading.contents import EpisodeContents
 from ..reading.schema import ARRAYS, PICTURES
 from ..run_folder import RUN, RunSettings
 
-MOST_DRAWN = 100  # Maximum length of each list of sampled values.
+MAX_LISTED_VALUES = 100  # Maximum length of each list of sampled values.
 
 
 def read_parameters(contents: EpisodeContents) -> dict[str, Any]:
@@ -42,11 +42,13 @@ def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str
     if varied:
         yield "\nWhat was drawn at random, from least to greatest:\n"
         yield "| what | from | to | episodes |\n|---|---|---|---|"
-        yield from [format_range_row(key, found) for key, found in varied.items()][:MOST_DRAWN]
+        yield from [format_range_row(key, found) for key, found in varied.items()][:MAX_LISTED_VALUES]
     if same:
         yield "\nWhat is the same in all episodes that have it:\n"
         yield "| what | value | episodes |\n|---|---|---|"
-        yield from [f"| `{key}` | {format_cell(found[0])} | {len(found)} |" for key, found in same.items()][:MOST_DRAWN]
+        yield from [f"| `{key}` | {format_cell(found[0])} | {len(found)} |" for key, found in same.items()][
+            :MAX_LISTED_VALUES
+        ]
 
 
 def format_range_row(key: str, found: Sequence[Any]) -> str:
@@ -125,7 +127,7 @@ def format_origins(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
 
 MARK = "<!-- sulcus card 1 -->"  # Line that marks a generated data sheet.
 NAME = "with sulcus"  # Text by which a data sheet names its program.
-MOST_LISTED = 12  # Maximum number of effects, solvers and tools that are listed.
+MAX_LISTED_NAMES = 12  # Maximum number of effects, solvers and tools that are listed.
 
 
 def write_datasheet(
@@ -146,7 +148,7 @@ def write_datasheet(
         describe_motivation(),
         describe_composition(episodes, rows, notes),
         describe_collection(episodes, run),
-        UNKNOWN,
+        LIMITATIONS,
         "## Preprocessing\n\nColour is JPEG, depth PNG of 16 bits and labels PNG of 8 bits. Nothing else was changed. "
         "`sulcus validate` compares images, arrays and checksums.\n",
         "## Uses\n\nTo train and test methods that track tools, estimate deformation or plan motion, before real data "
@@ -233,10 +235,10 @@ def describe_collection(episodes: Sequence[EpisodeContents], run: RunSettings | 
 def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
     """Yield lines with the number of occurrences of each text; at most the `MOST_LISTED` most frequent."""
     often = Counter(map(str, texts)).most_common()
-    yield from (f"- {title}: {text} (in {count})" for text, count in often[:MOST_LISTED])
-    if often[MOST_LISTED:]:
-        others = sum(count for _, count in often[MOST_LISTED:])
-        yield f"- {title}: {len(often) - MOST_LISTED} others (in {others})"
+    yield from (f"- {title}: {text} (in {count})" for text, count in often[:MAX_LISTED_NAMES])
+    if often[MAX_LISTED_NAMES:]:
+        others = sum(count for _, count in often[MAX_LISTED_NAMES:])
+        yield f"- {title}: {len(often) - MAX_LISTED_NAMES} others (in {others})"
 
 
 def format_value(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
@@ -251,7 +253,7 @@ def format_plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
 
 
 # Section on limitations.
-UNKNOWN = """## Limitations
+LIMITATIONS = """## Limitations
 
 - The error of the simulated motion relative to a patient is unknown. Models are compared with FEM, not with a patient.
 - Tissue stiffness and the constraints by skull and fluid are assumed, not measured.

@@ -89,13 +89,13 @@ DEPTH_RANGE = (0.1, 0.6)
 EXPORTED = ("colour", "colour_right", "depth", "segmentation", "tumour_mask")  # Exported images.
 FILE_MEGABYTES = 100  # Maximum size of a table [MB], as in LeRobot.
 FOLDER_FILES = 1000  # Maximum number of tables in a folder, as in LeRobot.
-LOOKED_AT = 5  # Number of images of an episode used for statistics.
-SPARSE = 4  # Pixel stride along each side of the images used for statistics.
+STATISTICS_IMAGES = 5  # Number of images of an episode used for statistics.
+STATISTICS_STRIDE = 4  # Pixel stride along each side of the images used for statistics.
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"  # Path of a table of frames.
 EPISODES = Path("meta/episodes/chunk-000/file-000.parquet")  # Path of the table of episodes.
-PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # Parquet type of an image.
+IMAGE_TYPE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # Parquet type of an image.
 # Columns of time and numbers that LeRobot requires in each row.
-COUNTED = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+REQUIRED_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
 def write_lerobot(
@@ -182,7 +182,7 @@ def build_columns(frames: int, episode: int, first: int, task: int, rate: float)
     every = np.arange(frames)
     same = np.ones(frames, np.int64)
     numbers = ((every / rate).astype(np.float32), every, episode * same, first + every, task * same)
-    return dict(zip(COUNTED, numbers, strict=True))
+    return dict(zip(REQUIRED_COLUMNS, numbers, strict=True))
 
 
 @dataclass
@@ -203,7 +203,7 @@ class Tables:
         for block in split_into_blocks(len(columns["index"])):
             arrays = {name: to_arrow_column(array[block.start : block.stop]) for name, array in columns.items()}
             for name in pictures:
-                arrays[f"observation.images.{name}"] = pa.array(encode_images(file, contents, name, block), PICTURE)
+                arrays[f"observation.images.{name}"] = pa.array(encode_images(file, contents, name, block), IMAGE_TYPE)
             table = pa.table(arrays)
             if self.writer is None:
                 self.number += 1
@@ -246,8 +246,8 @@ def to_arrow_column(array: np.ndarray) -> pa.Array:
 def measure_image_statistics(file: h5py.File, contents: EpisodeContents, name: str) -> RowStatistics:
     """Compute statistics of a few images: colour and labels relative to 255, depth in its own steps."""
     found = []
-    for frame in np.unique(np.linspace(0, contents.frames - 1, LOOKED_AT).round().astype(int)).tolist():
-        picture = read_one_image(file, contents, name, frame)[::SPARSE, ::SPARSE]
+    for frame in np.unique(np.linspace(0, contents.frames - 1, STATISTICS_IMAGES).round().astype(int)).tolist():
+        picture = read_one_image(file, contents, name, frame)[::STATISTICS_STRIDE, ::STATISTICS_STRIDE]
         scale = contents.depth_scale if PICTURES[name] == DEPTH else 255.0
         found.append(picture.reshape(-1, picture.shape[2] if picture.ndim == 3 else 1) / scale)
     return RowStatistics.compute(np.concatenate(found))
@@ -282,7 +282,7 @@ def build_task_table(tasks: Sequence[str]) -> pa.Table:
 
 def describe_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
     """Numbers as `info.json` describes them."""
-    kinds = {name: "float32" if name not in COUNTED or name == "timestamp" else "int64" for name in shapes}
+    kinds = {name: "float32" if name not in REQUIRED_COLUMNS or name == "timestamp" else "int64" for name in shapes}
     return {
         name: {"dtype": kinds[name], "shape": list(shape) or [1], "names": name_axes(name.rpartition(".")[2])}
         for name, shape in shapes.items()

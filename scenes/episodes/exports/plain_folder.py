@@ -18,7 +18,7 @@ from ..reading.schema import ARRAYS, PICTURES, SOLVED, get_suffix
 from ..reading.windows import read_image_bytes, read_numbers, read_rows
 from .columns import measure_stored_size, name_files, write_along
 
-WIDE = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
+SEPARATE_TABLES = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
 """Arrays with many numbers a frame, each in a table of its own."""
 
 
@@ -63,7 +63,7 @@ def write_tables(place: Path, file: h5py.File, contents: EpisodeContents) -> Non
         if described is None or name == "fem_frames" or not (described.framed or described.axes[0] == SOLVED):
             continue
         rows = read_rows(file, contents, name)
-        if name in WIDE:
+        if name in SEPARATE_TABLES:
             flat = np.asarray(rows).reshape(contents.frames, -1)
             axes = [f"{node}{axis}" for node in range(flat.shape[1] // 3) for axis in ("_x", "_y", "_z")]
             titles = axes if described.axes[-1] == 3 else [str(node) for node in range(flat.shape[1])]

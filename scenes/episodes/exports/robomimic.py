@@ -30,7 +30,7 @@ from .columns import (
 )
 
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")  # Exported images.
-SWELLS = 4  # Size of decoded images compressed by gzip, relative to the episodes' JPEG and PNG.
+IMAGE_SIZE_FACTOR = 4  # Size of decoded images compressed by gzip, relative to the episodes' JPEG and PNG.
 GYM = 2
 """robomimic's number for environments of Gymnasium's kind."""
 
@@ -46,7 +46,7 @@ def write_robomimic(
         Episodes without a tool, of different image sizes, or damaged; a file that cannot be written.
     """
     pictures, names = list_shared_images(episodes, EXPORTED), list_shared_numbers(episodes)
-    check_disk_space(path, SWELLS * measure_stored_size(episodes))
+    check_disk_space(path, IMAGE_SIZE_FACTOR * measure_stored_size(episodes))
     total, rates = 0, []
     with write_stream_atomically(path, ".hdf5") as stream, h5py.File(stream, "w") as out:
         data = out.create_group("data")

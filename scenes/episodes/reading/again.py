@@ -25,9 +25,9 @@ from .contents import REMEDY, format_finding, inspect_contents
 from .validation import Report, validate_episode
 from .windows import read_numbers
 
-SAME_MM = 0.02  # Largest difference of two solutions at training accuracy [mm].
-LIVE_MM = 0.2  # Largest difference of two solutions in played frames, at live accuracy [mm].
-MOST_BYTES = 8 * 1024**3  # Maximum memory for the examination of one file [bytes].
+TRAINING_TOLERANCE_MM = 0.02  # Largest difference of two solutions at training accuracy [mm].
+LIVE_TOLERANCE_MM = 0.2  # Largest difference of two solutions in played frames, at live accuracy [mm].
+MAX_MEMORY = 8 * 1024**3  # Maximum memory for the examination of one file [bytes].
 
 
 def solve_again(report: Report, count: int, device: str = "auto") -> Report:
@@ -40,28 +40,30 @@ def solve_again(report: Report, count: int, device: str = "auto") -> Report:
             contents = inspect_contents(file, report.path)
             missing = [name for name in ("plan", "seed", "episode", "body") if name not in contents.said]
             if missing or "tumour_fem" not in contents.shapes:
-                return _skipped(report, f"frames solved again: it states no {(*missing, 'tumour_fem')[0]}")
+                return _add_skipped(report, f"frames solved again: it states no {(*missing, 'tumour_fem')[0]}")
             place = to_body_path(report.path.parent, int(contents.said["body"]))
             if not place.is_dir():
-                return _skipped(report, "frames solved again: its body is not next to it")
-            frames, found = _answers(contents.said, open_body(place, device), contents.fem_frames, count)
+                return _add_skipped(report, "frames solved again: its body is not next to it")
+            frames, found = _solve_again(contents.said, open_body(place, device), contents.fem_frames, count)
             stored = read_numbers(file, contents, "tumour_fem")[frames]
             rest = read_numbers(file, contents, "tumour_rest")
     except InputError as error:
         words = f"frames cannot be solved again: {format_finding(error, report.path)}"
         return replace(report, problems=[*report.problems, words])
     off = 1e3 * np.linalg.norm(rest + found - stored, axis=2).max(axis=1)
-    allowed = LIVE_MM if contents.said.get("deformer") == "fem" else SAME_MM
+    allowed = LIVE_TOLERANCE_MM if contents.said.get("deformer") == "fem" else TRAINING_TOLERANCE_MM
     wrong = [f"frame {frame}, solved again: {far:.3f} mm error." for frame, far in zip(frames, off, strict=True)]
     broken = [words for words, far in zip(wrong, off, strict=True) if not far <= allowed]
     return replace(report, problems=[*report.problems, *broken], again_mm=float(off.max()), again=len(frames))
 
 
-def _skipped(report: Report, words: str) -> Report:
+def _add_skipped(report: Report, words: str) -> Report:
     return replace(report, skipped=[*report.skipped, words])
 
 
-def _answers(said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _solve_again(
+    said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the frames (k,), and the tumour's displacement (k, n, 3) [m] in each."""
     plan = plan_from(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
     seed, number = int(said["seed"]), int(said["episode"])
@@ -83,7 +85,7 @@ def validate_files(
     Files that a lost process had begun are checked again, each on its own.
     """
     left = list(dict.fromkeys(paths))
-    look_at = partial(_looked_at, look)
+    look_at = partial(_run_limited, look)
     try:
         for path, report in map_apart(look_at, tuple(left), workers):
             left.remove(path)
@@ -96,10 +98,10 @@ def validate_files(
                 yield Report(path, ["reading it crashes the process: it is damaged. Make it again, or leave it out."])
 
 
-def _looked_at(look: Callable[[Path], Report], path: Path) -> Report:
+def _run_limited(look: Callable[[Path], Report], path: Path) -> Report:
     find_device("cpu", "float32")  # keeps Warp's notes out of the report
     try:
-        with limit_memory(MOST_BYTES):
+        with limit_memory(MAX_MEMORY):
             return look(path)
     except InputError as error:
         return Report(path, [str(error)])

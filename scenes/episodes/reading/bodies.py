@@ -20,7 +20,7 @@ def find_anatomy(contents: EpisodeContents) -> Anatomy | None:
 
     It is searched in `bodies/*/anatomy.vtu` of the episode's folder, and of the folder above.
     """
-    return _known(str(contents.said.get("anatomy")), contents.path.resolve().parent)
+    return _find_anatomy(str(contents.said.get("anatomy")), contents.path.resolve().parent)
 
 
 def is_template(digest: str) -> bool:
@@ -36,7 +36,7 @@ def find_surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _known(digest: str, folder: Path) -> Anatomy | None:
+def _find_anatomy(digest: str, folder: Path) -> Anatomy | None:
     places = [path for above in (folder, folder.parent) for path in sorted(above.glob("bodies/*/anatomy.vtu"))]
     for path in (get_template_path(), *places):
         anatomy = _read(path)

@@ -13,10 +13,10 @@ import h5py
 import numpy as np
 
 from sim.errors import InputError
-from sim.runtime.file_limits import INFLATION, LARGEST_ARRAY
+from sim.runtime.file_limits import MAX_ARRAY_BYTES, MAX_INFLATION
 from sim.runtime.outside_files import read_as, to_path
 
-from .schema import ARRAYS, FORMATS, FRAMES, NEEDED, PICTURES, SOLVED, Array
+from .schema import ARRAYS, FORMATS, FRAMES, PICTURES, REQUIRED_ARRAYS, SOLVED, Array
 
 HINT = "`sulcus validate` gives details; "  # Hint in error messages.
 REMEDY = f"{HINT}make it again, or leave it out."  # Remedy in error messages.
@@ -76,12 +76,16 @@ class OpenFiles:
             self._open.popitem()[1].close()
 
 
-DEEPEST = 3  # Maximum depth of nested groups: an episode has one group, `pictures`.
-MOST_NAMES = 500  # Maximum number of names in a group.
-MOST_FRAMES = 1_000_000  # Maximum number of frames of an episode: hours.
-LARGEST_SIDE = 16384  # Largest image side [pixel].
-LONGEST_TEXT = 1 << 20  # Maximum size of a text attribute [bytes]: a plan, or the sampled values.
-FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}  # Allowed HDF5 filters.
+MAX_DEPTH = 3  # Maximum depth of nested groups: an episode has one group, `pictures`.
+MAX_NAMES = 500  # Maximum number of names in a group.
+MAX_FRAMES = 1_000_000  # Maximum number of frames of an episode: hours.
+MAX_IMAGE_SIDE = 16384  # Largest image side [pixel].
+MAX_TEXT_BYTES = 1 << 20  # Maximum size of a text attribute [bytes]: a plan, or the sampled values.
+ALLOWED_FILTERS = {
+    h5py.h5z.FILTER_DEFLATE,
+    h5py.h5z.FILTER_SHUFFLE,
+    h5py.h5z.FILTER_FLETCHER32,
+}  # Allowed HDF5 filters.
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,15 +155,15 @@ def inspect_contents(file: h5py.File, path: Path) -> EpisodeContents:
     said = read_attributes(file)
     if said.get("format") not in FORMATS:
         raise InputError(f"it is no episode, but {said.get('format', 'HDF5')!r}. Give files of `sulcus collect`.")
-    arrays = dict(_arrays(file))
-    missing = [name for name in NEEDED if name not in arrays]
+    arrays = dict(_find_arrays(file))
+    missing = [name for name in REQUIRED_ARRAYS if name not in arrays]
     missing += [name for name in ("width", "height") if not isinstance(said.get(name), int)]
     if missing:
         raise InputError(f"it has no {missing[0]!r}. {REMEDY}")
-    if not all(0 < int(said[name]) <= LARGEST_SIDE for name in ("width", "height")):
+    if not all(0 < int(said[name]) <= MAX_IMAGE_SIDE for name in ("width", "height")):
         raise InputError(f"its images have {said['width']} x {said['height']} pixels. {REMEDY}")
-    shapes = _checked(arrays)
-    return EpisodeContents(path, said, shapes, _solved(arrays, shapes))
+    shapes = _check_shapes(arrays)
+    return EpisodeContents(path, said, shapes, _read_solved_frames(arrays, shapes))
 
 
 def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
@@ -173,10 +177,10 @@ def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
     found = {}
     for name in item.attrs:
         described = item.attrs.get_id(name)
-        large = described.dtype.itemsize * int(np.prod(described.shape or (1,))) > LONGEST_TEXT
+        large = described.dtype.itemsize * int(np.prod(described.shape or (1,))) > MAX_TEXT_BYTES
         value = None if large else item.attrs[name]
-        if value is None or (isinstance(value, str | bytes) and len(value) > LONGEST_TEXT):
-            raise InputError(f"its attribute {name!r} has more than {LONGEST_TEXT} bytes. {REMEDY}")
+        if value is None or (isinstance(value, str | bytes) and len(value) > MAX_TEXT_BYTES):
+            raise InputError(f"its attribute {name!r} has more than {MAX_TEXT_BYTES} bytes. {REMEDY}")
         found[name] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     return found
 
@@ -189,9 +193,9 @@ def get_array(group: h5py.Group, name: str) -> h5py.Dataset:
     return found
 
 
-def _arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator[tuple[str, h5py.Dataset]]:
+def _find_arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator[tuple[str, h5py.Dataset]]:
     """Arrays by their names; InputError where one is not in the file itself."""
-    if len(file) > MOST_NAMES or depth > DEEPEST:
+    if len(file) > MAX_NAMES or depth > MAX_DEPTH:
         raise InputError(f"it holds more groups or names than an episode has. {REMEDY}")
     for name in file:
         full = f"{inside}{name}"
@@ -199,27 +203,27 @@ def _arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator[tupl
             raise InputError(f"{full!r} is a link and no array: episodes with links are not read. {REMEDY}")
         item = file[name]
         if isinstance(item, h5py.Group):
-            yield from _arrays(item, f"{full}/", depth + 1)
+            yield from _find_arrays(item, f"{full}/", depth + 1)
         elif isinstance(item, h5py.Dataset):
-            _demand_inside(full, item)
+            _check_stored_inside(full, item)
             yield full, item
 
 
-def _demand_inside(name: str, array: h5py.Dataset) -> None:
+def _check_stored_inside(name: str, array: h5py.Dataset) -> None:
     """Reject an array whose data are in another file, or are declared but missing."""
     if array.external or array.is_virtual:
         raise InputError(f"{name!r} lies in another file: episodes that refer to others are not read. {REMEDY}")
     pipeline = array.id.get_create_plist()
     filters = {pipeline.get_filter(number)[0] for number in range(pipeline.get_nfilters())}
-    if not filters <= FILTERS:
+    if not filters <= ALLOWED_FILTERS:
         raise InputError(f"{name!r} is packed in a way that is not read. {REMEDY}")
     size = array.size or 0
     stored = array.id.get_storage_size()
-    if size * array.dtype.itemsize > min(LARGEST_ARRAY, INFLATION * max(stored, 1 << 10)):
+    if size * array.dtype.itemsize > min(MAX_ARRAY_BYTES, MAX_INFLATION * max(stored, 1 << 10)):
         raise InputError(f"{name!r} of shape {array.shape} is larger than its file can hold. {REMEDY}")
 
 
-def _checked(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ...]]:
+def _check_shapes(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the known arrays; raise InputError if they are inconsistent."""
     sizes: dict[str, int] = {}
     if "fem_frames" not in arrays:
@@ -238,8 +242,8 @@ def _checked(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ...]]:
             raise InputError(f"{name!r} holds {array.dtype}: another kind is needed. {REMEDY}")
         _fit(name, array.shape, wanted, sizes)
         shapes[last if picture else name] = array.shape
-    if not 0 < sizes[FRAMES] <= MOST_FRAMES:
-        raise InputError(f"it has {sizes[FRAMES]} frames: 1 to {MOST_FRAMES} are read. {REMEDY}")
+    if not 0 < sizes[FRAMES] <= MAX_FRAMES:
+        raise InputError(f"it has {sizes[FRAMES]} frames: 1 to {MAX_FRAMES} are read. {REMEDY}")
     return shapes
 
 
@@ -255,7 +259,7 @@ def _fit(name: str, shape: tuple[int, ...], wanted: Array, sizes: dict[str, int]
     sizes |= {axis: length for axis, length in zip(axes, shape, strict=True) if isinstance(axis, str)}
 
 
-def _solved(arrays: Mapping[str, h5py.Dataset], shapes: Mapping[str, tuple[int, ...]]) -> np.ndarray:
+def _read_solved_frames(arrays: Mapping[str, h5py.Dataset], shapes: Mapping[str, tuple[int, ...]]) -> np.ndarray:
     count = shapes["time"][0]
     if "fem_frames" not in shapes:
         known = any(name in shapes for name in ("tumour_fem", "outcome_fem"))

@@ -106,4 +106,4 @@ ARRAYS: Mapping[str, Array] = {
 }
 """Arrays other than images, by name. Only `time` is required."""
 
-NEEDED = ("time",)  # Required arrays.
+REQUIRED_ARRAYS = ("time",)  # Required arrays.

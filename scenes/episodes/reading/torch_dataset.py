@@ -36,14 +36,14 @@ class EpisodeDataset(Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         """Return the window of a number, counted over all episodes."""
-        return {name: _tensor(value) for name, value in self.episodes[index].items()}
+        return {name: _to_tensor(value) for name, value in self.episodes[index].items()}
 
     def get_window(self, episode: int, first: int) -> dict[str, Any]:
         """Return the window of an episode that begins at a frame; InputError as `Episodes.get_window`."""
-        return {name: _tensor(value) for name, value in self.episodes.get_window(episode, first).items()}
+        return {name: _to_tensor(value) for name, value in self.episodes.get_window(episode, first).items()}
 
     at = get_window  # Former names, for one release.
 
 
-def _tensor(value: Any) -> Any:
+def _to_tensor(value: Any) -> Any:
     return torch.from_numpy(value) if isinstance(value, np.ndarray) else value

@@ -16,17 +16,17 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.outside_files import read_as
 
-from ..checksums import SUM, find_broken
+from ..checksums import CHECKSUM_ATTRIBUTE, find_broken
 from .bodies import find_anatomy, find_surface_rows
 from .contents import REMEDY, EpisodeContents, format_finding, get_array, inspect_contents, read_attributes
 from .schema import ARRAYS, LABELS, PICTURES
 from .windows import read_numbers, read_one_image
 
-LOOKED_AT = 12  # Number of frames that are rendered again, spread evenly.
-TURNED = 1e-3  # Share of a silhouette's pixels that may differ by rounding or machine.
-FEW = 4  # Number of pixels that may differ in addition.
-BLOCK = 256  # Number of rows held in memory at once.
-ROTATED = 1e-6  # Tolerance of a rotation's rows from unit length and right angles.
+CHECKED_FRAMES = 12  # Number of frames that are rendered again, spread evenly.
+MAX_DIFFERING_SHARE = 1e-3  # Share of a silhouette's pixels that may differ by rounding or machine.
+MAX_DIFFERING_PIXELS = 4  # Number of pixels that may differ in addition.
+BLOCK_ROWS = 256  # Number of rows held in memory at once.
+ROTATION_TOLERANCE = 1e-6  # Tolerance of a rotation's rows from unit length and right angles.
 # Arrays of poses.
 POSES = ("T_camera_world", "T_camera_world_right", "T_camera_world_tracked", "T_world_tool", "T_world_tool_tracked")
 
@@ -52,7 +52,7 @@ def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy |
         whole = read_numbers(file, contents, "tumour_left").all(axis=1)
     frames = np.flatnonzero(whole)
     left = [] if whole.all() else [f"silhouettes of {int((~whole).sum())} frames in which tumour is cut out"]
-    for frame in frames[np.unique(np.linspace(0, len(frames) - 1, LOOKED_AT).astype(int))] if len(frames) else ():
+    for frame in frames[np.unique(np.linspace(0, len(frames) - 1, CHECKED_FRAMES).astype(int))] if len(frames) else ():
         found = read_one_image(file, contents, "tumour_mask", int(frame)) > 0
         at = read_numbers(file, contents, "tumour_predicted", range(frame, frame + 1))[0]
         try:
@@ -60,7 +60,7 @@ def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy |
         except (ValueError, InputError) as error:
             return [f"frame {frame} has no camera that draws: {error}"], left
         off = int(np.count_nonzero(found != truth))
-        if off > FEW + TURNED * np.count_nonzero(truth):
+        if off > MAX_DIFFERING_PIXELS + MAX_DIFFERING_SHARE * np.count_nonzero(truth):
             return [
                 f"'tumour_mask' of frame {frame} differs in {off} of {np.count_nonzero(truth)} pixels from the "
                 "silhouette of 'tumour_predicted'."
@@ -124,7 +124,7 @@ def validate_episode(path: Path) -> Report:
             contents = inspect_contents(file, path)
             for check in (check_units, check_numbers, check_poses, check_images):
                 problems += check(file, contents)
-            if SUM in contents.said:
+            if CHECKSUM_ATTRIBUTE in contents.said:
                 problems += [f"{words}." for words in find_broken(file)]
             else:
                 skipped.append("checksums: it states none")
@@ -155,8 +155,8 @@ def check_numbers(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
         if name in PICTURES or ARRAYS[name].kind != "f":
             continue
         array = get_array(file, name)
-        for start in range(0, array.shape[0], BLOCK):
-            rows = array[start : start + BLOCK]
+        for start in range(0, array.shape[0], BLOCK_ROWS):
+            rows = array[start : start + BLOCK_ROWS]
             wrong = (np.isnan(rows) & ARRAYS[name].known) | (np.isinf(rows) & ARRAYS[name].limited)
             if wrong.any():
                 row = start + int(np.argwhere(wrong)[0][0])
@@ -178,7 +178,11 @@ def check_poses(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
         turns = poses[:, :3, :3]
         with np.errstate(all="ignore"):
             off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-            rigid = (off < ROTATED) & (np.linalg.det(turns) > 0.0) & (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+            rigid = (
+                (off < ROTATION_TOLERANCE)
+                & (np.linalg.det(turns) > 0.0)
+                & (poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1)
+            )
         if (known & ~rigid).any():
             yield f"'{name}' of row {int(np.argmax(known & ~rigid))} is no rotation and translation."
     for name in ("K", "K_of_frame"):
@@ -220,8 +224,8 @@ def count_solved_frames(file: h5py.File, contents: EpisodeContents) -> tuple[int
     if played or not solved or not {"tumour_fem", "tumour_predicted"} <= set(contents.shapes):
         return solved, unsolved, None
     truth, total, worst = get_array(file, "tumour_fem"), 0.0, 0.0
-    for start in range(0, solved, BLOCK):
-        frames = contents.fem_frames[start : start + BLOCK]
-        away = np.linalg.norm(get_array(file, "tumour_predicted")[frames] - truth[start : start + BLOCK], axis=2)
+    for start in range(0, solved, BLOCK_ROWS):
+        frames = contents.fem_frames[start : start + BLOCK_ROWS]
+        away = np.linalg.norm(get_array(file, "tumour_predicted")[frames] - truth[start : start + BLOCK_ROWS], axis=2)
         total, worst = total + float(away.mean()) * len(frames), max(worst, float(away.max(initial=0.0)))
     return solved, unsolved, (1e3 * total / solved, 1e3 * worst)

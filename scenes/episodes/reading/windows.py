@@ -41,7 +41,7 @@ def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: ran
     with read_as(contents.path, "an episode", REMEDY):
         array = get_array(file, name)
         if ARRAYS[name].axes[0] == SOLVED and name != "fem_frames":
-            return _solved(array, contents, frames)
+            return _read_solved_rows(array, contents, frames)
         return _read(array, frames) if ARRAYS[name].framed else array[:]
 
 
@@ -85,7 +85,7 @@ def _read(array: h5py.Dataset, frames: range) -> Rows:
     return [text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text) for text in found]
 
 
-def _solved(array: h5py.Dataset, contents: EpisodeContents, frames: range) -> Rows:
+def _read_solved_rows(array: h5py.Dataset, contents: EpisodeContents, frames: range) -> Rows:
     """Rows of an array that has one for each frame that was solved."""
     if len(contents.fem_frames) == contents.frames:
         return _read(array, frames)
@@ -233,7 +233,7 @@ class Episodes(Sequence[dict[str, Any]]):
         order = np.arange(len(self)) if seed is None else np.random.default_rng(seed).permutation(len(self))
         for start in range(0, len(order), size):
             windows = [self[int(index)] for index in order[start : start + size]]
-            yield {name: _stacked(name, [one[name] for one in windows]) for name in windows[0]}
+            yield {name: _stack_rows(name, [one[name] for one in windows]) for name in windows[0]}
 
     at, batches = get_window, iterate_batches  # Former names, for one release.
 
@@ -269,7 +269,7 @@ def read_episodes(
     return Episodes(contents, tuple(keys), window, step, stride, OpenFiles(most_open))
 
 
-def _stacked(name: str, rows: list[Any]) -> Rows | list[Any]:
+def _stack_rows(name: str, rows: list[Any]) -> Rows | list[Any]:
     if isinstance(rows[0], list):
         return rows
     try:

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 # Fraction of the gap below which the barrier is a parabola.
-RELAXED = wp.constant(0.01)
+PARABOLA_FRACTION = wp.constant(0.01)
 
 
 @wp.func
@@ -21,7 +21,7 @@ def barrier(d: Any, g: Any):
     zero = type(d)(0.0)
     if d >= g:
         return zero
-    low = type(d)(RELAXED) * g
+    low = type(d)(PARABOLA_FRACTION) * g
     e = wp.max(d, low)
     value = -(e - g) * (e - g) * wp.log(e / g)
     if d < low:
@@ -34,7 +34,7 @@ def barrier_slope(d: Any, g: Any):
     """Return the first derivative b'(d) / k [m], never positive: contact is purely repulsive."""
     if d >= g:
         return type(d)(0.0)
-    low = type(d)(RELAXED) * g
+    low = type(d)(PARABOLA_FRACTION) * g
     e = wp.max(d, low)
     slope = -(type(d)(2.0) * (e - g) * wp.log(e / g) + (e - g) * (e - g) / e)
     if d < low:
@@ -47,5 +47,5 @@ def barrier_curvature(d: Any, g: Any):
     """Return the second derivative b''(d) / k, never negative."""
     if d >= g:
         return type(d)(0.0)
-    e = wp.max(d, type(d)(RELAXED) * g)
+    e = wp.max(d, type(d)(PARABOLA_FRACTION) * g)
     return -(type(d)(2.0) * wp.log(e / g) + type(d)(4.0) * (e - g) / e - (e - g) * (e - g) / (e * e))

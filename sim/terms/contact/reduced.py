@@ -42,7 +42,7 @@ class Reduced:
     def __init__(self, term: DenseTerm, count: int, nodes: int, device: Device):
         self._term, self._count, self._nodes, self._device = term, count, nodes, device
         # Allocating an array takes as long as a launch.
-        self._arrays = lru_cache(2)(self._made)
+        self._arrays = lru_cache(2)(self._allocate_buffers)
 
     @property
     def functions(self) -> BlockFunctions:
@@ -69,7 +69,7 @@ class Reduced:
         self._term.add_matrix(at, self._device.upload(definite.astype(np.int32), wp.int32), numbers, out)
         return view(out)
 
-    def _made(self, columns: int) -> tuple[wp.array, wp.array, wp.array]:
+    def _allocate_buffers(self, columns: int) -> tuple[wp.array, wp.array, wp.array]:
         """Allocate displacements and forces (3n, b), and node indices (n, b)."""
         at, force = (self._device.allocate(3 * self._count, columns) for _ in range(2))
         return at, force, wp.zeros((self._count, columns), dtype=wp.int32, device=self._device.name)

@@ -19,11 +19,11 @@ from ...discretisation.space import Discretisation
 from ...discretisation.term import Cases
 from ...effects import SkullContact
 from ...runtime.device import Device, forward_kernel
-from .barrier import RELAXED, barrier, barrier_curvature, barrier_slope
-from .skull_surface import BONE, Bone, BoneSettings, build_bone
+from .barrier import PARABOLA_FRACTION, barrier, barrier_curvature, barrier_slope
+from .skull_surface import BONE_SETTINGS, Bone, BoneSettings, build_bone
 
 # Maximum displacement per step, as a fraction of a node's distance to the bone.
-ROOM_KEPT = wp.constant(0.9)
+MAX_STEP_FRACTION = wp.constant(0.9)
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
 @wp.func
 def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
     """Return the largest t <= 1 with distance - t falls - t^2 bends / 2 >= (1 - ROOM_KEPT) distance; bends >= 0."""
-    lost = wp.float64(ROOM_KEPT) * distance
+    lost = wp.float64(MAX_STEP_FRACTION) * distance
     root = falls + wp.sqrt(falls * falls + wp.float64(2.0) * lost * bends)
     if root > wp.float64(2.0) * lost:
         return wp.float64(2.0) * lost / root
@@ -227,7 +227,7 @@ def build_kernels(device: Device) -> SkullKernels:
         x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
         p = place(wall, s, x)
         d = distance(wall, p)
-        if d > wp.float64(RELAXED) * wall.times * wall.felt[s]:
+        if d > wp.float64(PARABOLA_FRACTION) * wall.times * wall.felt[s]:
             bends = share(p)[0] * wp.dot(along, wall.bend[s] * along)
             wp.atomic_min(out, c, scalar(fraction(d, wp.dot(slope(wall, s, x, p), along), bends)))
 
@@ -349,7 +349,7 @@ def build_skull(
     space: Discretisation,
     shear: float,
     device: Device,
-    bone: BoneSettings = BONE,
+    bone: BoneSettings = BONE_SETTINGS,
     settings: SkullBarrier = SkullBarrier(),
 ) -> Skull:
     """Return the term of `SkullContact` on tissue with a shear modulus [Pa]."""

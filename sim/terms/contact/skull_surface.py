@@ -20,10 +20,10 @@ from ...geometry.surface import (
 )
 
 # Distance [m] inside the craniotomy assigned to nodes under bone, so that these stay covered wherever they move.
-UNDER_BONE = -1.0
+COVERED_DISTANCE = -1.0
 # Area fractions of a quadratic triangle's nodes: all positive, so that every node has an area.
-CORNER = 1.0 / 12.0  # each corner
-MIDDLE = 1.0 / 4.0  # each midpoint
+CORNER_SHARE = 1.0 / 12.0  # each corner
+MIDPOINT_SHARE = 1.0 / 4.0  # each midpoint
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class BoneSettings:
     far: float = 2.5
 
 
-BONE = BoneSettings()
+BONE_SETTINGS = BoneSettings()
 """Default bone settings."""
 
 
@@ -90,7 +90,7 @@ class Bone:
     edge: float
 
 
-def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneSettings = BONE) -> Bone:
+def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneSettings = BONE_SETTINGS) -> Bone:
     """Return the bone over covered nodes and over those of the craniotomy near its edge; fixed nodes have none.
 
     Raises
@@ -103,7 +103,7 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
     slides = (normal != 0.0).any(axis=1) & ~held
     if not slides.any():
         raise InputError("SkullContact finds no node that can touch: all slide normals are zero, or their nodes fixed.")
-    inside, way = np.full(space.count, UNDER_BONE), np.zeros_like(normal)
+    inside, way = np.full(space.count, COVERED_DISTANCE), np.zeros_like(normal)
     felt = np.full(space.count, min(settings.felt, gap))
     edge, rim = 0.0, find_opening_edge(anatomy)
     if len(rim):
@@ -125,20 +125,20 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
         inside=inside[nodes],
         way=way[nodes],
         felt=felt[nodes],
-        area=_areas(space)[nodes],
+        area=_compute_nodal_areas(space)[nodes],
         gap=gap,
         edge=edge,
     )
 
 
-def _areas(space: Discretisation) -> np.ndarray:
+def _compute_nodal_areas(space: Discretisation) -> np.ndarray:
     """Return the tributary area (N,) [m^2] of each node on the surface."""
     area = compute_areas(space.nodes[space.surface[:, :3]])
-    shares = np.full(3, 1.0 / 3.0) if space.surface.shape[1] == 3 else np.repeat([CORNER, MIDDLE], 3)
+    shares = np.full(3, 1.0 / 3.0) if space.surface.shape[1] == 3 else np.repeat([CORNER_SHARE, MIDPOINT_SHARE], 3)
     return np.bincount(space.surface.ravel(), (area[:, None] * shares).ravel(), space.count)
 
 
-def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE) -> np.ndarray:
+def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE_SETTINGS) -> np.ndarray:
     """Estimate derivatives (k, 3, 3) [1/m], symmetric, of unit normals (k, 3) along a wall at points (k, 3) [m].
 
     Least-squares fit of n_j - n_i = H (x_j - x_i) in the tangent plane, to the nearest points with similar
@@ -176,7 +176,7 @@ def compute_edge_radius(nodes: np.ndarray, rim: np.ndarray) -> float:
 
 
 def measure_inside_opening(
-    anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float, far: float = BONE.far
+    anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float, far: float = BONE_SETTINGS.far
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return distances (n,) [m] of surface points (n, 3) [m] inside the craniotomy, and inward directions (n, 3).
 

@@ -7,7 +7,7 @@ import warp as wp
 from ...discretisation.term import BlockFunctions
 from ...runtime.blocks import get_block_shape, largest, wait
 from ...runtime.device import Device
-from .tool_functions import BULGE, ROOM_KEPT, Scale, Surface, Tools
+from .tool_functions import BULGE_BOUND, MAX_STEP_FRACTION, Scale, Surface, Tools
 from .tool_functions import build_functions as at_triangles
 
 
@@ -36,7 +36,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
     down, across = get_block_shape(device)
     threads, one = down * across, at_triangles(device, size)
 
-    bulge, kept = wp.constant(wp.float64(BULGE)), wp.constant(wp.float64(ROOM_KEPT))
+    bulge, kept = wp.constant(wp.float64(BULGE_BOUND)), wp.constant(wp.float64(MAX_STEP_FRACTION))
     nodes_of, motion_of, seen, spread = one.nodes_of, one.motion_of, one.seen, one.spread
     weight_of, reach_of, is_near, force_in_row = one.weight_of, one.reach_of, one.is_near, one.force_in_row
     add_matrix_in_row, share_in_row = one.add_matrix_in_row, one.share_in_row

@@ -22,10 +22,10 @@ from .reduced import Reduced
 from .tool_blocks import ContactStage, NearPairs
 from .tool_functions import Scale, Surface, Tools
 from .tool_kernels import build_kernels
-from .tool_path import TOUCH, ContactSampling, ToolPath, approach
+from .tool_path import CONTACT_SAMPLING, ContactSampling, ToolPath, approach
 
 # Distance from a point in a subdivided triangle to the nearest sample point, at most [edges of the subdivision].
-FARTHEST = 2.0 / 3.0
+MAX_SAMPLE_DISTANCE = 2.0 / 3.0
 
 
 class ToolContactTerm:
@@ -69,7 +69,7 @@ class ToolContactTerm:
         gap: float,
         shear: float,
         device: Device,
-        touch: ContactSampling = TOUCH,
+        touch: ContactSampling = CONTACT_SAMPLING,
     ):
         self.name = name
         cores = [core for tool in tools for core in list_cores(tool)]
@@ -79,9 +79,9 @@ class ToolContactTerm:
         self._triangles, self._closed = triangles, device.upload(whole, wp.int32)
         self._shapes, self._way, self._device, self._touch = tools, way, device, touch
         self._kernels = build_kernels(device, triangles.shape[1])
-        fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.sag * gap) / FARTHEST
-        self._surface, self._rows = _sampled(nodes, triangles, fine / touch.stretch, device)
-        self._bone, _ = _sampled(nodes, bone, fine, device)
+        fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.sag * gap) / MAX_SAMPLE_DISTANCE
+        self._surface, self._rows = _build_surface(nodes, triangles, fine / touch.stretch, device)
+        self._bone, _ = _build_surface(nodes, bone, fine, device)
         self._cores = [
             device.upload(np.array([core.centre for core in cores]), wp.vec3d),
             device.upload(np.array([core.half for core in cores]), wp.vec3d),
@@ -91,7 +91,7 @@ class ToolContactTerm:
         self.widen(1.0)
         self._pose: np.ndarray | None = None
         # a step needs the same poses several times
-        self._stood = lru_cache(4)(self._brought)
+        self._stood = lru_cache(4)(self._build_tools)
         self._single: list[Tools] = []
 
     def compute_stride(self, cases: Cases, u: wp.array) -> np.ndarray:
@@ -100,7 +100,7 @@ class ToolContactTerm:
         if way is None:
             return np.ones(len(cases.loads))
         clear = wp.full((len(self._owner), u.shape[1]), np.inf, dtype=wp.float64, device=self._device.name)
-        inputs = [u, self._surface, self._standing(way.interpolate(cases.gone))]
+        inputs = [u, self._surface, self._get_tools(way.interpolate(cases.gone))]
         self._device.launch(self._kernels.clearance, (len(self._triangles), u.shape[1]), inputs, [clear])
         of_tools = np.minimum.reduceat(clear.numpy(), self._first, axis=0).T + self._sag
         return way.compute_stride(self._shapes, of_tools.clip(0.0), self._touch)
@@ -140,12 +140,12 @@ class ToolContactTerm:
     def begin(self, cases: Cases) -> None:
         """Place the tools at their fraction of the path, and reset the gap."""
         way = self._way(cases)
-        self._stand(None if way is None else way.interpolate(cases.gone))
+        self._set_pose(None if way is None else way.interpolate(cases.gone))
         self.widen(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep the tools of these load cases only."""
-        self._stand(None if self._pose is None else self._pose[columns])
+        self._set_pose(None if self._pose is None else self._pose[columns])
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """Add the barrier energies."""
@@ -207,7 +207,7 @@ class ToolContactTerm:
         if self._pose is None:
             return None
         term, reduced = self._alone
-        term._stand(self._pose[columns])
+        term._set_pose(self._pose[columns])
         term._scale = self._scale
         return reduced
 
@@ -231,25 +231,25 @@ class ToolContactTerm:
         """Return the poses (b, tools, 4, 4), at which the next path begins."""
         return self._pose
 
-    def _stand(self, pose: np.ndarray | None) -> None:
+    def _set_pose(self, pose: np.ndarray | None) -> None:
         self._pose = pose
         if pose is not None:
-            self._tools = self._standing(pose)
+            self._tools = self._get_tools(pose)
         if pose is not None and len(pose) == 1:
-            self._tools = self._placed(self._tools)
+            self._tools = self._copy_tools(self._tools)
 
-    def _placed(self, tools: Tools) -> Tools:
+    def _copy_tools(self, tools: Tools) -> Tools:
         """Copy the tools of a single load case to fixed arrays, which a captured graph reads."""
         if not self._single:
-            self._single.append(self._brought(np.ascontiguousarray(self._pose, np.float64).tobytes()))
+            self._single.append(self._build_tools(np.ascontiguousarray(self._pose, np.float64).tobytes()))
         for mine, its in ((self._single[0].rotation, tools.rotation), (self._single[0].origin, tools.origin)):
             wp.copy(mine, its)
         return self._single[0]
 
-    def _standing(self, pose: np.ndarray) -> Tools:
+    def _get_tools(self, pose: np.ndarray) -> Tools:
         return self._stood(np.ascontiguousarray(pose, np.float64).tobytes())
 
-    def _brought(self, pose: bytes) -> Tools:
+    def _build_tools(self, pose: bytes) -> Tools:
         """Return the tools at poses (b, tools, 4, 4) in double precision."""
         of_cores = np.frombuffer(pose).reshape(-1, len(self._shapes), 4, 4)[:, self._owner].swapaxes(0, 1)
         out = Tools()
@@ -264,7 +264,7 @@ class ToolContactTerm:
             raise ValueError("no tool is there")
         out, near, name = ContactStage(), NearPairs(), self._device.name
         every = len(columns) == len(self._pose)
-        out.tools = self._tools if every else self._standing(self._pose[columns])
+        out.tools = self._tools if every else self._get_tools(self._pose[columns])
         out.surface, out.scale = self._surface, self._scale
         out.rows = self._rows
         near.pairs = wp.empty((len(columns), len(self._triangles) * len(self._owner)), dtype=wp.int32, device=name)
@@ -284,7 +284,7 @@ def build_tool_contact(
     space: Discretisation,
     shear: float,
     device: Device,
-    touch: ContactSampling = TOUCH,
+    touch: ContactSampling = CONTACT_SAMPLING,
 ) -> ToolContactTerm:
     """Return the contact term of an effect on tissue with a shear modulus [Pa]."""
     contact = isinstance(effect, ToolContact)
@@ -292,7 +292,7 @@ def build_tool_contact(
     triangles = space.surface[anatomy.bare]
     if not len(triangles):
         raise InputError(f"{type(effect).__name__} finds no surface to touch: all of it is fixed or under the skull.")
-    touchable, reach = np.unique(triangles), _reach(space.nodes, triangles)
+    touchable, reach = np.unique(triangles), _compute_node_reach(space.nodes, triangles)
     points, normals = space.nodes[touchable], compute_vertex_normals(space.nodes, triangles[:, :3])[touchable]
 
     @lru_cache(touch.kept)
@@ -314,14 +314,14 @@ def build_tool_contact(
                 raise InputError(
                     f"Touching has poses of {cause.pose.shape[1]} tools, but ToolContact has {len(tools)}."
                 )
-            return ToolPath(_begun(last, cases.anew, clear, cause.pose), cause.pose)
+            return ToolPath(_find_path_starts(last, cases.anew, clear, cause.pose), cause.pose)
         cause = cases.loads.get(Retracted)
         if cause is None:
             return None
         laid = cause.pose[:, None]
         held = laid.copy()
         held[:, 0, :3, 3] += cause.displacement
-        return ToolPath(_begun(last, cases.anew, lambda pose: pose, laid), held)
+        return ToolPath(_find_path_starts(last, cases.anew, lambda pose: pose, laid), held)
 
     whole = space.surface[:, :3]
     solid = np.logical_or(anatomy.held.all(axis=1), anatomy.slide_normal.any(axis=1))
@@ -332,7 +332,7 @@ def build_tool_contact(
     )  # fmt: skip
 
 
-def _sampled(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Device) -> tuple[Surface, int]:
+def _build_surface(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Device) -> tuple[Surface, int]:
     """Return surface triangles with sample points at most `fine` [m] apart, and the maximum rows per triangle."""
     corners = nodes[triangles[:, :3]]
     pieces = np.ceil(compute_edge_lengths(corners).max(axis=1) / fine).astype(np.int32)
@@ -344,7 +344,7 @@ def _sampled(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Devi
     return out, int(pieces.max(initial=0))
 
 
-def _begun(
+def _find_path_starts(
     last: np.ndarray | None, anew: np.ndarray | None, clear: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
 ) -> np.ndarray:
     """Return path starts for poses (B, tools, 4, 4): the last poses; contact-free ones without history or if `anew`."""
@@ -354,7 +354,7 @@ def _begun(
     return begin
 
 
-def _reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _compute_node_reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return the maximum distance (n,) [m] from each surface node, ascending, to the points nearest to it."""
     numbers, table = np.unique(triangles, return_inverse=True)
     out = np.zeros(len(numbers))

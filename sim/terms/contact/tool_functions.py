@@ -10,12 +10,12 @@ from ...runtime.device import Device
 from .barrier import barrier, barrier_curvature, barrier_slope
 
 # Maximum motion of a point per step, as a fraction of its distance from the tool's core.
-ROOM_KEPT = 0.8
+MAX_STEP_FRACTION = 0.8
 # Bound of a curved triangle's extent relative to its nodes' distance from the centre.
-BULGE = 1.5
+BULGE_BOUND = 1.5
 # Distance between neighbouring points of a row, at most, times pieces / largest node distance from the corners'
 # centroid: the sum of the shape functions' slopes.
-STEEP = {3: 4.0 / 3.0, 6: 28.0 / 3.0}
+SLOPE_SUMS = {3: 4.0 / 3.0, 6: 28.0 / 3.0}
 
 
 @wp.struct
@@ -131,8 +131,8 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
     shares = wp.types.vector(length=size, dtype=wp.float64)
     forces = wp.types.matrix(shape=(size, 3), dtype=wp.float64)
     blocks = wp.types.matrix(shape=(3 * size * (size + 1) // 2, 3), dtype=wp.float64)
-    bulge, kept = wp.constant(wp.float64(BULGE if size == 6 else 1.0)), wp.constant(wp.float64(ROOM_KEPT))
-    steep = wp.constant(wp.float64(STEEP[size]))
+    bulge, kept = wp.constant(wp.float64(BULGE_BOUND if size == 6 else 1.0)), wp.constant(wp.float64(MAX_STEP_FRACTION))
+    steep = wp.constant(wp.float64(SLOPE_SUMS[size]))
 
     @wp.func
     def shape_of(i: int, j: int, n: int) -> shares:

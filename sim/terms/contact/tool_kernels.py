@@ -8,8 +8,8 @@ import warp as wp
 from ...runtime.device import Device, forward_kernel
 from .barrier import barrier_slope
 from .tool_functions import (
-    BULGE,
-    ROOM_KEPT,
+    BULGE_BOUND,
+    MAX_STEP_FRACTION,
     Scale,
     Surface,
     Tools,
@@ -39,8 +39,8 @@ class ToolKernels:
 def build_kernels(device: Device, size: int) -> ToolKernels:
     """Build kernels for surface triangles of `size` nodes, 3 or 6. Each launches over (triangle, column)."""
     scalar, mat = device.scalar, device.matrix
-    here, kept = build_functions(device, size), wp.constant(wp.float64(ROOM_KEPT))
-    stretch = wp.constant(wp.float64(1.0 if size == 6 else BULGE))
+    here, kept = build_functions(device, size), wp.constant(wp.float64(MAX_STEP_FRACTION))
+    stretch = wp.constant(wp.float64(1.0 if size == 6 else BULGE_BOUND))
     forces, nodes_of, motion_of, seen, spread = here.forces, here.nodes_of, here.motion_of, here.seen, here.spread
     weight_of, is_near, least_distance, reach_of, pace_of, shape_of = (
         here.weight_of,

@@ -38,7 +38,7 @@ class ContactSampling:
     kept: int = 4096
 
 
-TOUCH = ContactSampling()
+CONTACT_SAMPLING = ContactSampling()
 """Default sampling of tool contact."""
 
 
@@ -71,7 +71,9 @@ class ToolPath:
         extent = np.array([compute_extent(tool) for tool in tools])
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
-    def compute_stride(self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = TOUCH) -> np.ndarray:
+    def compute_stride(
+        self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = CONTACT_SAMPLING
+    ) -> np.ndarray:
         """Return the path fraction (B,), at most 1, that tools with clearance `clear` (B, tools) [m] may move."""
         most = clear + touch.stride * np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
@@ -93,19 +95,19 @@ def approach(
     each vertex. The approach through air takes `march` steps at most.
     """
     cores, R = list_cores(tool), pose[:3, :3]
-    along_shaft = _cleared(tool, pose, R, cores, points, reach, march)
+    along_shaft = _find_clear_pose(tool, pose, R, cores, points, reach, march)
     touched = compute_distances(tool, pose, points) < reach
     outward = normals[touched].sum(axis=0)
     if not outward.any():
         return along_shaft
     T = Rotation.align_vectors(outward[None], np.array([[0.0, 0.0, 1.0]]))[0].as_matrix()
     balls = [Core(T.T @ R @ core.centre, np.zeros(3), core.radius + float(np.linalg.norm(core.half))) for core in cores]
-    along_normal = _cleared(tool, pose, T, balls, points, reach, march)
+    along_normal = _find_clear_pose(tool, pose, T, balls, points, reach, march)
     shaft, normal = (np.linalg.norm(start[:3, 3] - pose[:3, 3]) for start in (along_shaft, along_normal))
     return along_normal if 2.0 * normal < shaft else along_shaft
 
 
-def _cleared(
+def _find_clear_pose(
     tool: Tool,
     pose: np.ndarray,
     R: np.ndarray,
@@ -116,7 +118,7 @@ def _cleared(
 ) -> np.ndarray:
     """Return the pose as `approach`, along the third column of R (3, 3); `cores` in the axes of R contain the tool."""
     out, local = pose.copy(), (points - pose[:3, 3]) @ R
-    back, room = max(_above(core, local, reach) for core in cores), 0.0
+    back, room = max(_compute_rise(core, local, reach) for core in cores), 0.0
     for _ in range(march):
         back = max(0.0, back - room)
         out[:3, 3] = pose[:3, 3] + back * R[:, 2]
@@ -124,7 +126,7 @@ def _cleared(
     return out
 
 
-def _above(core: Core, local: np.ndarray, reach: np.ndarray) -> float:
+def _compute_rise(core: Core, local: np.ndarray, reach: np.ndarray) -> float:
     """Return the distance [m] by which a core must rise along its axis z to be above any surface on its way down."""
     aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
     highest = (local[:, 2] + reach)[aside <= core.radius + reach].max(initial=-np.inf)

@@ -123,14 +123,14 @@ def check_tissue(
         With every failed check and its error.
     """
     with np.errstate(invalid="ignore"):  # infinity - infinity is NaN, which fails the check
-        found = tuple(_findings(tissue, small_strain, strains))
+        found = tuple(_iterate_findings(tissue, small_strain, strains))
     broken = [str(finding) for finding in found if not finding.kept]
     if broken:
         raise InputError(f"the law {tissue.law} does not hold: {'; '.join(broken)}.")
     return found
 
 
-def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Iterator[Finding]:
+def _iterate_findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Iterator[Finding]:
     count, step = strains.count, strains.short_step
     mu, lam = tissue.lame
     if not (mu > 0.0 and 3.0 * lam + 2.0 * mu > 0.0 and np.isfinite([mu, lam]).all()):
@@ -143,7 +143,7 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
             f"the law {tissue.law} has {len(given)} coefficients, but {len(again)} at other Lamé parameters: "
             "must be equal."
         )
-    yield Finding("coefficients_at its own Lamé constants are its coefficients", _off(again, given), 1e-12)
+    yield Finding("coefficients_at its own Lamé constants are its coefficients", _compute_error(again, given), 1e-12)
     double, random = build_evaluator(tissue, "float64"), np.random.default_rng(3)
     H = random.normal(0.0, strains.large, (3 * count, 3, 3))
     J = np.linalg.det(np.eye(3) + H)
@@ -153,38 +153,42 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
     here = double(H, D)
 
     still = double(np.zeros((1, 3, 3)))
-    yield Finding("no energy and no stress at rest", max(_largest(still.stress), abs(still.energy[0])) / mu, 1e-9)
+    yield Finding("no energy and no stress at rest", max(_find_largest(still.stress), abs(still.energy[0])) / mu, 1e-9)
     small = random.normal(0.0, strains.small, (count, 3, 3))
     for carries in ("whole", "shape", "volume"):
         share = get_portion(tissue, carries)
         stress = double.replace(small, None, tissue.coefficients_at(*share)).stress
         name = "" if carries == "whole" else f" where elements carry {carries} alone"
-        yield Finding(f"Hooke's law at small strain{name}", _off(stress, compute_hooke_stress(small, *share)), 1e-4)
+        yield Finding(
+            f"Hooke's law at small strain{name}", _compute_error(stress, compute_hooke_stress(small, *share)), 1e-4
+        )
     parts = [
         double.replace(H, D, tissue.coefficients_at(*get_portion(tissue, carries))) for carries in ("shape", "volume")
     ]
     for name in ("energy", "stress", "change"):
         shape, volume = (getattr(part, name) for part in parts)
-        yield Finding(f"shape and volume make the whole {name}", _off(shape + volume, getattr(here, name)), 1e-8)
+        yield Finding(
+            f"shape and volume make the whole {name}", _compute_error(shape + volume, getattr(here, name)), 1e-8
+        )
 
     numeric = np.zeros_like(H)
     for i, j in np.ndindex(3, 3):
         one = np.zeros((3, 3))
         one[i, j] = strains.step
         numeric[:, i, j] = (double(H + one).energy - double(H - one).energy) / (2.0 * strains.step)
-    yield Finding("stress is the energy's derivative", _off(numeric, here.stress), 1e-6)
+    yield Finding("stress is the energy's derivative", _compute_error(numeric, here.stress), 1e-6)
     numeric = (double(H + step * D).stress - double(H - step * D).stress) / (2.0 * step)
-    yield Finding("stress_change is the stress's derivative", _off(numeric, here.change), 1e-6)
+    yield Finding("stress_change is the stress's derivative", _compute_error(numeric, here.change), 1e-6)
     one, other = (np.einsum("nij,nij->n", change, way) for change, way in ((here.change, E), (double(H, E).change, D)))
-    yield Finding("stress_change is symmetric", _off(other, one), 1e-8)
+    yield Finding("stress_change is symmetric", _compute_error(other, one), 1e-8)
 
     Q, _ = np.linalg.qr(random.normal(size=H.shape))
     Q *= np.linalg.det(Q)[:, None, None]
     turned = double(Q @ H @ Q.transpose(0, 2, 1)).energy
-    yield Finding("isotropic: the axes do not matter", _off(turned, here.energy), 1e-8)
+    yield Finding("isotropic: the axes do not matter", _compute_error(turned, here.energy), 1e-8)
     if not small_strain:
         turned = double(Q @ (np.eye(3) + H) - np.eye(3)).stress
-        yield Finding("stress turns with the tissue", _off(turned, Q @ here.stress), 1e-8)
+        yield Finding("stress turns with the tissue", _compute_error(turned, Q @ here.stress), 1e-8)
     if positive:
         inverted = double(np.diag([-2.0, 0.0, 0.0])[None]).energy[0]
         yield Finding(
@@ -192,7 +196,7 @@ def _findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Itera
         )
     single = build_evaluator(tissue, "float32")
     strained = random.normal(0.0, strains.single, (count, 3, 3)).astype(np.float32).astype(np.float64)
-    yield Finding("stress in single precision", _off(single(strained).stress, double(strained).stress), 1e-3)
+    yield Finding("stress in single precision", _compute_error(single(strained).stress, double(strained).stress), 1e-3)
 
 
 def compute_hooke_stress(H: np.ndarray, mu: float, lam: float) -> np.ndarray:
@@ -201,10 +205,10 @@ def compute_hooke_stress(H: np.ndarray, mu: float, lam: float) -> np.ndarray:
     return mu * (H + H.transpose(0, 2, 1)) + lam * trace * np.eye(3)
 
 
-def _largest(values: np.ndarray) -> float:
+def _find_largest(values: np.ndarray) -> float:
     return float(np.abs(values).max())
 
 
-def _off(found: np.ndarray, wanted: np.ndarray) -> float:
+def _compute_error(found: np.ndarray, wanted: np.ndarray) -> float:
     """Return the largest difference, relative to the largest reference value."""
-    return _largest(found - wanted) / max(_largest(wanted), np.finfo(float).tiny)
+    return _find_largest(found - wanted) / max(_find_largest(wanted), np.finfo(float).tiny)
