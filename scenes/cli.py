@@ -117,7 +117,7 @@ def run_command(args: argparse.Namespace, package: str) -> int:
 
 
 def limit_threads() -> None:
-    """Limit libraries that are not loaded yet to `MOST_THREADS`, here and in child processes, unless already set."""
+    """Limit libraries that are not loaded yet to `MAX_THREADS`, here and in child processes, unless already set."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, str(min(MAX_THREADS, os.cpu_count() or 1)))
 

@@ -134,7 +134,7 @@ def compile_problem(
 
                 barriers.append(build_skull(effect, anatomy, space, _compute_min_shear(effects), device))
             case Pulsation() | ToolDisplacement():
-                pass  # Elasticity includes the swelling; tool displacement is a constraint, see `_impose`.
+                pass  # Elasticity includes the swelling; tool displacement is a constraint, see `_build_imposed`.
             case Resection():
                 raise InputError("Resection changes the body: make its solver with `sim.build_fem`.")
             case OwnEffect():

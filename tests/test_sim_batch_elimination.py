@@ -28,7 +28,7 @@ from sim.terms.schur_stiffness import Exterior
 from surrogate.data.tool_loads import draw
 
 LAW = "stable-neo-hookean"
-STEP = "_corrected"
+STEP = "_run_cycle"
 """Method that takes a cycle's correction."""
 
 

@@ -279,7 +279,7 @@ def split_row_bands(
 ) -> list[tuple[slice, Camera]]:
     """Split the rows, from top to bottom, into bands, each with the camera at its time, cropped to these rows.
 
-    There are as many as needed for points (n, 3) [m] to move by at most `STEP` pixels in each.
+    There are as many as needed for points (n, 3) [m] to move by at most `MAX_BAND_MOTION` pixels in each.
     """
     middle = camera_at(0.0)
     moments = readout * np.linspace(-0.5, 0.5, MOTION_SAMPLES)

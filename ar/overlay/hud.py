@@ -76,7 +76,7 @@ class Below:
     lines
         (H, W) uint8: above 0 at lines without text, which `needed` text may cover.
     thin
-        (H, W) bool: lines that text covers rather than being farther than `NEAR` from its desired place.
+        (H, W) bool: lines that text covers rather than being farther than `MAX_TEXT_SHIFT` from its desired place.
     """
 
     sights: np.ndarray | None = None

@@ -127,7 +127,10 @@ def place_sheet(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, sights
 
 
 def paste(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, at: tuple[int, int]) -> None:
-    """Paste a sheet (h, w, 4) uint8 over an image (H, W, 3) uint8 at a column and a row; its place becomes `SHEET`."""
+    """Paste a sheet (h, w, 4) uint8 over an image (H, W, 3) uint8 at a column and a row.
+
+    Its place becomes `SHEET_VALUE`.
+    """
     column, row = at
     box = np.s_[row : row + sheet.shape[0], column : column + sheet.shape[1]]
     left = 1.0 - sheet[..., 3:] / np.float32(OPAQUE)

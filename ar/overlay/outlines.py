@@ -37,7 +37,10 @@ def join_boxes(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> 
 
 
 def find_pixel_box(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
-    """Return rows and columns that hold the pixels of points (V, 3) and `SURROUND` more; None if outside the image."""
+    """Return rows and columns that hold the pixels of points (V, 3) and `SOFT_EDGE_WIDTH` more.
+
+    None if outside the image.
+    """
     pixels, depth = camera.project(points)
     if not (depth > 0.0).all():
         return slice(0, camera.height), slice(0, camera.width)
@@ -229,7 +232,9 @@ def find_text(
 
 
 def compute_inked_share(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray) -> float:
-    """Compute the share of a silhouette's outline that has a colour; NaN for an outline of fewer than `FEW` pixels.
+    """Compute the share of a silhouette's outline that has a colour.
+
+    NaN for an outline of fewer than `MIN_PIXELS` pixels.
 
     Parameters as in `measure_outline_gap`: pixels near occluders and near the border are left out.
     """
@@ -244,7 +249,7 @@ def compute_inked_share(colour: np.ndarray, ink: Sequence[float], mask: np.ndarr
 def compute_changed_share(before: np.ndarray, after: np.ndarray, where: np.ndarray) -> float:
     """Compute the share of pixels that differ between images (H, W, 3) uint8, in a mask (H, W) bool without its edge.
 
-    NaN for fewer than `FEW` pixels.
+    NaN for fewer than `MIN_PIXELS` pixels.
     """
     inner = cv2.erode(where.astype(np.uint8), np.ones((2 * LINE_DISTANCE + 1,) * 2, np.uint8), borderValue=0) > 0
     return _share(~find_ink(cv2.absdiff(before, after), (0, 0, 0)), inner)

@@ -53,6 +53,6 @@ def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, i
 
 
 def list_places_within(middle: int, reach: int, last: int) -> np.ndarray:
-    """List the candidate places PAD, PAD + STEP, ... up to `last` that are at most `reach` from a centre."""
+    """List the candidate places PAD, PAD + GRID_SPACING, ... up to `last` that are at most `reach` from a centre."""
     places = np.arange(BORDER_DISTANCE, last + 1, GRID_SPACING)
     return places[np.abs(places - middle) <= reach]

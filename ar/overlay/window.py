@@ -126,7 +126,7 @@ class Roles:
     covered: np.ndarray | None = None
 
     def read_roles(self, segmentation: np.ndarray, box: tuple[slice, slice] = np.s_[:, :]) -> np.ndarray:
-        """Return the roles (h, w) uint8, `FRONT`, `SHUT` or 0, in a box of an image's segmentation (H, W) uint8."""
+        """Return the roles (h, w) uint8, `FRONT`, `CLOSED_GROUND` or 0, in a box of a segmentation (H, W) uint8."""
         found = cv2.LUT(segmentation[box], build_role_table(self.front, self.open))
         if self.covered is not None:
             found[self.covered[box]] = FRONT
@@ -135,7 +135,7 @@ class Roles:
 
 @lru_cache(maxsize=8)
 def build_role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) -> np.ndarray:
-    """Return the table (256,) uint8 of roles by the id of a layer: `FRONT`, `SHUT` or 0."""
+    """Return the table (256,) uint8 of roles by the id of a layer: `FRONT`, `CLOSED_GROUND` or 0."""
     ids = np.arange(256)
     shut = np.zeros(256, bool) if open_to is None else ~np.isin(ids, open_to)
     return np.where(np.isin(ids, front), FRONT, np.where(shut, CLOSED_GROUND, 0)).astype(np.uint8)
@@ -169,7 +169,7 @@ def from_edge(seen: RasterisedSurface) -> wp.array:
 
 
 def compute_chamfer_distance(beside: wp.array, device: str) -> wp.array:
-    """Compute the chamfer distance (h, w) of each pixel from those where `beside` is 0 [pixel], up to `REACH`."""
+    """Compute the chamfer distance (h, w) [pixel] from pixels where `beside` is 0, up to `CHAMFER_RADIUS`."""
     aside = wp.empty(beside.shape, dtype=wp.int32, device=device)
     distance = wp.empty(beside.shape, dtype=wp.float32, device=device)
     launch_in_bands(find_aside, [beside], [aside], beside.size, device)
@@ -211,7 +211,7 @@ def find_aside(
     # output
     aside: wp.array2d(dtype=wp.int32),
 ):
-    """Compute the distance in columns of each pixel from the edge in its own row, at most `REACH`."""
+    """Compute the distance in columns of each pixel from the edge in its own row, at most `CHAMFER_RADIUS`."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / beside.shape[1]

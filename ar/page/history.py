@@ -42,13 +42,13 @@ class Sample:
 
 @dataclass
 class History:
-    """Recent samples of some lines. Samples more than `SPAN` older than the newest are dropped."""
+    """Recent samples of some lines. Samples more than `TIME_SPAN` older than the newest are dropped."""
 
     lines: tuple[Line, ...]
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
 
     def add(self, sample: Sample) -> None:
-        """Append a sample, and drop those older than `SPAN`."""
+        """Append a sample, and drop those older than `TIME_SPAN`."""
         self.samples.append(sample)
         while self.samples[0].time < sample.time - TIME_SPAN:
             self.samples.popleft()
@@ -113,11 +113,13 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
     said = f"{line.name} [{line.unit}]" + (f", {line.whose}" if line.whose else "")
     scale = "".join(
         f'<text x="{LEFT_MARGIN - 5:g}" y="{top + room * (1 - share) + 4:g}" text-anchor="end">{share * high:g}</text>'
-        f'<path d="M{LEFT_MARGIN:g} {top + room * (1 - share):g}H{CHART_WIDTH - 6:g}" stroke="#666" stroke-width="0.6"/>'
+        f'<path d="M{LEFT_MARGIN:g} {top + room * (1 - share):g}H{CHART_WIDTH - 6:g}" '
+            'stroke="#666" stroke-width="0.6"/>'
         for share in (0.0, 1.0)
     )
     times = "".join(
-        f'<text x="{LEFT_MARGIN + (CHART_WIDTH - LEFT_MARGIN - 6) * share:g}" y="{top + room + 14:g}" text-anchor="{anchor}">{words}</text>'
+        f'<text x="{LEFT_MARGIN + (CHART_WIDTH - LEFT_MARGIN - 6) * share:g}" y="{top + room + 14:g}" '
+            f'text-anchor="{anchor}">{words}</text>'
         for share, anchor, words in (
             (0.0, "start", f"{TIME_SPAN:g} s ago"),
             (0.5, "middle", "10 s"),

@@ -93,12 +93,15 @@ class Cut:
 
 
 def draw_slices(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
-    """Draw three views (SIDE, 3 SIDE, 3) uint8 through a centre (3,) [m], side by side; plain ground without a scan."""
+    """Draw three views (VIEW_SIDE, 3 VIEW_SIDE, 3) uint8 through a centre (3,) [m], side by side.
+
+    Plain ground without a scan.
+    """
     return np.concatenate([view(plane, scan, np.asarray(middle, np.float64), cut) for plane in PLANES], axis=1)
 
 
 def view(plane: SliceView, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
-    """Draw one view (SIDE, SIDE, 3) uint8."""
+    """Draw one view (VIEW_SIDE, VIEW_SIDE, 3) uint8."""
     grey = (
         np.full((VIEW_SIDE, VIEW_SIDE), OUTSIDE_GREY, np.uint8) if scan is None else resample_view(plane, scan, middle)
     )
@@ -138,7 +141,7 @@ def describe_band(cut: Cut) -> str:
 
 
 def resample_view(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarray:
-    """Resample the scan in a view, (SIDE, SIDE) uint8; `NOWHERE` outside it."""
+    """Resample the scan in a view, (VIEW_SIDE, VIEW_SIDE) uint8; `OUTSIDE_GREY` outside it."""
     count = round(2.0 * HALF_VIEW / SAMPLING_DISTANCE)
     matrix = scan.T_index_world
     index = plane.compute_points(middle, count) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -151,7 +154,7 @@ def resample_view(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarr
 
 
 def find_pixels_within(plane: SliceView, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
-    """Compute the mask (SIDE, SIDE) bool of pixels within a distance (error [m]) of a surface, in 3-D."""
+    """Compute the mask (VIEW_SIDE, VIEW_SIDE) bool of pixels within a distance (error [m]) of a surface, in 3-D."""
     count = VIEW_SIDE // COARSE_SPACING
     if not len(layer.triangles):
         return np.zeros((VIEW_SIDE, VIEW_SIDE), bool)

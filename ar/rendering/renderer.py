@@ -207,7 +207,8 @@ class Renderer:
         count, height, width = nearest.shape
         shadow = self._draw_shadow(placed, casting)
         inputs = [
-            width, height * width, nearest.flatten(), self.stack.surfaces, placed, self._get_centres(cameras), self.light,
+            width, height * width, nearest.flatten(), self.stack.surfaces, placed, self._get_centres(cameras),
+            self.light,
             shadow, self.curve, still, lit_at, through.pixels,
         ]  # fmt: skip
         outputs = [array.flatten() for array in pictures.arrays]

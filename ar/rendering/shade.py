@@ -12,7 +12,7 @@ from .triangle import weights_at
 
 DEPTH_BIAS = wp.constant(0.0002)  # Minimum depth of an occluder in front of a point that it shades [m].
 HALF_SOFT_WIDTH = wp.constant(3)  # Half the width of the shadow's soft edge [shadow-map pixel].
-FILTER_WIDTH = wp.constant(7)  # Width of the shadow filter [shadow-map pixel]: 2 SOFT + 1.
+FILTER_WIDTH = wp.constant(7)  # Width of the shadow filter [shadow-map pixel]: 2 HALF_SOFT_WIDTH + 1.
 Taps = wp.types.vector(length=7, dtype=wp.float32)
 # Side of the tiles of the shadow map's depth bounds [shadow-map pixel]: the filter overlaps at most four.
 TILE_SIDE = wp.constant(8)
@@ -147,7 +147,8 @@ def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
         return 1.0
     if z > wp.max(wp.max(first[1], second[1]), wp.max(third[1], fourth[1])):
         return 0.0
-    # A box 2 SOFT wide about (u, v): taps at its border are weighted by their part inside, so that no steps are
+    # A box 2 HALF_SOFT_WIDTH wide about (u, v): taps at its border are weighted by their part inside, so that no steps
+    # are
     # visible.
     reach = wp.float32(HALF_SOFT_WIDTH) + 0.5
     across = Taps()

@@ -187,7 +187,8 @@ def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
     there = here - np.stack([rough, np.zeros_like(rough)], axis=1)
     there, found, apart = cv2.calcOpticalFlowPyrLK(
         view.left, view.right, here, there.astype(np.float32), winSize=(SUBPIXEL_SIDE, SUBPIXEL_SIDE), maxLevel=0,
-        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *SUBPIXEL_CRITERIA), flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *SUBPIXEL_CRITERIA),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     disparity, down = (here - there).T.astype(float)
     matched = (found.ravel() > 0) & (np.abs(disparity - rough) < MAX_SUBPIXEL_SHIFT)
@@ -214,7 +215,8 @@ FLOW_LEVELS = 1  # Highest pyramid level of the optical flow.
 FLOW_CRITERIA = (20, 0.01)  # Optical flow: maximum number of iterations, final step [pixel].
 MAX_RETURN_DISTANCE = 1.0  # Largest distance from the start after tracking forward and back [pixel].
 NEIGHBOUR_COUNT = 8  # Number of neighbours whose median motion a point is compared with.
-# Largest deviation from the neighbours' median [standard deviations]; the larger of DEVIATIONS and FREE applies.
+# Largest deviation from the neighbours' median [standard deviations]; the larger of MAX_RELATIVE_DEVIATION and
+# MAX_MOTION_DEVIATION applies.
 MAX_RELATIVE_DEVIATION = 4.0
 MAX_MOTION_DEVIATION = 0.5e-3  # Largest deviation from the neighbours' median motion [m].
 

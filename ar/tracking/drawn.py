@@ -21,7 +21,7 @@ INK, PAPER = 25.0, 225.0  # Grey levels of black ink and white paper.
 def render_targets(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
     """Render targets in front of an image (H, W) or (H, W, 3) uint8, sharp and evenly lit.
 
-    Every pixel is the mean of `SAMPLES`^2 rays, each traced through the lens to the first face that it meets.
+    Every pixel is the mean of `SAMPLES_PER_SIDE`^2 rays, each traced through the lens to the first face that it meets.
 
     Parameters
     ----------

@@ -17,7 +17,8 @@ FACTOR_BOUNDS = (0.5, 2.0)  # Search range of the factor on the focal length.
 FACTOR_TOLERANCE = 1e-3  # Tolerance of the factor.
 FACTOR_STEP = 0.02  # Step of the factor in the finite difference for the curvature of the sum of squares.
 MAX_RELATIVE_ERROR = 0.05  # Relative error above which a focal length differs.
-MAX_DEVIATIONS = 6.0  # Error above which a focal length differs [standard deviations], if it exceeds TOLERATED as well.
+# Error above which a focal length differs [standard deviations], if it exceeds MAX_RELATIVE_ERROR as well.
+MAX_DEVIATIONS = 6.0
 
 
 @dataclass(frozen=True)

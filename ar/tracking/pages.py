@@ -36,7 +36,8 @@ LINE_SPACING = 4.8
 """Line spacing of text [mm]."""
 PRINT_INSTRUCTIONS = (  # Instructions on each page.
     "Print at 100 % on A4 ('actual size', not 'fit to page'), then measure both rulers.",
-    f"If a ruler is not {RULER_LENGTH:.0f} mm long to 0.2 mm, do not use this page: correct the scale, and print it again.",
+    f"If a ruler is not {RULER_LENGTH:.0f} mm long to 0.2 mm, do not use this page: correct the scale, and print it "
+    "again.",
 )
 
 
@@ -174,7 +175,8 @@ def _draw_cube_page(target: Target) -> Page:
         "Or cut the faces apart and glue each alone. Sides that touch here must touch on the cube,",
         "and so must the upper side of +y and the side with the tab.",
         "The shaft leaves the cube through the middle of the face opposite +z, at a right angle.",
-        f"The tool's tip is nominally {_to_millimetres(TIP_DISTANCE):.0f} mm from the middle of the cube, before calibration.",
+        f"The tool's tip is nominally {_to_millimetres(TIP_DISTANCE):.0f} mm from the middle of the cube, before "
+        "calibration.",
     )
     return _compose_page(target, page, ink, placed, said, ((20.0, top), (55.0, top + 2.0 * wide + 20.0)))
 
@@ -290,7 +292,7 @@ def _draw_ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -
 
 
 def _draw_bar(ink: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None:
-    """Draw a line along a side of the page, whose centre is exact: `THIN` is a multiple of two pixels."""
+    """Draw a line along a side of the page, whose centre is exact: `LINE_WIDTH` is a multiple of two pixels."""
     half = _to_pixels(LINE_WIDTH) // 2
     low, high = np.minimum(start, end), np.maximum(start, end)
     ink.rectangle(

@@ -54,7 +54,7 @@ class Named:
 
 
 def read_images(path: Path) -> Iterator[Named]:
-    """Read at most `MOST_PICTURES` of the PNG and JPEG files of a folder, or of the frames of a video, in their order.
+    """Read at most `MAX_IMAGES` of the PNG and JPEG files of a folder, or of the frames of a video, in their order.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def _read(path: Path, kind: str = "L") -> np.ndarray:
 
 
 def _read_video_frames(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[Named]:
-    """Read one in `step` frames of a video from the `first` on; None: a step that gives `MOST_PICTURES` frames."""
+    """Read one in `step` frames of a video from the `first` on; None: a step that gives `MAX_IMAGES` frames."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file. {REMEDY}")
     video = _open_video(path)
@@ -174,7 +174,8 @@ def _read_video_frames(path: Path, step: int | None, colour: bool = False, first
         width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if not video.isOpened() or min(width, height) < 1:
             raise ValueError(
-                f"{path}: is not a readable video, as {_describe_flaw(path)}: give a video, or a folder of PNG or JPEG images."
+                f"{path}: is not a readable video, as {_describe_flaw(path)}: give a video, or a folder of PNG or "
+                "JPEG images."
             )
         _check_size(path, width, height)
         if turn := int(video.get(cv2.CAP_PROP_ORIENTATION_META)):
@@ -223,7 +224,7 @@ def _describe_flaw(path: Path) -> str:
 
 
 def _spread(count: int) -> list[int]:
-    """Select at most `MOST_PICTURES` of the numbers below `count`, evenly spaced."""
+    """Select at most `MAX_IMAGES` of the numbers below `count`, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_IMAGES)).round().astype(int)).tolist()
 
 

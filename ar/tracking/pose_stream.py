@@ -64,9 +64,9 @@ class PoseStream:
     def interpolate(self, time: float) -> Pose | None:
         """Interpolate the pose at a time [s], with constant velocity between two samples; None if there is none.
 
-        Gaps longer than `LONGEST` are not interpolated. After a sample without a successor, the last motion is
-        extrapolated for `AHEAD`. The covariance includes the interpolation error for a body that accelerates as
-        observed here.
+        Gaps longer than `MAX_GAP` are not interpolated. After a sample without a successor, the last motion is
+        extrapolated for `MAX_EXTRAPOLATION`. The covariance includes the interpolation error for a body that
+        accelerates as observed here.
         """
         time = self.to_stream_day(time)
         first = int(np.searchsorted(self.times, time + TIME_TOLERANCE, side="right")) - 1

@@ -240,7 +240,7 @@ def _widen_covariance(normal: np.ndarray, freedom: int) -> np.ndarray:
 
 
 def _scatter(off: np.ndarray, freedom: int) -> float:
-    """Estimate the residuals' standard deviation along one axis [m], at least `LEAST`."""
+    """Estimate the residuals' standard deviation along one axis [m], at least `MIN_RMS`."""
     return max(float(np.sqrt((off**2).sum() / freedom)), MIN_RMS)
 
 
@@ -280,7 +280,7 @@ class PairResiduals:
 
     @property
     def suspect(self) -> bool:
-        """True if the worst pair fits worse than in all but `FALSE_ALARM` of valid sets."""
+        """True if the worst pair fits worse than in all but `FALSE_ALARM_RATE` of valid sets."""
         return self.chance < FALSE_ALARM_RATE
 
 

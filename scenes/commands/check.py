@@ -88,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
             "tumour_error_unobserved_mm": _to_millimetres(error.prior),
         }
         print(
-            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_describe_compared(scene, name)}: error {figures.error_mm:.3f} "
+            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_describe_compared(scene, name)}: error "
+            f"{figures.error_mm:.3f} "
             f"mm at a motion of {figures.motion_mm:.2f} mm. Outline error {figures.drawn:.1f} px, "
             f"overlap {figures.overlap:.3f} (1 is best). {figures.leaked:.0%} leaks out of the "
             f"skull{_describe_bond(figures.bond)}{_summarise_estimates(figures)}",

@@ -34,7 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size.add_argument(
         "--quick",
         action="store_true",
-        help=f"small report with {QUICK_COUNTS[0]} simulated loads, few comparisons and one mesh: minutes instead of hours",
+        help=f"small report with {QUICK_COUNTS[0]} simulated loads, few comparisons and one mesh: minutes instead of "
+        "hours",
     )
     size.add_argument(
         "--full", action="store_true", help="every combination of law, element, mesh, tolerance and precision"

@@ -94,7 +94,8 @@ def run(args: argparse.Namespace) -> int:
     where = describe_machine(args.device)
     lines = sys.stderr if args.json else sys.stdout
     print(
-        f"{where}\n\n{_describe_study(study, args.tool_preset)}\n\n{_format_row(COLUMN_TITLES)}\n{_format_row(['-' * width for width in COLUMN_WIDTHS])}",
+        f"{where}\n\n{_describe_study(study, args.tool_preset)}\n\n{_format_row(COLUMN_TITLES)}\n"
+        f"{_format_row(['-' * width for width in COLUMN_WIDTHS])}",
         file=lines,
         flush=True,
     )

@@ -187,7 +187,8 @@ def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float,
     if not apart <= MAX_DISTANCE:
         middle = ", ".join(f"{1e3 * value:.0f}" for value in site.origin)
         raise InputError(
-            f"--load: the place is {apart:.0f} mm from the open cortex; {MAX_DISTANCE:g} mm is the most. The middle of the "
+            f"--load: the place is {apart:.0f} mm from the open cortex; {MAX_DISTANCE:g} mm is the most. The middle "
+            "of the "
             f"open cortex is at {middle} mm (RAS)."
         )
     arm = nearest - site.origin

@@ -133,7 +133,8 @@ def write_body(
     Raises
     ------
     InputError
-        No anatomy could be meshed in `TRIES` draws; an own anatomy that cannot be read; loads that train nothing.
+        No anatomy could be meshed in `MAX_ATTEMPTS` draws; an own anatomy that cannot be read; loads that train
+        nothing.
     """
     bodies = plan.contents.bodies
     anatomy, scan, values = _sample_anatomy(plan, seed, number)

@@ -39,7 +39,7 @@ class RunSettings:
     device
         "cpu" or "cuda": solutions of the two differ in the last digits.
     versions
-        Versions of the packages in `PARTS`.
+        Versions of the packages in `PACKAGES`.
     """
 
     plan: str

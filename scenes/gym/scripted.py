@@ -13,7 +13,7 @@ STIFFNESS = 60.0  # Stiffness of the tissue under a tool [N/m].
 BLADE_MOTION_RATIO = (
     1.0  # Motion of a blade relative to the required motion of the cortex, which is not observed under the blade.
 )
-BLADE_RATIO_INCREASE = 2.0  # Increase of the ratio FOLLOWS during the longest episode.
+BLADE_RATIO_INCREASE = 2.0  # Increase of the ratio BLADE_MOTION_RATIO during the longest episode.
 
 
 def compute_scripted_actions(task: str, states: np.ndarray) -> np.ndarray:

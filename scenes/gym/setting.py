@@ -95,7 +95,7 @@ class TaskSetting:
         return tuple(mesh.tets[list(step)].ravel() for step in surgery.build_resection(self.site.anatomy).steps[1:])
 
     def find_near(self, place: np.ndarray) -> np.ndarray:
-        """Vertices (n,) of the open cortex within `PATCH` of a place (3,) [m], or the nearest one."""
+        """Vertices (n,) of the open cortex within `PATCH_RADIUS` of a place (3,) [m], or the nearest one."""
         away = np.linalg.norm(self.site.anatomy.mesh.nodes[self.cortex] - place, axis=1)
         return self.cortex[away <= max(PATCH_RADIUS, away.min())]
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 MAX_LINES = 10  # Maximum number of printed lines in an interval.
-LINE_INTERVAL = 5.0  # Interval in which at most MOST lines are printed [s].
+LINE_INTERVAL = 5.0  # Interval in which at most MAX_LINES lines are printed [s].
 PREFIX = "sulcus link: "  # Start of each line.
 
 

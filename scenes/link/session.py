@@ -110,7 +110,7 @@ class OverlayCamera:
 class LinkSession:
     """Live link that receives poses, computes results, and publishes them.
 
-    All but `_computed` and the drawing belongs to the event loop's thread.
+    All but `_compute_messages` and the drawing belongs to the event loop's thread.
 
     Parameters
     ----------

@@ -136,7 +136,8 @@ def _check_kind(markup: Markup, option: str, **kinds: int | None) -> None:
         return
     words = {"Fiducial": "one point", "Line": "a line of two points", "ClosedCurve": "a closed curve"}
     raise InputError(
-        f"{markup.path}: holds {_describe_markup(markup)}; {option} takes {' or '.join(words[kind] for kind in kinds)}. "
+        f"{markup.path}: holds {_describe_markup(markup)}; {option} takes "
+        f"{' or '.join(words[kind] for kind in kinds)}. "
         "Save that from 3D Slicer."
     )
 

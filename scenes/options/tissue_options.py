@@ -78,7 +78,8 @@ def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN
         default=[],
         metavar="REGION:YOUNG[,POISSON]",
         help=f"Young's modulus [Pa] and, optionally, Poisson's ratio of a region, by number or name "
-        f"({', '.join(NON_BRAIN_REGIONS)}), such as oedema:2000 or 3:2000,0.45; for Ogden's law REGION:C1,M1;C2,M2;K; repeatable "
+        f"({', '.join(NON_BRAIN_REGIONS)}), such as oedema:2000 or 3:2000,0.45; for Ogden's law "
+        "REGION:C1,M1;C2,M2;K; repeatable "
         f"(default: {default}; necrosis as the tumour)",
     )
 

@@ -161,7 +161,7 @@ class PatientSetup:
     def select_default(self, scene: Scene) -> str:
         """Select the default deformer of a scene: the best model, guarded if its bound is weak.
 
-        A model of tissue that relaxes is used without guard, with its bound: see `_guardable`.
+        A model of tissue that relaxes is used without guard, with its bound: see `_can_guard`.
         """
         name = self.select_best(scene)
         return GUARDED if self._can_guard(scene) and get_held_out_error(self.models[name]).weak else name

@@ -34,8 +34,8 @@ STANDARD_TOLERANCE = 1e-4  # Solver tolerance of data sets.
 class FemVariant:
     """FEM variant; None means the value of the data set.
 
-    `mesh`: `OWN`, `HALVED` (every edge), or the number of nodes of the template. Default precision: single, or double
-    for tolerances that single precision cannot reach.
+    `mesh`: `OWN_MESH`, `HALVED_MESH` (every edge), or the number of nodes of the template. Default precision: single,
+    or double for tolerances that single precision cannot reach.
     """
 
     name: str

@@ -211,7 +211,8 @@ def _format_reference_table(section: Section) -> str:
         short = "" if row.solving is not None or row.loads is None else " of fitting"
         cost = (row.median, row.p99, row.bare, row.set_up, row.memory, row.card)
         cells = (
-            row.name, row.against, _count(row), *_spread(row.reference), *map(_format_number, cost), _format_solves(row),
+            row.name, row.against, _count(row), *_spread(row.reference), *map(_format_number, cost),
+            _format_solves(row),
             "" if row.inside is None else str(row.inside), _format_number(minutes) + short, _format_adaptation(row),
         )  # fmt: skip
         lines.append(("front" if row.name in best else "", cells))

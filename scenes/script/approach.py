@@ -68,7 +68,8 @@ def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
         apart = float(np.linalg.norm(entry - points[0]))
         if apart > MAX_CORTEX_DISTANCE:
             raise InputError(
-                f"{path}: its point lies {1e3 * apart:.0f} mm from the open cortex, and {1e3 * MAX_CORTEX_DISTANCE:g} mm is the most. "
+                f"{path}: its point lies {1e3 * apart:.0f} mm from the open cortex, and "
+                f"{1e3 * MAX_CORTEX_DISTANCE:g} mm is the most. "
                 "Open the skull there (--opening-at), or mark another entry."
             )
         return _approach(site, entry, site.axis)
@@ -79,7 +80,8 @@ def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
     angle = float(np.arccos(np.clip(way @ site.axis, -1.0, 1.0)))
     if angle > MAX_ENTRY_ANGLE:
         raise InputError(
-            f"{path}: runs at {np.degrees(angle):.0f} degrees to the opening's axis, and {np.degrees(MAX_ENTRY_ANGLE):.0f} is "
+            f"{path}: runs at {np.degrees(angle):.0f} degrees to the opening's axis, and "
+            f"{np.degrees(MAX_ENTRY_ANGLE):.0f} is "
             "the most. Open the skull where it enters: --opening-at with this file."
         )
     entry = _find_entry(site.corners, outer, way)
@@ -94,7 +96,8 @@ def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
     apart = max(before, beyond)
     if apart > MAX_CORTEX_DISTANCE:
         raise InputError(
-            f"{path}: ends {1e3 * apart:.0f} mm from where it would enter the open cortex, and {1e3 * MAX_CORTEX_DISTANCE:g} mm is "
+            f"{path}: ends {1e3 * apart:.0f} mm from where it would enter the open cortex, and "
+            f"{1e3 * MAX_CORTEX_DISTANCE:g} mm is "
             "the most that a line is drawn out by. See that it is of this opening, and draw it through the cortex."
         )
     return replace(_approach(site, entry, way), line=True)

@@ -101,7 +101,7 @@ class Scene:
     ------
     InputError
         A tool's force or pose without a tool; a duration or a frame rate that is not a number > 0; more than
-        `MOST_FRAMES` frames.
+        `MAX_FRAMES` frames.
     """
 
     name: str

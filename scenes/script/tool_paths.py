@@ -43,7 +43,7 @@ MIN_VISIBLE_FORCE = 2e-3
 
 
 def compute_lift(force: float) -> float:
-    """Return the height [m] above the tissue at which a tool that pushes with a force [N] is drawn: `AIR` when idle."""
+    """Return the height [m] above the tissue of a drawn tool that pushes with a force [N]: `IDLE_HEIGHT` when idle."""
     return IDLE_HEIGHT * max(0.0, 1.0 - force / MIN_VISIBLE_FORCE)
 
 
@@ -97,7 +97,7 @@ def draw(force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tu
 def palpate(
     depth: float, start: tuple[float, float], end: tuple[float, float], seconds: float, rise: float = 0.8
 ) -> Path:
-    """Lower by `AIR` [m] and on to `depth` [m] within `rise` [s], slide from `start` to `end` [m], and lift off."""
+    """Lower by `IDLE_HEIGHT` [m], then to `depth` [m] in `rise` [s], slide from `start` to `end` [m], lift off."""
     stroke = slide(1.0, start, end, seconds, rise)
 
     def path(time: float) -> Touch:
@@ -108,7 +108,7 @@ def palpate(
 
 
 def lay(depth: float, tilt: float = 0.0, rise: float = 1.5, at: tuple[float, float] = (0.0, 0.0)) -> Path:
-    """Come down by `AIR` [m] and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x, and stay there."""
+    """Lower by `IDLE_HEIGHT` [m] and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x, and stay there."""
 
     def path(time: float) -> Touch:
         return Touch(*at, tilt=(tilt, 0.0), depth=_interpolate_depth(smooth(time / rise), depth))

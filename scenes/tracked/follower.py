@@ -75,7 +75,7 @@ class TrackingResult:
     motion
         Estimated motion of the brain.
     camera
-        Camera with T_camera_scan; None if the reference has been lost for longer than `HELD`.
+        Camera with T_camera_scan; None if the reference has been lost for longer than `HOLD_TIME`.
     T_scan_tool, tip_covariance
         Pose (4, 4) [m] and covariance (3, 3) [m^2], if the tool is visible.
     band

@@ -68,7 +68,8 @@ def read_numbered_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.nd
 def read_stream(path: str | Path) -> PoseStream:
     """Read the poses of an external tracker, in a file of `read_poses`; its clock may restart at midnight.
 
-    Covariances are read from the columns `cov_00` to `cov_55`, as written by `write_poses`; default: `USUAL`.
+    Covariances are read from the columns `cov_00` to `cov_55`, as written by `write_poses`; default:
+    `USUAL_DEVIATIONS`.
 
     Raises
     ------

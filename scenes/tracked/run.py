@@ -172,7 +172,7 @@ def overlay_one(
 
 
 def to_aged(known: TrackingResult, age: float) -> TrackingResult:
-    """Return the result of an image of the given age [s]: it is stale beyond `OLD`."""
+    """Return the result of an image of the given age [s]: it is stale beyond `STALE_AGE`."""
     if age <= STALE_AGE or not known.relied:
         return known
     return replace(known, state=TumourState.STALE, words=f"stale, the image is {age:.1f} s old: do not rely on it")

@@ -170,7 +170,8 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> 
     if measure_shown_share(volume.affine, values.shape, anatomy) == 0.0:
         low, high = (1e3 * end for end in (anatomy.mesh.nodes.min(axis=0), anatomy.mesh.nodes.max(axis=0)))
         raise InputError(
-            f"{path}: shows none of this brain, which reaches from {_format_millimetres(low)} to {_format_millimetres(high)} mm (RAS). Give an image "
+            f"{path}: shows none of this brain, which reaches from {_format_millimetres(low)} to "
+            f"{_format_millimetres(high)} mm (RAS). Give an image "
             "in the space of the labels that the anatomy was made from, or register it to them first."
         )
     warnings = [*volume.notes, *list_warnings(values, volume.affine, labels, anatomy)]

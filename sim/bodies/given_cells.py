@@ -113,7 +113,7 @@ def note_pieces(mesh: TetMesh) -> tuple[str, ...]:
 
 
 def _count_overlaps(points: np.ndarray, tets: np.ndarray) -> int:
-    """Count nodes and centroids of tetrahedra (T, 4), at most `PROBES`, that lie inside another tetrahedron."""
+    """Count nodes and centroids of tetrahedra (T, 4), at most `MAX_PROBES`, that lie inside another tetrahedron."""
     corners = points[tets]
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)

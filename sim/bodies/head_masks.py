@@ -222,7 +222,7 @@ def _note_cavity(
 
 
 def _crop_masks(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return the masks cropped to brain and tumour with a margin of `SURROUNDINGS` voxels, and their affine (4, 4)."""
+    """Return the masks cropped to brain and tumour with a margin of `CROP_MARGIN` voxels, and their affine (4, 4)."""
     anything = marked["brain"] | marked["tumour"]
     ends = [np.flatnonzero(anything.any(axis=tuple({0, 1, 2} - {axis})))[[0, -1]] for axis in range(3)]
     low = np.maximum(0, np.array(ends)[:, 0] - CROP_MARGIN)

@@ -61,7 +61,7 @@ class Intensity:
         return ndimage.map_coordinates(self.values, index, order=1, mode="constant", output=np.float64) / 255.0
 
     def crop(self, points: np.ndarray, mesh: TetMesh, margin: float = 0.015) -> Intensity:
-        """Return the part around the box of points (n, 3) [m], with a margin [m], as 8-bit grey by `KEPT`.
+        """Return the part around the box of points (n, 3) [m], with a margin [m], as 8-bit grey by `STORED_WINDOW`.
 
         Raises
         ------

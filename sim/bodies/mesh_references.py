@@ -17,7 +17,7 @@ SUFFIXES = (
 
 
 def check_mesh_references(path: Path, limits: MeshBytes) -> None:
-    """Reject formats other than `ENDINGS`, numbers outside the file or its folder, and HDF5 beyond the limits.
+    """Reject formats other than `SUFFIXES`, numbers outside the file or its folder, and HDF5 beyond the limits.
 
     Raises
     ------

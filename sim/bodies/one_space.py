@@ -33,12 +33,14 @@ def has_one_space(brain: Mask, tumour: Mask) -> bool:
     within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), LPS))
     if within < MIN_INSIDE_FRACTION and turned > MIN_MIRRORED_FRACTION:
         raise InputError(
-            f"{tumour.path}: its tumour lies at {_format_box(boxes[1])}, and the brain of {brain.path} at {_format_box(boxes[0])}. "
+            f"{tumour.path}: its tumour lies at {_format_box(boxes[1])}, and the brain of {brain.path} at "
+            f"{_format_box(boxes[0])}. "
             f"With x and y negated it would lie in the brain: {EXPORT_REMEDY}"
         )
     if apart:
         raise InputError(
-            f"{tumour.path}: its tumour lies at {_format_box(boxes[1])} and does not overlap the brain of {brain.path}, at "
+            f"{tumour.path}: its tumour lies at {_format_box(boxes[1])} and does not overlap the brain of "
+            f"{brain.path}, at "
             f"{_format_box(boxes[0])}. Give volumes of one space, or resample one into the other's."
         )
     return turned > MIN_MIRRORED_FRACTION and not _is_same_grid(brain.grid, tumour.grid)
@@ -81,7 +83,7 @@ def _is_same_grid(one: VoxelGrid, other: VoxelGrid) -> bool:
 
 
 def _thin_points(points: np.ndarray) -> np.ndarray:
-    """Return a regular subset of at least `SAMPLED` points, or all."""
+    """Return a regular subset of at least `TEST_POINTS` points, or all."""
     return points[:: max(1, len(points) // TEST_POINTS)]
 
 

@@ -92,7 +92,8 @@ def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement =
     apart = float(np.linalg.norm(site - point))
     if apart > settings.near:
         raise InputError(
-            f"the opening at {_to_mm(point)} mm lies {apart * 1e3:.0f} mm from the nearest cortex that the skull covers; "
+            f"the opening at {_to_mm(point)} mm lies {apart * 1e3:.0f} mm from the nearest cortex that the skull "
+            "covers; "
             f"{settings.near * 1e3:g} mm is the most. {_format_box(cortex)} Over a deep point, give --opening-over."
         )
     return _check_not_over_stem(cortex, site, settings)

@@ -25,7 +25,7 @@ SITES = {
     "temporal": (66.0, -22.0, 2.0),
     "occipital": (28.0, -92.0, 14.0),
 }
-"""Named points on the right hemisphere's convexity, seen from `MIDDLE`: MNI152 coordinates [mm]."""
+"""Named points on the right hemisphere's convexity, seen from `MNI_CENTRE`: MNI152 coordinates [mm]."""
 
 Shape = Literal["sphere", "lobed"]  # tumour shapes
 MIN_RADIUS = 3e-3  # minimum tumour radius [m]

@@ -66,7 +66,7 @@ BACKWARD_CODE = """
 
 @cache
 def build_kernel(device: Device, code: str) -> wp.Kernel:
-    """Build the kernel that eliminates (`UP`) or substitutes back (`DOWN`) in each row of xs (b, n), front by front."""
+    """Build the kernel that eliminates (`FORWARD_CODE`) or back-substitutes (`BACKWARD_CODE`) rows of xs (b, n)."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
 

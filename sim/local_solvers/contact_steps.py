@@ -201,7 +201,7 @@ class ContactSteps:
             view(self._model.own)[:] = model.own
 
     def compute_direction(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
-        """Solve for the tools' forces with a proximal term, their direction and longest step: (`SAID`,) results.
+        """Solve for the tools' forces with a proximal term, their direction and longest step: (`OUTPUT_SIZE`,) results.
 
         With `bent` the model need not be convex. If the status is not `FOUND`, the other results are invalid. The
         returned array is overwritten by the next call.

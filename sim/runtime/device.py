@@ -125,7 +125,8 @@ def parse_device_names(words: str) -> tuple[str, ...]:
         cards = tuple(name for name in _list_devices() if name.startswith("cuda"))
         if not cards:
             raise InputError(
-                f"'all' means every GPU, and there is none here{_explain_no_gpu()}: choose auto, or name devices separated by "
+                f"'all' means every GPU, and there is none here{_explain_no_gpu()}: choose auto, or name devices "
+                "separated by "
                 "commas, as in cpu,cpu."
             )
         return cards

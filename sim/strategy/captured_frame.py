@@ -231,7 +231,7 @@ class CapturedFrame:
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
 
     def update_model(self, steps: float) -> None:
-        """Recompute the model of strained tissue at the solution, if this took more than `SERVED` steps."""
+        """Recompute the model of strained tissue at the solution, if this took more than `MAX_SERVED_STEPS` steps."""
         if self.part is not None and steps > MAX_SERVED_STEPS:
             self._load_updated_model(update_model_at(self.part, self._device, self._workspace.columns["u"]))
             self._workspace.columns["known"].zero_()  # curvature pairs are valid for their own model only
@@ -242,7 +242,9 @@ class CapturedFrame:
             self._knowing.load(bent)
 
     def push(self, point: np.ndarray, radius: float, force: np.ndarray, share: float) -> np.ndarray:
-        """Solve for a push at point (3,) with a footprint's radius [m] and a force (3,) [N]; return (HEAD + 3N,).
+        """Solve for a push at point (3,) with a footprint's radius [m] and a force (3,) [N].
+
+        Return (HEADER_SIZE + 3N,).
 
         The start is the present state, extrapolated by `share` times its change from the one before. The returned array
         is overwritten by the next frame.

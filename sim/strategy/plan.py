@@ -53,7 +53,7 @@ class SolverPlan:
     preconditioner
         Name of the preconditioner, from `name_of`.
     many, single
-        Local solver that is tried first for `WORTH` loads or more, and for one; None: no local solver.
+        Local solver that is tried first for `MIN_SHARED_CASES` loads or more, and for one; None: no local solver.
     contact
         Solver that is tried first for loads with tools moved by pose; None without such tools.
     quick

@@ -40,7 +40,7 @@ MAX_PRECONDITIONERS = 3  # Preconditioners that are cached; each is as large as 
 def quantise(steps: np.ndarray) -> np.ndarray:
     """Return the powers of two (B,) [s] nearest to steps (B,) [s], by ratio.
 
-    Steps of `LONGEST` or more become infinite; zero steps stay zero.
+    Steps of `MAX_DYNAMIC_STEP` or more become infinite; zero steps stay zero.
     """
     within = (steps > 0.0) & (steps < MAX_DYNAMIC_STEP)
     powers = np.exp2(np.round(np.log2(np.where(within, steps, 1.0))))

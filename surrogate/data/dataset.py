@@ -39,7 +39,7 @@ MESH = ("nodes", "tets", "region", "middles")  # Names of a mesh's arrays; linea
 SEAL_ATTRIBUTE = "digest of these attributes"  # Attribute that contains the hash of all other texts.
 CHUNK_ROWS = 256  # Number of rows read at once.
 MAX_DISPLACEMENT = 1.0  # Largest valid displacement [body lengths].
-CHECK_FORCE = 1e-3  # Force that cannot cause a displacement of FARTHEST [N], to check unit responses.
+CHECK_FORCE = 1e-3  # Force that cannot cause a displacement of MAX_DISPLACEMENT [N], to check unit responses.
 REMEDY = "Make it with `sulcus simulate`."  # Remedy in error messages.
 
 

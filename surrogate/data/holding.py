@@ -1,6 +1,6 @@
 """Load histories in relaxing tissue: a tool is brought in and then held.
 
-A load of a pose at a time [s] is such a history. The tool arrives within `BROUGHT`, or within the time if that is
+A load of a pose at a time [s] is such a history. The tool arrives within `APPROACH_TIME`, or within the time if that is
 shorter, and stays in place until the time.
 """
 

@@ -81,7 +81,8 @@ def leave_discs_out(points: np.ndarray, patch: Patch) -> DiscSplit:
     order = spread(points, MAX_POSITIONS) if len(points) else np.zeros(0, int)
     if len(order) < MIN_DISCS + 1:
         raise InputError(
-            f"the loads that converged have {len(order)} positions, too few to leave {MIN_DISCS} discs out: simulate more."
+            f"the loads that converged have {len(order)} positions, too few to leave {MIN_DISCS} discs out: simulate "
+            "more."
         )
     splits = [_build_discs(points, points[order], patch, radius) for radius in DISC_RADII]
     fewest = min(splits, key=lambda split: split.test.mean())

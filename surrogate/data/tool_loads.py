@@ -154,7 +154,7 @@ def _sample_block(tools: list[ToolLoads], patch: Patch, key: int, block: range) 
 
 
 def _generate_uniform(key: int, attempt: int, block: range) -> np.ndarray:
-    """Generate numbers (n, NUMBERS) in [0, 1) of each load of a block.
+    """Generate numbers (n, NUMBERS_PER_LOAD) in [0, 1) of each load of a block.
 
     Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": its counter gives any load's numbers
     without those before.
@@ -165,7 +165,7 @@ def _generate_uniform(key: int, attempt: int, block: range) -> np.ndarray:
 
 
 def _sample_tool(tool: ToolLoads, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
-    """Sample as `_drawn`, for one tool and some rows (k,) of the block: loads that do not fit are sampled again."""
+    """Sample as `_sample_block`, for one tool and some rows (k,) of the block; rejected loads are sampled again."""
     out, waiting = np.zeros((len(block), 7)), rows
     for attempt in range(MAX_ATTEMPTS):
         if not len(waiting):

@@ -39,7 +39,8 @@ def choose_ball(preset: str) -> Ball:
     """
     if preset not in BALL_PRESETS:
         raise InputError(
-            f"no ball stands for the preset {preset}: choose one of {', '.join(BALL_PRESETS)}, or give --blade or --capsule."
+            f"no ball stands for the preset {preset}: choose one of {', '.join(BALL_PRESETS)}, or give --blade or "
+            "--capsule."
         )
     return Ball(0.5 * sum(TOOLS[preset].footprint))
 
@@ -108,7 +109,7 @@ def _move_to_contact(
     """Lower a tool along its shaft over point (B, 3) until contact, and on by depth (B,) [m]; return the poses.
 
     Each step is the distance to the surface's nearest point (Hart 1996, "Sphere tracing", Visual Comput. 12:527-545).
-    The surface is sampled by `ROWS`^2 points a triangle.
+    The surface is sampled by `SAMPLE_ROWS`^2 points a triangle.
     """
     share = build_barycentric_lattice(SAMPLE_ROWS)
     surface = np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)

@@ -141,7 +141,7 @@ class Score:
     name
         Name of the deformer.
     mean_mm, p95_mm, p999_mm, max_mm
-        Mean, percentiles and maximum [mm]; p999 is None for fewer than `FEWEST_FOR_P999` loads.
+        Mean, percentiles and maximum [mm]; p999 is None for fewer than `MIN_LOADS_FOR_P999` loads.
     mean_percent, p95_percent, p999_percent, max_percent
         The same of errors divided by the load's motion, the mean displacement of the vertices in the reference [%].
     worst_mean_mm, worst_p95_mm, worst_p999_mm
@@ -243,7 +243,8 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
     rows = [
         f"{row.name:<10}{row.mean_mm:7.4f} {row.p95_mm:7.4f} {_format_number(row.p999_mm, '7.4f')} {row.max_mm:7.4f} | "
         f"{row.worst_mean_mm:7.4f} {row.worst_p95_mm:7.4f} {_format_number(row.worst_p999_mm, '7.4f')}    |"
-        f"{row.mean_percent:7.2f} {row.p95_percent:6.2f} {_format_number(row.p999_percent, '6.2f')} {row.max_percent:6.2f} |"
+        f"{row.mean_percent:7.2f} {row.p95_percent:6.2f} {_format_number(row.p999_percent, '6.2f')} "
+        f"{row.max_percent:6.2f} |"
         f"{'' if row.bare_microseconds is None else f'{row.bare_microseconds:.0f}':>5} |{row.microseconds:5.0f}"
         for row in scores
     ]

@@ -302,7 +302,7 @@ def compute_radius(covariance: np.ndarray) -> float:
 
 @cache
 def _sample_normal() -> np.ndarray:
-    """Sample standard normal numbers (DRAWS, 3) with a fixed seed."""
+    """Sample standard normal numbers (SAMPLE_COUNT, 3) with a fixed seed."""
     return np.random.default_rng(0).standard_normal((SAMPLE_COUNT, 3))
 
 

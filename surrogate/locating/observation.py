@@ -22,8 +22,9 @@ MIN_POINTS = 6  # Minimum number of points, and of different places.
 MIN_SPREAD_RATIO = 0.05  # Smallest ratio of the spread of points across a line to that along it.
 NEAR_DISTANCE = 6e-3  # Largest distance of at least half of the points from the open cortex [m].
 FAR_DISTANCE = 12e-3  # Largest distance of a point from the open cortex [m]; points beyond are outliers.
-NEAR_DISTANCE_NOW = 18e-3  # NEAR for positions on the displaced surface [m]: drained brains sink by over a centimetre.
-FAR_DISTANCE_NOW = 30e-3  # FAR for positions on the displaced surface, and for tool tips [m].
+# NEAR_DISTANCE for positions on the displaced surface [m]: drained brains sink by over a centimetre.
+NEAR_DISTANCE_NOW = 18e-3
+FAR_DISTANCE_NOW = 30e-3  # FAR_DISTANCE for positions on the displaced surface, and for tool tips [m].
 PLACE_TOLERANCE = 1e-3  # Distance below which points count as one [m].
 MAX_COORDINATE = 1e6  # Largest coordinate [m].
 MAX_MOTION = 0.025  # Largest median motion of a brain [m].
@@ -118,7 +119,7 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
 
 
 def choose_points(count: int) -> np.ndarray:
-    """Select the numbers (k,) of at most `MOST` points, evenly spread over `count`."""
+    """Select the numbers (k,) of at most `MAX_POINTS` points, evenly spread over `count`."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(int))
 
 
@@ -246,7 +247,8 @@ def _check_spread(where: np.ndarray, near: np.ndarray) -> None:
     places = len(np.unique(np.round(where / PLACE_TOLERANCE), axis=0))
     if places < MIN_POINTS:
         raise InputError(
-            f"{places} places a millimetre apart say too little: give {MIN_POINTS} at least, spread over the open cortex."
+            f"{places} places a millimetre apart say too little: give {MIN_POINTS} at least, spread over the open "
+            "cortex."
         )
     some = where[near]
     along, across, _ = np.linalg.svd(some - some.mean(axis=0), compute_uv=False)
@@ -255,7 +257,7 @@ def _check_spread(where: np.ndarray, near: np.ndarray) -> None:
 
 
 def _compute_surface_distances(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """Compute distances (n,) [m] from the open cortex; within `NEAR` of a vertex, from the nearest vertex."""
+    """Compute distances (n,) [m] from the open cortex; within `NEAR_DISTANCE` of a vertex, from the nearest vertex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     away = np.sqrt(compute_squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
     far = np.flatnonzero(away > NEAR_DISTANCE)

@@ -301,7 +301,8 @@ def condition_prior(
         kept &= ~np.isin(point, np.unique(some.point)[excess >= max(1.0, 0.5 * excess.max())])
         if len(np.unique(point[kept])) < MIN_INLIERS:
             raise InputError(
-                f"of {len(np.unique(point))} points fewer than {MIN_INLIERS} agree on a motion: check that each has its own "
+                f"of {len(np.unique(point))} points fewer than {MIN_INLIERS} agree on a motion: check that each has "
+                "its own "
                 "motion. If they are less sure, raise sigma."
             )
     unknown = np.zeros(len(prior.kind) + 6)

@@ -103,7 +103,7 @@ class MotionPrior:
     kind, skull
         Indices (r,) into `KINDS` and into the names of `sim.effects.SKULLS`.
     place
-        Number (r,) of the position under the tool, or `NOWHERE`.
+        Number (r,) of the position under the tool, or `NO_PLACE`.
     centre
         Undeformed coordinates (p, 3) [m] of these positions.
     nodes

@@ -95,7 +95,8 @@ def fit_bound(
     each
         Minimum number of calibration loads in a class of force: fewer than 99 give no guarantee at 0.99.
     curved
-        True if the scale's logarithm is quadratic in the load's features, given `BENDS` seen loads; else linear.
+        True if the scale's logarithm is quadratic in the load's features, given `MIN_QUADRATIC_ERRORS` seen loads; else
+        linear.
     away, growth
         Distances (n,) [m] of the calibration loads from the nearest training load; growth of the bound with it [1/m].
     """

@@ -176,7 +176,8 @@ class Learned:
             if len(far):
                 raise InputError(
                     f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was trained on "
-                    f"{unit * most:.3g} {symbol} at most: give up to {MAX_TRAINING_RATIO:g} times that, or ask the finite "
+                    f"{unit * most:.3g} {symbol} at most: give up to {MAX_TRAINING_RATIO:g} times that, or ask the "
+                    "finite "
                     "elements."
                 )
         away = find_nearest(pushed.point[doubtful], self._patch.points)[1]
@@ -202,9 +203,9 @@ class Learned:
         Raises
         ------
         InputError
-            Loads of another kind, or that do not touch the open cortex, or are more than `FARTHEST` times as strong or
-            as wide as any of the training. A start with other rows, or as `relaxation.followed`; a vertex in `at` that
-            the model does not predict.
+            Loads of another kind, or that do not touch the open cortex, or are more than `MAX_TRAINING_RATIO` times as
+            strong or as wide as any of the training. A start with other rows, or as `relaxation.followed`; a vertex in
+            `at` that the model does not predict.
         """
         check_loads(loads)
         if start is not None and not isinstance(start, Deformation):

@@ -9,7 +9,10 @@ import numpy as np
 MAX_VERTEX_ERROR = 0.2e-3
 """Limit of the maximum vertex error of the tumour, at 95 %, beyond which FEM is used instead of a model [m]."""
 VERTEX_ERROR_LIMITS = (MAX_VERTEX_ERROR, 0.1e-3, 0.05e-3, 0.02e-3, 0.01e-3, 0.0)
-"""Candidate limits: a model gets the largest one that satisfies `MEAN` and `WORST`; with 0, FEM solves all loads."""
+"""Candidate limits: a model gets the largest one that satisfies `MAX_MEAN_ERROR` and `MAX_P999_ERROR`.
+
+With 0, FEM solves all loads.
+"""
 MAX_MEAN_ERROR = 0.01  # Largest mean error of a model without FEM fallback, as a share of the motion.
 MAX_P999_ERROR = 0.2e-3  # Largest 99.9th percentile of the vertex errors of a model without FEM fallback [m].
 MIN_LOADS_FOR_P999 = 1000
@@ -26,11 +29,12 @@ class LeftOut:
         Error over the motion of its load, mean over loads and tumour vertices: of the model alone, and as `Guarded`.
         Loads solved by FEM count as exact.
     p999
-        99.9th percentile of the model alone, over loads and vertices [m]; None for fewer than `FEWEST_FOR_P999` loads.
+        99.9th percentile of the model alone, over loads and vertices [m]; None for fewer than `MIN_LOADS_FOR_P999`
+        loads.
     solved
         Share of these loads that FEM solves.
     limit
-        Limit of `LIMITS` [m] in use; older files have the first.
+        Limit of `VERTEX_ERROR_LIMITS` [m] in use; older files have the first.
     """
 
     mean: float
@@ -86,7 +90,9 @@ def find_handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np
 
 
 def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> LeftOut:
-    """Compute errors on B loads, with the largest of `LIMITS` that keeps the guarded model within `MEAN` and `WORST`.
+    """Compute errors on B loads, and the largest of `VERTEX_ERROR_LIMITS` with a guarded model of small error.
+
+    Its mean error is at most `MAX_MEAN_ERROR`, its 99.9th percentile `MAX_P999_ERROR`.
 
     Parameters
     ----------
@@ -109,7 +115,7 @@ def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray
 
 
 def _compute_p999(distance: np.ndarray) -> float | None:
-    """Compute the 99.9th percentile of errors (B, n) [m]; None for fewer than `FEWEST_FOR_P999` loads."""
+    """Compute the 99.9th percentile of errors (B, n) [m]; None for fewer than `MIN_LOADS_FOR_P999` loads."""
     return float(np.percentile(distance, 99.9)) if len(distance) >= MIN_LOADS_FOR_P999 else None
 
 

@@ -38,7 +38,7 @@ class Relaxed:
     strange
         (B,) bool: True if the history is outside the training.
     memory
-        State for the next time step, in the layout of `MEMORY`.
+        State for the next time step, in the layout of `MEMORY_KEY`.
     """
 
     share: np.ndarray

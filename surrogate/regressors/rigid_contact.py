@@ -193,7 +193,7 @@ class RigidContact:
         return compute_bounding_balls(self.points[self.triangles])
 
     def _compute_path(self, x: np.ndarray) -> tuple[list[PlacedBox], float, np.ndarray | None]:
-        """Compute the tool's path for a row of features, its radius [m], and a row of `_found`, or None.
+        """Compute the tool's path for a row of features, its radius [m], and a row of `_find_contact`, or None.
 
         The path starts at the previous pose, if that is nearer than the first contact; then the row is the result
         there. Else it starts at the first step of the approach.
@@ -223,7 +223,7 @@ class RigidContact:
         return PlacedBox(x[8:11], axes, self.core[:3])
 
     def _solve_contact(self, stations: list[PlacedBox], radius: float, begun: np.ndarray | None) -> np.ndarray:
-        """Solve the contact of a tool of a radius [m] at the last of the stations of its path: a row of `_found`.
+        """Solve the contact of a tool of a radius [m] at the last station of its path: a row of `_find_contact`.
 
         begun is the result at the first of them; None: no contact before.
         """

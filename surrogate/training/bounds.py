@@ -133,8 +133,9 @@ def collect_missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarr
 def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = None) -> Bound:
     """Calibrate a bound on loads `near` the training loads, with a `growth` [1/m] by distance from these.
 
-    One in `SCALE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
-    guarantee. With fewer than `ENOUGH` loads all calibrate, and its scale follows the errors of `seen`, if given.
+    One in `SCALE_STRIDE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
+    guarantee. With fewer than `MIN_SCALE_LOADS` loads all calibrate, and its scale follows the errors of `seen`, if
+    given.
     """
     if seen is None or len(near.error) >= MIN_SCALE_LOADS:
         fits = _select_scale_loads(near)
@@ -193,7 +194,7 @@ class ModelErrors:
     force: Missed | None = None
 
     def list_available(self) -> dict[str, Missed]:
-        """Return the available errors, by the names of `WAYS`."""
+        """Return the available errors, by the names of `BOUND_FITS`."""
         found = {"tumour": self.tumour, "tip": self.tip}
         return found if self.force is None else {**found, "force": self.force}
 

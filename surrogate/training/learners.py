@@ -59,7 +59,7 @@ class SharedInputs:
         return tuple(ModelPart("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
     def solve_counts(self, name: str, examples: Examples) -> SolveCounts:
-        """Count the FEM solves that a model of `LEARNERS` or `OF_POSES`, or a user-defined one, depends on."""
+        """Count the FEM solves that a model of `LEARNERS` or `POSE_LEARNERS`, or a user-defined one, depends on."""
         known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
         seconds = [data.estimate_seconds("load", loads)]
@@ -124,7 +124,7 @@ class Tuned:
 
 
 def find_inner_discs(points: np.ndarray) -> np.ndarray:
-    """Return the mask (n,) of points in discs round `CENTRES` of the points (n, 3), far from each other."""
+    """Return the mask (n,) of points in discs round `INNER_DISCS` of the points (n, 3), far from each other."""
     distance = find_nearest(points, points[spread(points, INNER_DISCS)])[1]
     return distance <= np.quantile(distance, INNER_SHARE)
 

@@ -111,7 +111,7 @@ def train(
     converged load, calibrates nothing and returns the models trained on it.
 
     Every model predicts the tumour and the open cortex; the cortex is not scored, and comes from the compliance matrix
-    if the model type is not in `EXPANDED`. Cases that did not converge are ignored.
+    if the model type is not in `SERIES_MODELS`. Cases that did not converge are ignored.
 
     Parameters
     ----------

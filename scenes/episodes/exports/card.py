@@ -110,7 +110,10 @@ def keep_card(
     if not numbers or not (changed or _is_outdated(folder, {to_episode_name(number) for number in numbers})):
         return None
     if len(numbers) > MAX_COMPARED_EPISODES:
-        return f"No data sheet of more than {MAX_COMPARED_EPISODES} episodes: `sulcus convert {folder} --to card` writes it."
+        return (
+            f"No data sheet of more than {MAX_COMPARED_EPISODES} episodes: `sulcus convert {folder} --to card` "
+            "writes it."
+        )
     try:
         write_card(folder, progress=progress)
     except (InputError, OSError) as error:  # the episodes of the run are unaffected

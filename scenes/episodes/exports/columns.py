@@ -131,7 +131,7 @@ def read_per_frame(file: h5py.File, contents: EpisodeContents, name: str) -> np.
 
 
 def split_into_blocks(frames: int) -> Iterator[range]:
-    """All frames, `BLOCK` at a time."""
+    """All frames, `BLOCK_FRAMES` at a time."""
     return (range(start, min(start + BLOCK_FRAMES, frames)) for start in range(0, frames, BLOCK_FRAMES))
 
 

@@ -233,7 +233,7 @@ def describe_collection(episodes: Sequence[EpisodeContents], run: RunSettings | 
 
 
 def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
-    """Yield lines with the number of occurrences of each text; at most the `MOST_LISTED` most frequent."""
+    """Yield lines with the number of occurrences of each text; at most the `MAX_LISTED_NAMES` most frequent."""
     often = Counter(map(str, texts)).most_common()
     yield from (f"- {title}: {text} (in {count})" for text, count in often[:MAX_LISTED_NAMES])
     if often[MAX_LISTED_NAMES:]:

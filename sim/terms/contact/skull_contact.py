@@ -135,7 +135,10 @@ def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
 
 @wp.func
 def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
-    """Return the largest t <= 1 with distance - t falls - t^2 bends / 2 >= (1 - ROOM_KEPT) distance; bends >= 0."""
+    """Return the largest t <= 1 with distance - t falls - t^2 bends / 2 >= (1 - MAX_STEP_FRACTION) distance.
+
+    Bends >= 0.
+    """
     lost = wp.float64(MAX_STEP_FRACTION) * distance
     root = falls + wp.sqrt(falls * falls + wp.float64(2.0) * lost * bends)
     if root > wp.float64(2.0) * lost:
