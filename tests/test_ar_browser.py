@@ -24,9 +24,7 @@ def heard():
     return {"force": [], "deformer": [], "play": [], "frame": []}
 
 
-def open_page(
-    heard: dict[str, list], port: int, host: str = "127.0.0.1", limits: ConnectionLimits = DEFAULT_LIMITS
-) -> Browser:
+def open_page(heard, port, host="127.0.0.1", limits=DEFAULT_LIMITS) -> Browser:
     bodies = [
         SceneSurface("tumour", TRIANGLE, np.array([[0, 1, 2]]), (0.2, 0.9, 0.3)),
         SceneSurface("brain", TRIANGLE, np.array([[0, 1, 2]]), opacity=0.3),

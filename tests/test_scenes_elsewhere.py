@@ -12,16 +12,10 @@ from scipy.stats import chi2
 from theatres import template_theatre
 
 from ar.optics.lens import Lens
+from ar.tracking import pose_stream
 from ar.tracking.pictures import read_video
 from ar.tracking.pose import Pose, Verdict
-from ar.tracking.pose_stream import (
-    DAY_SECONDS,
-    MAX_EXTRAPOLATION,
-    MAX_GAP,
-    Clock,
-    build_pose_stream,
-    estimate_clock_by_motion,
-)
+from ar.tracking.pose_stream import Clock, build_pose_stream, estimate_clock_by_motion
 from ar.tracking.rigid import move_about
 from ar.tracking.targets import build_patient_reference
 from scenes.cli import main
@@ -51,6 +45,7 @@ TRACKER = move_about(np.eye(4), np.zeros(3), np.array([0.3, -0.2, 1.1, 0.5, -0.7
 """T_tracker_scan."""
 NOISE = np.diag(np.repeat([1e-4**2, 3e-4**2], 3))
 NONE = np.zeros((6, 6))
+DAY, AHEAD = pose_stream.DAY_SECONDS, pose_stream.MAX_EXTRAPOLATION
 
 
 def swung(time):
@@ -96,32 +91,31 @@ def test_pose_gap_extrapolates_for_a_moment_only():
     times = np.concatenate([np.arange(0.0, 1.0, 0.04), np.arange(1.3, 2.0, 0.04)])
     stream = sampled(swung, times)
     last = times[times < 1.0][-1]
-    on, beyond = stream.interpolate(last + 0.9 * MAX_EXTRAPOLATION), stream.interpolate(last + 1.1 * MAX_EXTRAPOLATION)
+    on, beyond = stream.interpolate(last + 0.9 * AHEAD), stream.interpolate(last + 1.1 * AHEAD)
     assert beyond is None and on is not None
-    off = twist(on.T_camera_target, swung(last + 0.9 * MAX_EXTRAPOLATION))
+    off = twist(on.T_camera_target, swung(last + 0.9 * AHEAD))
     assert off @ np.linalg.solve(on.covariance, off) <= chi2.ppf(0.95, 6)
     assert np.trace(on.covariance) > 2.0 * np.trace(stream.interpolate(0.5).covariance)
     assert stream.interpolate(-0.01) is None and stream.compute_age(-0.01) == np.inf and stream.interpolate(1.2) is None
     assert stream.interpolate(1.3) is not None and stream.interpolate(1.31) is not None
     assert stream.interpolate(1.3 - 5e-5) is not None and stream.interpolate(1.29) is None  # files round times
-    assert stream.compute_age(1.2) == pytest.approx(1.2 - last) and MAX_GAP < 0.3
-    assert ExternalTracker(stream, sampled(swung, times[:10])).compute_age(2.5) == pytest.approx(
-        2.5 - times[9]
-    )  # of the older one
+    assert stream.compute_age(1.2) == pytest.approx(1.2 - last) and pose_stream.MAX_GAP < 0.3
+    older = ExternalTracker(stream, sampled(swung, times[:10]))
+    assert older.compute_age(2.5) == pytest.approx(2.5 - times[9])
     with pytest.raises(ValueError, match="pose 3 is not later"):
         build_pose_stream(np.array([0.0, 2.0, 1.0]), np.tile(np.eye(4), (3, 1, 1)), np.tile(NONE, (3, 1, 1)))
 
 
 def test_a_clock_of_24_hours_goes_on_at_midnight():
     times = np.arange(0.0, 2.0, 0.025)
-    stamps = (times + DAY_SECONDS - 1.0) % DAY_SECONDS
+    stamps = (times + DAY - 1.0) % DAY
     stream = build_pose_stream(stamps, np.stack([swung(time) for time in times]), np.tile(NONE, (len(times), 1, 1)))
     for time in (0.4, 1.5):
-        for days in (-DAY_SECONDS, 0.0, DAY_SECONDS):
-            pose = stream.interpolate(time + DAY_SECONDS - 1.0 + days)
+        for days in (-DAY, 0.0, DAY):
+            pose = stream.interpolate(time + DAY - 1.0 + days)
             np.testing.assert_allclose(pose.T_camera_target, swung(time), atol=5e-4)
     epoch = sampled(swung, times, offset=1.7e9)  # seconds since 1970: other days are other times
-    assert epoch.interpolate(1.7e9 + 0.5) is not None and epoch.interpolate(1.7e9 + 0.5 + DAY_SECONDS) is None
+    assert epoch.interpolate(1.7e9 + 0.5) is not None and epoch.interpolate(1.7e9 + 0.5 + DAY) is None
 
 
 def test_clocks_are_compared_by_motion_with_an_error_that_holds():
@@ -192,9 +186,9 @@ def test_a_tool_in_a_film_is_where_another_tracker_has_it(follower, stage, bodie
     truth = read_truth(FILM / "truth.npz", stage.anatomy.digest, len(stage.tumour_vertices))
     rng, late = np.random.default_rng(0), 0.06
     times = np.arange(-0.5, 3.5, 1.0 / 30.0)
-    streams = [sampled(bodies[name], times, rng, DAY_SECONDS - 1.0 + late) for name in ("tool", "patient")]
-    right = ExternalTracker(*streams, Clock(DAY_SECONDS - 1.0 + late, 2e-3))
-    wrong = replace(right, clock=Clock(DAY_SECONDS - 1.0))
+    streams = [sampled(bodies[name], times, rng, DAY - 1.0 + late) for name in ("tool", "patient")]
+    right = ExternalTracker(*streams, Clock(DAY - 1.0 + late, 2e-3))
+    wrong = replace(right, clock=Clock(DAY - 1.0))
     (off, spread), (late_off, _) = tips(follower, right, truth), tips(follower, wrong, truth)
     assert len(off) == len(truth.times) and off.max() < 6e-4 and (off < 3.0 * spread).all()
     assert late_off.max() > 5e-4 and late_off.max() > 2.0 * off.max()
@@ -203,7 +197,7 @@ def test_a_tool_in_a_film_is_where_another_tracker_has_it(follower, stage, bodie
     true = truth.T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
     step = twist(looked.T_camera_target, true)
     assert np.linalg.norm(step[:3]) < 1e-3 and step @ np.linalg.solve(looked.covariance, step) < chi2.ppf(0.999, 6)
-    riding = replace(eye, body=sampled(lambda time: np.eye(4), times, offset=DAY_SECONDS - 1.0 + late))
+    riding = replace(eye, body=sampled(lambda time: np.eye(4), times, offset=DAY - 1.0 + late))
     np.testing.assert_allclose(replace(right, eye=riding).find_reference(0.0).T_camera_target, looked.T_camera_target)
 
 
@@ -314,7 +308,7 @@ class Still:
 
 def written(path, stream):
     rows = [
-        TrackedRow(time % DAY_SECONDS, Verdict.GOOD, Pose(T, covariance, 0.0, 0), 0.0)
+        TrackedRow(time % DAY, Verdict.GOOD, Pose(T, covariance, 0.0, 0), 0.0)
         for time, T, covariance in zip(stream.times.tolist(), stream.poses, stream.covariances, strict=True)
     ]
     write_poses(path, rows, np.zeros(3))
@@ -323,12 +317,10 @@ def written(path, stream):
 
 def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys):
     times, rng = np.arange(-0.5, 3.5, 0.025), np.random.default_rng(2)
-    files = [
-        written(tmp_path / f"{name}.csv", sampled(bodies[name], times, rng, DAY_SECONDS - 1.0))
-        for name in ("tool", "patient")
-    ]
+    streams = ((name, sampled(bodies[name], times, rng, DAY - 1.0)) for name in ("tool", "patient"))
+    files = [written(tmp_path / f"{name}.csv", stream) for name, stream in streams]
     again = read_stream(files[0])
-    assert again.daily and again.times[-1] > DAY_SECONDS and again.covariances[0, 0, 0] == pytest.approx(1e-8)
+    assert again.daily and again.times[-1] > DAY and again.covariances[0, 0, 0] == pytest.approx(1e-8)
     given = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
     words = ["overlay", str(FILM / "film.mp4"), *given, "--tool", str(FILM / "tool.json"), "--poses", *files]
     quick = ["--deformer", "rest", "--device", "cpu", "--json"]
@@ -338,7 +330,7 @@ def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys)
     assert said["tool_seen_percent"] == said["reference_seen_percent"] > 70.0
     assert said["states"][TumourState.UNKNOWN.value] == 11
     offset, error = (float(part.split()[0]) for part in (err.split("clock is ")[1], err.split("+- ")[1]))
-    assert abs(offset - (DAY_SECONDS - 1.0)) < 5.0 * error < 0.05
+    assert abs(offset - (DAY - 1.0)) < 5.0 * error < 0.05
     for more, why in (
         (["--clock", "soon"], "give seconds"),
         (["--camera-poses", files[0]], "give --hand-eye"),

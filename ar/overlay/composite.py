@@ -227,9 +227,7 @@ def _draw_sketch(
 def _describe_motion(hidden: Layer, before: Layer, words: Words) -> str:
     """Describe the surface's mean motion, or the given motion."""
     mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-    return (
-        f"{words.names.motion} {format_millimetres(mean) if words.moved is None else format_millimetres(*words.moved)}"
-    )
+    return f"{words.names.motion} {format_millimetres(*((mean,) if words.moved is None else words.moved))}"
 
 
 def _write_lines(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overlaid:
@@ -257,9 +255,8 @@ def _write_labels(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Seque
         before_it = taken.copy()
         write_gauge(out, taken, measure.camera, measure.gauge, front, sketch.taken, sketch.thin)
         # The text of the style is not about the number.
-        apart = cv2.dilate(
-            ((taken > 0) & (before_it == 0)).view(np.uint8), np.ones((2 * STYLE_TEXT_DISTANCE + 1,) * 2, np.uint8)
-        )
+        square = np.ones((2 * STYLE_TEXT_DISTANCE + 1,) * 2, np.uint8)
+        apart = cv2.dilate(((taken > 0) & (before_it == 0)).view(np.uint8), square)
     ground, around = sketch.ground, sketch.around
     if ground is None or around is None:
         measure.lay(out, taken, front, front)

@@ -230,9 +230,8 @@ def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
         if answer is None:
             return None
         last, before, inverted = answer, time, max(inverted, int(answer.inverted[0]))
-        found.append(
-            _get_tumour_motion(stage.select_stage(scene.build_loads(theatre.site, scene.path(time), time)), last)
-        )
+        loads = scene.build_loads(theatre.site, scene.path(time), time)
+        found.append(_get_tumour_motion(stage.select_stage(loads), last))
     return SolvedMotions(tuple(found), inverted)
 
 
@@ -344,8 +343,7 @@ def split_contributions(
         first = last
     found[COMBINED] = compute_field_size(off - (design @ slope).reshape(off.shape))
     found[MESH] = compute_field_size(estimate_mesh_deviations(scene, draws)[:, None, None] * motion)
-    found[REGISTRATION] = float(np.sqrt(3.0)) * REGISTRATION_PRIOR.range[1]
-    return found | {SEGMENTATION: SEGMENTATION_PRIOR.range[1]}
+    return found | {REGISTRATION: 3.0**0.5 * REGISTRATION_PRIOR.range[1], SEGMENTATION: SEGMENTATION_PRIOR.range[1]}
 
 
 def collect_contributor_values(draws: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:

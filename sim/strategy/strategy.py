@@ -265,9 +265,8 @@ class Strategy:
             answer.put(some, self._run_newton(gather_columns(device, found.u, some), few), device)
         left = np.flatnonzero(~answer.good)
         for some in batched(left):
-            answer.put(
-                some, self._close_gaps(cases.select(some), gather_columns(device, start, some), outer, gaps), device
-            )
+            begun = gather_columns(device, start, some)
+            answer.put(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
         return answer
 
     def _close_gaps(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
@@ -290,9 +289,8 @@ class Strategy:
 
     def _run_newton(self, start: wp.array, outer: int, tolerance: float | None = None) -> SolverResult:
         """Solve the begun batch by Newton, in at most `outer` iterations."""
-        newton = NewtonCG(self._touched, self.accuracy.inner)
         accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
-        found = find_equilibrium(self.problem, newton, start, accuracy)
+        found = find_equilibrium(self.problem, NewtonCG(self._touched, accuracy.inner), start, accuracy)
         return self._build_result(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
 
     def _build_result(
