@@ -79,6 +79,17 @@ class Fem:
     ------
     InputError
         Unsupported effects or elements, a body that is not fixed, a device that is not available, a batch below 1.
+
+    Examples
+    --------
+    >>> from scenes import get_template_path
+    >>> from sim import Bonded, Elasticity, Fem, Held, ToolForce, open_cortex, push, read_anatomy
+    >>> anatomy = read_anatomy(get_template_path())
+    >>> place = open_cortex(anatomy).place(right_mm=0, up_mm=0)
+    >>> fem = Fem(anatomy, [Elasticity(), Held(), Bonded(), ToolForce()], device="cpu", element="p1")
+    >>> result = fem.deform(push(place.point, 0.1 * place.inward, footprint=7e-3), at=anatomy.tumour_nodes)
+    >>> print(f"{1e3 * np.linalg.norm(result.displacement[0].mean(axis=0)):.1f} mm; {result.outcome[0].value}")
+    0.3 mm; converged to the tolerance asked for
     """
 
     def __init__(

@@ -266,6 +266,13 @@ def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) ->
     ------
     InputError
         See `Loads`.
+
+    Examples
+    --------
+    >>> from sim import push
+    >>> loads = push(np.zeros(3), force=np.array([[0, 0, -0.1], [0, 0, -0.2]]), footprint=7e-3)
+    >>> len(loads)  # the point and the radius are common to both load cases
+    2
     """
     rows = _repeat_rows("Pushed", point=(point, (3,)), force=(force, (3,)), footprint=(footprint, ()))
     return Loads((Pushed(**rows),))

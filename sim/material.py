@@ -45,6 +45,13 @@ class Material:
     ------
     InputError
         Unknown law, E <= 0, nu outside (-1, 0.5), a series that is not physical or not supported by the law.
+
+    Examples
+    --------
+    >>> from sim import Material
+    >>> tissue = Material("neo-hookean", young=3000.0, poisson=0.49)
+    >>> print(f"{tissue}; mu {tissue.lame[0]:.0f} Pa")
+    neo-hookean, E 3 kPa, nu 0.49; mu 1007 Pa
     """
 
     law: str

@@ -94,18 +94,23 @@ def solve_with_debonding(
 
     Returns
     -------
-    Torn
+    DebondedSolution
         Solution after debonding, debonded vertices, and convergence.
-
-    Examples
-    --------
-    >>> found = torn(anatomy, pushed_effects(anatomy, BRAIN), push(point, force, footprint=6e-3))  # doctest: +SKIP
-    >>> found.rested, len(found.sliding) + len(found.free)  # doctest: +SKIP
 
     Raises
     ------
     InputError
         More than one load, no `Bonded`, a body that separates completely, and as `Fem.deform`.
+
+    Examples
+    --------
+    >>> from scenes import get_template_path
+    >>> from sim import BRAIN, build_push_effects, open_cortex, push, read_anatomy, solve_with_debonding
+    >>> anatomy = read_anatomy(get_template_path())
+    >>> place, effects = open_cortex(anatomy).place(), build_push_effects(anatomy, BRAIN)
+    >>> found = solve_with_debonding(anatomy, effects, push(place.point, 0.3 * place.inward, 7e-3), element="p1")
+    >>> found.rested, len(found.sliding), len(found.free)
+    (True, 0, 0)
     """
     if len(loads) != 1:
         raise InputError(f"{len(loads)} loads debond separately: give one at a time.")

@@ -39,6 +39,14 @@ class Camera:
     ------
     ValueError
         Wrong shapes, numbers that are not finite, no focal length, or a transform that is not rigid.
+
+    Examples
+    --------
+    >>> from ar import Camera
+    >>> K = np.array([[1000.0, 0.0, 319.5], [0.0, 1000.0, 239.5], [0.0, 0.0, 1.0]])
+    >>> camera = Camera(K, np.eye(4), width=640, height=480)  # at the origin, along z
+    >>> camera.project(np.array([0.01, 0.0, 0.2]))[0].round(1).tolist()  # [pixel]
+    [369.5, 239.5]
     """
 
     K: np.ndarray
@@ -213,6 +221,13 @@ def look_at(
 
     `vertical_fov` [rad]; square pixels, principal point in the centre. Raises ValueError if no direction is defined:
     eye on target, or `up` along the line of sight.
+
+    Examples
+    --------
+    >>> from ar import look_at
+    >>> camera = look_at(eye=np.array([0.0, 0.0, 0.3]), target=np.zeros(3), up=np.array([0.0, 1.0, 0.0]))
+    >>> camera.project(np.zeros(3))[0].round(1).tolist()  # [pixel]
+    [319.5, 239.5]
     """
     forward = np.asarray(target, np.float64) - eye
     right = np.cross(forward, up)

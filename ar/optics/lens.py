@@ -33,6 +33,12 @@ class Lens:
     ------
     ValueError
         A coefficient that is not finite, or a lens that folds the image already at its centre.
+
+    Examples
+    --------
+    >>> from ar import Lens
+    >>> Lens(k1=-0.2, k2=0.05).distort(np.array([0.3, 0.0])).round(3).tolist()  # x / z, y / z
+    [0.295, 0.0]
     """
 
     k1: float = 0.0

@@ -156,6 +156,16 @@ def composite(
     ------
     ValueError
         An unknown style, or a camera or a mask whose size differs from the image's.
+
+    Examples
+    --------
+    >>> from ar import Layer, build_lamp, composite, look_at, render
+    >>> vertices, triangles = 0.1 * np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
+    >>> camera = look_at(np.array([0.0, 0.0, 0.4]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    >>> image = render(camera, [Layer("cortex", 1, vertices, triangles)], build_lamp(camera, np.zeros(3)))
+    >>> overlay = composite(image, camera, Layer("tumour", 2, 0.5 * vertices, triangles), style="contour")
+    >>> overlay.colour.shape, bool(overlay.taken.any())
+    ((480, 640, 3), True)
     """
     _check(picture, camera, style, cover.covered)
     if style == "none":

@@ -113,6 +113,15 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
     ------
     ValueError
         Two layers with one id.
+
+    Examples
+    --------
+    >>> from ar import Layer, build_lamp, look_at, render
+    >>> layer = Layer("cortex", 1, 0.1 * np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
+    >>> camera = look_at(np.array([0.0, 0.0, 0.4]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    >>> image = render(camera, [layer], build_lamp(camera, target=np.zeros(3)))
+    >>> image.colour.shape, int(image.segmentation[240, 320]), round(float(image.depth[240, 320]), 1)
+    ((480, 640, 3), 1, 0.4)
     """
     return Renderer(layers, lamp, device).render(camera, [layer.vertices for layer in layers if not layer.still])
 

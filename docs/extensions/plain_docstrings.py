@@ -32,10 +32,10 @@ def _each(app: Sphinx, kind: Any, name: str, member: object, settings: object, l
 
 
 def structured(lines: Sequence[str]) -> list[str]:
-    """Convert text to reStructuredText: marks are escaped, indented formulas keep their shape."""
+    """Convert text to reStructuredText: marks are escaped, indented formulas and doctests keep their shape."""
     found: list[str] = []
     plain: list[str] = []
-    inside = described = False
+    inside = described = shown = False
     for number, line in enumerate(lines):
         inset, empty = line.startswith("    "), not line.strip()
         # Below the underline of a section, inset lines describe parameters.
@@ -44,7 +44,11 @@ def structured(lines: Sequence[str]) -> list[str]:
             found += [*_unmarked(plain), "::", ""]
             plain, inside = [], True
         inside = inside and (inset or empty)
-        (found if inside else plain).append(line)
+        shown = (shown or line.startswith(">>>")) and not empty
+        if shown:
+            found += _unmarked(plain)
+            plain = []
+        (found if inside or shown else plain).append(line)
     return found + _unmarked(plain)
 
 

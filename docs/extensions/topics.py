@@ -3,17 +3,17 @@
 TOPICS = {
     "sim": {
         "Meshes and anatomies": """TetMesh Anatomy Body OpenCortex Place Subject Tumour Lobed MeshPlan MeshFile
-            MeshWarning read_mesh write_mesh read_anatomy write_anatomy make_anatomy open_cortex volume_subject
-            template_subject refined""",
+            MeshWarning read_mesh write_mesh read_anatomy write_anatomy make_anatomy open_cortex build_volume_subject
+            build_template_subject refine""",
         "Tissue": "Material Ogden Tissue BRAIN MATERIALS Law check_tissue",
-        "Loads": """Loads Pushed Touching Displaced Nodal Prescribed Posture Retracted Resected push posture
-            stacked""",
+        "Loads": """Loads Pushed Touching Displaced Nodal Prescribed Posture Retracted Resected push build_posture
+            stack""",
         "Tools": "Ball Capsule Spatula Core",
         "Effects of a scene": """Elasticity Held Bonded Slide SkullContact ToolForce ToolContact ToolDisplacement
-            NodalForce Gravity Inertia Pulsation Resection Retraction pushed_effects""",
-        "Solver": """Fem finite_elements Deformer Deformation Outcome Cost Accuracy DRAFT LIVE TRAIN REFERENCE
+            NodalForce Gravity Inertia Pulsation Resection Retraction build_push_effects""",
+        "Solver": """Fem build_fem Deformer Deformation Outcome Cost Accuracy DRAFT LIVE TRAIN REFERENCE
             InputError""",
-        "Derived results": "pressure torn Torn",
+        "Derived results": "compute_pressure solve_with_debonding DebondedSolution",
         "Extension": "OwnEffect OwnCause OwnTool Term Cases",
     },
     "surrogate": {
@@ -22,7 +22,7 @@ TOPICS = {
         "Evaluation": "score Score compute_coverage Coverage",
         "Tumour position from observations": """Locator make_locator load_locator save_locator Location Observation
             read_observation""",
-        "Tissue of a patient": "fit_tissue FittedTissue load_tissue save_tissue Frame Tool read_tools",
+        "Tissue of a patient": "fit_tissue FittedTissue load_tissue save_tissue ObservedFrame Tool read_tools",
         "Extension": "Regressor register_learner",
     },
     "ar": {
@@ -32,11 +32,12 @@ TOPICS = {
         "Output": "Browser read_png write_png write_video",
     },
     "scenes": {
-        "Scenes": "Scene find_scene Bounds Player Frame Theatre open_theatre Site build_site get_template_path",
+        "Scenes": """Scene find_scene Bounds Player Frame PatientSetup open_theatre CraniotomyFrame
+            build_craniotomy_frame get_template_path""",
         "Tool motion": """Touch press slide palpate stroke_cortex keep_idle draw lay Instrument Probe Blade Debulking
-            Lying""",
+            HeadPose""",
         "Cameras": "Viewpoint HandHeld Microscope Orbit Focus read_calibration write_calibration",
-        "Observation of the cortex": "Sight StereoSight",
+        "Observation of the cortex": "PointObservation StereoObservation",
         "Episodes": "collect Episodes EpisodeDataset read_episodes write_card",
     },
 }

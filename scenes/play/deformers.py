@@ -281,6 +281,13 @@ def open_theatre(
     InputError
         See `check_scene_exists`, before anything is read. Missing, unreadable or inconsistent files; an
         unavailable device.
+
+    Examples
+    --------
+    >>> from scenes import find_scene, open_theatre
+    >>> theatre = open_theatre(device="cpu")
+    >>> theatre.list_deformers(find_scene("press"))
+    ('linear', 'ann', 'svr', 'series', 'series-gp', 'guarded', 'fem')
     """
     for name in scenes:
         check_scene_exists(name)

@@ -149,6 +149,14 @@ class Player:
     """Scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous solution.
 
     If not `composed`, no overlay and no text are drawn, and `Frame.shown` is the camera image.
+
+    Examples
+    --------
+    >>> from scenes import find_scene, open_theatre
+    >>> player = open_theatre(device="cpu").build_player("series-gp", find_scene("press"))
+    >>> frame = player.draw(60, 2.0, player.get_touch(60))
+    >>> print(f"{frame.shown.shape}, the tumour moves by {1e3 * frame.moved:.1f} mm")
+    (600, 800, 3), the tumour moves by 1.3 mm
     """
 
     stage: Stage

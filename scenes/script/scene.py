@@ -268,6 +268,13 @@ def find_scene(name: str) -> Scene:
     InputError
         There is no scene of that name. Or the file is missing, does not run or has no SCENE. Or the scene's path gives
         no Touch, or its tissue fails `sim.check_tissue`.
+
+    Examples
+    --------
+    >>> from scenes import find_scene
+    >>> scene = find_scene("press")
+    >>> scene.duration, round(scene.path(2.0).force, 1)  # [s], [N]
+    (4.0, 0.3)
     """
     check_scene_exists(name)
     if name.endswith(".py"):

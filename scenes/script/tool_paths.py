@@ -62,7 +62,15 @@ def keep_idle(time: float) -> Touch:
 
 
 def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
-    """Press one position up to `force` [N] within `rise` [s], hold [s], and release as slowly."""
+    """Press one position up to `force` [N] within `rise` [s], hold [s], and release as slowly.
+
+    Examples
+    --------
+    >>> from scenes import press
+    >>> path = press(0.3, rise=1.0, hold=2.0)
+    >>> [round(path(time).force, 2) for time in (0.0, 0.5, 1.0, 3.0, 4.0)]  # [N]
+    [0.0, 0.15, 0.3, 0.3, 0.0]
+    """
 
     def path(time: float) -> Touch:
         return Touch(*at, force * (smooth(time / rise) - smooth((time - rise - hold) / rise)))

@@ -217,6 +217,14 @@ def read_anatomy(path: str | Path) -> Anatomy:
     InputError
         See `read_mesh`; a mesh without `held`, `slide_normal` or `craniotomy`, or with non-finite values there. A
         body outside the size limits for coordinates in metres.
+
+    Examples
+    --------
+    >>> from scenes import get_template_path
+    >>> from sim import read_anatomy
+    >>> anatomy = read_anatomy(get_template_path())
+    >>> anatomy.mesh.nodes.shape, anatomy.mesh.tets.shape, anatomy.tumour_nodes.shape
+    ((5312, 3), (25633, 4), (243,))
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "the body measures", MeshWarning)  # rejected below instead

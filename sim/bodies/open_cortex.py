@@ -127,6 +127,14 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
     ------
     InputError
         An anatomy without exposed cortex.
+
+    Examples
+    --------
+    >>> from scenes import get_template_path
+    >>> from sim import open_cortex, read_anatomy
+    >>> cortex = open_cortex(read_anatomy(get_template_path()))
+    >>> round(1e3 * cortex.radius, 1), cortex.place(right_mm=5, up_mm=0).inward.round(1).tolist()  # [mm], [1]
+    (22.8, [-0.7, -0.2, -0.7])
     """
     triangles = anatomy.open_surface
     if len(triangles) == 0:

@@ -191,6 +191,13 @@ def build_template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     ------
     InputError
         A tumour that would extend beyond the brain.
+
+    Examples
+    --------
+    >>> from sim import Tumour, build_template_subject
+    >>> subject = build_template_subject(Tumour(radius=0.010, cover=0.012))
+    >>> print(f"{1e6 * subject.tumour_volume:.1f} ml in {len(subject.pieces)} piece")
+    4.2 ml in 1 piece
     """
     return build_synthetic_subject(tumour, _load_scaled_template(head), head)
 

@@ -83,6 +83,14 @@ class TetMesh:
     -----
     MeshWarning
         Dihedral angles below one degree; a body smaller than 1 mm or larger than 10 m.
+
+    Examples
+    --------
+    >>> from sim import TetMesh
+    >>> nodes = 0.01 * np.eye(4, 3, k=-1)  # origin, and 10 mm along each axis
+    >>> mesh = TetMesh(nodes, tets=np.array([[0, 1, 2, 3]]), region=np.array([1]))
+    >>> print(f"{1e9 * mesh.volumes.sum():.1f} mm^3")
+    166.7 mm^3
     """
 
     nodes: np.ndarray

@@ -87,6 +87,14 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     InputError
         Unknown preset, a count below one, a negative seed, an anatomy without open cortex or (for `seed`) without
         tumour, or a patch too small for the tool.
+
+    Examples
+    --------
+    >>> from scenes import open_theatre
+    >>> from surrogate import draw
+    >>> loads = draw("palpation", open_theatre(device="cpu").anatomy, count=100, seed=0)
+    >>> len(loads), bool((np.linalg.norm(loads.causes[0].force, axis=1) <= 0.4).all())  # [N]
+    (100, True)
     """
     if preset not in PRESETS:
         raise InputError(f"no preset is called {preset!r}: choose one of {', '.join(PRESETS)}.")

@@ -93,6 +93,16 @@ class Learned:
         Errors on held-out cortex; None if none was held out, or for older files.
     force
         Model of the tool's force, if trained.
+
+    Examples
+    --------
+    >>> from scenes import open_theatre
+    >>> from sim import open_cortex, push
+    >>> model = open_theatre(device="cpu").models["series-gp"]
+    >>> place = open_cortex(model.anatomy).place()
+    >>> result = model.deform(push(place.point, 0.3 * place.inward, footprint=7e-3), at=model.anatomy.tumour_nodes)
+    >>> print(f"{1e3 * np.linalg.norm(result.displacement[0].mean(axis=0)):.1f} mm; {result.outcome[0].value}")
+    1.2 mm; predicted by a trained model inside its training range
     """
 
     anatomy: Anatomy

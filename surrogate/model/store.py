@@ -92,6 +92,16 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
     InputError
         A file that is missing or not a model file of this project, that was trained on another anatomy, or that holds
         an invalid model.
+
+    Examples
+    --------
+    >>> from scenes import get_template_path
+    >>> from sim import read_anatomy
+    >>> from surrogate import load
+    >>> path = get_template_path()
+    >>> models = load(path.with_suffix(".model.npz"), read_anatomy(path))
+    >>> sorted(models)
+    ['ann', 'linear', 'series', 'series-gp', 'svr']
     """
     path = to_path(path)
     if not path.is_file():

@@ -1,0 +1,39 @@
+"""Examples in the docstrings of public names: each runs as it is printed."""
+
+import doctest
+import importlib
+import inspect
+
+import numpy as np
+import pytest
+
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+LEAST = 20  # Number of public names with an example.
+
+
+def find_examples():
+    """Public names of the packages whose docstrings have examples, by `package.name`."""
+    found = {}
+    for package in map(importlib.import_module, ("sim", "surrogate", "ar", "scenes")):
+        for name in package.__all__:
+            value = getattr(package, name)
+            text = inspect.getdoc(value) or ""
+            if ">>>" in text and (inspect.isclass(value) or inspect.isfunction(value)):  # a constant has its class's
+                found[f"{package.__name__}.{name}"] = text
+    return found
+
+
+EXAMPLES = find_examples()
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example_prints_what_it_shows(name):
+    test = doctest.DocTestParser().get_doctest(EXAMPLES[name], {"np": np}, name, None, None)
+    assert not any(doctest.SKIP in example.options for example in test.examples)
+    report = []
+    failed, attempted = doctest.DocTestRunner(optionflags=FLAGS).run(test, out=report.append)
+    assert attempted and not failed, "".join(report)
+
+
+def test_main_names_have_examples():
+    assert len(EXAMPLES) >= LEAST
