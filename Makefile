@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
 # Pages answer visitors in time: these tests have the machine to themselves.
-PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py tests/test_scenes_overlay_page.py tests/test_scenes_referee.py tests/test_scenes_view.py
+PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py tests/test_scenes_overlay_page.py tests/test_scenes_fem_worker.py tests/test_scenes_view.py
 
 # The most telling tests: a minute on two cores.
 QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile scenes_solve \

@@ -20,9 +20,9 @@ import numpy as np
 
 from scenes.play.deformers import PatientSetup, open_theatre
 from scenes.play.observer import Observer, TumourEstimate
+from scenes.script.observation_models import PointObservation
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import get_template_path
-from scenes.script.sight import PointObservation
 
 MOMENTS, COUNTS = 5, (30, 100, 300)
 ERRORS = {"none": PointObservation(white=2e-5, smooth=2e-5, shift=0.0, turn=0.0), "of sag": PointObservation()}

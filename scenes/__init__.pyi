@@ -7,12 +7,12 @@ from .episodes.reading.windows import Episodes, read_episodes
 from .play.deformers import PatientSetup, open_theatre
 from .play.player import Frame, Player
 from .script.camera_paths import Focus, HandHeld, Microscope, Orbit
+from .script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
 from .script.debulking import Debulking
-from .script.head_posture import HeadPose
+from .script.head_pose import HeadPose
+from .script.observation_models import PointObservation, StereoObservation
 from .script.scene import Bounds, Scene, find_scene
 from .script.shipped_files import get_template_path
-from .script.sight import PointObservation, StereoObservation
-from .script.site import CraniotomyFrame, build_craniotomy_frame
 from .script.tool import Blade, Instrument, Probe
 from .script.tool_paths import Touch, draw, keep_idle, lay, palpate, press, slide, stroke_cortex
 from .script.viewpoint import Viewpoint

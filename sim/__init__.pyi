@@ -9,6 +9,7 @@ from .bodies.refine import refine
 from .bodies.subject import MeshPlan, Subject, make_anatomy
 from .bodies.template import Lobed, Tumour, build_template_subject
 from .contact_pressure import compute_pressure
+from .debonding import DebondedSolution, solve_with_debonding
 from .deformation import Cost, Deformation, Deformer, Outcome
 from .discretisation.body import Body
 from .discretisation.term import Cases, Term
@@ -48,7 +49,6 @@ from .loads import (
 from .material import BRAIN, MATERIALS, Material, Ogden, Tissue
 from .resected_fem import build_fem
 from .skulls import Bonded, SkullContact, Slide
-from .tearing import DebondedSolution, solve_with_debonding
 from .terms.laws.conformance import check_tissue
 from .terms.laws.law import Law
 from .tools import Ball, Capsule, Core, OwnTool, Spatula

@@ -33,8 +33,8 @@ from .minimisers.power_series import SeriesReading, count_terms, expand_taylor, 
 from .minimisers.residual import measure_residual
 from .runtime.columns import unstack_columns
 from .runtime.device import find_device
-from .runtime.exclusive import lock_method
 from .runtime.memory import check_fits, choose_batch_size, measure_free_bytes
+from .runtime.method_lock import lock_method
 from .runtime.threads import limit_to_one_thread
 from .strategy.bone import solve_off_bone
 from .strategy.extrapolation import as_pushes, compute_directions, extrapolate_start

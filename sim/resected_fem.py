@@ -18,7 +18,7 @@ from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
 from .fem import MID_EDGE_KEY, Fem
 from .loads import Loads, Resected, check_loads
-from .runtime.exclusive import lock_method
+from .runtime.method_lock import lock_method
 
 # Key in the memory: number of completed steps (B,).
 DONE_KEY = "resection"

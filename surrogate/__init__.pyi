@@ -7,7 +7,7 @@ from .data.tool_poses import draw_poses
 from .evaluation.coverage import Coverage, compute_coverage
 from .evaluation.score import Score, score
 from .fitting.fit import fit_tissue
-from .fitting.frame import ObservedFrame, Tool, read_tools
+from .fitting.observed_frame import ObservedFrame, Tool, read_tools
 from .fitting.tissue import FittedTissue, load_tissue, save_tissue
 from .locating.locator import Location, Locator
 from .locating.locator_store import load_locator, make_locator, save_locator

@@ -259,7 +259,7 @@ def study_rows(study):
 
 @pytest.fixture(scope="module")
 def site(box):
-    from scenes.script.site import build_craniotomy_frame
+    from scenes.script.craniotomy_frame import build_craniotomy_frame
 
     return build_craniotomy_frame(box)
 
@@ -293,7 +293,7 @@ def still(box):
     """An observer and the body at rest, with errors as they are by default, and many points."""
     from scenes.play.deformers import PatientSetup
     from scenes.play.observer import Observer
-    from scenes.script.sight import PointObservation
+    from scenes.script.observation_models import PointObservation
 
     return Observer(PatientSetup(box, None, {}, "cpu").site, None, PointObservation(points=400)), box.mesh.nodes
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.tracking.pictures import read_video
+from ar.tracking.image_sequences import read_video
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import Follower
 from scenes.tracked.registration_file import read_registration

@@ -7,10 +7,10 @@ from contextlib import asynccontextmanager
 
 import numpy as np
 
-from scenes.link.answer import PoseResponder
 from scenes.link.frame import HEADER, pack_message, read_header, to_stamp
-from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.link.outgoing import Outgoing
+from scenes.link.pose_responder import PoseResponder
+from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from scenes.link.session import LinkSession
 
 HOST = "127.0.0.1"

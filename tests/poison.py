@@ -5,8 +5,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from surrogate.data.answer_rows import compute_row_checksums
 from surrogate.data.dataset import read_rows
+from surrogate.data.solution_rows import compute_row_checksums
 
 
 def poisoned(source: Path, target: Path, rows: np.ndarray, group: str = "answers") -> tuple[Path, np.ndarray]:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from visitor import Visitor, free_port, wait_for
 
+from ar.page.access_guard import DEFAULT_LIMITS, ConnectionLimits
 from ar.page.browser import Browser
 from ar.page.elements import PICTURE, SAID, SLICES, STYLE_KEY, keep_together, to_data_url
-from ar.page.guard import DEFAULT_LIMITS, ConnectionLimits
 from ar.page.parts import Dropdown, Fold, Note, Playback, SceneSurface, SceneViewpoint, Sign, Slider, Toggle
 from ar.page.recording import RECORD_LABEL, STOP_LABEL
 from ar.page.style import NOTE, PAGE, STATUS, build_style

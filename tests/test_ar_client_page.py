@@ -5,7 +5,7 @@ import http.client
 from contextlib import closing
 
 import pytest
-from test_ar_guard import Page
+from test_ar_access_guard import Page
 
 from ar.page.client_page import NO_WEBGL_CLASS, SCRIPT, build_document
 from ar.page.style import build_style

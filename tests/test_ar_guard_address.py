@@ -1,9 +1,9 @@
 """A page behind a proxy or another port: addresses that are allowed, each with the token."""
 
 import pytest
-from test_ar_guard import Page, ask, knock
+from test_ar_access_guard import Page, ask, knock
 
-from ar.page import guard
+from ar.page import access_guard as guard
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from ar.overlay.hud import (
     wrap_line,
 )
 from ar.overlay.outlines import find_text
-from ar.overlay.places import BORDER_DISTANCE
+from ar.overlay.text_placement import BORDER_DISTANCE
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.drawn import render_targets
 from ar.tracking.pose import Tracker, Verdict, find_pose
+from ar.tracking.synthetic_images import render_targets
 from ar.tracking.targets import (
     TIP_DISTANCE,
     DetectedCorners,

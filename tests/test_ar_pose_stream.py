@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ar.tracking.pose_stream import Clock, build_pose_stream
-from scenes.tracked.elsewhere import ExternalTracker
+from scenes.tracked.external_tracker import ExternalTracker
 
 
 @pytest.mark.parametrize(("error", "expected"), [(0.0, 0.0), (0.01, 2e-3)])

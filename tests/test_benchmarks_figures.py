@@ -14,7 +14,7 @@ from benchmarks.figures.figure_readings import LIVE, STAGES
 from benchmarks.figures.figures import FIGURES, NAMED, SHORTCUTS, words_of
 from benchmarks.peers import comparison as peers
 from benchmarks.studies import elements, frame, live, robustness, scaling, shortcuts, skull_models, stages, throughput
-from scenes.script.site import build_craniotomy_frame
+from scenes.script.craniotomy_frame import build_craniotomy_frame
 from surrogate.data.tool_loads import PRESETS
 
 HOUSE = Path(__file__).parents[1]

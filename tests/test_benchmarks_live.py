@@ -11,8 +11,8 @@ from benchmarks.__main__ import main
 from benchmarks.studies import live
 from benchmarks.studies.live import RIDES, WARM_UP, Frame, Ride, errors, frames_of, loads_of, tally
 from scenes.analysis.budget import MAX_LIVE_ERROR
+from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import find_scene
-from scenes.script.site import build_craniotomy_frame
 from scenes.script.tool_paths import stroke_cortex
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome

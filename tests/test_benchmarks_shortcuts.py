@@ -11,7 +11,7 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.studies import shortcuts
 from benchmarks.studies.shortcuts import Row, Work, measure, works
-from scenes.script.site import CraniotomyFrame, build_craniotomy_frame
+from scenes.script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
 from sim.effects import build_push_effects

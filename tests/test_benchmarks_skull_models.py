@@ -14,11 +14,11 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, build_template_subject
+from sim.debonding import Tearing
 from sim.deformation import Outcome
 from sim.effects import Bonded, Slide, build_push_effects
 from sim.fem import Fem
 from sim.material import Material
-from sim.tearing import Tearing
 from surrogate.data.dataset import read_dataset
 from surrogate.data.tool_loads import draw
 from surrogate.model.applicability import read_trained_skull

@@ -29,7 +29,7 @@ ORDER = (
     {"sim.local_solvers"},
     {"sim.strategy"},
     {"sim.fem"},
-    {"sim.resected_fem", "sim.contact_pressure", "sim.tearing"},
+    {"sim.resected_fem", "sim.contact_pressure", "sim.debonding"},
     {"surrogate.array_functions"},
     {"surrogate.data", "surrogate.regressors"},
     {"surrogate.model"},
@@ -73,7 +73,7 @@ OWNERS = {
     "onnx": {"surrogate/onnx_export/export.py", "surrogate/onnx_export/graph.py"},
     "fastcrc": {"scenes/link/frame.py"},
     "pyamg": {"sim/linalg/amg.py"},
-    "PIL": {"ar/tracking/pages.py", "ar/tracking/pictures.py", "scenes/commands/inspection_sheet.py"},
+    "PIL": {"ar/tracking/pages.py", "ar/tracking/image_sequences.py", "scenes/commands/inspection_sheet.py"},
     "nibabel": {"sim/bodies/intensity.py", "sim/bodies/nifti.py", "scenes/warp/images.py"},
 }
 """Libraries that nobody else imports."""

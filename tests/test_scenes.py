@@ -9,9 +9,9 @@ from theatres import PUSHING, on_template, small, template_theatre
 
 from ar.optics.camera import project_cv2
 from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clip_surface
-from scenes.script.head_posture import HeadPose
+from scenes.script.craniotomy_frame import build_craniotomy_frame
+from scenes.script.head_pose import HeadPose
 from scenes.script.scene import SCENES, find_scene
-from scenes.script.site import build_craniotomy_frame
 from scenes.script.tool import Probe
 from scenes.script.tool_paths import IDLE_HEIGHT, Touch, compute_lift
 from scenes.script.viewpoint import TARGET_DEPTH, Viewpoint

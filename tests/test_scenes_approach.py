@@ -17,8 +17,8 @@ from scenes.cli import main
 from scenes.options.placement_options import add_opening_arguments, get_trajectory_option, to_opening_options
 from scenes.play.deformers import PatientSetup
 from scenes.script.approach import Approach, approach_of
+from scenes.script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
 from scenes.script.scene import PALPATION, find_scene
-from scenes.script.site import CraniotomyFrame, build_craniotomy_frame
 from scenes.script.tool import Blade
 from scenes.script.tool_paths import Touch, keep_idle, press
 from sim.bodies.label_volume import build_volume_subject

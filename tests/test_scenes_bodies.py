@@ -16,7 +16,7 @@ from scenes.episodes.make import make_body, to_body_path
 from scenes.episodes.plan import load_plan
 from sim.anatomy import PART_LABELS, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
-from surrogate.model.left_out import MAX_VERTEX_ERROR, HeldOutError, LeftOut
+from surrogate.model.held_out import MAX_VERTEX_ERROR, HeldOutError, LeftOut
 from surrogate.model.store import load, read_reported_errors
 
 PLAN = """title = "A box"

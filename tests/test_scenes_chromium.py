@@ -22,7 +22,7 @@ def demo(box):
     """A page that has played up to frame 40 and is paused."""
     scene = small(path=press(0.3, rise=1.0, hold=1.0), duration=2.0, frames_per_second=60.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scenes.page.cast.FemWorker", Silent)
+        patch.setattr("scenes.page.scene_solvers.FemWorker", Silent)
         demo = Demo(theatre_of(box), scene, "linear", "127.0.0.1", free_port())
         demo.wish.set(plays=False, number=40)
         done = threading.Event()

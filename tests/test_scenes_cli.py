@@ -10,8 +10,8 @@ from theatres import put, theatre_of
 from visitor import free_port
 
 from scenes.cli import limit_threads, main
-from scenes.page.cast import SceneSolvers
 from scenes.page.demo import Demo
+from scenes.page.scene_solvers import SceneSolvers
 from scenes.play.waiting_notice import Busy
 
 

@@ -13,7 +13,7 @@ from scenes.page.comparison import (
     compare_with_fem,
     format_comparison,
 )
-from scenes.page.referee import FemResult
+from scenes.page.fem_worker import FemResult
 from scenes.page.text import format_cost_table
 from scenes.play.frame_text import describe_outcome
 from scenes.play.player import Player

@@ -3,9 +3,9 @@
 from theatres import short, sinking, small
 
 from ar.page.parts import Dropdown, Fold, Slider
-from scenes.page.beside import TIP
 from scenes.page.controls import build_controls, is_animated
 from scenes.page.requests import Requests
+from scenes.page.side_panels import TIP
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
 

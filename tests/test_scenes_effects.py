@@ -20,8 +20,8 @@ from scenes.play.frame_text import format_acting
 from scenes.play.reference import solve_reference_frames
 from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import CORTEX, TOOL, Stage
+from scenes.script.craniotomy_frame import HOLE_RATIO
 from scenes.script.scene import Bounds, find_scene
-from scenes.script.site import HOLE_RATIO
 from scenes.script.tool_paths import Touch
 from sim.accuracy import TRAIN
 from sim.deformation import guess

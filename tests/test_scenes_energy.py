@@ -10,8 +10,8 @@ import pytest
 import warp as wp
 from conftest import make_box
 
+from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import SCENES, find_scene
-from scenes.script.site import build_craniotomy_frame
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, guess

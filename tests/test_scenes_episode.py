@@ -24,7 +24,7 @@ from sim.effects import Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
-from surrogate.data.answer_rows import read_tissue_statement
+from surrogate.data.solution_rows import read_tissue_statement
 
 
 @pytest.fixture(scope="module")

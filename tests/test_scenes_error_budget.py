@@ -20,8 +20,8 @@ from scenes.analysis.error_budget import (
     sample_errors,
 )
 from scenes.analysis.tracking_errors import change_calibration, sample_usual_covariance
+from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.priors import REGISTRATION, REGISTRATION_PRIOR, SEGMENTATION, SEGMENTATION_PRIOR
-from scenes.script.site import build_craniotomy_frame
 from scenes.script.uncertainty import SURROGATE
 from scenes.tracked.filming import USUAL_CALIBRATION, VIEW, place_reference
 from sim.errors import InputError

@@ -12,10 +12,10 @@ from theatres import template_theatre
 
 from ar.tracking.pose_stream import build_pose_stream
 from ar.tracking.rigid import move_about
-from scenes.link.answer import PoseResponder
-from scenes.link.heard import ReceivedTransforms, TransformNames
+from scenes.link.pose_responder import PoseResponder
+from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from scenes.script.scene import find_scene
-from scenes.tracked.elsewhere import CameraMount, ExternalTracker
+from scenes.tracked.external_tracker import CameraMount, ExternalTracker
 from scenes.tracked.follower import TumourState
 from scenes.tracked.run import Shown, write_rows
 from scenes.tracked.tool_motion import NO_ERROR_WARNING, BrainMotion, ToolMotion

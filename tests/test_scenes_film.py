@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.tracking.drawn import CELL_SIDE, STRIP_WIDTH, read_stamp, stamp_time
-from ar.tracking.pictures import read_video
+from ar.tracking.image_sequences import read_video
+from ar.tracking.synthetic_images import CELL_SIDE, STRIP_WIDTH, read_stamp, stamp_time
 from scenes.cli import main
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_intrinsic_covariance, write_calibration

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from theatres import template_theatre
 
-from ar.tracking.drawn import read_stamp
 from ar.tracking.pose import Tracker
+from ar.tracking.synthetic_images import read_stamp
 from ar.tracking.targets import Detector, build_patient_reference, build_tool_cube
 from scenes.play.deformers import AtRest
 from scenes.play.player import Player

@@ -15,7 +15,7 @@ from ar.tracking.pose import Pose, TrackedTargets
 from ar.tracking.registration import Registration
 from scenes.script.scene import find_scene
 from scenes.tracked.follower import HOLD_TIME, PATIENT, TumourState, compute_tip_covariance
-from scenes.tracked.picture import Painter
+from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.run import to_aged
 from scenes.tracked.tracked_tool import TrackedTool
 from sim.tools import Ball

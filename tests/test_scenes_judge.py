@@ -12,8 +12,8 @@ from theatres import small, theatre_of
 
 from scenes.play.deformers import PatientSetup, open_theatre
 from scenes.play.reference import solve_reference_frames
+from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import Scene
-from scenes.script.site import build_craniotomy_frame
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import write_anatomy

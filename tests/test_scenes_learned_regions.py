@@ -19,7 +19,7 @@ from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN, MATERIALS, Material
-from surrogate.data.answer_rows import describe_tissue_source
+from surrogate.data.solution_rows import describe_tissue_source
 
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=500.0)
 

@@ -14,7 +14,7 @@ from sim.bodies.meshfile import read_mesh, write_anatomy
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import Material
-from surrogate.data.answer_rows import describe_tissue_source
+from surrogate.data.solution_rows import describe_tissue_source
 from surrogate.locating.causes import KINDS
 from surrogate.locating.locator_store import load_locator, save_locator
 from surrogate.locating.observation import MAX_POINTS, Observation, choose_points, to_evidence

@@ -12,8 +12,8 @@ from conftest import make_box
 from witness import slippery
 
 from scenes.play.effect_ablation import list_device_arrays, remove_effect
+from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import SCENES, Scene, find_scene
-from scenes.script.site import build_craniotomy_frame
 from sim.compile import compile_problem
 from sim.discretisation.footprint import ContactSurface
 from sim.discretisation.space import discretise

@@ -17,7 +17,6 @@ from scenes.link.frame import (
     to_stamp,
     to_time,
 )
-from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.link.messages import (
     Code,
     SentMesh,
@@ -32,6 +31,7 @@ from scenes.link.messages import (
     read_transform,
     transform,
 )  # fmt: skip
+from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from links import NAMES, NOW, linked, peers, played
 
-from scenes.link.answer import NO_TARGETS, PoseResult
 from scenes.link.frame import HEADER
 from scenes.link.messages import encode_points, read_points, transform
 from scenes.link.outgoing import Outgoing
+from scenes.link.pose_responder import NO_TARGETS, PoseResult
 from scenes.tracked.follower import TrackingResult, TumourState
 from scenes.tracked.tool_motion import BrainMotion
 from sim.loads import Loads, Touching

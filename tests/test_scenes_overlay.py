@@ -12,13 +12,13 @@ from films import FILM, Recorded
 
 from ar.overlay.outlines import compute_changed_share, compute_ink, compute_silhouette, find_ink, measure_outline_gap
 from ar.rendering.layer import Layer
-from ar.rendering.real_picture import build_real_image
-from ar.tracking.pictures import Named, read_video
+from ar.rendering.real_image import build_real_image
+from ar.tracking.image_sequences import Named, read_video
 from scenes.cli import main
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import TumourState
-from scenes.tracked.picture import Painter
+from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.run import Timed, draw_overlays, pace_images, read_timed
 from scenes.tracked.tool_motion import ToolMotion
 from scenes.tracked.truth import compute_overlay_error, read_truth, summarise_errors

@@ -13,12 +13,12 @@ from films import FILM
 from visitor import Visitor, free_port, wait_for
 
 from ar.page.elements import HISTORY, KEYS, PICTURE, SAID, SLICES, TABS
-from ar.tracking.pictures import read_video
+from ar.tracking.image_sequences import read_video
 from scenes.cli import main
 from scenes.tracked.follower import TumourState
+from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.page import OverlayPage
-from scenes.tracked.picture import Painter
-from scenes.tracked.seekable_film import SeekableFilm
+from scenes.tracked.seekable_video import SeekableFilm
 
 
 @contextmanager

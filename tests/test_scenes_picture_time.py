@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenes.commands.link import parse_address
-from scenes.link.answer import place_camera
 from scenes.link.console import format_address
 from scenes.link.frame import to_stamp
-from scenes.link.heard import ReceivedTransforms, TransformNames
+from scenes.link.pose_responder import place_camera
+from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from sim.errors import InputError
 
 BEGUN, STEP = 1e9, 1.0 / 30.0

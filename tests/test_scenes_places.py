@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
+from scenes.warp.deformed_anatomy import Cause, DeformedAnatomy
 from scenes.warp.landmarks import list_landmarks
-from scenes.warp.moment import Cause, DeformedAnatomy
 from scenes.warp.places import FIELD_TOLERANCE, MIN_SPACING, compute_fields, find_finer_spacing, find_folds, list_places
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh

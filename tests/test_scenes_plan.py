@@ -20,7 +20,7 @@ from sim.errors import InputError
 from sim.material import BRAIN, Material
 from sim.runtime.device import find_device
 from sim.runtime.memory import check_fits
-from surrogate.data.answer_rows import describe_tissue_source, read_tissue_statement
+from surrogate.data.solution_rows import describe_tissue_source, read_tissue_statement
 from surrogate.model.applicability import find_rejection
 
 TINY = """

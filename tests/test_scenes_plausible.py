@@ -7,7 +7,7 @@ from test_scenes_overlay import INK, pictures
 
 from ar.overlay.outlines import find_ink
 from scenes.tracked.follower import TumourState
-from scenes.tracked.picture import Painter
+from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.plausible import describe_implausible
 
 

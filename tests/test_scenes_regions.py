@@ -18,8 +18,8 @@ from sim.bodies.meshfile import write_anatomy
 from sim.effects import Elasticity, build_push_effects
 from sim.fem import Fem
 from sim.material import BRAIN, Material
-from surrogate.data.answer_rows import read_tissue_statement
 from surrogate.data.dataset import read_dataset
+from surrogate.data.solution_rows import read_tissue_statement
 from surrogate.training.expansion import Expansion
 
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=500.0)

@@ -14,7 +14,7 @@ from theatres import sinking
 from visitor import free_port
 
 from scenes.page.demo import Demo
-from scenes.page.referee import FemWorker
+from scenes.page.fem_worker import FemWorker
 from scenes.page.requests import HAND, SCRIPT
 from scenes.page.view import move_bodies
 from scenes.play.deformers import AtRest, PatientSetup
@@ -22,7 +22,7 @@ from scenes.play.effect_ablation import remove_effect
 from scenes.play.player import Frame, Player
 from scenes.play.replay import IN_ORDER, FrameCache, ReplayOrder, ReplaySession, plan_replay_order
 from scenes.script.debulking import Debulking
-from scenes.script.head_posture import build_drainage
+from scenes.script.head_pose import build_drainage
 from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
 from scenes.script.tool_paths import Touch, lay, press
 from sim.anatomy import Anatomy

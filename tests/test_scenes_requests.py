@@ -9,7 +9,7 @@ from theatres import Silent
 from visitor import Visitor, report, wait_for
 
 from scenes.page.demo import MESSAGE_TIME
-from scenes.page.referee import FemWorker
+from scenes.page.fem_worker import FemWorker
 from scenes.page.requests import HAND, SCRIPT, Requests, describe_holder
 from scenes.play.deformers import PatientSetup
 from scenes.play.player import Player
@@ -62,7 +62,7 @@ class TestWish:
 
 @pytest.fixture
 def silent(monkeypatch):
-    monkeypatch.setattr("scenes.page.cast.FemWorker", Silent)
+    monkeypatch.setattr("scenes.page.scene_solvers.FemWorker", Silent)
 
 
 @pytest.fixture

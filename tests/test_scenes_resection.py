@@ -17,7 +17,7 @@ from scenes.episodes.episode import collect
 from scenes.page.demo import Demo
 from scenes.play.frame_text import format_acting
 from scenes.script.debulking import Debulking
-from scenes.script.head_posture import build_drainage
+from scenes.script.head_pose import build_drainage
 from scenes.script.tool_paths import Touch
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import guess

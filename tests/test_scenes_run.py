@@ -11,13 +11,13 @@ from theatres import template_theatre
 from ar.overlay.hud import TEXT_SCALE
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text
 from ar.screen import write_film
-from ar.tracking.pictures import Named, read_video
+from ar.tracking.image_sequences import Named, read_video
 from scenes.cli import main
 from scenes.play.stage import TUMOUR_COLOUR
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import Follower
-from scenes.tracked.picture import Painter
+from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.registration_file import read_registration
 from scenes.tracked.run import draw_overlays, read_timed
 from scenes.tracked.tool_motion import ToolMotion

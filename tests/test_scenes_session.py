@@ -15,13 +15,13 @@ from films import FILM
 from links import HOST, NAMES, in_mm, linked, peers, played
 
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, measure_outline_gap
-from ar.tracking.pictures import read_video
+from ar.tracking.image_sequences import read_video
 from scenes.link.frame import to_stamp
-from scenes.link.heard import TransformNames
 from scenes.link.messages import encode_image, read_image, transform
+from scenes.link.received_transforms import TransformNames
 from scenes.link.session import OverlayCamera
 from scenes.play.stage import TUMOUR_COLOUR
-from scenes.tracked.picture import Painter
+from scenes.tracked.overlay_painter import Painter
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

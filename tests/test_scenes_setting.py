@@ -18,7 +18,7 @@ from scenes.gym.episode import (
     EpisodeScore,
     compute_reward,
 )
-from scenes.gym.model_answers import PressedModel
+from scenes.gym.model_responses import PressedModel
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
 from scenes.play.deformers import to_model_path
@@ -26,7 +26,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.material import BRAIN, MATERIALS
-from surrogate.data.answer_rows import describe_tissue_source
+from surrogate.data.solution_rows import describe_tissue_source
 
 STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
 

@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from ar.rendering.real_picture import add_vignette
+from ar.rendering.real_image import add_vignette
 from scenes.play.player import Player
 from scenes.play.stage import CORTEX, Stage
 from scenes.script.viewpoint import Viewpoint

@@ -12,9 +12,9 @@ from benchmarks.studies.stereo_study import row
 from scenes.play.deformers import AtRest
 from scenes.play.player import REJECTED_WARNING, Player
 from scenes.play.stereo_observer import StereoObserver
+from scenes.script.observation_models import StereoObservation
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import get_template_path
-from scenes.script.sight import StereoObservation
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points

@@ -8,7 +8,7 @@ from theatres import template_theatre
 import scenes.gym  # noqa: F401
 from scenes.gym.tasks import PALPATE
 from scenes.gym.tool_motion import MAX_HEIGHT, lay_tool, move_tool
-from scenes.script.site import build_craniotomy_frame
+from scenes.script.craniotomy_frame import build_craniotomy_frame
 
 
 def test_tool_leans_and_sinks_no_farther_than_it_may(box):

@@ -13,7 +13,7 @@ from ar.optics.calibration import Calibration
 from ar.tracking.targets import TIP_DISTANCE
 from scenes.cli import main
 from scenes.tracked.calibration_file import read_calibration, write_calibration
-from scenes.tracked.elsewhere import follow_body
+from scenes.tracked.external_tracker import follow_body
 from scenes.tracked.pose_file import COVARIANCE, read_poses
 
 PLATE_AT = flat((20.0, 15.0, 5.0), (-0.08, 0.0, 0.28))

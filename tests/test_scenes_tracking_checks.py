@@ -8,9 +8,9 @@ import pytest
 from theatres import template_theatre
 
 from scenes.cli import main
-from scenes.tracked.drawn_film import build_synthetic_video
 from scenes.tracked.follower import Follower, TumourState
-from scenes.tracked.picture import Painter
+from scenes.tracked.overlay_painter import Painter
+from scenes.tracked.rendered_video import build_synthetic_video
 from scenes.tracked.tracking_checks import TrackingFigures, build_default_pipeline, measure_tracking
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tiny_episodes import packed
 
-from scenes.episodes.reading.again import solve_again
+from scenes.episodes.reading.repeated_frames import solve_again
 from scenes.episodes.reading.validation import validate_episode
 
 

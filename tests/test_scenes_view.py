@@ -3,7 +3,7 @@
 import numpy as np
 from visitor import report, wait_for
 
-from scenes.page.referee import FemWorker
+from scenes.page.fem_worker import FemWorker
 from scenes.page.view import FEM_COLOUR, STALE_COLOUR
 
 

@@ -6,7 +6,7 @@ import pytest
 from sim.fields.extension import extend_field
 from sim.fields.folds import compute_jacobians, unfold
 from sim.fields.grid import Grid, build_grid_around
-from sim.fields.in_tetrahedra import interpolate_in_tetrahedra
+from sim.fields.grid_interpolation import interpolate_in_tetrahedra
 from sim.fields.inversion import invert_field
 from sim.fields.warp_fields import compute_faint_threshold, remove_faint, warp_fields
 from sim.geometry.locate import locate

@@ -24,9 +24,9 @@ from sim.geometry.tetmesh import TetMesh
 from sim.loads import push
 from sim.material import read_tissue_json
 from sim.runtime.journal import DamageWarning
-from surrogate.data.answer_rows import compute_row_checksums, get_row_type
 from surrogate.data.dataset import FORMAT, OLD_FORMAT, SEAL_ATTRIBUTE, read_dataset, read_stored
 from surrogate.data.simulate import simulate
+from surrogate.data.solution_rows import compute_row_checksums, get_row_type
 from surrogate.data.tool_loads import draw
 from surrogate.training.train import train
 

@@ -15,12 +15,12 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Touching
 from sim.material import Material, to_tissue_json
-from surrogate.data.answer_rows import compute_row_checksums, get_row_type
 from surrogate.data.cortex_patch import build_barycentric_lattice, open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis, compute_tool_features
 from surrogate.data.indentation import get_poses, to_indentation
 from surrogate.data.simulate import simulate
+from surrogate.data.solution_rows import compute_row_checksums, get_row_type
 from surrogate.data.tool_poses import choose_ball, compute_poses, draw_poses
 from surrogate.evaluation.score import compare_forces, compute_point_errors
 from surrogate.model.store import load, save

@@ -11,10 +11,10 @@ from sim.errors import InputError
 from sim.fem import Fem
 from surrogate.fitting import fit
 from surrogate.fitting.fit import MESH_FORCE_RATIO, compute_probability, estimate_young_moduli, weigh_tissues
-from surrogate.fitting.frame import ObservedFrame, Tool, find_foot
+from surrogate.fitting.frame_likelihood import find_unsupported
+from surrogate.fitting.observed_frame import ObservedFrame, Tool, find_foot
 from surrogate.fitting.responses import POISSONS, RATIOS, build_drained_loads, build_force_loads, solve_responses
 from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
-from surrogate.fitting.weighing import find_unsupported
 from surrogate.locating.calibration import sample_seen_patch
 from surrogate.locating.causes import YOUNG, Group
 from surrogate.locating.observation import Observation

@@ -9,14 +9,14 @@ import pytest
 from theatres import player, small
 
 from scenes.options.theatre_options import add_theatre, build_requested_theatre
-from scenes.page.cast import ALL_ACTIVE, SceneSolvers
+from scenes.page.scene_solvers import ALL_ACTIVE, SceneSolvers
 from scenes.play.deformers import GUARDED, AtRest
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
 from sim.errors import InputError
 from surrogate.data.tool_loads import draw
 from surrogate.model.guarded import describe_error, find_first_model
-from surrogate.model.left_out import MAX_VERTEX_ERROR, LeftOut, measure_held_out
+from surrogate.model.held_out import MAX_VERTEX_ERROR, LeftOut, measure_held_out
 from surrogate.model.store import load, save
 
 

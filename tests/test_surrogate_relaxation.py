@@ -20,8 +20,8 @@ from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import compute_tool_features
-from surrogate.data.holding import APPROACH_TIME, HISTORY, read_series, sample_times
 from surrogate.data.indentation import Relaxing, add_relaxation, get_poses, get_relaxation, to_indentation
+from surrogate.data.load_histories import APPROACH_TIME, HISTORY, read_series, sample_times
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.score import compute_point_errors

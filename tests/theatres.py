@@ -13,7 +13,7 @@ from ar.optics.lens import Lens
 from scenes.play.deformers import PatientSetup, to_model_path
 from scenes.play.player import Player
 from scenes.play.stage import Stage
-from scenes.script.head_posture import build_drained_turn
+from scenes.script.head_pose import build_drained_turn
 from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
 from scenes.script.shipped_files import get_template_path
 from scenes.script.tool_paths import keep_idle, press

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from ..rendering import rasteriser, real_picture, shade, surfaces
+from ..rendering import rasteriser, shade, surfaces
+from ..rendering import real_image as real_picture
 from ..rendering.layer import Layer, compute_vertex_normals
 from ..rendering.parallel import load
 from ..rendering.rasteriser import RasterisedSurface, rasterise_surface
@@ -42,8 +43,8 @@ from .outlines import (
     join_boxes,
     to_key,
 )
-from .places import BORDER_DISTANCE, TEXT_DISTANCE
 from .styles import STYLES, Opening, Style
+from .text_placement import BORDER_DISTANCE, TEXT_DISTANCE
 from .window import BORDER_COLOUR, CLOSED_GROUND, FRONT, Lines, Roles, draw_overlay
 
 DOUBTFUL_COLOUR = (
@@ -368,21 +369,16 @@ def format_head_lines(texts: Sequence[str], tool: np.ndarray) -> list[str]:
     tried = [[part for text in texts for part in wrap_line(text, share * width)] for share in HEAD_WIDTHS]
     for lines in tried:
         long = max((cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines), default=0)
-        if not tool[
-            HEAD_ROW - TEXT_DISTANCE : HEAD_ROW + LINE_SPACING * len(lines) + TEXT_DISTANCE,
-            : BORDER_DISTANCE + long + TEXT_DISTANCE,
-        ].any():
+        rows = slice(HEAD_ROW - TEXT_DISTANCE, HEAD_ROW + LINE_SPACING * len(lines) + TEXT_DISTANCE)
+        if not tool[rows, : BORDER_DISTANCE + long + TEXT_DISTANCE].any():
             return lines
     return tried[0]
 
 
 def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
     """Draw text lines in the top-left corner, below the orientation letter, in place; may cover other lines."""
-    free, middle, below = (
-        drawn.taken.copy(),
-        len(drawn.taken) // 2,
-        HEAD_ROW + LINE_SPACING * (len(lines) + MAX_LOWER_ROWS),
-    )
+    free, middle = drawn.taken.copy(), len(drawn.taken) // 2
+    below = HEAD_ROW + LINE_SPACING * (len(lines) + MAX_LOWER_ROWS)
     free[:HEAD_ROW] = free[middle - HEAD_ROW // 2 : middle + HEAD_ROW // 2] = 1  # for the orientation letters
     free[below:] = 1  # rather over a line than in the centre of the image
     before = free.copy()
@@ -393,15 +389,8 @@ def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
 def write_doubt(drawn: Overlaid, doubt: str) -> None:
     """Write the reason why a result is unreliable in the bottom-left corner, in place; may cover other text."""
     height, width = drawn.taken.shape
-    lay(
-        drawn.colour,
-        drawn.taken,
-        format_warning(doubt, width),
-        (0, height),
-        TEXT_SCALE,
-        compute_ink(WARNING_COLOUR),
-        needed=True,
-    )
+    lines, ink = format_warning(doubt, width), compute_ink(WARNING_COLOUR)
+    lay(drawn.colour, drawn.taken, lines, (0, height), TEXT_SCALE, ink, needed=True)
 
 
 def format_warning(doubt: str, width: int) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from .places import BORDER_DISTANCE, find_free_place
+from .text_placement import BORDER_DISTANCE, find_free_place
 
 Corner = Literal["top left", "top right", "bottom left", "bottom right"]
 FONT = cv2.FONT_HERSHEY_SIMPLEX  # OpenCV font of all text in images.

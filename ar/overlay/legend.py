@@ -10,7 +10,7 @@ import numpy as np
 
 from .hud import FONT, HEAD_ROW, WHITE, write_haloed
 from .outlines import OPAQUE
-from .places import BORDER_DISTANCE, TEXT_DISTANCE
+from .text_placement import BORDER_DISTANCE, TEXT_DISTANCE
 from .window import BORDER_COLOUR, DEPTH_STEP, DEPTH_STEP_COUNT, MAX_TINT_OPACITY, MIN_TINT_OPACITY
 
 LEGEND_TEXT_SCALE = 0.4  # Font scale of a legend.

@@ -17,8 +17,8 @@ from .gauge import Gauge
 from .hud import HEAD_ROW, TEXT_SCALE, Below, bound_words, lay, wrap_line, write_haloed
 from .legend import LEGEND_TEXT_SCALE, draw_depth_scale, paste, place_sheet
 from .outlines import OPAQUE, compute_ink, draw_dashes, to_key
-from .places import BORDER_DISTANCE, find_free_place
 from .styles import Style
+from .text_placement import BORDER_DISTANCE, find_free_place
 from .window import FRONT, Roles
 
 SEARCH_MARGIN = 3e-3  # Search margin beyond the last ring [m].

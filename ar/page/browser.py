@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import viser
 
+from .access_guard import DEFAULT_LIMITS, ConnectionLimits, check_address, open_server, to_bracketed
 from .control_lock import Clients, Inputs, format_note
 from .elements import (
     ASIDE_SPOT,
@@ -31,7 +32,6 @@ from .elements import (
     keep_together,
     to_data_url,
 )
-from .guard import DEFAULT_LIMITS, ConnectionLimits, check_address, open_server, to_bracketed
 from .parts import Control, Fold, LastChange, Note, Playback, SceneSurface, SceneViewpoint, Sign
 from .recording import Recorder
 from .scene import add_body, set_up_scene
@@ -70,7 +70,7 @@ class Browser:
         """Start the server; if `port` is taken, the next free one is used, see `address`.
 
         `words` is HTML under the image, `size` the image's width and height [pixel] until the first arrives. `origins`
-        are further addresses of the page, of a proxy or another port, in the form of `ar.page.guard.format_origin`.
+        are further addresses of the page, of a proxy or another port, as written by `access_guard.format_origin`.
 
         Raises
         ------
@@ -79,7 +79,7 @@ class Browser:
         OSError
             A host that is not this machine.
         UnguardedError
-            A viser release that `ar.page.guard` does not support.
+            A viser release that `ar.page.access_guard` does not support.
         """
         check_address(host, port)
         self.limits, self.origins = limits, origins

@@ -114,12 +114,12 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
     scale = "".join(
         f'<text x="{LEFT_MARGIN - 5:g}" y="{top + room * (1 - share) + 4:g}" text-anchor="end">{share * high:g}</text>'
         f'<path d="M{LEFT_MARGIN:g} {top + room * (1 - share):g}H{CHART_WIDTH - 6:g}" '
-            'stroke="#666" stroke-width="0.6"/>'
+        'stroke="#666" stroke-width="0.6"/>'
         for share in (0.0, 1.0)
     )
     times = "".join(
         f'<text x="{LEFT_MARGIN + (CHART_WIDTH - LEFT_MARGIN - 6) * share:g}" y="{top + room + 14:g}" '
-            f'text-anchor="{anchor}">{words}</text>'
+        f'text-anchor="{anchor}">{words}</text>'
         for share, anchor, words in (
             (0.0, "start", f"{TIME_SPAN:g} s ago"),
             (0.5, "middle", "10 s"),

@@ -10,7 +10,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from .pictures import Named, to_named_image
+from .image_sequences import Named, to_named_image
 
 MAX_FAILURES = 10  # Number of consecutive failed images before the camera is opened again.
 RETRY_PAUSE = 0.05  # Pause between two tries [s].

@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
     """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
     from scenes.analysis.budget import MAX_LIVE_ERROR
     from scenes.analysis.measurement import describe_machine
+    from scenes.script.craniotomy_frame import build_craniotomy_frame
     from scenes.script.scene import find_scene
-    from scenes.script.site import build_craniotomy_frame
 
     from ..studies.live import RIDES, errors, frames_of, live_fem, loads_of, tally
 

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure."""
-    from scenes.script.sight import StereoObservation
+    from scenes.script.observation_models import StereoObservation
 
     from ..studies.stereo_study import rows
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.loads import Pushed
 from surrogate.fitting.fit import fit_from_evidence
-from surrogate.fitting.frame import ObservedFrame, Tool
+from surrogate.fitting.observed_frame import ObservedFrame, Tool
 from surrogate.fitting.responses import Responses, build_drained_loads, build_force_loads, solve_responses
 from surrogate.fitting.tissue import CLASSES, FittedTissue
 from surrogate.locating.locator import Locator

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.link.answer import NO_TARGETS, CameraView, PoseResult
 from scenes.link.frame import HEADER, BadMessageError, pack_message, read_header, to_stamp, to_time
-from scenes.link.heard import ReceivedTransforms, TransformNames
 from scenes.link.messages import Code, SentMesh, encode_polydata, encode_status, transform
 from scenes.link.outgoing import SentPlaces
+from scenes.link.pose_responder import NO_TARGETS, CameraView, PoseResult
+from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from scenes.link.session import LinkSession
 from scenes.tracked.follower import TrackingResult, TumourState
 from scenes.tracked.tool_motion import BrainMotion

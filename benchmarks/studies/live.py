@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scenes.analysis.measurement import time_work
+from scenes.script.craniotomy_frame import CraniotomyFrame
 from scenes.script.scene import Scene
-from scenes.script.site import CraniotomyFrame
 from scenes.script.tool import Probe
 from scenes.script.tool_paths import stroke_cortex
 from sim.accuracy import LIVE, Accuracy

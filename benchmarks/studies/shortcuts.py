@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scenes.analysis.measurement import time_work
+from scenes.script.craniotomy_frame import CraniotomyFrame
 from scenes.script.scene import find_scene
-from scenes.script.site import CraniotomyFrame
 from sim.accuracy import LIVE, TRAIN, Accuracy
 from sim.effects import Effect, ToolContact, build_push_effects
 from sim.fem import Fem

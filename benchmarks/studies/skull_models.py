@@ -10,12 +10,12 @@ import numpy as np
 from scenes.analysis.measurement import time_work
 from sim.accuracy import NO_STRAIN_LIMIT
 from sim.anatomy import Anatomy
+from sim.debonding import TEARING, Tearing, solve_with_debonding
 from sim.deformation import Deformation, join_deformations
 from sim.effects import Bonded, build_push_effects
 from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
-from sim.tearing import TEARING, Tearing, solve_with_debonding
 
 from .elements import tumour_motion
 

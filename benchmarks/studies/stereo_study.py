@@ -9,8 +9,8 @@ import numpy as np
 
 from scenes.play.deformers import PatientSetup
 from scenes.play.observer import TumourEstimate
+from scenes.script.observation_models import StereoObservation
 from scenes.script.scene import Scene
-from scenes.script.sight import StereoObservation
 from sim.errors import InputError
 
 

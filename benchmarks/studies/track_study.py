@@ -17,8 +17,8 @@ from scipy.stats import chi2, qmc
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.drawn import render_targets
 from ar.tracking.pose import Pose, Tracker, Verdict
+from ar.tracking.synthetic_images import render_targets
 from ar.tracking.targets import MARKER_RATIO, TIP_DISTANCE, build_tool_cube
 
 # The camera of the published trials: pixels, focal length [pixel], how far its targets are [m], and a usual lens.

@@ -18,8 +18,8 @@ from ar.tracking.targets import build_patient_reference
 from sim.errors import InputError
 from surrogate.locating.calibration import RADIUS_SQUARED
 
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.priors import MESH, REGISTRATION, REGISTRATION_PRIOR, SEGMENTATION, SEGMENTATION_PRIOR
-from ..script.site import CraniotomyFrame
 from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
 from .tracking_errors import CORNER_NOISE, change_calibration, compute_row_delay, project_by_rows, project_corners

@@ -5,7 +5,7 @@ import numpy as np
 from sim.effects import Elasticity, Gravity, Held, SkullContact
 from sim.material import MATERIALS
 
-from ..script.head_posture import build_drained_turn
+from ..script.head_pose import build_drained_turn
 from ..script.scene import Scene
 
 DRAINED_TISSUE = MATERIALS["drained"].tissue  # Drained tissue: fluid leaves it in minutes.

@@ -6,8 +6,8 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.material import Material
 
+from ..script.observation_models import PointObservation
 from ..script.scene import Bounds, Scene
-from ..script.sight import PointObservation
 from ..script.tool import Probe
 from ..script.tool_paths import press
 from ..script.viewpoint import Viewpoint

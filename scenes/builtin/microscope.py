@@ -6,9 +6,9 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity, Gravity, Held, Slide, ToolForce
 from sim.material import Material
 
-from ..script.head_posture import build_drainage
+from ..script.head_pose import build_drainage
+from ..script.observation_models import StereoObservation
 from ..script.scene import Bounds, Scene
-from ..script.sight import StereoObservation
 from ..script.tool import Probe
 from ..script.tool_paths import Touch, press
 from ..script.viewpoint import Viewpoint

@@ -4,7 +4,7 @@ from sim.effects import Elasticity, Gravity, Held, SkullContact
 from sim.material import MATERIALS
 
 from ..script.debulking import Debulking
-from ..script.head_posture import build_drainage
+from ..script.head_pose import build_drainage
 from ..script.scene import Scene
 
 DRAINED_TISSUE = MATERIALS["drained"].tissue  # Drained tissue: fluid leaves it in minutes.

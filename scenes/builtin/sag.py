@@ -4,9 +4,9 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity, Gravity, Held, Slide
 from sim.material import Material
 
-from ..script.head_posture import build_drainage
+from ..script.head_pose import build_drainage
+from ..script.observation_models import PointObservation
 from ..script.scene import Bounds, Scene
-from ..script.sight import PointObservation
 from ..script.viewpoint import Viewpoint
 
 BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)  # Softer than the default, unknown to the estimate.

@@ -82,7 +82,7 @@ def _calibrate_camera(args: argparse.Namespace) -> int:
     from ar.tracking.intrinsics import calibrate_intrinsics, choose_views
     from ar.tracking.targets import build_calibration_board
 
-    from ..tracked.board_pictures import detect_board
+    from ..tracked.board_views import detect_board
     from ..tracked.calibration_file import SUFFIXES, build_intrinsics_header, write_calibration
 
     if not args.out:

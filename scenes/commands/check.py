@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_tracking(args: argparse.Namespace, theatre: PatientSetup, table: TextIO) -> dict[str, object]:
     """Check the overlay on a synthetic video whose markers disappear and return."""
-    from ..tracked.drawn_film import build_synthetic_video
+    from ..tracked.rendered_video import build_synthetic_video
     from ..tracked.tracking_checks import build_default_pipeline, measure_tracking
 
     film = build_synthetic_video(theatre)

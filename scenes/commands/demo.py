@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     # One thread for all kernels of the first image: each compilation reads Warp's headers first, for two seconds.
     kernels = ThreadPoolExecutor(1, "kernels")
     kernels.submit(load_kernels)
-    from ar.page.guard import check_address
+    from ar.page.access_guard import check_address
 
     from .interrupt import run_until_ended
 
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
 def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitStack) -> int:
     """Open the page, and play when `kernels` has loaded those of the first image; `closing` closes the page."""
-    from ar.page.guard import UnguardedError
+    from ar.page.access_guard import UnguardedError
 
     from ..page.demo import Demo
 

@@ -20,7 +20,7 @@ from .locate import describe_left_out
 from .locator import REGIONS, find_locator
 
 if TYPE_CHECKING:
-    from surrogate.fitting.frame import ObservedFrame
+    from surrogate.fitting.observed_frame import ObservedFrame
     from surrogate.fitting.tissue import FittedTissue
 
 
@@ -63,9 +63,9 @@ def run(args: argparse.Namespace) -> int:
     from sim.bodies.meshfile import read_anatomy
     from sim.runtime.device import find_device
     from surrogate.fitting.fit import fit_tissue
-    from surrogate.fitting.frame import check_frames
+    from surrogate.fitting.frame_likelihood import find_unsupported
+    from surrogate.fitting.observed_frame import check_frames
     from surrogate.fitting.tissue import save_tissue, to_tissue_path
-    from surrogate.fitting.weighing import find_unsupported
 
     out = check_output_path(args.out or to_tissue_path(args.anatomy), ".json", args.force, [args.anatomy, *args.frames])
     find_device(args.device, "float32")
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _read_frames(args: argparse.Namespace) -> list[ObservedFrame]:
-    from surrogate.fitting.frame import ObservedFrame, read_tools
+    from surrogate.fitting.observed_frame import ObservedFrame, read_tools
     from surrogate.locating.observed_files import read_observation
 
     tools = ((),) * len(args.frames) if args.tool_log is None else read_tools(args.tool_log, len(args.frames))

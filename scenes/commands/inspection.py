@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL, name_region
 from sim.bodies.dural_septa import SEPTA
 from sim.bodies.head_masks import NECROSIS, HeadMasks
-from sim.bodies.one_space import share_on
 from sim.bodies.placement import describe_side
+from sim.bodies.space_consistency import share_on
 from sim.bodies.subject import Subject
 from sim.effects import Elasticity
 from sim.material import Tissue

@@ -94,6 +94,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _get_physics(stated: Mapping[str, str]) -> dict[str, object]:
     """Return the properties that two bodies must share to be compared: tissue, with that of regions, and element."""
-    from surrogate.data.answer_rows import TISSUE_KEY, read_tissue_statement
+    from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_statement
 
     return {"tissue": read_tissue_statement(stated) if TISSUE_KEY in stated else None, "element": stated.get("element")}

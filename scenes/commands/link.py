@@ -29,7 +29,7 @@ from ..tracked.tracked_scene import build_mover, build_tracked_scene
 from .interrupt import run_until_ended
 
 if TYPE_CHECKING:
-    from ..link.heard import TransformNames
+    from ..link.received_transforms import TransformNames
     from ..link.session import LinkSession
     from ..play.deformers import PatientSetup
     from ..tracked.tracked_tool import TrackedTool
@@ -146,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
 
 def parse_names(args: argparse.Namespace) -> TransformNames:
     """Names of the transforms that are received."""
-    from ..link.heard import TransformNames
+    from ..link.received_transforms import TransformNames
 
     return TransformNames(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
 
@@ -236,14 +236,14 @@ def open_link(args: argparse.Namespace) -> LinkSession:
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
 
-    from ..link.answer import PoseResponder
     from ..link.console import limit_rate, print_safely
-    from ..link.heard import ReceivedTransforms
     from ..link.outgoing import Outgoing
+    from ..link.pose_responder import PoseResponder
+    from ..link.received_transforms import ReceivedTransforms
     from ..link.session import LinkSession, OverlayCamera
     from ..play.deformers import open_theatre
     from ..tracked.calibration_file import read_calibration
-    from ..tracked.picture import Painter
+    from ..tracked.overlay_painter import Painter
     from ..tracked.registration_file import describe_other_mesh, read_registration
     from ..tracked.tool_motion import ToolMotion
     from ..tracked.tracked_tool import read_tool

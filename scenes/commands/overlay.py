@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
 
     from ..tracked.follower import Follower
+    from ..tracked.overlay_painter import Painter
     from ..tracked.page import OverlayPage
-    from ..tracked.picture import Painter
     from ..tracked.run import Shown
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".webp")  # Endings of video file names.
@@ -153,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     """Show a video or a live camera on a page, until the time is over or a signal arrives."""
-    from ar.page.guard import UnguardedError, check_address
+    from ar.page.access_guard import UnguardedError, check_address
 
     from ..tracked.run import write_rows
 
@@ -193,7 +193,7 @@ def _show_camera(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> 
 
 
 def _show_video(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
-    from ..tracked.seekable_film import SeekableFilm
+    from ..tracked.seekable_video import SeekableFilm
 
     film = SeekableFilm(Path(args.pictures), args.rate)
     return _build_page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)
@@ -232,12 +232,12 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
 
     from ..play.deformers import open_theatre
     from ..tracked.calibration_file import read_calibration, read_intrinsic_covariance
-    from ..tracked.film_camera import check_video
     from ..tracked.follower import Follower
-    from ..tracked.picture import Painter
+    from ..tracked.overlay_painter import Painter
     from ..tracked.registration_file import describe_other_mesh, read_registration
     from ..tracked.tool_motion import ToolMotion
     from ..tracked.tracked_tool import read_tool
+    from ..tracked.video_camera import check_video
 
     if args.tool is None and args.deformer not in (None, REST):
         raise InputError(f"--deformer {args.deformer} requires tool poses: give --tool TOOL.json, too.")
@@ -271,7 +271,7 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
 def _draw_video(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
     """Draw all frames, into a video if requested; return them without their colours."""
     from ar.screen import write_film
-    from ar.tracking.pictures import read_frame_rate, read_video
+    from ar.tracking.image_sequences import read_frame_rate, read_video
 
     from ..tracked.run import draw_overlays, read_timed
 

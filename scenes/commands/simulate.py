@@ -27,11 +27,11 @@ from sim.runtime.partial_files import to_unfinished_path
 from sim.runtime.timing import time_stage
 from sim.runtime.versions import get_version
 from sim.tools import Ball, BuiltIn, Capsule, Spatula
-from surrogate.data.answer_rows import describe_tissue_source
-from surrogate.data.crew import LazyFem, open_solvers
 from surrogate.data.dataset import read_outcomes
-from surrogate.data.holding import HISTORY, sample_times
+from surrogate.data.load_histories import HISTORY, sample_times
 from surrogate.data.simulate import SimulatedRows, simulate
+from surrogate.data.solution_rows import describe_tissue_source
+from surrogate.data.solver_pool import LazyFem, open_solvers
 from surrogate.data.tool_loads import OVERLOAD_PRESETS, PRESETS, compute_rejected_share, describe_rejected, draw
 from surrogate.data.tool_poses import choose_ball, draw_poses
 

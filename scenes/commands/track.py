@@ -54,9 +54,9 @@ def run(args: argparse.Namespace) -> int:
     from ar.tracking.targets import TIP_DISTANCE
 
     from ..tracked.calibration_file import read_calibration
-    from ..tracked.elsewhere import follow_body
-    from ..tracked.film_camera import check_video
+    from ..tracked.external_tracker import follow_body
     from ..tracked.pose_file import write_poses
+    from ..tracked.video_camera import check_video
 
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: frame rate [1/s] must be > 0.")

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from sim.errors import InputError
 
     from ..episodes.bodies import describe_weak, list_model_errors, to_weak_json
-    from ..episodes.reading.again import validate_files
+    from ..episodes.reading.repeated_frames import validate_files
     from ..episodes.reading.windows import list_episode_paths
 
     if args.workers < 1:
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     reports = [found[path] for path in dict.fromkeys(paths)]
     reports += [one for place in args.episodes if place.is_dir() for one in list_lost_episodes(place)]
     if args.solve:
-        from ..episodes.reading.again import solve_again
+        from ..episodes.reading.repeated_frames import solve_again
 
         bar = tqdm(reports, unit="episode", desc="solved again", file=sys.stderr)
         reports = [one if one.problems else solve_again(one, args.solve, args.device) for one in bar]

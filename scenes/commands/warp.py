@@ -20,7 +20,7 @@ from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissu
 if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
     from ..script.scene import Scene
-    from ..warp.moment import DeformedAnatomy
+    from ..warp.deformed_anatomy import DeformedAnatomy
 
 ORDERS = ("linear", "cubic")  # Interpolations of images.
 MAX_FORCE = 20.0  # Largest accepted force [N]: more is a typing error.
@@ -208,7 +208,7 @@ def select_moments(
     """
     from tqdm import tqdm
 
-    from ..warp.moment import Played, read_moment
+    from ..warp.deformed_anatomy import Played, read_moment
 
     if scene is None:
         return read_moment(args.located, theatre.anatomy), []

@@ -20,13 +20,13 @@ from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce, build_push
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import Material
-from surrogate.data.answer_rows import describe_tissue_source
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import CREATION_KEYS, simulate
+from surrogate.data.solution_rows import describe_tissue_source
 from surrogate.data.tool_loads import draw as draw_loads
 from surrogate.model.applicability import find_rejection
+from surrogate.model.held_out import HeldOutError
 from surrogate.model.learned import Learned
-from surrogate.model.left_out import HeldOutError
 from surrogate.model.store import load, read_reported_errors, save
 from surrogate.training.expansion import Expansion
 from surrogate.training.train import train
@@ -34,7 +34,7 @@ from surrogate.training.train import train
 from ..play.deformers import PatientSetup, open_theatre, to_model_path
 from ..script.shipped_files import get_template_path
 from .draws import build_generator, sample_value
-from .half_made import DATA, TABLE, check_resumed, forget
+from .incomplete_bodies import DATA, TABLE, check_resumed, forget
 from .plan import NO_LEARNER, Bodies, EpisodePlan, compute_anatomy_digest, list_fields, to_ratio_key
 from .run_folder import BODIES, get_versions
 

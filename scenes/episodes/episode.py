@@ -28,7 +28,7 @@ from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
 from sim.resected_fem import OperatedFem
 from sim.runtime.atomic_files import check_disk_space, write_stream_atomically
 from sim.runtime.versions import get_version
-from surrogate.data.answer_rows import describe_tissue_source
+from surrogate.data.solution_rows import describe_tissue_source
 from surrogate.model.guarded import find_model
 from surrogate.model.learned import Learned
 

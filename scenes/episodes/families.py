@@ -14,7 +14,7 @@ from sim.effects import Effect, Gravity, Retraction, ToolContact, ToolForce
 from ..builtin.retract import RELAXING_BRAIN
 from ..script.camera_paths import sample_wandering
 from ..script.debulking import Debulking
-from ..script.head_posture import Lie, build_drained_turn, get_supine_pose
+from ..script.head_pose import Lie, build_drained_turn, get_supine_pose
 from ..script.tool import Blade, Instrument, Probe
 from ..script.tool_paths import Path, Touch, draw, keep_idle, lay, palpate, press, slide, smooth
 from .draws import Number, ValueLimits

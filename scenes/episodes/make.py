@@ -26,7 +26,7 @@ from ..script.scene import Scene
 from .bodies import BODY_FILE, EpisodeBody, read_body, write_body
 from .draws import build_generator
 from .episode import EpisodeRecording, collect
-from .half_made import clear_folder, is_begun
+from .incomplete_bodies import clear_folder, is_begun
 from .plan import NO_LEARNER, EpisodePlan
 from .run_folder import BODIES, to_episode_name
 from .scripted import build_scene, sample_body_number, sample_episode

@@ -14,8 +14,8 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 
 from ..script.camera_paths import PATHS
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
-from ..script.site import CraniotomyFrame
 from ..script.viewpoint import Appearance, Cottonoid, Viewpoint
 from .bodies import EpisodeBody
 from .draws import build_generator, sample_value

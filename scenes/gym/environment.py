@@ -18,11 +18,11 @@ from sim.errors import InputError
 
 from .episode import Episode, EpisodeStep
 from .observation import KINDS, build_action_space, build_space
-from .pictures import ObservationCamera
+from .observation_camera import ObservationCamera
 from .registration import MAX_STEPS, NAMESPACE
 from .setting import TaskSetting, check_arguments, open_setting
 from .tasks import STEP_SECONDS, find_task
-from .touched import TissueRequest
+from .tissue_requests import TissueRequest
 
 RENDER_MODES = ("rgb_array",)  # Supported render modes.
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1.0 / STEP_SECONDS)}

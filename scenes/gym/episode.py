@@ -12,11 +12,11 @@ from sim.errors import InputError
 from ..script.camera_paths import sample_wandering
 from ..script.tool_paths import smooth
 from .observation import FORCE_NOISE, MOTION_NOISE, POSITION_NOISE, compute_states
-from .pictures import Seen
+from .observation_camera import Seen
 from .setting import TaskSetting
 from .tasks import MAX_LOAD_RATIO, STEP_SECONDS, Goal
+from .tissue_requests import TissueRequest, Touched
 from .tool_motion import RobotTool, build_tool_frame, compute_lever, lay_tool, move_tool, shift_pose
-from .touched import TissueRequest, Touched
 
 STEP_PENALTY = 0.01  # Penalty of a step.
 LIMIT_PENALTY = 0.5  # Penalty of a step with a load over its limit.

@@ -25,14 +25,14 @@ from surrogate.model.guarded import has_tool_pressure
 from ..play.deformers import PatientSetup, open_theatre
 from ..play.learned_regions import find_learned_regions
 from ..play.stage import Stage
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
 from ..script.shipped_files import get_spatula_model_path
-from ..script.site import CraniotomyFrame
 from ..script.tool import Blade, Probe
-from .fem_answers import CutElements, PosedElements
-from .model_answers import Hertz, PosedModel, PressedModel
+from .fem_responses import CutElements, PosedElements
+from .model_responses import Hertz, PosedModel, PressedModel
 from .tasks import Goal, GymTask
-from .touched import TissueModel
+from .tissue_requests import TissueModel
 
 PHYSICS = ("auto", "model", "fem")  # Kinds of deformation models.
 TEMPLATE = "template"  # Name of the shipped anatomy.

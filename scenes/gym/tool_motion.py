@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..script.site import CraniotomyFrame
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.tool import Instrument, Probe
 
 MAX_HEIGHT = 0.02  # Largest height of a tool above the centre of the open cortex [m].

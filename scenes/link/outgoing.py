@@ -14,7 +14,6 @@ from sim.geometry.locate import Located, locate
 
 from ..play.stage import Stage
 from ..tracked.follower import TrackingResult, TumourState
-from .answer import PoseResult
 from .frame import BadMessageError, pack_message
 from .messages import (
     EMPTY_MESH,
@@ -26,6 +25,7 @@ from .messages import (
     encode_string,
     transform,
 )
+from .pose_responder import PoseResult
 
 # Largest distance of a requested point from the tumour or open cortex in the scan to which it is assigned [m].
 MAX_POINT_DISTANCE = 2e-3

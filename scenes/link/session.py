@@ -16,12 +16,10 @@ import numpy as np
 from ar.optics.calibration import Calibration
 
 from ..tracked.follower import TrackingResult, TumourState, compute_radius_across
-from ..tracked.picture import Painter
-from .answer import CameraView, PoseResult, add_bound, add_lateness
+from ..tracked.overlay_painter import Painter
 from .clients import LinkClients
 from .console import format_address
 from .frame import BadMessageError, Header, pack_message, to_stamp
-from .heard import ReceivedTransforms, check_status
 from .messages import (
     IMAGE,
     POINT,
@@ -34,6 +32,8 @@ from .messages import (
     read_transform,
 )
 from .outgoing import MAX_PLACES, UNTRACKED_POINTS, SentPlaces
+from .pose_responder import CameraView, PoseResult, add_bound, add_lateness
+from .received_transforms import ReceivedTransforms, check_status
 
 CHECK_INTERVAL = 0.1  # Interval of checks for missing input [s].
 STATUS_INTERVAL = 1.0  # Interval of unchanged STATUS messages [s].

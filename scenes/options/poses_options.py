@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
     from ar.tracking.pose_stream import Clock, PoseStream
 
-    from ..tracked.elsewhere import ExternalTracker
+    from ..tracked.external_tracker import ExternalTracker
 
 AUTO = "auto"  # Value of --clock that estimates the time offset.
 
@@ -83,7 +83,7 @@ def open_external_tracker(args: argparse.Namespace, calibration: Calibration) ->
         Files that cannot be read; clocks that cannot be compared.
     """
     from ..tracked.calibration_file import read_hand_eye
-    from ..tracked.elsewhere import CameraMount, ExternalTracker
+    from ..tracked.external_tracker import CameraMount, ExternalTracker
     from ..tracked.pose_file import read_stream
 
     if args.poses is None:
@@ -100,7 +100,7 @@ def open_external_tracker(args: argparse.Namespace, calibration: Calibration) ->
 
 def _report_mismatch(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
     """Report the times of poses and images, if the video begins outside the poses."""
-    from ar.tracking.pictures import read_video
+    from ar.tracking.image_sequences import read_video
 
     from ..tracked.run import read_timed
 
@@ -119,10 +119,10 @@ def _report_mismatch(args: argparse.Namespace, elsewhere: ExternalTracker) -> No
 
 def _choose_clock(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
     """Return the given clock offset, or the one estimated from the video's own markers."""
-    from ar.tracking.pictures import read_video
+    from ar.tracking.image_sequences import read_video
     from ar.tracking.pose_stream import Clock
 
-    from ..tracked.elsewhere import estimate_video_clock
+    from ..tracked.external_tracker import estimate_video_clock
     from ..tracked.run import read_timed
 
     if args.clock != [AUTO]:

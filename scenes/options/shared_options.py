@@ -91,7 +91,7 @@ def list_addresses(args: argparse.Namespace) -> tuple[str, ...]:
     InputError
         A text that is no such address.
     """
-    from ar.page.guard import format_origin
+    from ar.page.access_guard import format_origin
 
     try:
         return tuple(map(format_origin, args.address))

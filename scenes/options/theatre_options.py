@@ -16,8 +16,8 @@ from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_argumen
 
 if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
+    from ..script.craniotomy_frame import CraniotomyFrame
     from ..script.scene import Scene
-    from ..script.site import CraniotomyFrame
 
 
 def add_bodies(parser: argparse.ArgumentParser) -> None:

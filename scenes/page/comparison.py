@@ -18,7 +18,7 @@ from ..play.frame_text import describe_outcome
 from ..play.player import Frame, Player
 from ..play.tip_reading import measure_tip_distance
 from ..script.tool_paths import compute_lift
-from .referee import FemResult
+from .fem_worker import FemResult
 
 # Texts: the displayed result is FEM's; FEM's result is the reference.
 FEM_SHOWN, FEM_REFERENCE = "this is the result of the FEM solver", "the truth is the result of the FEM solver"

@@ -14,11 +14,11 @@ from ar.page.parts import Dropdown, Fold, Note, Slider, Toggle
 from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
 
 from ..script.camera_paths import PATHS
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import SCENES, Scene
-from ..script.site import CraniotomyFrame
 from ..script.tool_paths import IDLE_HEIGHT, Touch
-from .beside import TIP, TUMOUR_MIDDLE
 from .requests import HAND, SCRIPT, Requests
+from .side_panels import TIP, TUMOUR_MIDDLE
 from .text import describe_effect
 
 MAX_FORCE = 0.4  # End of the force slider [N].

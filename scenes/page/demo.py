@@ -24,8 +24,6 @@ from ..play.stage import Stage
 from ..play.waiting_notice import Busy
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
-from .beside import list_lines, render_slices, sample_of
-from .cast import SceneSolvers
 from .comparison import (
     FEM_REFERENCE,
     FEM_SHOWN,
@@ -36,8 +34,10 @@ from .comparison import (
     format_comparison,
 )
 from .controls import PLAN, build_controls, is_animated, to_slider_values
-from .referee import FemResult, FemWorker
+from .fem_worker import FemResult, FemWorker
 from .requests import HAND, SCRIPT, Requests, describe_holder
+from .scene_solvers import SceneSolvers
+from .side_panels import list_lines, render_slices, sample_of
 from .text import describe_effect, describe_work, format_caption, format_pending, plan_words, report
 from .view import (
     FEM_COLOUR,

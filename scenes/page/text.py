@@ -16,8 +16,8 @@ from ..play.deformers import GUARDED, PatientSetup
 from ..play.observer import ELLIPSOID_COLOUR, TumourEstimate
 from ..play.player import Frame, is_undeformed
 from ..play.stage import TRUTH_COLOUR, TUMOUR_COLOUR, Stage
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
-from ..script.site import CraniotomyFrame
 from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
 from .comparison import ComparisonRow

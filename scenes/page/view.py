@@ -11,8 +11,8 @@ from ar.page.parts import SceneSurface, SceneViewpoint, Sign
 from ..play.observer import ELLIPSOID_COLOUR, SPHERE, SPHERE_FACES
 from ..play.player import Frame, Player
 from ..play.stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
-from ..script.site import CraniotomyFrame
-from .referee import FemResult
+from ..script.craniotomy_frame import CraniotomyFrame
+from .fem_worker import FemResult
 
 FEM_COLOUR = TRUTH_COLOUR  # Colour of the FEM tumour.
 STALE_COLOUR = (0.45, 0.45, 0.45)

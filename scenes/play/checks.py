@@ -14,7 +14,7 @@ from sim.deformation import Deformation
 from surrogate.locating.prior import compute_middle
 
 from ..script.scene import Bounds
-from .picture_checks import (
+from .image_checks import (
     has_distance_at_tip,
     has_printed_numbers,
     is_hidden_part_marked,

@@ -14,7 +14,7 @@ from ar.rendering.layer import Layer, Solid
 from sim.bodies.intensity import Intensity
 from sim.geometry.surface import normalise_vectors
 
-from ..script.site import CraniotomyFrame
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.tool import build_capsule
 from ..script.viewpoint import Cottonoid
 

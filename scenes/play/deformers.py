@@ -21,20 +21,20 @@ from sim.fem import Fem, describe_solver
 from sim.loads import Loads
 from sim.resected_fem import OperatedFem, build_fem
 from sim.runtime.device import find_device
-from surrogate.data.answer_rows import find_first_tissue
+from surrogate.data.solution_rows import find_first_tissue
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_store import load_locator, to_locator_path
 from surrogate.locating.regions import find_differing_regions
 from surrogate.model.applicability import find_rejection
 from surrogate.model.guarded import Guarded, get_held_out_error
+from surrogate.model.held_out import MAX_VERTEX_ERROR
 from surrogate.model.learned import Learned
-from surrogate.model.left_out import MAX_VERTEX_ERROR
 from surrogate.model.store import load
 
+from ..script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
+from ..script.observation_models import PointObservation, StereoObservation
 from ..script.scene import Scene, check_scene_exists
 from ..script.shipped_files import get_template_path
-from ..script.sight import PointObservation, StereoObservation
-from ..script.site import CraniotomyFrame, build_craniotomy_frame
 from ..script.uncertainty import Uncertainty, mark_of, read_uncertainties, to_uncertainty_path
 from .observer import Observer
 from .player import Player

@@ -14,8 +14,8 @@ from sim.deformation import Deformer
 from sim.effects import Effect, Elasticity
 from sim.errors import InputError
 
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
-from ..script.site import CraniotomyFrame
 from .deformers import PatientSetup
 from .stage import Stage
 

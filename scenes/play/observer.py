@@ -23,8 +23,8 @@ from surrogate.locating.locator import Location, Locator
 from surrogate.locating.observation import Observation
 from surrogate.locating.prior import compute_middle
 
-from ..script.sight import PointObservation, StereoObservation
-from ..script.site import HOLE_RATIO, CraniotomyFrame
+from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
+from ..script.observation_models import PointObservation, StereoObservation
 from ..script.tool import build_sphere
 
 TOUCH_DISTANCE = 1e-3  # Distance from the cortex within which a tool touches it [m].

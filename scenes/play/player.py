@@ -17,19 +17,19 @@ from ar.overlay.legend import LegendNames
 from ar.overlay.marks import Cover, Marks, Trace, Words
 from ar.overlay.styles import Style
 from ar.rendering.layer import Layer
-from ar.rendering.real_picture import add_vignette
+from ar.rendering.real_image import add_vignette
 from ar.rendering.renderer import Picture
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
-from sim.geometry.ball_at_rest import find_resting_tip
 from sim.geometry.closest_point import find_closest_points
+from sim.geometry.first_contact import find_resting_tip
 from sim.geometry.surface import is_enclosing
 from sim.loads import Loads, stack
 from surrogate.model.guarded import find_first_model
 from surrogate.model.learned import Learned
 
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
-from ..script.site import CraniotomyFrame
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, compute_lift
 from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty

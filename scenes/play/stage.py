@@ -19,9 +19,9 @@ from sim.discretisation.resected_body import RemainingBody, list_remaining_bodie
 from sim.effects import SkullContact
 from sim.loads import Loads, Resected
 
+from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
+from ..script.observation_models import StereoObservation
 from ..script.scene import Scene
-from ..script.sight import StereoObservation
-from ..script.site import HOLE_RATIO, CraniotomyFrame
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
 from .observer import Sees
 

@@ -11,7 +11,7 @@ import numpy as np
 from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
 
-from ..script.sight import StereoObservation
+from ..script.observation_models import StereoObservation
 from .observer import NO_POINTS, RigidError, TumourEstimate, find_touched, locate_tumour, sample_rigid_error
 from .stage import Stage
 from .stereo_update import First, StereoPair, observe_first, observe_point_cloud, observe_points

@@ -17,7 +17,7 @@ from sim.geometry.closest_point import find_closest_points
 from surrogate.locating.evidence import INDEPENDENT_ERROR, SIGMA
 from surrogate.locating.observation import Observation
 
-from ..script.site import HOLE_RATIO, CraniotomyFrame
+from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
 
 RESOLUTION = 6000.0  # Resolution of the rectified images [pixel/m of cortex].
 HALF_WIDTH = 1.05  # Half-width of the rectified images [radii of the craniotomy].

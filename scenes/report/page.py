@@ -15,7 +15,7 @@ import numpy as np
 from ar.screen import write_png
 from sim.runtime.atomic_files import write_atomically
 from surrogate.evaluation.choose import find_pareto_front
-from surrogate.model.left_out import MIN_LOADS_FOR_P999
+from surrogate.model.held_out import MIN_LOADS_FOR_P999
 
 from ..analysis.loglog_chart import ChartPanel, Curve, Dot, draw_panels
 from ..analysis.measurement import write_table

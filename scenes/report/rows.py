@@ -42,7 +42,7 @@ def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
     """Import all modules that rows need, and start Warp silently; on a GPU also PyTorch and the renderer."""
     find_device("auto", "float32")
     if study.on_card:
-        for name in ("torch", "scenes.report.picture"):
+        for name in ("torch", "scenes.report.worst_case_image"):
             import_module(name)
     return study
 
@@ -65,7 +65,7 @@ def measure_row(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
     # The time for images does not belong to the row.
     from ar.screen import write_png
 
-    from .picture import render_worst
+    from .worst_case_image import render_worst
 
     picture.parent.mkdir(parents=True, exist_ok=True)
     write_png(picture, render_worst(study, field))

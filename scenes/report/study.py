@@ -20,10 +20,10 @@ from sim.loads import Loads, Pushed
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
 from sim.runtime.versions import get_version
-from surrogate.data.answer_rows import TISSUE_KEY, read_tissue_statement
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import split_forces
+from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_statement
 from surrogate.data.splits import DiscSplit, leave_discs_out
 from surrogate.training.expansion import SERIES_MODELS, Expansion
 

@@ -9,7 +9,7 @@ import numpy as np
 from sim.bodies.markups import Markup
 from sim.errors import InputError
 
-from .site import CraniotomyFrame
+from .craniotomy_frame import CraniotomyFrame
 from .tool import Instrument, Probe
 from .tool_paths import Path, Touch
 

@@ -10,7 +10,7 @@ from sim.anatomy import Anatomy
 from sim.effects import Resection
 from sim.errors import InputError
 
-from .site import build_craniotomy_frame
+from .craniotomy_frame import build_craniotomy_frame
 
 
 @dataclass(frozen=True)

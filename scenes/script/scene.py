@@ -32,10 +32,10 @@ from sim.loads import Cause, Loads, Pushed, Resected, Retracted, Touching
 from sim.material import Material, Tissue
 from sim.runtime.user_script import format_script_error, run_script
 
+from .craniotomy_frame import CraniotomyFrame
 from .debulking import Debulking
-from .head_posture import Lie, get_supine_pose
-from .sight import PointObservation, StereoObservation
-from .site import CraniotomyFrame
+from .head_pose import Lie, get_supine_pose
+from .observation_models import PointObservation, StereoObservation
 from .tool import Instrument, Probe
 from .tool_paths import IDLE_HEIGHT, Path, Touch, keep_idle
 from .viewpoint import PLAIN_APPEARANCE, USUAL_VIEWPOINT, Appearance, Viewpoint

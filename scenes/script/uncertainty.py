@@ -14,9 +14,9 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
 
+from .craniotomy_frame import CraniotomyFrame
 from .priors import PRIORS, REGISTRATION, REGISTRATION_PRIOR, SEGMENTATION
 from .scene import Scene
-from .site import CraniotomyFrame
 
 FORMAT = "sulcus uncertainty 1"  # Name and version of the file format.
 LEVEL = 0.95

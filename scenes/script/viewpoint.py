@@ -12,7 +12,7 @@ from ar.optics.camera import Camera, build_stereo_pair, look_at
 from sim.errors import InputError
 
 from .camera_paths import CameraPath
-from .site import CraniotomyFrame
+from .craniotomy_frame import CraniotomyFrame
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,16 @@ from ar.optics.camera import Camera, find_row_time, split_row_bands
 from ar.optics.lens import Lens
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Renderer
-from ar.tracking.drawn import render_targets, stamp_time
 from ar.tracking.registration import Registration
 from ar.tracking.rigid import move_about
+from ar.tracking.synthetic_images import render_targets, stamp_time
 from ar.tracking.targets import Target, build_patient_reference, build_tool_cube, find_window
 from sim.errors import InputError
 from sim.tools import BuiltIn
 
 from ..play.player import Player
 from ..play.stage import TOOL, TOOL_COLOUR
-from ..script.site import CraniotomyFrame
+from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.viewpoint import Viewpoint
 from .registration_file import describe_scan
 from .tracked_tool import TrackedTool

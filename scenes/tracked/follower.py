@@ -19,7 +19,7 @@ from ar.tracking.targets import build_patient_reference, build_tool_cube
 
 from ..script.uncertainty import BOUND_DEVIATIONS, LEVEL
 from .agreement import Agreement
-from .elsewhere import ExternalTracker
+from .external_tracker import ExternalTracker
 from .plausible import describe_implausible, describe_misplaced_tool
 from .tool_motion import BrainMotion, ToolMotion
 from .tracked_tool import TrackedTool

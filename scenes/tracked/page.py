@@ -17,18 +17,18 @@ from ar.overlay.styles import Style
 from ar.page.browser import Browser
 from ar.page.history import History
 from ar.page.parts import Playback, SceneSurface
-from ar.tracking.pictures import Named
+from ar.tracking.image_sequences import Named
 
 from ..page.controls import add_overlay_controls, build_slice_control
 from ..page.view import STALE_COLOUR, build_brain, choose_viewpoint, list_orientation_labels
 from ..play.stage import TOOL_COLOUR, TUMOUR_COLOUR
 from ..play.waiting_notice import Busy
-from .beside import list_lines, render_slices, sample_of
 from .follower import MAX_GAP, MAX_INTERVAL, Follower, TrackingResult, TumourState
-from .picture import GREY_STATES, Painter
+from .overlay_painter import GREY_STATES, Painter
+from .overlay_panels import list_lines, render_slices, sample_of
+from .overlay_text import describe_overlay, report
 from .run import Shown, Timed, overlay_one
-from .seekable_film import SeekableFilm
-from .words import describe_overlay, report
+from .seekable_video import SeekableFilm
 
 FADED_BRIGHTNESS = 0.35  # Brightness factor of an outdated image.
 FAILURE_TIME = 2.0  # Time for which the page stays after a failure [s].

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.tracking.drawn import read_stamp
-from ar.tracking.pictures import Named
+from ar.tracking.image_sequences import Named
 from ar.tracking.pose_stream import DAY_SECONDS
+from ar.tracking.synthetic_images import read_stamp
 from sim.runtime.atomic_files import write_atomically
 
 from .follower import Follower, TrackingResult, TumourState
-from .picture import Painter
+from .overlay_painter import Painter
 from .truth import OverlayError
 
 LATENCY_EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)  # Edges of the histogram of latencies [ms].

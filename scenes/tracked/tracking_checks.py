@@ -13,12 +13,12 @@ from ar.overlay.hud import TEXT_SCALE, WHITE
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text, measure_outline_gap
 from ar.overlay.styles import Style
 
-from ..play.picture_checks import SOFT_LENGTH
+from ..play.image_checks import SOFT_LENGTH
 from ..play.stage import TUMOUR_COLOUR
-from .drawn_film import DrawnFilm
 from .filming import VideoFrame, register_with_error
 from .follower import Follower, TrackingResult
-from .picture import Painter
+from .overlay_painter import Painter
+from .rendered_video import DrawnFilm
 from .run import STALE_AGE, Timed, overlay_one
 from .tool_motion import ToolMotion
 

@@ -15,11 +15,11 @@ import numpy as np
 from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, compute_faint_threshold, forward_on, remove_faint, warp_grid
 
+from .deformed_anatomy import DeformedAnatomy
 from .images import PatientImage, Warped, write_field_nifti, write_warped
 from .landmarks import CENTROID, Landmark, compute_centroid
 from .markups import write_markups
 from .meshes import build_surface_mesh, write_glb, write_stl, write_vtp
-from .moment import DeformedAnatomy
 from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation
 from .places import FIELD_TOLERANCE, Folded, SamplePlaces, compute_fields, find_folds, list_places
 from .readme import write_readme

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from sim.bodies.voxels import LPS
 from sim.fields.grid import Grid, build_grid_around
-from sim.fields.in_tetrahedra import interpolate_in_tetrahedra
+from sim.fields.grid_interpolation import interpolate_in_tetrahedra
 
 TYPES = {"f4": "float", "u1": "unsigned char"}  # Names of data types in NRRD.
 LEVEL = 1  # Compression level, the lowest: more hardly reduces floats.

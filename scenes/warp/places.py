@@ -14,8 +14,8 @@ from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, warp_fields, warp_grid
 from sim.geometry.tetmesh import compute_signed_volumes
 
+from .deformed_anatomy import DeformedAnatomy
 from .landmarks import Landmark, list_landmarks
-from .moment import DeformedAnatomy
 
 # Weights of corners at the places inside a tetrahedron; no field is fitted there.
 INNER_WEIGHTS = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4))

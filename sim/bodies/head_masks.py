@@ -13,8 +13,8 @@ from ..errors import InputError
 from .conventions import CONVENTIONS, Convention, check_labels_fit
 from .label_contacts import build_contradiction_check, count_label_contacts, find_contradiction
 from .label_map import Label, LabelMap, Mask, count_on_border, format_labels, read_labels, widen_grid
-from .one_space import has_one_space
 from .placement import describe_side
+from .space_consistency import has_one_space
 from .volume import read_volume
 from .voxels import DEFAULT_VOXELS, VoxelGrid, Voxels
 

@@ -17,9 +17,9 @@ from .dural_septa import SEPTA, Septum
 from .head_masks import HeadMasks, Sources, read_head_masks
 from .intensity import read_intensity
 from .label_map import Label, Mask, count_on_border
-from .one_space import check_scan_space
 from .placement import Piece, find_reachable_site
 from .signed_distance import Blur, mask_field
+from .space_consistency import check_scan_space
 from .subject import Subject, SubjectPart, find_rim
 from .voxels import VoxelGrid
 

@@ -21,8 +21,8 @@ from ..runtime.atomic_files import write_atomically
 from ..runtime.file_limits import MESH_BYTES, MeshBytes, limit_memory
 from ..runtime.outside_files import read_as, to_path
 from .abaqus import AbaqusMesh, read_abaqus
-from .given_cells import check_cell_types, check_one_body, collect_regions, merge_nodes, note_pieces
 from .markups import SIGNS
+from .mesh_checks import check_cell_types, check_one_body, collect_regions, merge_nodes, note_pieces
 from .mesh_references import check_mesh_references
 from .vtu_size import check_vtu_size
 

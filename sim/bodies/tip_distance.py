@@ -9,8 +9,8 @@ import numpy as np
 
 from ..anatomy import Anatomy
 from ..errors import InputError
-from ..geometry.ball_at_rest import find_resting_tips
 from ..geometry.closest_point import find_closest_points
+from ..geometry.first_contact import find_resting_tips
 from ..loads import Loads, Pushed, Touching
 from ..tools import BuiltIn, find_foremost_points
 from .open_cortex import OpenCortex, open_cortex

@@ -10,12 +10,12 @@ from scipy import ndimage
 
 from ..anatomy import Anatomy
 from ..geometry.tetmesh import compute_signed_volumes
-from .collar import extrapolate_beyond_surface
 from .extension import extend_field
 from .folds import unfold
 from .grid import Grid, build_grid_around
-from .in_tetrahedra import interpolate_in_tetrahedra
+from .grid_interpolation import interpolate_in_tetrahedra
 from .inversion import invert_field
+from .near_surface import extrapolate_beyond_surface
 from .projection import NodalField, project
 
 MIN_FADE_DISTANCE = 5e-3  # constant part of the distance over which the field fades to zero [m]

@@ -27,8 +27,8 @@ from sim.runtime.outside_files import read_as, to_path
 from sim.runtime.partial_files import to_unfinished_path
 from sim.tools import BuiltIn, read_tool_statement
 
-from .answer_rows import compute_row_checksums, format_row_numbers, get_row_type
 from .cortex_patch import open_patch
+from .solution_rows import compute_row_checksums, format_row_numbers, get_row_type
 
 CAUSES: dict[str, type[Cause]] = {  # Types of loads that a data set may contain, by name.
     kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture, Touching)

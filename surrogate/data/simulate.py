@@ -25,7 +25,6 @@ from sim.runtime.processes import LostError
 from sim.runtime.timing import listen_to_stages, time_stage
 from sim.runtime.versions import get_version
 
-from .answer_rows import CHECKSUM_TYPE, compute_row_checksums, get_row_type
 from .array_meanings import FILE_DESCRIPTION, explain
 from .cortex_patch import open_patch
 from .dataset import (
@@ -41,6 +40,7 @@ from .dataset import (
     write_loads,
     write_provenance,
 )
+from .solution_rows import CHECKSUM_TYPE, compute_row_checksums, get_row_type
 from .tasks import LoadBatch, SolverPool, count_posed_tools, solve_batches
 
 STAGES = {"unit": "unit responses", "answers": "loads"}  # Names of the file's groups in reports of their seconds.

@@ -13,8 +13,8 @@ from sim.loads import Loads, Nodal, Touching
 from sim.runtime.journal import Batch
 from sim.runtime.processes import Child, map_unordered
 
-from .answer_rows import to_rows
 from .cortex_patch import open_patch
+from .solution_rows import to_rows
 
 # Far inside the small-strain range: 1 uN on one node of brain tissue strains its elements by some 1e-5, so that one
 # solve with the undeformed stiffness is exact enough.

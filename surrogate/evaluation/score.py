@@ -14,8 +14,8 @@ from sim.errors import InputError
 from sim.loads import Loads
 from sim.runtime.threads import limit_to_one_thread
 
+from ..model.held_out import MIN_LOADS_FOR_P999
 from ..model.learned import Learned
-from ..model.left_out import MIN_LOADS_FOR_P999
 from .coverage import Held, format_held, measure_held
 
 

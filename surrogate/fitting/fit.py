@@ -23,10 +23,7 @@ from ..locating.evidence import Evidence
 from ..locating.locator import Locator
 from ..locating.observation import to_evidence
 from ..locating.regions import Region
-from .frame import FORCE_SIGMA, ObservedFrame, Tool, check_frames, find_foot
-from .responses import POISSONS, RATIOS, TOOL_FORCE, Responses, build_drained_loads, build_force_loads, solve_responses
-from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
-from .weighing import (
+from .frame_likelihood import (
     factorise_errors,
     find_unsupported,
     predict_seen,
@@ -35,6 +32,9 @@ from .weighing import (
     weigh_pressed,
     whiten_columns,
 )
+from .observed_frame import FORCE_SIGMA, ObservedFrame, Tool, check_frames, find_foot
+from .responses import POISSONS, RATIOS, TOOL_FORCE, Responses, build_drained_loads, build_force_loads, solve_responses
+from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 
 EXPONENTS = (9.5, 19.0)
 """Candidate -m of Ogden's law, equally probable: tissue stiffens with indentation, so a dent alone gives no E."""

@@ -15,10 +15,10 @@ from sim.geometry.locate import Located
 from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, Presses
 from .ensemble import Ensemble, compute_surface_motion
 from .evidence import SIGMA, Evidence, build_motion_evidence
+from .iterated_conditioning import match_and_update
 from .observation import Observation
 from .posterior import Posterior
 from .prior import MotionPrior, build_prior, compute_middle
-from .rounds import match_and_update
 
 LEVEL = 0.95
 """Nominal coverage of ellipsoids."""

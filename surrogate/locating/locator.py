@@ -16,11 +16,11 @@ from sim.runtime.threads import limit_to_one_thread
 from .calibration import compute_covering_factor, is_within_trials
 from .cause_shares import CauseShare, compute_cause_shares, group_cause_shares
 from .causes import KINDS
+from .iterated_conditioning import match_and_update
 from .observation import Observation, choose_points
 from .posterior import Posterior, is_within_errors
 from .prior import MotionPrior
 from .regions import Region
-from .rounds import match_and_update
 
 MAX_OUTLIER_SHARE = 0.35  # Largest share of outliers.
 MAX_SURPRISE = 2.5  # Largest `surprise` that a cause of the ensemble can explain.

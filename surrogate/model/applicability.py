@@ -26,8 +26,8 @@ from sim.effects import (
 from sim.material import Pairs
 from sim.tools import BuiltIn, Tool, name_tool
 
-from ..data.answer_rows import read_tissue_statement
-from ..data.holding import get_relaxation_series
+from ..data.load_histories import get_relaxation_series
+from ..data.solution_rows import read_tissue_statement
 from .learned import Learned
 
 # Effects that do nothing without a load of their kind: training may include them although a scene does not.

@@ -15,8 +15,8 @@ from sim.loads import Loads
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS
 from ..regressors.rigid_contact import RigidContact
+from .held_out import MAX_VERTEX_ERROR, HeldOutError, find_handed_over
 from .learned import Learned, ModelPart
-from .left_out import MAX_VERTEX_ERROR, HeldOutError, find_handed_over
 from .tool_contact import CONTACT_KEY
 
 

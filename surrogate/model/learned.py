@@ -21,15 +21,15 @@ from sim.material import Pairs
 from sim.runtime.threads import limit_to_one_thread
 from sim.tools import BuiltIn
 
-from ..data.answer_rows import read_tissue_statement
 from ..data.cortex_patch import Patch, find_nearest, open_patch
 from ..data.encode import ENCODERS, Basis, Encoder, split_forces
-from ..data.holding import read_series
 from ..data.indentation import add_relaxation, get_only_pushes, get_poses, to_indentation
+from ..data.load_histories import read_series
+from ..data.solution_rows import read_tissue_statement
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound, compute_features
-from .left_out import LeftOut
+from .held_out import LeftOut
 from .relaxation import MEMORY_KEY, Relaxed, follow_relaxation
 from .tip_distance import Distance, TipModel
 from .tool_contact import ForceModel, build_warm_encoders, collect_held_state, compute_wrench
@@ -68,8 +68,7 @@ class ModelPart:
 class Learned:
     """Sum of parts, as a `Deformer`.
 
-    Every part predicts the response to one newton, which is multiplied by the force. Zero force gives zero motion, and
-    the relative error of a weak load is that of a strong one.
+    Every part predicts the response to one newton, which is multiplied by the force: zero force gives zero motion.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ from sim.loads import Pushed
 from sim.material import Pairs
 
 from ..data.encode import split_forces
-from ..data.holding import compute_unfaded
+from ..data.load_histories import compute_unfaded
 
 MEMORY_KEY = "relaxation"
 """Key in `Deformation.memory`: depth [m], position of first contact [m], then each h [m]; (B, 4 + pairs)."""

@@ -20,22 +20,22 @@ from sim.runtime.outside_files import read_as, to_path
 from sim.runtime.versions import get_version
 from sim.tools import read_tool_statement
 
-from ..data.answer_rows import find_first_tissue
 from ..data.encode import Basis
+from ..data.solution_rows import find_first_tissue
 from ..regressors.baselines import Ann, Pcr, Svr
 from ..regressors.force_series import ForcePairs, Remainder, Series
 from ..regressors.gp import Gp
 from ..regressors.protocol import Fitted, Linear, Regressor
 from ..regressors.rigid_contact import RigidContact
 from .conformal import GROWTH, Bound
+from .held_out import HeldOutError, LeftOut
 from .learned import Learned, ModelPart
-from .left_out import HeldOutError, LeftOut
+from .model_validation import check_finite_state, check_model_state
 from .npz_archive import Archive, compute_seal, write_archive
 from .own_learners import find_own, name_of
 from .tip_distance import TipModel
 from .tool_contact import ForceModel
 from .training_range import Envelope
-from .vetting import check_finite_state, check_model_state
 
 FORMAT = "sulcus model 2"  # Name and version of the file format.
 REMEDY = "Make one with `sulcus train`."  # Remedy in error messages.

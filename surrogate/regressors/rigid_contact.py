@@ -27,7 +27,7 @@ from sim.runtime.threads import limit_to_one_thread
 from sim.tools import Ball
 
 if TYPE_CHECKING:
-    from sim.discretisation.nearest_places import PlacedBox
+    from sim.discretisation.nearest_points import PlacedBox
 
 MEAN_GAP = 0.5 * ToolContact((Ball(1.0),)).gap  # Mean gap that FEM keeps between tissue and tool [m].
 CANDIDATE_DISTANCE = 1.5  # Distance from a tool's core within which facets are contact candidates [radii].
@@ -199,7 +199,7 @@ class RigidContact:
         there. Else it starts at the first step of the approach.
         """
         # Warp is imported only for pressing tools, not for reading a model.
-        from sim.discretisation.nearest_places import PlacedBox
+        from sim.discretisation.nearest_points import PlacedBox
 
         point, direction, depth, radius = x[:3], x[3:6], x[6], x[7]
         if not len(self.core):
@@ -217,7 +217,7 @@ class RigidContact:
         return [there.move(way) for way in ways], self.core[3] + MEAN_GAP, None
 
     def _place_box(self, x: np.ndarray) -> PlacedBox:
-        from sim.discretisation.nearest_places import PlacedBox
+        from sim.discretisation.nearest_points import PlacedBox
 
         axes = np.column_stack([x[11:14], np.cross(x[14:17], x[11:14]), x[14:17]])
         return PlacedBox(x[8:11], axes, self.core[:3])
@@ -227,7 +227,7 @@ class RigidContact:
 
         begun is the result at the first of them; None: no contact before.
         """
-        from sim.discretisation.nearest_places import Nearest
+        from sim.discretisation.nearest_points import Nearest
 
         facets, nodes, table, rows = self._select_facets(stations, radius)
         nearest = Nearest(len(facets))

@@ -12,8 +12,8 @@ from sim.loads import Loads, Pushed, select_rows
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
-from ..data.holding import read_series
 from ..data.indentation import add_relaxation, to_indentation
+from ..data.load_histories import read_series
 from ..data.splits import DiscSplit
 from ..evaluation.coverage import Coverage, measure_covered
 from ..evaluation.score import compute_force_errors, compute_point_errors

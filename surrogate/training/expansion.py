@@ -24,10 +24,10 @@ from sim.runtime.outside_files import read_as
 from sim.runtime.versions import get_version
 
 from ..array_functions import Rounded, round_to_half
-from ..data.answer_rows import read_tissue_statement
 from ..data.cortex_patch import Patch, open_patch
 from ..data.dataset import Dataset
 from ..data.encode import Basis, compute_nodal_shares, reduce, split_forces
+from ..data.solution_rows import read_tissue_statement
 from ..data.tool_loads import spread
 from ..model.applicability import read_trained_skull
 from ..model.kept_arrays import REMEDY

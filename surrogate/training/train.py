@@ -16,8 +16,8 @@ from ..data.splits import CALIBRATION_STRIDE, MAX_CALIBRATION_LOADS, DiscSplit, 
 from ..evaluation.coverage import FORCE_CLASSES, Coverage
 from ..evaluation.score import ForceScore, Score, score, score_forces
 from ..model.conformal import LEVELS, USUAL_GROWTH, compute_conformal_quantile
+from ..model.held_out import measure_held_out
 from ..model.learned import Learned, ModelPart
-from ..model.left_out import measure_held_out
 from ..model.own_learners import OWN_LEARNERS, find_own
 from ..model.tip_distance import TipModel
 from ..model.tool_contact import ForceModel

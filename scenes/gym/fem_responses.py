@@ -1,0 +1,174 @@
+"""FEM response to a moved tool, and to drainage and resection of the brain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.contact_pressure import compute_pressure
+from sim.deformation import Deformation, join_deformations
+from sim.fem import Fem
+from sim.geometry.closest_point import find_closest_points
+from sim.geometry.surface import compute_vertex_normals
+from sim.geometry.tetmesh import TetMesh
+from sim.loads import Loads, Resected, Touching
+from sim.resected_fem import OperatedFem
+
+from ..script.craniotomy_frame import CraniotomyFrame
+from ..script.head_pose import HeadPose
+from .model_responses import Hertz
+from .tissue_requests import TissueRequest, Touched
+
+
+@dataclass(frozen=True, eq=False)
+class PosedElements:
+    """FEM in contact with a rigid tool.
+
+    The pressure under a ball is Hertz's at its force; under a blade it is the maximum of `sim.compute_pressure`.
+
+    Parameters
+    ----------
+    fem
+        FEM with `ToolContact` of the tool.
+    ball
+        Hertz model of the tool, if the tool is a ball.
+    together
+        True if all environments are solved in one batch.
+    """
+
+    fem: Fem
+    ball: Hertz | None
+    together: bool = False
+
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+        """Solve as `TissueModel.compute_responses`; environments at the start of an episode form a separate batch."""
+        found: dict[int, Touched] = {}
+        begin = [row for row, each in enumerate(asked) if each.last is None]
+        going = [row for row, each in enumerate(asked) if each.last is not None]
+        for rows in (begin, going):
+            for some in [rows] if self.together and rows else [[row] for row in rows]:
+                found |= dict(zip(some, self._solve_poses([asked[row] for row in some]), strict=True))
+        return [found[row] for row in range(len(asked))]
+
+    def _solve_poses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+        loads = Loads((Touching(np.stack([each.pose for each in asked])[:, None]),))
+        starts = [each.last.memory for each in asked if each.last is not None and each.last.memory is not None]
+        answer = self.fem.deform(loads, _join_starts(starts) if starts else None)
+        force = answer.reaction[:, 0, :3]
+        size = np.linalg.norm(force, axis=1)
+        if self.ball is not None:
+            highest = [self.ball.compute_pressure(float(each)) for each in size]
+        else:
+            highest = compute_pressure(self.fem, loads, answer).max(axis=1).tolist()
+        rows = [answer]
+        if len(asked) > 1:
+            rows = [replace(answer.select(np.array([row])), warm={}) for row in range(len(asked))]
+        return [
+            Touched(row.displacement[0], row.nodes, force[number], highest[number], row.outcome[0].good, memory=row)
+            for number, row in enumerate(rows)
+        ]
+
+
+def _join_starts(starts: Sequence[Deformation]) -> Deformation:
+    return starts[0] if len(starts) == 1 else join_deformations(starts)
+
+
+LEVEL_SPACING = (
+    0.1  # Spacing of the solved fluid levels, relative to the height; solutions in between are interpolated.
+)
+MAX_SURFACE_DISTANCE = 0.03  # Distance from the corridor and the tumour within which healthy tissue is considered [m].
+
+
+class HealthySurface(NamedTuple):
+    """The surface (S, 3) of the healthy tissue that is left near the tumour; outward normals (V, 3) at rest."""
+
+    triangles: np.ndarray
+    normals: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CutElements:
+    """FEM under gravity, by fluid level and resection step; each state is solved once.
+
+    Contact of the tool, a ball, with healthy tissue follows `Hertz`. The ball enters the tumour and moves no tissue.
+
+    Parameters
+    ----------
+    site
+        The open cortex.
+    fem
+        FEM of the resection.
+    ball
+        Hertz model of the tool on brain tissue.
+    """
+
+    site: CraniotomyFrame
+    fem: OperatedFem
+    ball: Hertz
+    _solved: dict[tuple[int, int], Deformation] = field(default_factory=dict)
+    _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
+
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+        """Solve as `TissueModel.compute_responses`; independent of earlier requests, as levels have one order."""
+        return [self._solve_touch(each) for each in asked]
+
+    def _solve_touch(self, asked: TissueRequest) -> Touched:
+        level = (1.0 - asked.fluid) / LEVEL_SPACING
+        low = int(level)
+        share = level - low
+        motion = self._solve_level(low, asked.done).displacement[0]
+        if share > 0.0:
+            motion = (1.0 - share) * motion + share * self._solve_level(low + 1, asked.done).displacement[0]
+        force = self._compute_force(asked.pose, asked.done, motion)
+        size = float(np.linalg.norm(force))
+        good = all(self._solve_level(low + more, asked.done).outcome[0].good for more in range(2 if share > 0.0 else 1))
+        return Touched(motion, np.arange(len(motion)), force, self.ball.compute_pressure(size), good)
+
+    def _solve_level(self, level: int, done: int) -> Deformation:
+        """Return the solution at a fluid level, started from the level above.
+
+        After more steps, from that after fewer.
+        """
+        key = level, done
+        if key not in self._solved:
+            start = None
+            if done > 1:
+                start = self._solve_level(level, done - 1)
+            elif level > 0:
+                start = self._solve_level(level - 1, done)
+            posture = HeadPose(fluid=1.0 - LEVEL_SPACING * level).build_posture(self.site.anatomy.mesh.nodes)
+            self._solved[key] = self.fem.deform(Loads((posture, Resected(np.array([float(done)])))), start)
+        return self._solved[key]
+
+    def _compute_force(self, pose: np.ndarray, done: int, motion: np.ndarray) -> np.ndarray:
+        """Force (3,) [N] of the ball on healthy tissue."""
+        healthy, nodes = self._get_healthy(done), self.site.anatomy.mesh.nodes
+        radius = self.ball.radius
+        middle = pose[:3, 3] + radius * pose[:3, 2]
+        near = find_closest_points(middle[None], (nodes + motion)[healthy.triangles])
+        corners = healthy.triangles[near.triangle[0]]
+        outward = near.weights[0] @ healthy.normals[corners]
+        outward /= np.linalg.norm(outward)
+        away = middle - near.point[0]
+        distance = float(np.copysign(np.linalg.norm(away), away @ outward))
+        return -float(self.ball.compute_force(np.array(radius - distance))) * outward
+
+    def _get_healthy(self, done: int) -> HealthySurface:
+        """Return the remaining body after a number of steps."""
+        if done not in self._surfaces:
+            self._surfaces[done] = self._build_healthy(done)
+        return self._surfaces[done]
+
+    def _build_healthy(self, done: int) -> HealthySurface:
+        body = self.fem.get_remains(done).anatomy
+        left, brain = body.mesh, ~body.in_tumour
+        surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
+        tumour = self.site.anatomy.tumour_nodes
+        way = np.linspace(self.site.origin, left.nodes[tumour].mean(axis=0), 8)
+        middle = left.nodes[surface].mean(axis=1)
+        around = np.concatenate([way, left.nodes[tumour]])
+        near = np.linalg.norm(middle[:, None] - around, axis=2).min(axis=1) < MAX_SURFACE_DISTANCE
+        return HealthySurface(surface[near], compute_vertex_normals(left.nodes, surface))

@@ -1,0 +1,199 @@
+"""Predicted response to a moved tool, by models trained on forces or on tool poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sim.errors import InputError
+from sim.geometry.closest_point import find_closest_points
+from sim.loads import Loads, Pushed, Touching
+from sim.material import Tissue
+from sim.tools import Ball
+from surrogate.data.cortex_patch import Patch, open_patch
+from surrogate.data.indentation import to_indentation
+from surrogate.model.guarded import compute_tool_pressure
+from surrogate.model.learned import Learned
+
+from ..script.craniotomy_frame import CraniotomyFrame
+from .tissue_requests import TissueRequest, Touched
+
+DEPTH_TOLERANCE = 1e-5  # Tolerance of the ball's depth [m].
+MAX_ITERATIONS = 12  # Maximum number of iterations for the ball's depth.
+MAX_FORCE_RATIO = 1.5  # Largest force in the search, relative to the strongest of the training.
+
+
+@dataclass(frozen=True)
+class Hertz:
+    """Forces, depths and pressures of a ball without friction.
+
+    Parameters
+    ----------
+    radius
+        Radius of the ball [m].
+    tissue
+        Tissue of the half space; only its stiffness at small strains is used.
+    """
+
+    radius: float
+    tissue: Tissue
+
+    @cached_property
+    def modulus(self) -> float:
+        """E / (1 - nu^2) [Pa], which is 2 mu / (1 - nu)."""
+        mu, lame = self.tissue.lame
+        return 2.0 * mu / (1.0 - 0.5 * lame / (lame + mu))
+
+    def compute_force(self, depth: np.ndarray) -> np.ndarray:
+        """Return forces [N] at depths [m]: F = 4/3 E' sqrt(r) d^1.5; none above the surface."""
+        return 4.0 / 3.0 * self.modulus * np.sqrt(self.radius) * np.maximum(depth, 0.0) ** 1.5
+
+    def compute_contact_radius(self, force: np.ndarray) -> np.ndarray:
+        """Radii of contact [m] under forces [N]: a^3 = 3 F r / (4 E')."""
+        return np.cbrt(0.75 * force * self.radius / self.modulus)
+
+    def compute_pressure(self, force: float) -> float:
+        """Return the pressure [Pa] in the middle of the contact under a force [N]: 3 F / (2 pi a^2)."""
+        return 1.5 * force / (np.pi * float(self.compute_contact_radius(np.array(force))) ** 2) if force > 0.0 else 0.0
+
+    def compute_extra_depth(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+        """Return the extra depth [m] of the ball's centre compared with a wider footprint (k,) [m] at equal forces.
+
+        The middle of a footprint sqrt(1 - (s/a)^2) sinks by 3 F / (4 E' a).
+        """
+        own = np.where(force > 0.0, self.compute_contact_radius(force), 1.0)
+        return 0.75 * force / self.modulus * (1.0 / own - 1.0 / footprint)
+
+
+@dataclass(frozen=True, eq=False)
+class PressedModel:
+    """Search for the force under which the predicted cortex touches the ball.
+
+    The force acts at the point of the undeformed cortex nearest to the ball's centre, away from the centre. The
+    footprint has the contact radius of `Hertz`. If the model was trained only on wider footprints, the depth is
+    corrected by the difference of Hertz's formula.
+
+    Parameters
+    ----------
+    site
+        The open cortex.
+    model
+        Model trained on pushes.
+    ball
+        Hertz model of the tool on the model's tissue.
+    together
+        True if all environments are predicted in one batch.
+    """
+
+    site: CraniotomyFrame
+    model: Learned
+    ball: Hertz
+    together: bool = False
+
+    @cached_property
+    def _patch(self) -> Patch:
+        return open_patch(self.site.anatomy)
+
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+        """Predict as `TissueModel.compute_responses`."""
+        poses = np.stack([each.pose for each in asked])
+        parts = [poses] if self.together else np.split(poses, len(poses))
+        return [touched for part in parts for touched in self._predict_poses(part)]
+
+    def _predict_poses(self, poses: np.ndarray) -> list[Touched]:
+        """Predict tools at poses (B, 4, 4) together."""
+        near = to_indentation(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
+        depth = np.linalg.norm(near.force, axis=1)
+        inward = np.divide(near.force, depth[:, None], out=np.zeros_like(near.force), where=depth[:, None] > 0.0)
+        answers = [Touched(np.zeros((len(self.model.nodes), 3)), self.model.nodes, np.zeros(3), 0.0) for _ in poses]
+        rows = np.flatnonzero(depth > 0.0)
+        if not len(rows):
+            return answers
+        point, inward = near.point[rows], inward[rows]
+        size, found = self._find_forces(point, inward, depth[rows])
+        answer = self.model.deform(self._build_loads(point, inward, size))
+        stated = np.where(np.isfinite(answer.bound[0]), answer.bound[0], self.model.bound)
+        for number, row in enumerate(rows.tolist()):
+            answers[row] = Touched(
+                answer.displacement[number], answer.nodes, size[number] * inward[number],
+                self.ball.compute_pressure(float(size[number])), bool(found[number]), float(stated[number]),
+            )  # fmt: skip
+        return answers
+
+    def _build_loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
+        """Pushes of sizes (k,) [N], each on a footprint of its contact radius, clipped to the training range."""
+        return Loads((Pushed(point, size[:, None] * inward, self._compute_footprint(size)),))
+
+    def _compute_footprint(self, size: np.ndarray) -> np.ndarray:
+        return np.clip(self.ball.compute_contact_radius(size), *self.model.envelope.footprint)
+
+    def _find_forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Find forces (k,) [N] at points (k, 3) by the secant method, and whether each reaches its depth (k,) [m]."""
+        patch, rows = self._patch, np.arange(len(depth))
+        place = find_closest_points(point, patch.points[patch.triangles])
+        corners, most = patch.triangles[place.triangle], MAX_FORCE_RATIO * self.model.envelope.force[1]
+
+        def off(size: np.ndarray) -> np.ndarray:
+            """Return the signed depth error (k,) [m] of the ball under each trial force."""
+            moved = self.model.deform(self._build_loads(point, inward, size), at=patch.nodes).displacement
+            there = np.einsum("kc,kci,ki->k", place.weights, moved[rows[:, None], corners], inward)
+            return there + self.ball.compute_extra_depth(size, self._compute_footprint(size)) - depth
+
+        before, short = np.zeros(len(depth)), -depth
+        size = np.minimum(self.ball.compute_force(depth), most)
+        for _ in range(MAX_ITERATIONS):
+            now = off(size)
+            near = np.abs(now) < DEPTH_TOLERANCE
+            if near.all():
+                break
+            slope = np.where(near, np.inf, now - short) / np.where(near | (size == before), 1.0, size - before)
+            # Converged entries stay: others in the batch have no influence.
+            before, short, size = size, now, np.where(near, size, np.clip(size - now / slope, 0.0, most))
+        return size, np.abs(off(size)) < DEPTH_TOLERANCE
+
+
+@dataclass(frozen=True, eq=False)
+class PosedModel:
+    """Prediction of motion, force and bound by a model of tool poses; a blade continues from its last state.
+
+    The pressure under a ball is that of Hertz under its force; under a blade it is the highest of
+    `compute_tool_pressure`.
+
+    Parameters
+    ----------
+    model
+        Model trained on poses of the tool.
+    ball
+        Hertz model of the tool, if the tool is a ball.
+    """
+
+    model: Learned
+    ball: Hertz | None
+
+    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+        """Predict as `TissueModel.compute_responses`, one by one.
+
+        If the model rejects a pose, the tissue stays and is marked unreliable.
+        """
+        return [self._predict_pose(each.pose, each.last) for each in asked]
+
+    def _predict_pose(self, pose: np.ndarray, last: Touched | None) -> Touched:
+        loads = Loads((Touching(pose[None, None]),))
+        try:
+            answer = self.model.deform(loads, None if last is None else last.memory)
+        except InputError:
+            nodes = self.model.nodes
+            rest = Touched(np.zeros((len(nodes), 3)), nodes, np.zeros(3), 0.0) if last is None else last
+            return replace(rest, good=False, error=float("inf"))
+        force = answer.reaction[0, 0, :3]
+        if self.ball is None:
+            highest = float(compute_tool_pressure(self.model, loads, answer).max())
+        else:
+            highest = self.ball.compute_pressure(float(np.linalg.norm(force)))
+        error = float(answer.bound[0, 0])
+        if not np.isfinite(error):
+            error = self.model.bound
+        return Touched(answer.displacement[0], answer.nodes, force, highest, error=error, memory=answer)

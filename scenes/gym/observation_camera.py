@@ -1,0 +1,53 @@
+"""Images of environments: colour and depth; those of one cavity are rendered together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from ar.optics.camera import Camera
+from ar.rendering.renderer import Renderer
+
+from .setting import TaskSetting
+from .tissue_requests import Touched
+
+Seen = tuple[Touched, np.ndarray, int]
+"""Rendered state: the tissue's response, T_world_tool (4, 4), and the number of resection steps done."""
+
+
+class ObservationCamera:
+    """Renderer of camera images of a setting."""
+
+    def __init__(self, setting: TaskSetting):
+        self.setting = setting
+        self._renderers: dict[int, Renderer] = {}
+
+    @cached_property
+    def camera(self) -> Camera:
+        """It stays where it is."""
+        return self.setting.scene.viewpoint.build_camera(self.setting.site)
+
+    def render(self, seen: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
+        """Colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 where nothing is."""
+        shape = len(seen), self.camera.height, self.camera.width
+        colour, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
+        for done in sorted({each[2] for each in seen}):
+            rows = [row for row, each in enumerate(seen) if each[2] == done]
+            stage = self.setting.get_stage(done)
+            scenes = [
+                stage.build_layers(self._compute_positions(touched), pose)
+                for touched, pose, _ in (seen[row] for row in rows)
+            ]
+            if done not in self._renderers:
+                self._renderers[done] = Renderer(scenes[0], stage.lamp, stage.device)
+            moved = [np.concatenate([each.vertices for each in layers if not each.still]) for layers in scenes]
+            pictures = self._renderers[done].render_batch(np.stack(moved), [self.camera])
+            colour[rows], depth[rows] = pictures.colour.numpy(), pictures.depth.numpy()
+        return colour, depth
+
+    def _compute_positions(self, touched: Touched) -> np.ndarray:
+        positions = self.setting.site.anatomy.mesh.nodes.copy()
+        positions[touched.nodes] += touched.motion
+        return positions

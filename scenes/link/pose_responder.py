@@ -1,0 +1,236 @@
+"""Tracking result of a tool's pose: positions of tumour and open cortex, with their errors."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from ar.overlay.gauge import Gauge
+from ar.tracking.pose import Pose, TrackedTargets
+from ar.tracking.pose_stream import MAX_GAP, PoseStream
+from ar.tracking.registration import Registration
+
+from ..script.uncertainty import LEVEL
+from ..tracked.follower import (
+    MAX_OVERLAY_ERROR,
+    UNCHECKED_WARNING,
+    UNKNOWN_WARNING,
+    TrackingResult,
+    TumourState,
+    compute_tip_covariance,
+    describe_wide_band,
+)
+from ..tracked.overlay_painter import Painter
+from ..tracked.plausible import describe_misplaced_tool
+from ..tracked.tool_motion import ToolMotion
+from ..tracked.tracked_tool import TrackedTool
+from .frame import to_stamp, to_time
+from .received_transforms import ReceivedTransforms, Sent
+
+MIN_POSES = 3  # Minimum number of poses to estimate the camera's acceleration between them.
+OWNER_QUESTION = "are these its poses and registration?"  # Question in the warning about a misplaced tool.
+NO_TARGETS = TrackedTargets(0, {}, {}, {})  # Tracking result without targets.
+TIMED_DEPTH = 2e-3  # Depth of the tool whose solution is timed at the start [m].
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPlacement:
+    """Camera pose T (4, 4) [m] in the reference's frame, and error of a position by the camera's motion [m]."""
+
+    T: np.ndarray
+    moved: float
+
+
+def place_camera(
+    course: Sequence[Sent], now: float, stamp: int, place: np.ndarray, stale: float
+) -> CameraPlacement | str:
+    """Interpolate a camera's pose at an image's time stamp, from its poses, the newest last; or return a reason.
+
+    Between two poses, and just after the newest, see `PoseStream.interpolate`. The error is the camera's
+    possible acceleration between them, at a position (3,) [m] in the reference's frame. Otherwise, and with fewer than
+    three poses, it is the newest pose, and the position's motion in the image since. Without stamps, arrival times of
+    messages are used. A reason has {name} instead of the transform's name.
+    """
+    body = course[-1]
+    stamped = bool(stamp and all(sent.stamp for sent in course))
+    times = np.array([to_time(sent.stamp) if stamped else sent.arrived for sent in course])
+    time = to_time(stamp) if stamped else now
+    poses = np.stack([sent.T for sent in course])
+    if stamped and len(course) >= MIN_POSES and np.ptp(times[-MIN_POSES:]) <= MAX_GAP * MIN_POSES:
+        between = PoseStream(times, poses, np.zeros((len(course), 6, 6))).interpolate(time)
+        if between is not None:
+            arm = float(np.linalg.norm(place - between.T_camera_target[:3, 3]))
+            shift, turn = np.sqrt(np.diag(between.covariance)[[0, 3]])
+            return CameraPlacement(between.T_camera_target, float(shift + turn * arm))
+    apart = abs(time - times[-1])
+    if apart > stale:
+        return f"no {{name}} within {stale:g} s of the image's time"
+    if len(course) < 2:
+        return "one {name} alone, which does not say how fast the camera moves"
+    step = times[-1] - times[-2]
+    here, there = (np.linalg.inv(T) @ np.append(place, 1.0) for T in poses[-1:-3:-1])
+    way = float(np.linalg.norm((here - there)[:3]))
+    return CameraPlacement(body.T, way * apart / step if step > 0.0 else np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseResult:
+    """Result for a pose.
+
+    Parameters
+    ----------
+    stamp
+        The pose's own time stamp; without one, or without a result, that of the computation.
+    known
+        Positions of tumour and cortex, with state and text of an overlay.
+    gauge
+        Distance from tip to tumour; None if unknown.
+    """
+
+    stamp: int
+    known: TrackingResult
+    gauge: Gauge | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """Pose of the scan in a camera's frame: T_camera_scan (4, 4) [m].
+
+    `moved` is the tumour's error [m] from the time between pose and image.
+    """
+
+    T_camera_scan: np.ndarray
+    moved: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseResponder:
+    """Solver for poses: a pure function of the received transforms, except for the start of an FEM solution.
+
+    Parameters
+    ----------
+    motion
+        Model of the brain's motion under a tool.
+    tool
+        Shape of the tool, and its pose in the tracked frame.
+    tracking
+        Standard deviation of the tip's position along each axis [m], which messages do not contain.
+    registration
+        Registration from a file; None: it is received, with unknown error and patient.
+    """
+
+    motion: ToolMotion
+    tool: TrackedTool
+    tracking: float
+    registration: Registration | None = None
+
+    def compute_result(
+        self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
+    ) -> PoseResult:
+        """Compute the result at a time `now` [s], from the result `before`; `moment` is now, in seconds since 1970."""
+        registration = self._find_registration(heard)
+        if isinstance(registration, str):
+            return self._build_unknown(registration, moment, before)
+        body = heard.find_relative(heard.names.tool, now)
+        if isinstance(body, str):
+            return self._build_unknown(body, moment, before)
+        stamp = body.stamp or to_stamp(moment)
+        beside = Pose(body.T, np.diag(np.repeat([self.tracking**2, 0.0], 3)), 0.0, 0)
+        pose = np.linalg.inv(registration.T_patient_scan) @ body.T @ self.tool.T_cube_tool
+        spread = compute_tip_covariance(registration, self.tool, beside)
+        motion = self.motion.compute_motion(pose, spread, None if before is None else before.motion)
+        known = TrackingResult(
+            to_time(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "",
+            NO_TARGETS, motion, None, pose, spread,
+        )  # fmt: skip
+        known = replace(known, seen=known.time, felt=moment, **self._describe_doubts(known, before))
+        if known.state is TumourState.UNKNOWN:
+            return PoseResult(stamp, known)
+        known = self._add_band(known, registration)
+        if known.relied and registration.scanned is None:
+            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED_WARNING)
+        stage = self.motion.stage
+        gauge = Painter(stage, self.tool).measure_tip(known, stage.build_tumour(motion.positions))
+        return PoseResult(stamp, known, gauge)
+
+    def measure(self) -> float:
+        """Measure the time of one solution [s]: the tool 2 mm deep at the craniotomy, with kernels loaded before."""
+        site, pose = self.motion.stage.site, np.eye(4)
+        pose[:3] = np.column_stack([site.right, site.up, -site.axis, site.origin + TIMED_DEPTH * site.axis])
+        self.motion.compute_motion(pose, self.tracking**2 * np.eye(3))
+        begun = clock.perf_counter()
+        self.motion.compute_motion(pose, self.tracking**2 * np.eye(3))
+        return clock.perf_counter() - begun
+
+    def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
+        """Return the scan's pose in the camera's frame for an image's time stamp, or why it is unknown at `now` [s]."""
+        name = heard.names.camera
+        registration, body = self._find_registration(heard), heard.find_relative(name, now)
+        if isinstance(registration, str) or isinstance(body, str):
+            return registration if isinstance(registration, str) else str(body)
+        middle = registration.T_patient_scan @ np.append(self.motion.stage.tumour_at_rest.vertices.mean(axis=0), 1.0)
+        placed = place_camera(heard.list_transforms(name), now, stamp, middle[:3], heard.stale)
+        if isinstance(placed, str):
+            return placed.format(name=name)
+        return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)
+
+    def _find_registration(self, heard: ReceivedTransforms) -> Registration | str:
+        """Return the registration from the file or the last message, or the reason why there is none."""
+        if self.registration is not None:
+            return self.registration
+        sent = heard.sent.get(heard.names.registration)
+        if sent is None:
+            return f"no {heard.names.registration} yet"
+        return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
+
+    def _describe_doubts(self, known: TrackingResult, before: TrackingResult | None) -> dict[str, object]:
+        """Return state, text and `near` of an unreliable result; only `near` of a reliable one."""
+        near = before is not None and before.near
+        assert known.T_scan_tool is not None
+        doubt, near = describe_misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, OWNER_QUESTION)
+        doubt = doubt or known.motion.doubt
+        if doubt:
+            return {"state": TumourState.UNSURE, "words": doubt, "near": near}
+        if not known.motion.known:
+            return {"state": TumourState.UNKNOWN, "words": UNKNOWN_WARNING, "near": near}
+        return {"near": near}
+
+    def _add_band(self, known: TrackingResult, registration: Registration) -> TrackingResult:
+        """Add the bound on the tumour's error [m], and its parts by source, to a reliable result."""
+        if not known.relied:
+            return known
+        middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
+        _, covariance = registration.point(middle)
+        registered = float(np.sqrt(chi2.ppf(LEVEL, 3) * max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
+        parts = {"registration": registered, "tool": known.motion.tool, "model": known.motion.model}
+        band = float(np.hypot(registered, known.motion.error))
+        return add_bound(known, band, parts)
+
+    def _build_unknown(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
+        """Nothing is known now, and why."""
+        felt = None if before is None else before.felt
+        near = before is not None and before.near
+        state = TumourState.NO_TOOL if felt is None else TumourState.STALE
+        motion = self.motion.rest if before is None else before.motion
+        return PoseResult(
+            to_stamp(moment), TrackingResult(moment, state, why, NO_TARGETS, motion, felt=felt, near=near)
+        )  # fmt: skip
+
+
+def add_bound(known: TrackingResult, band: float, parts: dict[str, float]) -> TrackingResult:
+    """Add a bound [m] on the position, and its parts, to a result; beyond 5 mm it is unreliable."""
+    if band <= MAX_OVERLAY_ERROR:
+        return replace(known, band=band, parts=parts)
+    return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band), band=None, parts={})
+
+
+def add_lateness(answer: PoseResult, age: float, stale: float) -> PoseResult:
+    """Return the result for a pose of the given age [s]: stale if older than `stale`."""
+    if age <= stale or not (answer.known.relied or answer.known.state is TumourState.UNSURE):
+        return answer
+    words = f"stale, the result is {age:.1f} s old: do not rely on it"
+    return replace(answer, known=replace(answer.known, state=TumourState.STALE, words=words, band=None), gauge=None)

@@ -1,0 +1,237 @@
+"""Poses of tool and reference by an external tracker, at the times of the images and in the camera's frame."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ar.optics.calibration import Calibration
+from ar.tracking.image_sequences import REMEDY, Named, read_video
+from ar.tracking.pose import Pose, TrackedTargets, Tracker, Verdict
+from ar.tracking.pose_stream import Clock, PoseStream, estimate_clock_by_motion
+from ar.tracking.rigid import build_cross_matrices, turn_vectors
+from ar.tracking.synthetic_images import read_stamp
+from ar.tracking.targets import build_patient_reference, build_tool_cube, list_targets
+from sim.errors import InputError
+from sim.runtime.outside_files import read_as
+
+from .agreement import Agreement
+from .pose_file import TrackedRow
+
+REST_POSE = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
+"""Pose of the camera in its own coordinate system."""
+MAX_TIME_GAP = (
+    1.0  # Time between poses and an image beyond which they belong to another clock or another recording [s].
+)
+
+
+def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:
+    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
+
+    Raises
+    ------
+    ValueError
+        Images of another size than the camera was calibrated at.
+    """
+    targets = {each.name: each for each in list_targets()}
+    wanted = [each for each in (body, frame) if each != "camera"]
+    tracker = Tracker(calibration.build_camera(np.eye(4)), tuple(targets[name] for name in wanted))
+    state: TrackedTargets | None = None
+    for picture in film:
+        begun = time.perf_counter()
+        state = tracker.track(picture.grey, state)
+        verdict, pose, lacks = _select_pose(state, wanted)
+        if pose is not None and body == "camera":
+            pose = REST_POSE.transform_to(pose)
+        yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun, lacks)
+
+
+def follow_body(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
+    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
+
+    Times are the stamps in the images, or else those of the video.
+
+    Raises
+    ------
+    InputError
+        Unreadable input, or images of another size than the camera was calibrated at.
+    """
+    count = 0
+    with read_as(path, "a video", REMEDY):
+        try:
+            for row in track_rows(map(_set_stamped_time, read_video(path, rate)), calibration, body, frame):
+                count += 1
+                yield row
+        except ValueError as error:
+            raise InputError(str(error)) from error
+    if not count:
+        raise InputError(f"{path}: holds no image. {REMEDY}")
+
+
+def _set_stamped_time(picture: Named) -> Named:
+    """Return an image with the time of its stamp, if it has one."""
+    stamp = read_stamp(picture.grey)
+    return picture if stamp is None else replace(picture, time=stamp)
+
+
+def _select_pose(state: TrackedTargets, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
+    """Return the pose of the first target, relative to the second if given; else the verdict of the missing one."""
+    for name in wanted:
+        if name not in state.poses:
+            return state.verdicts[name], None, name
+    pose, *others = (state.poses[name] for name in wanted)
+    return Verdict.GOOD, pose.transform_to(others[0]) if others else pose, ""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMount:
+    """Pose of the camera in the tracker's frame.
+
+    Parameters
+    ----------
+    T_body_camera
+        (4, 4) [m]: from the camera to the body that it is fixed to.
+    covariance
+        Covariance (6, 6) of a camera translation [m] and a small rotation about it [rad], in the axes of that body.
+    body
+        Poses of that body; None: the tracker's own frame.
+    """
+
+    T_body_camera: np.ndarray
+    covariance: np.ndarray
+    body: PoseStream | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ExternalTracker:
+    """Poses of another tracker.
+
+    Parameters
+    ----------
+    tool, patient
+        Poses of the tool and of the patient's reference.
+    clock
+        Offset of its clock from that of the images.
+    eye
+        Pose of the camera; None: its images determine it relative to the printed reference.
+    """
+
+    tool: PoseStream
+    patient: PoseStream
+    clock: Clock = field(default_factory=Clock)
+    eye: CameraMount | None = None
+
+    def find_tool(self, time: float) -> Pose | None:
+        """Return the tool relative to the reference, in the image of a time [s]; None if the poses are missing."""
+        return self._interpolate_pose(time, self._interpolate_tool)
+
+    def find_reference(self, time: float) -> Pose | None:
+        """Return the reference in the camera's frame, in the image of a time [s]; None if it is unknown."""
+        return self._interpolate_pose(time, self._locate_in_camera)
+
+    @property
+    def swapped(self) -> ExternalTracker:
+        """The same poses with the tool's taken for the reference's."""
+        return replace(self, tool=self.patient, patient=self.tool)
+
+    def compare_targets(self, time: float, seen: Mapping[str, Pose], before: Agreement) -> Agreement:
+        """Check these poses against the printed targets that are visible in the image of a time [s].
+
+        `seen` has the targets in the camera's frame, by name. If images determine the camera relative to the reference,
+        only
+        the tool's poses can be compared.
+        """
+        reference, tool = (seen.get(target().name) for target in (build_patient_reference, build_tool_cube))
+        if self.eye is None:
+            body, other = self.find_tool(time), self.swapped.find_tool(time)
+            if tool is None or reference is None or body is None:
+                return before
+            return before.add_image(build_tool_cube().name, tool.transform_to(reference), body, other)
+        body, other = self.find_reference(time), self.swapped.find_reference(time)
+        for each, target, a, b in (("patient", reference, body, other), ("tool", tool, other, body)):
+            before = before if target is None or a is None else before.add_image(each, target, a, b)
+        return before
+
+    @property
+    def streams(self) -> dict[str, PoseStream]:
+        """All poses, by whose they are."""
+        camera = {} if self.eye is None or self.eye.body is None else {"camera": self.eye.body}
+        return {"tool": self.tool, "patient": self.patient, **camera}
+
+    def describe_mismatch(self, time: float) -> str:
+        """Describe the body whose poses are all far from the image of a time [s], and by how much; empty: none."""
+        for name, stream in self.streams.items():
+            at = stream.to_stream_day(time + self.clock.offset)
+            first, last = stream.times[[0, -1]].tolist()
+            if at < first - MAX_TIME_GAP:
+                return f"the {name}'s poses begin {first - at:.1f} s after this image"
+            if at > last + MAX_TIME_GAP:
+                return f"the {name}'s poses end {at - last:.1f} s before this image"
+        return ""
+
+    def compute_age(self, time: float) -> float | None:
+        """Return the age [s] of the poses at an image's time [s]; None if current ones exist."""
+        time = time + self.clock.offset
+        missing = [each.compute_age(time) for each in self.streams.values() if each.interpolate(time) is None]
+        return max(missing) if missing else None
+
+    def _interpolate_pose(self, time: float, pose_at: Callable[[float], Pose | None]) -> Pose | None:
+        """Return a pose at an image's time [s]; its covariance includes the motion during the clock error."""
+        time, error = time + self.clock.offset, self.clock.error
+        pose = pose_at(time)
+        if pose is None or error == 0.0:
+            return pose
+        other = pose_at(time - error) or pose_at(time + error)
+        if other is None:
+            return None
+        T, U = pose.T_camera_target, other.T_camera_target
+        step = np.concatenate([U[:3, 3] - T[:3, 3], turn_vectors(U[None, :3, :3] @ T[:3, :3].T)[0]])
+        return Pose(T, pose.covariance + np.outer(step, step), pose.residual, pose.corners)
+
+    def _interpolate_tool(self, time: float) -> Pose | None:
+        tool, patient = self.tool.interpolate(time), self.patient.interpolate(time)
+        return None if tool is None or patient is None else tool.transform_to(patient)
+
+    def _locate_in_camera(self, time: float) -> Pose | None:
+        assert self.eye is not None
+        patient = self.patient.interpolate(time)
+        body = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 0) if self.eye.body is None else self.eye.body.interpolate(time)
+        if patient is None or body is None:
+            return None
+        beside = patient.transform_to(body)
+        T_camera_body = np.linalg.inv(self.eye.T_body_camera)
+        arm = beside.T_camera_target[:3, 3] - self.eye.T_body_camera[:3, 3]
+        slope = np.block([[-np.eye(3), build_cross_matrices(arm)], [np.zeros((3, 3)), -np.eye(3)]])
+        whole = beside.covariance + slope @ self.eye.covariance @ slope.T
+        turned = np.kron(np.eye(2), T_camera_body[:3, :3])
+        return Pose(T_camera_body @ beside.T_camera_target, turned @ whole @ turned.T, 0.0, 0)
+
+
+def estimate_video_clock(
+    film: Iterable[Named], calibration: Calibration, tool: PoseStream, patient: PoseStream
+) -> Clock:
+    """Estimate the clock offset between the tracker and a video that shows the printed cube and reference.
+
+    Raises
+    ------
+    ValueError
+        See `estimate_clock_by_motion` and `track_rows`.
+    """
+    film_rows = track_rows(film, calibration, build_tool_cube().name, build_patient_reference().name)
+    seen = [(row.time, row.pose) for row in film_rows if row.pose is not None]
+    times, places = [time for time, _ in seen], [pose.T_camera_target[:3, 3] for _, pose in seen]
+    both = [
+        (time, pose)
+        for time in tool.times.tolist()
+        if (pose := ExternalTracker(tool, patient).find_tool(time)) is not None
+    ]
+    others = [pose.T_camera_target[:3, 3] for _, pose in both]
+    if not both:
+        raise ValueError("tool and reference have poses at no common time: record both at once.")
+    return estimate_clock_by_motion(
+        np.array(times), np.array(places), np.array([time for time, _ in both]), np.array(others)
+    )

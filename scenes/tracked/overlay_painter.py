@@ -1,0 +1,140 @@
+"""Tumour overlay on a real image: reliable position in colour, last known position in grey, nothing when lost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ar.optics.camera import Camera
+from ar.overlay.composite import HEAD_WIDTHS, Overlaid, composite, write_doubt, write_head
+from ar.overlay.gauge import Gauge
+from ar.overlay.hud import bound_words, wrap_line
+from ar.overlay.marks import BEFORE_COLOUR, BEFORE_STROKES, Cover, Marks, Words
+from ar.overlay.outlines import compute_ink, compute_silhouette, draw_dashes, find_outlines, find_pixel_box, join_boxes
+from ar.overlay.styles import MIN_REPORTED_SHARE, Opening, Style
+from ar.rendering.layer import Layer
+from ar.rendering.real_image import build_real_image
+
+from ..play.player import measure_gauge
+from ..play.stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
+from ..script.uncertainty import BOUND_DEVIATIONS
+from .follower import TrackingResult, TumourState
+from .tracked_tool import TrackedTool
+
+NO_CONTACT_TEXT = "the tool does not touch: as in the scan"  # Text in the image.
+SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
+"""The opening is visible within the drape's hole; all else may be bone."""
+GREY_STATES = (TumourState.NO_TOOL, TumourState.STALE, TumourState.NO_REFERENCE)
+"""States in which the tumour is drawn in grey, and dotted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Painter:
+    """Renderer of tracking results over images.
+
+    Parameters
+    ----------
+    stage
+        Stage with the brain to draw.
+    tool
+        Tool that occludes the tumour; None: no tool.
+    style
+        See `ar.overlay.composite.composite`.
+    device
+        Warp device.
+    """
+
+    stage: Stage
+    tool: TrackedTool | None = None
+    style: Style = "window"
+    device: str = "cpu"
+
+    def paint(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None = None) -> Overlaid:
+        """Draw a tracking result on an image (H, W, 3) uint8.
+
+        covered (H, W) bool marks foreground in front of the brain, such as a hand. Nothing is drawn over it, and the
+        image
+        shows the share of the tumour that it hides.
+        """
+        if known.state in GREY_STATES or known.camera is None:
+            return self._draw_grey(colour, known, covered)
+        camera, tumour = known.camera, self.stage.build_tumour(known.motion.positions)
+        gauge = self.measure_tip(known, tumour)
+        before = self.stage.tumour_at_rest if known.motion.known and known.motion.moved > 0.0 else None
+        doubt = "" if known.relied else known.words
+        band = 0.0 if known.band is None else known.band
+        box = find_pixel_box(camera, tumour.vertices)
+        if gauge is not None:
+            box = join_boxes(box, find_pixel_box(camera, np.stack([gauge.tip, gauge.nearest])))
+        layers = [] if box is None else self._build_layers(known)
+        whole = slice(0, camera.height), slice(0, camera.width)
+        picture = build_real_image(colour, camera, layers, box or whole, self.device)
+        lines = [*format_head_lines(known), *self._describe_hidden(camera, tumour, covered)]
+        head = [part for line in lines for part in wrap_line(line, HEAD_WIDTHS[0] * camera.width)]
+        cover = Cover((TOOL,), SEEN_THROUGH, covered)
+        words = Words(doubt, head, PREDICTED_LINES, (known.motion.moved, known.motion.error), known.band)
+        return composite(picture, camera, tumour, self.style, cover, Marks(band, gauge, before), words)
+
+    def _describe_hidden(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
+        """Describe the foreground's share of the tumour in the image, if it is noticeable."""
+        box = find_pixel_box(camera, tumour.vertices)
+        if covered is None or box is None or self.style == "none":
+            return ()
+        mask = compute_silhouette(camera.crop_to(*box), tumour.vertices, tumour.triangles)
+        hidden = np.count_nonzero(mask & covered[box])
+        share = hidden / max(np.count_nonzero(mask), 1)
+        return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= MIN_REPORTED_SHARE else ()
+
+    def _build_layers(self, known: TrackingResult) -> list[Layer]:
+        """Build the open cortex, under which the tumour is seen, the surrounding drape as in videos, and the tool."""
+        tool = self.build_tool_layer(known)
+        return [*self.stage.build_layers(known.motion.positions, None), *([] if tool is None else [tool])]
+
+    def build_tool_layer(self, known: TrackingResult, cubed: bool = True) -> Layer | None:
+        """Return the tool's surface if its pose is available, with or without its cube."""
+        pose = known.T_scan_tool
+        if self.tool is None or pose is None:
+            return None
+        return Layer("tool", TOOL, *self.tool.build_surface(pose, cubed), TOOL_COLOUR)
+
+    def measure_tip(self, known: TrackingResult, tumour: Layer) -> Gauge | None:
+        """From the tool's tip to the tumour, with the error of both; None where one is not known."""
+        if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
+            return None
+        gauge = measure_gauge(known.T_scan_tool[:3, 3], tumour)
+        along = (gauge.nearest - gauge.tip) / max(gauge.distance, np.finfo(float).tiny)
+        spread = BOUND_DEVIATIONS * float(np.sqrt(along @ known.tip_covariance @ along))
+        return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, known.motion.error)))
+
+    def _draw_grey(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None) -> Overlaid:
+        """Return the outline in grey, if it has a place, and why."""
+        over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
+        if known.camera is not None and self.style != "none":
+            self._draw_dotted(over, known.camera, self.stage.build_tumour(known.motion.positions))
+            if covered is not None:
+                over.colour[covered] = colour[covered]
+        write_head(over, [])
+        write_doubt(over, known.words)
+        return over
+
+    def _draw_dotted(self, over: Overlaid, camera: Camera, tumour: Layer) -> None:
+        box = find_pixel_box(camera, tumour.vertices)
+        if box is None:
+            return
+        mask = compute_silhouette(camera.crop_to(*box), tumour.vertices, tumour.triangles)
+        draw_dashes(over.colour[box], find_outlines(mask), compute_ink(BEFORE_COLOUR), BEFORE_STROKES)
+
+
+def format_head_lines(known: TrackingResult) -> Sequence[str]:
+    """Describe the tumour position and its error, for the top of the image."""
+    if known.band is None:
+        return ()
+    largest = max(known.parts, key=lambda name: known.parts[name])
+    lines = [NO_CONTACT_TEXT] if known.state is TumourState.REST else []
+    if known.relied:
+        lines.append(f"overlay error <= {bound_words(known.band, 1)} across the view (95 %), mainly {largest}")
+    motion = "; of motion: not known" if not known.motion.known else ""
+    camera = "" if "camera" in known.parts else ", camera"
+    return (*lines, f"error by tissue{camera} and segmentation: not known{motion}")

@@ -1,0 +1,116 @@
+"""Short rendered video with temporarily covered markers, of a brain whose motion under the tool is known exactly."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ar.optics.calibration import Calibration
+from ar.tracking.image_sequences import Named, to_named_image
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, Deformer
+from sim.loads import Loads, Touching
+from surrogate.model.learned import build_prediction
+
+from ..play.deformers import PatientSetup
+from ..play.player import Player
+from ..play.stage import Stage
+from ..script.camera_paths import HandHeld
+from ..script.craniotomy_frame import CraniotomyFrame
+from ..script.scene import find_scene
+from .filming import (
+    USUAL_CALIBRATION,
+    VIEW,
+    Mounted,
+    Taking,
+    Trouble,
+    VideoFrame,
+    from_where_it_sees_all,
+    mount_targets,
+    render_shots,
+)
+
+SCENE = "palpate"
+"""Scene of the video."""
+CAMERA = USUAL_CALIBRATION.resize_calibration(800, 600, scale=True)
+"""Camera of the video: fewer pixels than usual, so that it takes seconds."""
+FRAME_RATE = 10.0  # Frame rate [1/s].
+DURATION = 1.7  # Length of the video [s].
+START_TIME = 0.5  # Start time in the scene [s]: the ball makes contact at 0.4 s.
+# Covered targets and gaps, with their times [s].
+DISTURBANCES = (Trouble("reference", 0.25, 0.55), Trouble("tool", 0.85, 1.05), Trouble("gap", 1.25, 1.55))
+TISSUE_SPREAD = 25e-3  # Standard deviation of the tissue displacement around a tool's tip [m].
+
+
+@dataclass(frozen=True, eq=False)
+class Dent:
+    """A Deformer that solves nothing: tissue goes with the tool's tip, the less the farther it is from it."""
+
+    anatomy: Anatomy
+    site: CraniotomyFrame
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """Compute the deformation under posed tools: the tissue is as deep as their tip is under the open cortex."""
+        nodes = self.anatomy.mesh.nodes
+        cause = loads.get(Touching)
+        assert cause is not None
+        moved = []
+        for tip in cause.pose[:, 0, :3, 3]:
+            place = self.site.find_nearest(tip).point
+            depth = max(0.0, float((tip - place) @ self.site.axis))
+            share = np.exp(-np.square(nodes - place).sum(axis=1) / (2.0 * TISSUE_SPREAD**2))
+            moved.append(depth * share[:, None] * self.site.axis)
+        exact = np.zeros((2, len(loads)))
+        found = build_prediction(
+            np.stack(moved), np.arange(len(nodes)), loads, [False] * len(loads), clock.perf_counter(), exact, ""
+        )
+        return found if at is None else found.restrict(at)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnFilm:
+    """Images with their ground truth.
+
+    Parameters
+    ----------
+    stage, mounts, calibration, deformer
+        Scene, printed targets, camera, and deformer that gives the true motion.
+    shots
+        Images in temporal order.
+    taking
+        Image degradation, with covered targets and their times.
+    """
+
+    stage: Stage
+    mounts: Mounted
+    calibration: Calibration
+    deformer: Deformer
+    shots: tuple[VideoFrame, ...]
+    taking: Taking
+
+    def get_image(self, shot: VideoFrame) -> Named:
+        """Return an image as a video gives it."""
+        return to_named_image(f"{shot.time:.1f} s", shot.colour, shot.time)
+
+
+def build_synthetic_video(theatre: PatientSetup) -> DrawnFilm:
+    """Render the video of a theatre's anatomy.
+
+    Raises
+    ------
+    InputError
+        An anatomy without open cortex.
+    """
+    view = replace(VIEW.calibrate(CAMERA), path=HandHeld(0))
+    whole = find_scene(SCENE)
+    scene = replace(
+        whole, path=lambda time: whole.path(time + START_TIME), viewpoint=from_where_it_sees_all(view),
+        frames_per_second=FRAME_RATE, duration=DURATION,
+    )  # fmt: skip
+    stage = theatre.build_stage(scene)
+    deformer = Dent(theatre.anatomy, stage.site)
+    player = Player(stage, deformer)
+    mounts, taking = mount_targets(player), Taking(troubles=DISTURBANCES)
+    return DrawnFilm(stage, mounts, CAMERA, deformer, tuple(render_shots(player, mounts, taking)), taking)

@@ -1,0 +1,50 @@
+"""Random access to the images of a video by number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ar.tracking.image_sequences import count_frames, read_video
+
+from .run import Timed, read_timed
+
+
+@dataclass(eq=False)
+class SeekableFilm:
+    """Video, or folder of images.
+
+    Parameters
+    ----------
+    path
+        Path; for errors see `ar.tracking.image_sequences.read_video`.
+    rate
+        Frame rate of a folder [1/s].
+    count
+        Number of images, as far as known.
+    """
+
+    path: Path
+    rate: float
+    count: int = field(init=False)
+    film: Iterator[Timed] = field(init=False)
+    next: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        """Open it."""
+        self.count = count_frames(self.path)
+        self.film = self._from(0)
+
+    def _from(self, number: int) -> Iterator[Timed]:
+        return read_timed(read_video(self.path, self.rate, colour=True, first=number))
+
+    def read_image(self, number: int) -> Timed | None:
+        """Return an image by its number; None if the video ends before it, which `count` then gives."""
+        if number != self.next:
+            # From its start: a video's own leaps do not land on every frame.
+            self.film = self._from(number)
+        found, self.next = next(self.film, None), number + 1
+        if found is None:
+            self.count, self.next = min(self.count, number), -1
+        return found

@@ -1,0 +1,137 @@
+"""Solvers of a data set's loads: FEM in this process, or a process with its own FEM on each of several devices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sim.accuracy import Accuracy
+from sim.anatomy import Anatomy
+from sim.deformation import Deformation, Deformer
+from sim.effects import Effect
+from sim.fem import Fem
+from sim.loads import Loads, Touching
+from sim.runtime.memory import check_fits
+from sim.runtime.processes import process_pool, run_on_each
+from sim.strategy.memory_needed import Needed, estimate_needed
+
+from .load_histories import get_relaxation_series, solve_histories
+from .tasks import SolverPool
+
+
+@dataclass(frozen=True, eq=False)
+class LazyFem:
+    """FEM that is built on first use: a `Deformer`.
+
+    Parameters
+    ----------
+    anatomy, effects, accuracy, element, batch, device
+        See `Fem`.
+    loads
+        Number of loads that will be solved.
+    share
+        Number of processes that share the device.
+    """
+
+    anatomy: Anatomy
+    effects: tuple[Effect, ...]
+    accuracy: Accuracy
+    element: str | None
+    batch: int | None
+    loads: int
+    device: str = "auto"
+    share: int = 1
+
+    @cached_property
+    def fem(self) -> Fem:
+        """FEM, built on first use."""
+        return Fem(self.anatomy, self.effects, self.accuracy, self.device, self.batch, self.element)
+
+    @property
+    def needed(self) -> Needed | None:
+        """Required GPU memory; None on the CPU."""
+        return estimate_needed(
+            self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share
+        )
+
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """Solve as `Fem.deform`; poses in relaxing tissue are histories, as in `solve_histories`."""
+        if start is None and get_relaxation_series(self.effects) and loads.get(Touching) is not None:
+            answer = solve_histories(self.fem, loads)
+            return answer if at is None else answer.restrict(at)
+        return self.fem.deform(loads, start, at)
+
+
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """Deformer of the loads, its element, its description, and the number of loads that are solved together."""
+
+    deformer: Deformer | SolverPool
+    element: str
+    description: str
+    batch: int
+
+
+@contextmanager
+def open_solvers(asked: LazyFem, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
+    """Open FEM solvers on each of the devices; with one device the solver is in this process.
+
+    Without `batch`, the largest size that fits is used. Several GPUs then get equal numbers of batches. `said` first
+    receives the required memory of each GPU.
+
+    Raises
+    ------
+    InputError
+        See `Fem`; a GPU with too little memory.
+    LostError
+        A process that was killed.
+    """
+    if len(devices) == 1:
+        own = replace(asked, device=devices[0])
+        _check_all_fit([own.needed], said)
+        yield Solver(own, *describe_fem_task(own, None))
+        return
+    most, own = max(devices.count(name) for name in devices), -(-asked.loads // len(devices))
+    with process_pool(devices, place_on_device, replace(asked, share=most, loads=own)) as children:
+        none = [None] * len(devices)
+        _check_all_fit(run_on_each(children, estimate_memory, none), said)
+        elements, words, batches = zip(*run_on_each(children, describe_fem_task, none), strict=True)
+        batch = min(batches)
+        if asked.batch is None and devices[0].startswith("cuda"):
+            batch = choose_even_batch(batch // most, asked.loads, len(devices))
+        yield Solver(SolverPool(asked.anatomy, children), elements[0], words[0], batch)
+
+
+def place_on_device(device: str, asked: LazyFem) -> LazyFem:
+    """Return the FEM of a device."""
+    return replace(asked, device=device)
+
+
+def estimate_memory(asked: LazyFem, task: None) -> Needed | None:
+    """Return the GPU memory that the FEM needs."""
+    return asked.needed
+
+
+def describe_fem_task(asked: LazyFem, task: None) -> tuple[str, str, int]:
+    """Return the FEM's element, description and batch size, after a check that it fits in memory."""
+    if asked.needed is None:  # on the CPU: before a file is created that keeps its batch
+        fem = asked.fem
+        check_fits(fem.problem.rows, fem.batch, min(fem.batch, asked.loads), fem.problem.device, fem.strategy.held)
+    return asked.fem.space.element, asked.fem.description, asked.fem.batch
+
+
+def choose_even_batch(most: int, loads: int, devices: int) -> int:
+    """Compute the widest batch of at most `most` loads with which every device has equally many, but for the last."""
+    rounds = -(-loads // (max(most, 1) * devices))
+    return max(1, -(-loads // (max(rounds, 1) * devices)))
+
+
+def _check_all_fit(needed: Sequence[Needed | None], said: Callable[[str], object]) -> None:
+    for each in dict.fromkeys(map(str, filter(None, needed))):
+        said(f"{each}.")
+    for each in filter(None, needed):
+        each.check_fits()

@@ -1,0 +1,145 @@
+"""Likelihood of one frame in each tissue: Gaussian in the unknown sizes of the tissue's own motions, and in errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.special import logsumexp
+
+from sim.effects import SKULLS
+from sim.errors import InputError
+
+from ..array_functions import compute_squared_distances
+from ..locating.causes import DRAINAGE
+from ..locating.evidence import Evidence, compute_correlation
+from ..locating.locator import Locator
+from ..locating.prior import MotionPrior
+from .observed_frame import ObservedFrame
+from .responses import SOLVED_SKULLS, Responses
+
+# Model error of linear tissue as a share of a point's motion, in the independent and in the correlated part.
+MODEL_ERROR_SHARE = 0.05
+MODEL_ERROR_LENGTH = 10e-3  # Correlation length of the correlated part [m].
+MIN_MOTION_SHARE = 0.1  # Lower bound of a point's motion in the model error, relative to the mean motion.
+MOTION_SIZES = (0.3, 1.0, 3.0)  # Candidate sizes of motions, relative to the observation.
+EVIDENCE_DIVISOR = 2.0  # Divisor of the log evidence of drained fluid.
+TOOL_EVIDENCE_DIVISOR = 8.0  # Divisor of the log evidence of tools, whose dents are nonlinear.
+
+
+def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
+    """Compute the log-likelihood (skulls, poissons, ratios) of a frame with drained fluid."""
+    lower, seen = factorise_errors(evidence)
+    rows = {name: predict_seen(drained, name, evidence) for name in SOLVED_SKULLS}
+    own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
+    lets_go = prior.project_shapes(*evidence.weights)[:, own].T
+    size = np.mean([_compute_size(each) for each in rows.values()])
+    found = {name: _compute_log_evidence(each / size, evidence, lower, seen) for name, each in rows.items()}
+    found["contact"] = _compute_log_evidence((lets_go / _compute_size(lets_go))[None, None], evidence, lower, seen)
+    shape = found[SOLVED_SKULLS[0]].shape
+    return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / EVIDENCE_DIVISOR
+
+
+def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """Compute the log-likelihood (skulls, 1, 1) of a frame with tools: its `columns` (k,) of the responses.
+
+    Dents of tools determine the skull only. Their information on Poisson's ratio and stiffness ratio is mostly that on
+    how they stiffen tissue.
+    """
+    lower, seen = factorise_errors(evidence)
+    rows = {name: predict_seen(pressed, name, evidence)[:, :, columns] for name in SOLVED_SKULLS}
+    size = np.mean([_compute_size(each) for each in rows.values()])
+    found = {name: _compute_log_evidence(each / size, evidence, lower, seen) for name, each in rows.items()}
+    found = {name: logsumexp(each) - np.log(each.size) for name, each in found.items()}
+    found["contact"] = found["slide"]
+    return np.array([found[name] for name in SKULLS])[:, None, None] / TOOL_EVIDENCE_DIVISOR
+
+
+def predict_seen(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
+    """Compute the observed displacements (poissons, ratios, loads, m) [m] of responses."""
+    column = np.searchsorted(responses.nodes, evidence.place.vertices)
+    return np.einsum(
+        "prlmki,mk,mi->prlm",
+        responses.motion[skull][..., column, :],
+        evidence.place.weights,
+        evidence.axis,
+        optimize=True,
+    )
+
+
+def _compute_size(rows: np.ndarray) -> float:
+    return float(np.sqrt((rows**2).sum(axis=-2).mean()))
+
+
+def factorise_errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+    """Compute the Cholesky factor (m, m) of the covariance of all errors, and the root mean square observation [m].
+
+    The model error is a share of the motion that is `believed` (m,) [m]; None: of the observation. That includes noise:
+    points that seem to move farther are then down-weighted, so that motions are underestimated.
+    """
+    value = evidence.value if believed is None else believed
+    length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]
+    seen = float(np.sqrt((value**2).mean()))
+    off = MODEL_ERROR_SHARE * np.maximum(length, MIN_MOTION_SHARE * np.sqrt(3.0) * seen)
+    axes = evidence.axis @ evidence.axis.T
+    noise = (
+        evidence.compute_noise()
+        + np.outer(off, off)
+        * compute_correlation(compute_squared_distances(evidence.at, evidence.at), MODEL_ERROR_LENGTH)
+        * axes
+    )
+    noise[np.diag_indices(len(noise))] += off**2
+    rigid = evidence.rigid * evidence.rigid_scale
+    return cholesky(noise + rigid @ rigid.T, lower=True), max(seen, 1e-6)
+
+
+def whiten_columns(lower: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Whiten columns (m,) or (m, k) by errors whose covariance has the Cholesky factor `lower` (m, m)."""
+    return solve_triangular(lower, columns, lower=True, check_finite=False)
+
+
+def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
+    """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m) of joint size 1."""
+    motion = seen * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
+    gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.value)
+    logs = []
+    for times in MOTION_SIZES:
+        root = np.linalg.cholesky(np.eye(gram.shape[-1]) + times**2 * gram)
+        half = np.linalg.solve(root, times * pull[..., None])[..., 0]
+        logs.append(0.5 * (half**2).sum(axis=-1) - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1))
+    return logsumexp(logs, axis=0) - np.log(len(MOTION_SIZES))
+
+
+def find_unsupported(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple[np.ndarray, ...]:
+    """Return the point numbers (k,), from 0, that `Locator.locate` rejects in each frame.
+
+    Raises
+    ------
+    InputError
+        A frame that no cause explains, or of which more than a third is rejected.
+    """
+    found = []
+    for number, frame in enumerate(frames, start=1):
+        try:
+            found.append(locator.locate(frame.observation).outliers)
+        except InputError as error:
+            raise InputError(f"frame {number}: {error}") from error
+    return tuple(found)
+
+
+def remove_points(frames: Sequence[ObservedFrame], left_out: Sequence[np.ndarray]) -> list[ObservedFrame]:
+    """Remove points of given numbers (k,) from each frame of points with correspondences."""
+    return [
+        _remove_points(frame, numbers) if len(numbers) else frame
+        for frame, numbers in zip(frames, left_out, strict=True)
+    ]
+
+
+def _remove_points(frame: ObservedFrame, numbers: np.ndarray) -> ObservedFrame:
+    seen = frame.observation
+    assert seen.rest is not None
+    kept = np.delete(np.arange(len(seen.now)), numbers)
+    sigma = None if seen.sigma is None else seen.sigma[kept]
+    return replace(frame, observation=replace(seen, now=seen.now[kept], rest=seen.rest[kept], sigma=sigma))

@@ -1,0 +1,40 @@
+"""Reference solutions of the page: those of the newest request, and of the frame that is shown."""
+
+import threading
+
+import numpy as np
+from visitor import run_until, wait_for
+
+from scenes.page.fem_worker import FemWorker
+
+
+def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypatch):
+    """The frame was drawn before the finite elements answered it: no further one brings their tumour along."""
+    asked = []
+    monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
+    demo.wish.set(plays=False, number=90)
+    fem = demo.browser.meshes["finite elements"]
+    rest = np.array(fem.vertices)
+
+    seen = []
+
+    def moved():
+        seen.append(demo.referee.truth)
+        if len(seen) == 5:
+            FemWorker.ask(demo.referee, *asked[0])
+        return np.linalg.norm(fem.vertices - rest, axis=1).max() > 5e-4
+
+    run_until(demo, monkeypatch, moved)
+    assert len(asked) == 1 and seen[:5] == [None] * 5
+
+
+def test_the_referee_answers_the_newest_question(theatre, scene):
+    referee = FemWorker(theatre, scene, threading.Lock())
+    for number in range(60):
+        referee.ask(number, None)
+    assert wait_for(lambda: referee.truth is not None and referee.truth.number == 59)
+    truth = referee.truth
+    assert truth is not None and truth.deformation.time[0] == truth.loads.times[0] == scene.times[59]
+    assert truth.deformation.outcome[0].good and truth.seconds > 0.0
+    referee.close()
+    assert not referee.thread.is_alive()

@@ -1,0 +1,69 @@
+"""Trained models that answer tools of environments, against finite elements and Hertz."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gym_examples import SIZE
+
+from scenes.gym.model_responses import Hertz
+from scenes.gym.setting import open_setting
+from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
+from scenes.gym.tissue_requests import TissueRequest
+from sim.material import MATERIALS
+
+
+def test_the_model_has_the_force_of_the_finite_elements():
+    """By pose, at 3 mm: its force within 25 %, the tumour's nodes within a quarter of their motion."""
+    site = open_setting(PALPATE, "template", "model", "cpu", SIZE).site
+    poses = [PALPATE.tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (-2e-3, 3e-3)]
+    found = []
+    for physics in ("model", "fem"):
+        answers, last = open_setting(PALPATE, "template", physics, "cpu", SIZE).answers, None
+        for pose in poses:
+            (last,) = answers.compute_responses([TissueRequest(pose, last)])
+        assert last is not None and last.good
+        motion = np.zeros((len(site.anatomy.mesh.nodes), 3))
+        motion[last.nodes] = last.motion
+        found.append((np.linalg.norm(last.force), motion[site.anatomy.tumour_nodes]))
+    (force, motion), (expected, true) = found
+    assert abs(force / expected - 1.0) < 0.25 and expected > 0.05
+    assert np.linalg.norm(motion - true, axis=1).max() < 0.25 * np.linalg.norm(true, axis=1).max()
+
+
+def test_many_answered_together_are_as_each_alone():
+    setting = open_setting(PALPATE, "template", "model", "cpu", SIZE)
+    site = setting.site
+    tips = [site.origin + 1e-3 * depth * site.axis for depth in (-3.0, 0.5, 2.0, 4.0)]
+    asked = [TissueRequest(PALPATE.tool.pose(tip, site.axis, site.right)) for tip in tips]
+    together = replace(setting.answers, together=True).compute_responses(asked)
+    for one, each in zip(setting.answers.compute_responses(asked), together, strict=True):
+        assert np.allclose(one.force, each.force, atol=1e-4) and np.allclose(one.motion, each.motion, atol=1e-5)
+    unbound = replace(setting.answers, model=replace(setting.answers.model, bounds=None, bound=7e-4))
+    assert unbound.compute_responses(asked[2:3])[0].error == 7e-4  # loads without a bound have the model's
+
+
+def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):
+    setting = open_setting(DEBULK, boxed, "auto", "cpu", SIZE)
+    site, ball = setting.site, Hertz(DEBULK.tool.radius, MATERIALS["drained"].tissue)
+    for depth in (1e-3, DEBULK.tool.radius + 1e-3):  # its middle above a flat top, and below it
+        tip = site.origin + 0.012 * site.right + depth * site.axis  # beside the corridor
+        (touched,) = setting.answers.compute_responses(
+            [TissueRequest(DEBULK.tool.pose(tip, site.axis, site.right), done=1)]
+        )
+        force = float(ball.compute_force(np.array(depth)))
+        assert touched.force @ site.axis == pytest.approx(force, rel=1e-6)
+        assert touched.pressure == pytest.approx(1.5 * force / (np.pi * DEBULK.tool.radius * depth))
+    assert float(
+        ball.compute_extra_depth(np.array(force), ball.compute_contact_radius(np.array(force)))
+    ) == pytest.approx(0.0)
+
+
+def test_a_pose_that_the_model_refuses_ends_an_episode():
+    setting = open_setting(RETRACT, "template", "model", "cpu", SIZE)
+    site, tool = setting.site, RETRACT.tool
+    poses = [tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (2e-3, 40e-3)]
+    (first,) = setting.answers.compute_responses([TissueRequest(poses[0])])
+    (second,) = setting.answers.compute_responses([TissueRequest(poses[1], first)])
+    assert first.good and not second.good and second.error == np.inf
+    assert np.array_equal(second.motion, first.motion)

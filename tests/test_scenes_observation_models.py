@@ -1,0 +1,279 @@
+"""Locating a tumour in scenes: what an image and the page show of it, and how it is checked."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from locators import locator_of
+from theatres import SIGHTED, short, small
+
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, bound_words, format_millimetres, wrap_line
+from ar.overlay.outlines import compute_ink, find_ink, has_text
+from scenes.cli import main
+from scenes.page.text import describe_estimate, format_page_legend, report
+from scenes.play.checks import is_within_surface, list_objections, measure
+from scenes.play.deformers import PatientSetup, open_theatre
+from scenes.play.observer import ELLIPSOID_COLOUR
+from scenes.play.player import REJECTED_WARNING
+from scenes.play.reference import solve_reference_frames
+from scenes.play.scene_costs import add_cost_label
+from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
+from scenes.script.observation_models import PointObservation
+from scenes.script.scene import Bounds, find_scene
+from scenes.script.shipped_files import get_template_path
+from scenes.script.tool_paths import press
+from scenes.script.uncertainty import TumourError, Uncertainty
+from sim.anatomy import PART_LABELS
+from sim.bodies.meshfile import write_anatomy
+from sim.errors import InputError
+from surrogate.locating.locator_store import save_locator, to_locator_path
+from surrogate.locating.prior import compute_middle
+from surrogate.locating.regions import Region
+
+# Small errors, as a tumour in a box moves little.
+SIGHT = PointObservation(points=80, white=1e-4, smooth=1e-4, shift=1e-4, turn=0.0)
+
+
+@pytest.fixture(scope="module")
+def theatre(box, tmp_path_factory):
+    path = tmp_path_factory.mktemp("sight") / "box.locator.npz"
+    save_locator(path, locator_of(box, solved=True).restrict())
+    return PatientSetup(box, None, {}, "cpu", path)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    near = replace(find_scene("press").viewpoint, width=480, height=360)
+    return replace(small(path=press(0.3, rise=1.0, hold=0.5)), viewpoint=near, sight=SIGHT)
+
+
+@pytest.fixture(scope="module")
+def play(theatre, scene):
+    return theatre.build_player("fem", scene)
+
+
+@pytest.fixture(scope="module")
+def frames(play):
+    return list(play.play_frames(every=40))
+
+
+@pytest.fixture(scope="module")
+def truth(theatre, scene, frames):
+    return solve_reference_frames(theatre, scene, [frame.loads for frame in frames])
+
+
+def test_what_the_tool_hides_is_not_seen_and_where_it_touches_is(still, play):
+    observer, rest = still
+    held = play.place_tool(play.scene.tool, play.get_touch(40), rest)
+    corners = np.asarray(play.scene.tool.mesh.vertices) @ held.pose[:3, :3].T + held.pose[:3, 3]
+    seen, all_seen = observer.observe(0, rest, corners), observer.observe(0, rest)
+    assert 0 < len(all_seen.now) - len(seen.now) < 300 and len(seen.rest) == len(seen.now) == len(seen.sigmas)
+    away = np.linalg.norm(seen.rest - held.tip, axis=1)
+    assert away.min() > 3e-3 and len(seen.tips) == 1
+    assert np.linalg.norm(seen.tips[0] - held.tip) < 3e-3
+    lifted = observer.observe(0, rest, corners - 4e-3 * play.site.axis)
+    assert not len(lifted.tips) and len(seen.now) < len(lifted.now)
+
+
+def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
+    frame = frames[1]
+    found = frame.estimate
+    assert found.location is not None and found.held and found.off < 0.7 * np.linalg.norm(found.true)
+    assert frame.moved == found.moved == pytest.approx(np.linalg.norm(found.location.centroid))
+    for ink, least in ((TUMOUR_COLOUR, 200), (ELLIPSOID_COLOUR, 10), (TRUTH_COLOUR, 10)):
+        assert np.count_nonzero(find_ink(frame.shown, compute_ink(ink))) >= least
+    nodes = play.site.anatomy.tumour_nodes
+    believed, positions = play.estimate_positions(frame), play.compute_positions(frame.deformation)
+    assert not np.allclose(believed[nodes], positions[nodes], atol=1e-5)
+    others = np.setdiff1d(np.arange(len(positions)), nodes)
+    assert np.array_equal(believed[others], positions[others])  # the camera sees the true cortex
+    moved = compute_middle(play.site.anatomy, (believed - play.site.anatomy.mesh.nodes)[None])[0]
+    assert moved == pytest.approx(found.motion, abs=1e-6)
+    assert "locate" in frame.seconds and frame.remark.endswith(f"estimate error {1e3 * found.off:.1f} mm")
+
+
+def test_the_checks_pass_and_tell_what_an_estimate_is_worth(play, frames, truth):
+    figures = measure(play, play.get_camera, frames, truth)
+    assert figures.find_violations(Bounds(overlap=0.5, error=3e-3)) == []
+    # One frame moves, and by nothing that the locator's dents are: 14 % of it are removed.
+    assert figures.covered == 1.0 and 0.1 < figures.removed < 1.0 and figures.error_mm > 0.01
+
+
+def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
+    frame, others = frames[1], [frames[0], *frames[2:]]
+
+    def sentences(wrong):
+        figures = measure(play, play.get_camera, [others[0], wrong, *others[1:]], truth)
+        return " ".join(figures.find_violations(Bounds(overlap=0.0, error=1.0, covered=1.0)))
+
+    plain = replace(play, stage=replace(play.stage, observer=None))
+    undrawn = plain.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, 0.1)
+    assert "the drawn outline" in sentences(replace(undrawn, estimate=frame.estimate))
+    astray = replace(frame.estimate, middle=frame.estimate.middle + 0.01)
+    for wrong in (astray, replace(frame.estimate, location=None)):  # one that is refused has no ellipsoid
+        assert "ellipsoid holds the tumour's middle in" in sentences(replace(frame, estimate=wrong))
+    silent = replace(frame, remark="estimate error 9.9 mm")
+    assert "does not show its frame number or" in sentences(silent)
+    other = replace(frame, estimate=replace(frame.estimate, true=np.full(3, 1.0)))
+    assert sentences(other) == ""  # the truth is that of the finite elements
+    assert sentences(frame) == ""
+
+
+def test_an_ellipsoid_holds_what_its_covariance_says(frames):
+    found = frames[1].estimate
+    closed, root = found.build_ellipsoid(), np.linalg.cholesky(found.location.centroid_covariance)
+    at, way = found.middle + found.motion, np.array([0.6, 0.0, 0.8])
+    assert is_within_surface(closed, at + 2.7 * root @ way) and not is_within_surface(closed, at + 2.85 * root @ way)
+    assert replace(found, true=found.motion + 2.79 * root @ way).held  # chi-square of three, 95 %: 2.795
+    assert not replace(found, true=found.motion + 2.8 * root @ way).held
+
+
+def test_where_nothing_moves_that_is_said(play, frames):
+    found = frames[0].estimate
+    assert not found.noticed and frames[0].remark.startswith("no significant motion detected; ")
+    assert "No significant motion detected." in " ".join(describe_estimate(found))
+    tried, guess = (replace(found, location=replace(found.location, calibrated=known)) for known in (True, False))
+    assert "guess" not in tried.words + " ".join(describe_estimate(tried))
+    assert "; rough estimate; " in guess.words and "It is a guess" in " ".join(describe_estimate(guess))
+
+
+@pytest.fixture(scope="module")
+def refused(theatre, scene):
+    """A frame whose points are off by far more than they say."""
+    play = theatre.build_player("fem", scene)
+    stage = replace(play.stage, observer=Wild(play.stage.observer))
+    return replace(play, stage=stage), replace(play, stage=stage).draw(40, 4 / 3, play.get_touch(40))
+
+
+class Wild:
+    """An observer whose points are scattered."""
+
+    def __init__(self, observer):
+        self.observer = observer
+
+    def estimate(self, number, positions, tool=None):
+        wild = replace(self.observer, sight=replace(self.observer.sight, white=8e-3, smooth=1e-4))
+        sigma = replace(wild.observe(number, positions, tool), sigma=None)
+        return _estimated(replace(wild), sigma, positions)
+
+
+def _estimated(observer, seen, positions):
+    with pytest.raises(InputError) as refusal:
+        observer.locator.locate(seen)
+    return replace(observer.estimate(0, positions), observation=seen, location=None, refusal=str(refusal.value))
+
+
+def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
+    play, frame = refused
+    found, said = frame.estimate, []
+    assert frame.doubt == REJECTED_WARNING and found.build_ellipsoid() is None and not found.held and frame.remark == ""
+    nodes = play.site.anatomy.tumour_nodes
+    assert np.array_equal(play.estimate_positions(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
+    assert not find_ink(frame.shown, compute_ink(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
+    assert np.count_nonzero(find_ink(frame.shown, compute_ink(TRUTH_COLOUR))) > 10
+    monkeypatch.setattr(
+        "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
+    )
+    add_cost_label(frame, "fem")
+    assert any(line == f"estimate: rejected, {found.refusal}" for line in said)
+    assert "Observation rejected" in report(frame, play.stage, "fem", "", (), 100)
+
+
+def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
+    """Refusals, slips, and a tumour that lies still in most frames, each with its reason; else nothing."""
+    _, wild = refused
+    best = max(frames, key=lambda frame: np.linalg.norm(frame.estimate.true))
+    slipped = replace(best.estimate, location=replace(best.estimate.location, slipped=True))
+    still = replace(best, estimate=replace(best.estimate, true=np.zeros(3)))
+    assert list_objections([best, best]) == [] and list_objections([replace(best, estimate=None)]) == []
+    why = wild.estimate.refusal
+    assert list_objections([wild, best]) == [f"the locator rejects the observation in 1 of 2 frames: {why}"]
+    (doubt,) = list_objections([replace(best, estimate=slipped), best])
+    assert "doubts its result in 1 of 2 frames" in doubt and "may have slipped" in doubt
+    (sparse,) = list_objections([still, best, still])
+    assert "moves in 1 of 3 frames" in sparse and "give a smaller --every" in sparse
+
+
+def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
+    frame, said = frames[1], []
+    found = frame.estimate
+    monkeypatch.setattr(
+        "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
+    )
+    add_cost_label(replace(frame, named=False), "fem")
+    truth = 1e3 * np.linalg.norm(found.true)
+    off = bound_words(found.location.p95, 1)
+    assert said[0] == f"truth: tumour moved {truth:.2f} mm"
+    assert said[1] == f"estimate: tumour moved {1e3 * found.moved:.2f} +- {off}"
+    assert f"truth: {frame.deformation.source}" in said and f"estimate: {found.source}" in said
+    assert said[-1].startswith("lines: ") and not any("tumour moved" in line for line in said[2:])
+    foot = f"estimate moved {format_millimetres(found.moved, found.location.p95)}"
+    assert f"truth moved {truth:.1f} mm; estimate" in frame.remark
+    assert all(
+        has_text(frame.shown, line, TEXT_SCALE) for line in wrap_line(foot, MAX_BOTTOM_WIDTH * frame.shown.shape[1])
+    )
+    said.clear()
+    add_cost_label(replace(frame, named=True), "fem")
+    assert not any(line.startswith("lines: ") for line in said)
+
+
+def test_numbers_and_errors_come_before_explanations(play, frames):
+    words = report(frames[1], play.stage, "fem", "", (), 100)
+    order = "by the estimate (truly", "converged", "Tumour position error", "<b>estimate</b> from", "frame "
+    places = [words.index(each) for each in order]
+    assert places == sorted(places)
+
+
+def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
+    frame = frames[1]
+    assert frame.tumour_error == TumourError(None, "", frame.estimate.worst)
+    times = tuple(float(time) for time in play.scene.times[[0, -1]])
+    flat = {"times": times, "worst": (3e-3, 3e-3), "middle": (2e-3, 2e-3), "moved": (1e-3, 1e-3)}
+    known = Uncertainty("it", "", 9, 0, **flat, parts={"E": (1e-3, 1e-3)})
+    knowing = replace(play, uncertainty=known)
+    both = knowing.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, 0.1).tumour_error
+    assert both.prior == pytest.approx(3e-3) and both.bound == both.observed == frame.estimate.worst
+
+
+def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
+    said = format_page_legend(play.scene)
+    assert all(words in said for words in ("estimate", "truth", "95 %", "scan", "tip to tumour"))
+    assert "estimate" not in format_page_legend(replace(play.scene, sight=None))
+    found = frames[1].estimate
+    words = " ".join(describe_estimate(found))
+    assert f"error {1e3 * found.off:.1f} mm; the truth is inside the ellipsoid" in words
+    assert f"{len(found.observation.now)} points of the cortex, and where the tool touches; no force" in words
+    assert "outside of" in " ".join(describe_estimate(replace(found, true=np.ones(3))))
+
+
+def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
+    with pytest.raises(InputError, match="sulcus locator"):
+        PatientSetup(box, None, {}, "cpu").build_stage(replace(short(), sight=SIGHT))
+    write_anatomy(tmp_path / "box.vtu", box)
+    words = ["--anatomy", str(tmp_path / "box.vtu"), "--device", "cpu", "--out", str(tmp_path / "out")]
+    assert main(["render", "sag", *words]) == 2
+    said = capsys.readouterr().err
+    assert "has no locator at" in said and not (tmp_path / "out").exists()
+    assert "sulcus train" not in said and "is the truth, as finite elements have it" in said
+
+
+def test_locator_of_other_regions_is_rejected(theatre, scene):
+    other = replace(theatre)
+    other.__dict__["locator"] = replace(theatre.locator, regions=(Region(PART_LABELS["oedema"], 0.5),))
+    with pytest.raises(InputError, match=r"another stiffness of region 3 \(oedema\) than the scene\."):
+        other.build_stage(scene)
+
+
+def test_no_trained_model_is_the_truth(scene):
+    theatre = open_theatre(device="cpu")
+    assert theatre.list_deformers(scene) == ("fem",) and theatre.list_deformers(replace(scene, sight=None)) != ("fem",)
+
+
+def test_what_ships_locates_its_tumour(capsys):
+    assert to_locator_path(get_template_path()).stat().st_size < 8_000_000
+    assert main(["check", *SIGHTED, "--every", "40", "--device", "cpu", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["scenes"]
+    assert [row["scene"] for row in rows] == list(SIGHTED)
+    for row in rows:
+        assert row["covered"] >= 0.9 and row["removed"] > 0.3 and row["motion_mm"] > 1.5 and row["deformer"] == "fem"

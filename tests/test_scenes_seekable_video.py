@@ -1,0 +1,18 @@
+"""Films that are read from any frame on."""
+
+import numpy as np
+from films import FILM
+
+from ar.tracking.image_sequences import read_video
+from scenes.tracked.seekable_video import SeekableFilm
+
+
+def test_a_film_is_gone_to_and_fro_in(tmp_path):
+    film, pictures = SeekableFilm(FILM / "film.mp4", 30.0), list(read_video(FILM / "film.mp4", 30.0, colour=True))
+    assert film.count == len(pictures) == 17
+    for number in (3, 4, 16, 0):
+        found = film.read_image(number)
+        assert found.stamped and np.array_equal(found.picture.colour, pictures[number].colour)
+    film.count = 40  # as a file may say
+    assert film.read_image(20) is None and film.count == 20 and film.read_image(17) is None and film.count == 17
+    assert film.read_image(16).picture.name == "frame 16"

@@ -1,0 +1,47 @@
+"""Limits of Gymnasium's tasks: of force and of pressure."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+
+import scenes.gym  # noqa: F401
+from scenes.gym.tasks import PALPATE
+from scenes.gym.tissue_requests import Touched
+
+DOWN = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], np.float32)
+
+
+@pytest.mark.parametrize(("limit", "share"), [(0.5, "pressure"), (2.0, "force")])
+def test_load_is_the_share_of_the_limit_reached_first(limit, share):
+    environment = gymnasium.make("sulcus/Palpate-v0", device="cpu", size=(48, 36)).unwrapped
+    task = replace(PALPATE, pressure=limit * PALPATE.pressure)
+    environment.episode.setting = replace(environment.episode.setting, task=task)
+    environment.reset(seed=3)
+    terminated = False
+    while not terminated:
+        *_, terminated, _, truth = environment.step(DOWN)
+    shares = {"force": np.linalg.norm(truth["force"]) / task.force, "pressure": truth["pressure"] / task.pressure}
+    assert truth["load"] == pytest.approx(shares[share]) and shares[share] > 1.25 > 1.2 * min(shares.values())
+
+
+@pytest.mark.parametrize(("shares", "ends"), [("110111", "success"), ("1x", "unreliable"), ("11x", "unreliable")])
+def test_episode_is_over_after_goals_in_a_row_or_a_bad_answer(shares, ends):
+    """Shares of the force that is asked for; x: of a solution that is not good."""
+    environment = gymnasium.make("sulcus/Palpate-v0", device="cpu", size=(48, 36)).unwrapped
+    nodes, seen = np.arange(len(environment.setting.site.anatomy.mesh.nodes)), iter(f"0{shares}")
+
+    def answer(asked):
+        share, goal = next(seen), environment.episode.drawn.goal
+        force = np.array([0.0, 0.0, goal.amount * (share != "0")])
+        return [Touched(np.zeros((len(nodes), 3)), nodes, force, 0.0, good=share != "x")]
+
+    task = replace(PALPATE, aside=1.0, held=3)
+    setting = replace(environment.setting, task=task, answers=SimpleNamespace(compute_responses=answer))
+    environment.setting = environment.episode.setting = setting
+    environment.reset(seed=3)
+    over = [environment.step(0.0 * DOWN) for _ in shares]
+    assert [terminated for _, _, terminated, _, _ in over] == [False] * (len(shares) - 1) + [True]
+    assert over[-1][-1]["success"] == (ends == "success") != (over[-1][1] < -5.0)

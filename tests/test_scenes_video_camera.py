@@ -1,0 +1,62 @@
+"""A film that was taken by another camera, or at another zoom, is refused."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from films import FILM
+
+from scenes.cli import main
+from scenes.tracked.calibration_file import read_calibration, write_calibration
+from scenes.tracked.video_camera import check_video
+
+
+@pytest.mark.parametrize(("factor", "way"), [(1.15, "13% shorter"), (0.85, "18% longer")])
+def test_a_film_of_another_zoom_is_refused_before_it_is_followed(factor, way, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(
+        "scenes.tracked.external_tracker.follow_body", lambda *given: pytest.fail("the whole film is followed")
+    )
+    calibration = read_calibration(FILM / "camera.yaml")
+    path = tmp_path / "camera.yaml"
+    write_calibration(path, replace(calibration, focal=tuple(factor * each for each in calibration.focal)))
+    given = [str(FILM / "film.mp4"), "--camera", str(path)]
+    for words in (["track", *given, "--out", str(tmp_path / "poses.csv")], ["overlay", *given]):
+        words += ["--registration", str(FILM / "registration.json")] if words[0] == "overlay" else []
+        assert main(words) == 2
+        said = capsys.readouterr().err
+        assert said.splitlines()[-1].startswith(f"sulcus {words[0]}: {FILM / 'film.mp4'}: its markers are seen with ")
+        assert f"focal lengths that are {way}" in said and f"than {path} states" in said
+        assert "calibrate this one" in said
+    assert list(tmp_path.iterdir()) == [path]
+    check_video(FILM / "film.mp4", 30.0, calibration, "the film's own")
+    nearly = replace(calibration, focal=tuple(1.02 * each for each in calibration.focal))
+    check_video(FILM / "film.mp4", 30.0, nearly, "two per cent off")
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "it is empty"),
+        (b"no video", "its bytes are not a video's"),
+        ((FILM / "film.mp4").read_bytes()[:2000], "it is cut off or damaged"),
+    ],
+)
+def test_what_is_no_video_is_one_sentence_with_its_reason(content, why, tmp_path, capsys):
+    (tmp_path / "short.mp4").write_bytes(content)
+    given = [str(tmp_path / "short.mp4"), "--camera", str(FILM / "camera.yaml")]
+    assert main(["track", *given, "--out", str(tmp_path / "poses.csv")]) == 2
+    assert capsys.readouterr().err == (
+        f"sulcus track: {tmp_path}/short.mp4: is not a readable video, as {why}: give a video, or a folder of PNG "
+        "or JPEG images.\n"
+    )
+
+
+def test_libraries_print_nothing_of_what_is_no_video(tmp_path):
+    """In a process that has opened none: FFmpeg asks once how much it says."""
+    (tmp_path / "short.mp4").write_text("no video")
+    code = "import pathlib, sys; from ar.tracking import pictures; pictures.read_frame_rate(pathlib.Path(sys.argv[1]))"
+    words = [sys.executable, "-c", code, str(tmp_path / "short.mp4")]
+    done = subprocess.run(words, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
+    assert done.stdout == done.stderr == ""
