@@ -207,7 +207,7 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
     Raises
     ------
     InputError
-        A grid that would exceed `MOST_VOXELS`.
+        A grid that would exceed `MAX_VOXELS`.
     """
     inverse = np.linalg.inv(affine)
     index = other.outline @ inverse[:3, :3].T + inverse[:3, 3]

@@ -130,7 +130,7 @@ def _scale_affine(image: Nifti1Image | MGHImage, metre: float) -> np.ndarray:
 
 
 def _check_voxel_count(path: Path, shape: tuple[int, ...]) -> None:
-    """Reject a file that declares more than `MOST_VOXELS` voxels, before memory is allocated."""
+    """Reject a file that declares more than `MAX_VOXELS` voxels, before memory is allocated."""
     voxels = math.prod(shape)
     if voxels > MAX_VOXELS:
         raise InputError(f"{path}: has {voxels:.3g} voxels; the maximum is {MAX_VOXELS:.3g}. Resample it.")

@@ -25,8 +25,7 @@ from ..runtime.views import from_view, view
 from .contact_batch import ContactState
 from .contact_forces import FORCES, NONCONVEX, allocate_ends, allocate_scratch
 from .contact_kernel import build_kernel
-from .contact_structs import ComplianceModel as Softness
-from .contact_structs import Ends
+from .contact_structs import ComplianceModel, Ends
 from .press_kernel import build_press_kernel
 from .strained_part import StrainedModel
 
@@ -175,7 +174,7 @@ class ContactSteps:
         self._matrix = wp.zeros((1, size, size), dtype=wp.float64, device=name)
         self._compliance = from_view(exact, compliance.columns).reshape((1, *compliance.columns.shape))
         self._every = device.upload(np.arange(len(compliance.nodes))[None], wp.int32)
-        self._model = Softness()
+        self._model = ComplianceModel()
         self._model.rest, self._model.known = self._compliance[0], device.upload(compliance.known, wp.int32)
         self._model.learnt, self._model.middle = exact.allocate(1, 0, len(compliance.rows)), exact.allocate(1, 0, 0)
         self._model.own = wp.zeros((1, count + 1, count + 1), dtype=wp.float32, device=name)
@@ -203,7 +202,7 @@ class ContactSteps:
     def compute_direction(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
         """Solve for the tools' forces with a proximal term, their direction and longest step: (`OUTPUT_SIZE`,) results.
 
-        With `bent` the model need not be convex. If the status is not `FOUND`, the other results are invalid. The
+        With `bent` the model need not be convex. If the status is not `SOLVED`, the other results are invalid. The
         returned array is overwritten by the next call.
         """
         self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, drag

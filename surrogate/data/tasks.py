@@ -48,7 +48,7 @@ def solve_batches(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -
 
 
 def solve_batch(deformer: Deformer, task: LoadBatch) -> bytes:
-    """Solve a batch (`answer_rows.get_row_type`). Every batch starts undeformed, independent of earlier ones."""
+    """Solve a batch (`solution_rows.get_row_type`). Every batch starts undeformed, independent of earlier ones."""
     anatomy = deformer.anatomy
     unit = task.loads is None
     loads = build_unit_loads(anatomy, task.rows) if task.loads is None else task.loads
