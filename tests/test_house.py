@@ -66,7 +66,9 @@ OWNERS = {
     "isal": {"scenes/episodes/png.py"},
     "meshio": {"sim/bodies/meshfile.py"},
     "gymnasium": {f"scenes/gym/{of}.py" for of in ["environment", "observation", "registration"]},
-    "viser": {f"ar/page/{of}.py" for of in ["browser", "control_lock", "access_guard", "messages", "recording", "scene"]},
+    "viser": {
+        f"ar/page/{of}.py" for of in ("browser", "control_lock", "access_guard", "messages", "recording", "scene")
+    },
     "nilearn": {"sim/bodies/template.py"},
     "pyarrow": {"scenes/episodes/exports/lerobot.py"},
     "matplotlib": {"scenes/analysis/loglog_chart.py"},
