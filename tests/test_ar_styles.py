@@ -176,7 +176,7 @@ def test_cut_has_letters_at_both_ends_despite_tool():
 
 def test_words_at_the_head_are_broken_beside_a_tool():
     tool = np.zeros((480, 640), bool)
-    texts = ["FEM reference: no surrogate error", "tumour position error <= 5.7 mm (95 %), above all registration"]
+    texts = ["FEM reference (no surrogate)", "tumour position error <= 5.7 mm (95 %), above all registration"]
     assert format_head_lines(texts, tool) == texts
     tool[:200, 330:390] = True
     lines = format_head_lines(texts, tool)

@@ -109,7 +109,7 @@ def test_files_of_others_are_kept(folder, tmp_path, capsys):
         assert f"{name}: exists. Give --force" in refused([folder, "--out", tmp_path / "camera.yaml"], capsys)
         assert [path.read_text() for path in tmp_path.iterdir()] == ["image_width: 3"]
         mine.unlink()
-    assert "give a name that ends so" in refused([folder, "--out", tmp_path / "camera.txt"], capsys)
+    assert "give a name with this extension" in refused([folder, "--out", tmp_path / "camera.txt"], capsys)
     assert "give --out K.yaml" in refused([folder], capsys)
 
 

@@ -69,7 +69,9 @@ def test_the_page_fits_and_is_in_register(demo, window, size):
 def test_in_a_low_window_what_switches_physics_off_is_in_sight(demo, window):
     """The fold stands above the 3-D view, with room for a verdict's five lines over it."""
     window.size(1280, 720)
-    fold = "[...document.querySelectorAll('legend, span, div')].findLast(e => e.innerText?.startsWith('more: switch'))"
+    fold = (
+        "[...document.querySelectorAll('legend, span, div')].findLast(e => e.innerText?.startsWith('physics effects'))"
+    )
     window.value(f"document.getElementById('{TABS[0][1]}').click()")
     assert window.wait(f"innerWidth == 1280 && {fold}?.offsetHeight > 0")
     view = box_of(window, "document.querySelector('canvas')")

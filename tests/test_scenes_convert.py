@@ -31,7 +31,7 @@ def test_conflicting_options_give_message_and_no_file(folder, box, tmp_path, cap
     bare = write_episode(tmp_path / "in/bare.h5", box, Wanted(4))
     with h5py.File(bare, "a") as file:
         del file["T_world_tool"]
-    for given, words in (([folder, wide], "convert them apart"), ([bare], "has no tool")):
+    for given, words in (([folder, wide], "convert them separately"), ([bare], "has no tool")):
         for name in ("lerobot", "robomimic"):
             out = tmp_path / ("x.hdf5" if name == "robomimic" else "x")
             assert main(["convert", *map(str, given), "--to", name, "--out", str(out)]) == 2

@@ -161,7 +161,7 @@ def test_element_folded_at_mid_edge_counts_as_inverted(solve) -> None:
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
 def test_linear_elements_on_a_quadratic_mesh_are_refused(solve, element: str) -> None:
     code, _, _, errors = solve(CURVED, {"fixed": BASE.astype(int), "force": FORCE}, "--element", element)
-    assert code == 2 and f"no {element}: take p2" in errors
+    assert code == 2 and f"not {element}: use p2" in errors
 
 
 def test_a_mesh_of_both_kinds_is_refused(solve) -> None:

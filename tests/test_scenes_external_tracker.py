@@ -329,7 +329,7 @@ def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys)
     said = json.loads(out)
     assert said["tool_seen_percent"] == said["reference_seen_percent"] > 70.0
     assert said["states"][TumourState.UNKNOWN.value] == 11
-    offset, error = (float(part.split()[0]) for part in (err.split("clock is ")[1], err.split("+- ")[1]))
+    offset, error = (float(part.split()[0]) for part in (err.split("clock runs ")[1], err.split("+- ")[1]))
     assert abs(offset - (DAY - 1.0)) < 5.0 * error < 0.05
     for more, why in (
         (["--clock", "soon"], "give seconds"),

@@ -36,5 +36,5 @@ def test_a_guess_is_called_so_and_blames_no_part():
         named = replace(error, registration=1.56e-3)
         for words in (format_errors(None, named, False)[-1], format_tumour_trust(named)):
             assert "registration 1.6 mm" in words
-    assert format_tumour_error(alone, brief=True) == "position error <= 4.2 mm, rough estimate"
-    assert format_tumour_error(seen, brief=True) == "position error <= 1.0 mm"
+    assert format_tumour_error(alone, brief=True) == "tumour <= 4.2 mm, rough estimate"
+    assert format_tumour_error(seen, brief=True) == "tumour <= 1.0 mm"

@@ -18,7 +18,7 @@ from types import SimpleNamespace as Names
 class Demo:
     def __init__(self, *words, **named):
         self.browser = Names(address="here", addresses=(), token=None)
-        self.busy, self.cast = Names(on=len), Names(predicted=lambda *asked: None)
+        self.busy, self.cast = Names(begin_work=len), Names(predict=lambda *asked: None)
         self.solve = threading.Thread(target=time.sleep, args=(100.0,), daemon=True)
         self.solve.start()
 
@@ -39,13 +39,13 @@ class Demo:
         print("all closed", flush=True)
 
 theatre = Names(models={"linear": Names(bound=1e-4, left_out=None)}, learned_tissue=None, anatomy=Names(mesh=None),
-                best=lambda scene: "linear", usual=lambda scene: "linear",
-                knowing=lambda scene: True, refusals=lambda scene: {}, described=lambda name, scene: name)
+                select_best=lambda scene: "linear", select_default=lambda scene: "linear",
+                select_models=lambda scene: True, list_rejections=lambda scene: {}, describe_deformer=lambda name, scene: name)
 sys.modules["ar.overlay.composite"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
 sys.modules["scenes.page.demo"] = Names(Demo=Demo)
 scene = Names(name="none", viewpoint=None, elasticity=Names(default=None, regions={}),
-              made_of=lambda tissue, element: scene, replace_regions=lambda regions: scene)
+              replace_tissue=lambda tissue, element: scene, replace_regions=lambda regions: scene)
 sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",), check_scene_exists=len)
 sys.modules["scenes.play.deformers"] = Names(open_theatre=lambda *words: theatre)
 from scenes.commands.demo import add_arguments, run

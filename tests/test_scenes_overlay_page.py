@@ -183,7 +183,7 @@ def test_the_page_fits_and_is_in_register(page, window, size):
     assert seek(page, 6)
     window.size(*size)
     said = f"document.getElementById('{SAID}').innerText"
-    assert window.wait(f"innerWidth == {size[0]} && {said}.includes('picture\\u00a06')")
+    assert window.wait(f"innerWidth == {size[0]} && {said}.includes('image\\u00a06')")
     assert_fits(window, size, ("Overlay error", "Tumour position error"))
     assert_in_register(window, page.browser.shown[1])
     for number, place in ((1, SLICES), (2, HISTORY)):

@@ -8,7 +8,7 @@ def test_frames_that_are_there_are_kept_or_removed_by_force(box_folder, tmp_path
     monkeypatch.chdir(box_folder)
     words = ["render", "press", "--anatomy", "box.vtu", "--device", "cpu", "--out", str(tmp_path), "--plain"]
     assert main([*words, "--every", "60", "--film", str(tmp_path / "press.gif")]) == 0
-    assert f"film {tmp_path / 'press.gif'}" in capsys.readouterr().out
+    assert f"video {tmp_path / 'press.gif'}" in capsys.readouterr().out
     first = {path: path.read_bytes() for path in tmp_path.glob("frame_*.png")}
     assert len(first) == 3
     assert all(read_png(path).shape == (600, 800, 3) for path in first)

@@ -94,7 +94,7 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, tmp_path, monkeypatc
     reported = []
     tabulate_series(study, lambda done, total: reported.append((done, total)))
     assert reported and reported[-1][0] == reported[-1][1]
-    monkeypatch.setattr("surrogate.training.expansion.Expansion.fem", None)
+    monkeypatch.setattr("surrogate.training.expansion.Expansion.build_fem", None)
     tabulate_series(study, lambda done, total: reported.append(None))
     assert None not in reported
     row = measure_row(replace(study), LearnerSpec("series"), tmp_path / "series.png")

@@ -217,7 +217,7 @@ def test_the_command(tmp_path, capsys):
     for text in (
         "| force or motion    | as drawn    | +-5 %     |",
         "| surrogate's error  |             | table     |        | 0.123  |",
-        "held-out bipolar loads", "FEM with element p2", "--beside p2", "This anatomy has no skull",
+        "held-out bipolar loads", "FEM with element p2", "--compare p2", "This anatomy has no skull",
         "Use --element smoothed",
     ):  # fmt: skip
         assert text in said

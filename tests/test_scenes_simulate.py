@@ -54,4 +54,4 @@ def test_simulate_takes_quadratic_anatomies_as_they_are(body, tmp_path, capsys) 
     assert len(anatomy.tumour_nodes) > len(body.tumour_nodes)
     capsys.readouterr()
     assert main(["simulate", str(tmp_path / "body.vtu"), "--out", str(tmp_path / "no.h5"), "--element", "p1"]) == 2
-    assert "take p2" in capsys.readouterr().err and not (tmp_path / "no.h5").exists()
+    assert "use p2" in capsys.readouterr().err and not (tmp_path / "no.h5").exists()

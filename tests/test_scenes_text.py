@@ -56,7 +56,7 @@ class TestTrust:
     @pytest.mark.parametrize(("bound", "words"), [(1e-7, "0.01 mm"), (6e-6, "0.01 mm"), (1.231e-3, "1.24 mm")])
     def test_a_bound_is_not_reported_too_small(self, bound, words):
         bounded = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
-        assert f"is more than {words} from where its finite elements have it" in format_trust(bounded, "svr")
+        assert f"Surrogate error (95 %): at most {words} at any point" in format_trust(bounded, "svr")
 
     def test_undeformed_brain_has_no_motion_and_no_error_of_it(self, theatre):
         scene = small(path=press(0.2), duration=1.0)

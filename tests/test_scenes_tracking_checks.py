@@ -107,7 +107,7 @@ def test_what_never_comes_back_fails():
 
 
 def test_check_exit_status_is_1_where_tracking_alone_fails(film, parts, monkeypatch, capsys):
-    names = {"drawn_film.build_synthetic_video": film, "tracking_checks.build_default_pipeline": parts}
+    names = {"rendered_video.build_synthetic_video": film, "tracking_checks.build_default_pipeline": parts}
     names["tracking_checks.measure_tracking"] = TrackingFigures(16, 1, 0, 0.0, 0.0)
     for name, found in names.items():
         monkeypatch.setattr(f"scenes.tracked.{name}", lambda *given, found=found: found)

@@ -238,7 +238,7 @@ class TestSaid:
                     "tumour position error <= 4.2 mm (95 %), mainly E",
                 ],
             ),
-            (False, None, NOT_KNOWN, ["FEM reference: no surrogate error", NOT_KNOWN_WORDS]),
+            (False, None, NOT_KNOWN, ["FEM reference (no surrogate)", NOT_KNOWN_WORDS]),
             (
                 True, None, TumourError(4.11e-3, "E"),
                 [
@@ -259,10 +259,10 @@ class TestSaid:
     @pytest.mark.parametrize(
         ("trained", "promised", "error", "said"),
         [
-            (True, 2.21e-4, TumourError(4.11e-3, "E"), ["surrogate error <= 0.23 mm", "position error <= 4.2 mm"]),
-            (True, None, NOT_KNOWN, ["surrogate error: not known", "position error: not known"]),
-            (False, None, TumourError(4.11e-3, "E"), ["FEM reference", "position error <= 4.2 mm"]),
-            (False, None, TumourError(4.11e-3, "E", 1e-3), ["position error <= 1.0 mm"]),
+            (True, 2.21e-4, TumourError(4.11e-3, "E"), ["surrogate <= 0.23 mm", "tumour <= 4.2 mm"]),
+            (True, None, NOT_KNOWN, ["surrogate: not known", "tumour: not known"]),
+            (False, None, TumourError(4.11e-3, "E"), ["FEM reference", "tumour <= 4.2 mm"]),
+            (False, None, TumourError(4.11e-3, "E", 1e-3), ["tumour <= 1.0 mm"]),
         ],
     )
     def test_small_pictures_say_them_in_few_words(self, trained, promised, error, said):
@@ -334,7 +334,7 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     assert checked["tumour_error_mm"] == pytest.approx(1e3 * max(stored.evaluate(0.1 * one).prior for one in range(3)))
     assert main(["check", *words, "--deformer", "linear", "--every", "3"]) == 0
     said = capsys.readouterr().out
-    assert "surrogate error <= " in said and "position error <= " in said
+    assert "surrogate <= " in said and "tumour <= " in said
     assert main(["collect", *words, "--deformer", "linear", "--out", str(tmp_path / "one.h5")]) == 0
     with h5py.File(tmp_path / "one.h5") as file:
         assert np.isfinite(file["tumour_error"][:]).all() and file["tumour_error"][0] > file["model_error"][0] >= 0.0

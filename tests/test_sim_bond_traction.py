@@ -55,7 +55,7 @@ def test_what_is_not_bonded_says_nothing(cube):
 
 def test_skulls_that_contradict_each_other_are_refused(cube):
     for other in (Slide(), SkullContact()):
-        with pytest.raises(InputError, match=f"Bonded and {type(other).__name__} contradict each other"):
+        with pytest.raises(InputError, match=f"Bonded and {type(other).__name__} are alternative contact models"):
             Fem(cube, (Elasticity(TISSUE), Held(), Bonded(), other, NodalForce()), device="cpu")
     with pytest.raises(InputError, match=r"Bonded.shear is 0.0 Pa"):
         Bonded(shear=0.0)

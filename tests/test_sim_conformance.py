@@ -104,7 +104,7 @@ class TestLaw:
             def coefficients(self):
                 return 1.0, 2.0
 
-        with pytest.raises(InputError, match=r"2 coefficients, but 3 at other Lamé constants"):
+        with pytest.raises(InputError, match=r"2 coefficients, but 3 at other Lamé parameters"):
             check_tissue(Longer(500.0, 1500.0, 1e4))
         with pytest.raises(InputError, match=r"Lamé constants -2.0"):
             check_tissue(YEOH.Yeoh(-1.0, 0.0, 1e4))

@@ -37,7 +37,7 @@ POINT, FORCE = np.array([0.05, 0.05, 0.1]), np.array([0.0, 0.0, -0.2])
 PUSH = push(POINT, FORCE, 0.02)
 
 WRONG: dict[str, tuple[Any, str]] = {
-    "ragged": ([[1.0, 2.0, 3.0], [1.0]], "makes no array"),
+    "ragged": ([[1.0, 2.0, 3.0], [1.0]], "cannot be converted"),
     "text": ("left", "type <U4"),
     "texts": ([["a", "b", "c"]], "type <U1"),
     "complex": (np.ones((1, 3)) * 1j, "type complex128"),
@@ -70,7 +70,7 @@ def test_arrays_of_every_cause_are_refused_by_name(wrong: str) -> None:
     for kind, arrays in CAUSES.items():
         assert len(Loads((kind(**arrays),))) == 1
         for name in arrays:
-            with pytest.raises(InputError, match=rf"{kind.__name__}\.{name} (has|makes)"):
+            with pytest.raises(InputError, match=rf"{kind.__name__}\.{name} (has|cannot)"):
                 Loads((kind(**{**arrays, name: value}),))
 
 
@@ -125,7 +125,7 @@ VERTICES = [
     (np.array([[1, 2]]), r"shape \(1, 2\)"),
     (3, r"shape \(\)"),
     (["one"], "type <U3"),
-    ([[1], [1, 2]], "at makes no array"),
+    ([[1], [1, 2]], "at cannot be converted"),
     ([-1], "no vertex -1"),
     ([10**6], "no vertex 1000000: choose from 0 to 63"),
     (np.array([2**63 + 5], np.uint64), "no vertex"),

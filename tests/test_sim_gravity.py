@@ -193,7 +193,7 @@ def test_a_tool_in_a_drained_head_and_batches() -> None:
         (lambda: Gravity(direction=(0.0, 0.0, 0.0)), "direction is .* not all zero"),
         (lambda: Gravity(direction=(0.0, math.inf, 0.0)), "direction is .* finite"),
         (lambda: Gravity(direction=(1.0, 0.0)), "direction is .* three"),  # pyright: ignore[reportArgumentType]
-        (lambda: Gravity(csf_level=math.nan), "csf_level is no number"),
+        (lambda: Gravity(csf_level=math.nan), "csf_level is NaN"),
         (lambda: Gravity(density=0.0), r"Gravity\.density is 0\.0 kg/m\^3"),
         (lambda: Gravity(csf_density=math.inf), r"Gravity\.csf_density is inf"),
         (lambda: build_posture([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], 0.1), r"Posture\.direction has a row of zeros"),

@@ -101,7 +101,9 @@ def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys, da
     skull.write_bytes(damaged)
     code, text, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
     assert code == 2 and not text and not (tmp_path / "fs.vtu").exists()
-    assert error.startswith("sulcus anatomy: ") and str(skull) in error and "anew" in error and error.count("\n") == 1
+    assert (
+        error.startswith("sulcus anatomy: ") and str(skull) in error and "Reinstall" in error and error.count("\n") == 1
+    )
 
 
 def test_a_skull_with_a_hole_or_none_is_refused(skull, tmp_path, capsys, monkeypatch):

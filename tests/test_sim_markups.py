@@ -46,7 +46,7 @@ def test_points_of_older_files_are_of_the_system_that_is_stated(tmp_path, system
         ("LPS", OLD.format(1, "nan"), "non-finite coordinates"),
         ("LPS", "1,2", "cannot be read as markups"),
         ("LPS", OLD.format(1, 2).replace('1",', "1,"), "cannot be read as markups"),
-        ("LPS", "", "has 0 points that are placed"),
+        ("LPS", "", "has 0 placed points"),
     ],
 )
 def test_older_files_that_do_not_say_all_are_refused(tmp_path, system, row, reason):
@@ -67,7 +67,7 @@ def test_a_curve_is_smooth_through_its_points(tmp_path):
         ({"coordinateUnits": ["m", "m", "m"]}, "must be mm"),
         ({"points": [[0.0, np.nan, 0.0]]}, "non-finite coordinates"),
         ({"points": [[0.0, 1e308, 0.0]]}, "more than 10 m away: coordinates are in mm"),
-        ({"points": []}, "has 0 points that are placed"),
+        ({"points": []}, "has 0 placed points"),
         ({"controlPoints": 3}, "cannot be read as markups"),
     ],
 )

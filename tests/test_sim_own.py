@@ -102,7 +102,7 @@ class TestEffect:
             answer(Elasticity(), Nothing((5,)))
         with pytest.raises(InputError, match=r"two terms are called 'tool force'"):
             answer(Elasticity(), Named((5,)))
-        with pytest.raises(InputError, match=r"asked for 2 times"):
+        with pytest.raises(InputError, match=r"occurs 2 times"):
             answer(Elasticity(), VEINS.Veins((5,)), VEINS.Veins((6,)))
 
     def test_a_cause_of_ones_own_reaches_its_effect_and_no_other(self):

@@ -126,7 +126,7 @@ def test_a_cause_that_does_not_act_is_not_launched(launches: list[str]) -> None:
     ("effects", "sentence"),
     [
         ([Held(), NodalForce()], "no effect resists deformation"),
-        ([Elasticity(), Elasticity(), Held()], "Elasticity is asked for 2 times"),
+        ([Elasticity(), Elasticity(), Held()], "Elasticity occurs 2 times"),
         ([Elasticity(), Held(), "gravity"], "no effect is called str: choose from Elasticity"),
         (
             [Elasticity(regions={4: Material("linear", 1.0, 0.0)}), Held()],

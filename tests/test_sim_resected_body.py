@@ -253,8 +253,8 @@ class TestHardCases:
         [
             ((162,), r"step 2 of Resection cannot be done: the mesh has no tetrahedron 162: choose from 0 to 161"),
             ((-1,), "no tetrahedron -1"),
-            (tuple(set(range(162)) - set(TOP)), "step 2 of Resection cannot be done: all 162 tetrahedra are taken"),
-            (within((0, 0, 0), (3, 3, 1)), "step 2 of Resection cannot be done: all 162 tetrahedra are taken"),
+            (tuple(set(range(162)) - set(TOP)), "step 2 of Resection cannot be done: all 162 tetrahedra are removed"),
+            (within((0, 0, 0), (3, 3, 1)), "step 2 of Resection cannot be done: all 162 tetrahedra are removed"),
         ],
     )
     def test_steps_that_the_body_does_not_bear_are_sentences(self, step: tuple[int, ...], sentence: str) -> None:
@@ -281,7 +281,7 @@ class TestHardCases:
             operated.deform(lying([1, 3]))
 
     def test_a_plain_solver_says_whose_work_it_is(self) -> None:
-        with pytest.raises(InputError, match=r"sim\.finite_elements"):
+        with pytest.raises(InputError, match=r"sim\.build_fem"):
             compile_problem((*EFFECTS, STEPS), BODY, find_device("cpu", "float64"))
         with pytest.raises(InputError, match="asked for 2 times"):
             build_fem(BODY, (*EFFECTS, STEPS, STEPS))

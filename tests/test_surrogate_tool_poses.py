@@ -167,7 +167,7 @@ def test_the_command_makes_poses_that_finite_elements_answer(tmp_path, box, caps
     write_anatomy(mesh, box)
     wanted = ["simulate", str(mesh), "--out", str(out), "--count", "3", "--json"]
     assert main([*wanted, "--ball", "7"]) == 2
-    assert "--blade are moved by pose: give --poses too" in capsys.readouterr().err
+    assert "--blade are moved by pose: give --pose-control too" in capsys.readouterr().err
     assert main([*wanted, "--poses", "--ball", "7"]) == 0
     ball = Ball(7e-3)
     data = read_dataset(out)

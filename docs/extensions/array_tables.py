@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from scenes.episodes.episode import MEANINGS as EPISODE
 from scenes.episodes.episode import UNITS
-from surrogate.data.array_meanings import GROUPS
+from surrogate.data.array_meanings import GROUP_DESCRIPTIONS
 from surrogate.data.array_meanings import MEANINGS as DATASET
 
 
 def dataset_table() -> str:
     """Return the groups and arrays of a data set."""
-    groups = [f"| `{name}/` | {text} |" for name, text in GROUPS.items()]
+    groups = [f"| `{name}/` | {text} |" for name, text in GROUP_DESCRIPTIONS.items()]
     arrays = [f"| `{name}` | {_unit(of.unit)} | {of.axes} | {of.text} |" for name, of in DATASET.items()]
     return _lines(
         ["| group | what it holds |", "|---|---|", *groups],

@@ -112,7 +112,7 @@ def label_words(args: argparse.Namespace) -> list[str]:
 
 
 # Options that place a tumour in the template.
-PLACING_OPTIONS = ("radius", "cover", "tumour_shape", "site", "tumour_at", "head", "brain_ml", "falx_depth")
+PLACING_OPTIONS = ("radius", "cover", "tumour_shape", "site", "tumour_at", "head", "brain_volume", "falx_depth")
 MIN_BRAIN_ML = 20.0  # Smallest accepted volume of a brain [ml].
 MAX_BRAIN_ML = 5000.0  # Largest accepted volume of a brain [ml].
 

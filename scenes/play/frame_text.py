@@ -110,21 +110,21 @@ def format_errors(
 def format_model_error(promised: float | None, trained: bool, brief: bool = False) -> str:
     """Describe the error of the model relative to its FEM."""
     if not trained:
-        return "FEM reference" if brief else "FEM reference: no surrogate error"
+        return "FEM reference" if brief else "FEM reference (no surrogate)"
     if promised is None:
-        return "surrogate error: not known" if brief else "surrogate error relative to FEM: not known"
-    within = f"surrogate error <= {bound_words(promised, 2)}"
-    return within if brief else f"{within} (95 %, relative to FEM)"
+        return "surrogate: not known" if brief else "surrogate error relative to FEM: not known"
+    within = bound_words(promised, 2)
+    return f"surrogate <= {within}" if brief else f"surrogate error <= {within} (95 %, relative to FEM)"
 
 
 def format_tumour_error(error: TumourError, brief: bool = False) -> str:
     """Describe the error of the drawn tumour position relative to the patient."""
     if error.bound is None:
-        return "position error: not known" if brief else NOT_KNOWN_WORDS
-    within, guess = f"position error <= {bound_words(error.bound, 1)}", ", rough estimate" if error.guess else ""
+        return "tumour: not known" if brief else NOT_KNOWN_WORDS
+    within, guess = bound_words(error.bound, 1), ", rough estimate" if error.guess else ""
     if brief:
-        return within if error.observed is not None else f"{within}{guess}"
-    said = f"tumour {within} (95 %)"
+        return f"tumour <= {within}{guess if error.observed is None else ''}"
+    said = f"tumour position error <= {within} (95 %)"
     of = error.registration_words
     if error.observed is None:
         if of and not guess and error.largest == REGISTRATION:
