@@ -40,7 +40,8 @@ class Demo:
 
 theatre = Names(models={"linear": Names(bound=1e-4, left_out=None)}, learned_tissue=None, anatomy=Names(mesh=None),
                 select_best=lambda scene: "linear", select_default=lambda scene: "linear",
-                select_models=lambda scene: True, list_rejections=lambda scene: {}, describe_deformer=lambda name, scene: name)
+                select_models=lambda scene: True, list_rejections=lambda scene: {},
+                describe_deformer=lambda name, scene: name)
 sys.modules["ar.overlay.composite"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
 sys.modules["scenes.page.demo"] = Names(Demo=Demo)

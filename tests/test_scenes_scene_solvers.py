@@ -102,10 +102,10 @@ class Loop:
         return self.demo.browser
 
     def __exit__(self, *_):
-        self.demo.browser.plays = self.stop
+        self.demo.browser.show_playback = self.stop
         self.demo.wish.set(plays=True)  # a page that is paused shows an error until it is asked for more
         self.thread.join()
-        self.demo.browser.plays = self.plays
+        self.demo.browser.show_playback = self.plays
         assert not self.failed
 
 

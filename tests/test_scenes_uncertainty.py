@@ -259,8 +259,8 @@ class TestSaid:
     @pytest.mark.parametrize(
         ("trained", "promised", "error", "said"),
         [
-            (True, 2.21e-4, TumourError(4.11e-3, "E"), ["surrogate <= 0.23 mm", "tumour <= 4.2 mm"]),
-            (True, None, NOT_KNOWN, ["surrogate: not known", "tumour: not known"]),
+            (True, 2.21e-4, TumourError(4.11e-3, "E"), ["model <= 0.23 mm", "tumour <= 4.2 mm"]),
+            (True, None, NOT_KNOWN, ["model: not known", "tumour: not known"]),
             (False, None, TumourError(4.11e-3, "E"), ["FEM reference", "tumour <= 4.2 mm"]),
             (False, None, TumourError(4.11e-3, "E", 1e-3), ["tumour <= 1.0 mm"]),
         ],
@@ -334,7 +334,7 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     assert checked["tumour_error_mm"] == pytest.approx(1e3 * max(stored.evaluate(0.1 * one).prior for one in range(3)))
     assert main(["check", *words, "--deformer", "linear", "--every", "3"]) == 0
     said = capsys.readouterr().out
-    assert "surrogate <= " in said and "tumour <= " in said
+    assert "surrogate error <= " in said and "tumour position error <= " in said
     assert main(["collect", *words, "--deformer", "linear", "--out", str(tmp_path / "one.h5")]) == 0
     with h5py.File(tmp_path / "one.h5") as file:
         assert np.isfinite(file["tumour_error"][:]).all() and file["tumour_error"][0] > file["model_error"][0] >= 0.0

@@ -56,7 +56,10 @@ def test_what_is_no_video_is_one_sentence_with_its_reason(content, why, tmp_path
 def test_libraries_print_nothing_of_what_is_no_video(tmp_path):
     """In a process that has opened none: FFmpeg asks once how much it says."""
     (tmp_path / "short.mp4").write_text("no video")
-    code = "import pathlib, sys; from ar.tracking import image_sequences; image_sequences.read_frame_rate(pathlib.Path(sys.argv[1]))"
+    code = (
+        "import pathlib, sys; from ar.tracking.image_sequences import read_frame_rate; "
+        "read_frame_rate(pathlib.Path(sys.argv[1]))"
+    )
     words = [sys.executable, "-c", code, str(tmp_path / "short.mp4")]
     done = subprocess.run(words, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
     assert done.stdout == done.stderr == ""

@@ -116,7 +116,7 @@ def test_a_skull_with_a_hole_or_none_is_refused(skull, tmp_path, capsys, monkeyp
     assert code == 2 and f"{skull}: no such file" in error and "pip install -e '.[heads]'" in error
     monkeypatch.setitem(sys.modules, "mne", None)  # as where it is not installed
     code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
-    assert code == 2 and "mne, which is not there" in error and "pip install -e '.[heads]'" in error
+    assert code == 2 and "mne, which is not installed" in error and "pip install -e '.[heads]'" in error
 
 
 @pytest.fixture

@@ -283,7 +283,7 @@ class TestHardCases:
     def test_a_plain_solver_says_whose_work_it_is(self) -> None:
         with pytest.raises(InputError, match=r"sim\.build_fem"):
             compile_problem((*EFFECTS, STEPS), BODY, find_device("cpu", "float64"))
-        with pytest.raises(InputError, match="asked for 2 times"):
+        with pytest.raises(InputError, match="occurs 2 times"):
             build_fem(BODY, (*EFFECTS, STEPS, STEPS))
         with pytest.raises(InputError, match="Resected, which no effect uses: add the effect Resection"):
             Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(lying([1]))

@@ -112,9 +112,9 @@ def format_model_error(promised: float | None, trained: bool, brief: bool = Fals
     if not trained:
         return "FEM reference" if brief else "FEM reference (no surrogate)"
     if promised is None:
-        return "surrogate: not known" if brief else "surrogate error relative to FEM: not known"
+        return "model: not known" if brief else "surrogate error relative to FEM: not known"
     within = bound_words(promised, 2)
-    return f"surrogate <= {within}" if brief else f"surrogate error <= {within} (95 %, relative to FEM)"
+    return f"model <= {within}" if brief else f"surrogate error <= {within} (95 %, relative to FEM)"
 
 
 def format_tumour_error(error: TumourError, brief: bool = False) -> str:
