@@ -157,11 +157,10 @@ def _start_warp() -> None:
         wp.config.log_level = wp.LOG_ERROR
     if wp.config.kernel_cache_dir is None:
         ensure_writable_cache()
-    try:
-        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-        return wp.init()
-    except OSError:
-        shown = os.dup(STDERR)
+    if sys.stderr is None or _has_cuda_driver():
+        wp.init()
+        return
+    shown = os.dup(STDERR)
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), STDERR)
     try:
@@ -171,6 +170,14 @@ def _start_warp() -> None:
         os.close(shown)
     if parent_process() is None:
         os.write(STDERR, b"No CUDA GPU found: using the CPU.\n")
+
+
+def _has_cuda_driver() -> bool:
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def _explain_no_gpu() -> str:
