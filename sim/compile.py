@@ -326,7 +326,7 @@ def _build_law_term(
 
     `swelling`: the effect, and a mask (T,) of elements that swell.
     """
-    from .terms.elasticity import ElasticTerm as ElasticityTerm
+    from .terms.elasticity import ElasticTerm
 
     law = build_functions(tissues)
     lame = np.array([get_portion(tissue, carries) for tissue in tissues])[which]
@@ -343,4 +343,4 @@ def _build_law_term(
         from .terms.swelling import Swelling
 
         sources.append(Swelling(swelling[0].compute_swelling, swelling[1], device))
-    return ElasticityTerm(name, law, elements, coefficients, lame, device, sources)
+    return ElasticTerm(name, law, elements, coefficients, lame, device, sources)

@@ -16,7 +16,7 @@ from visitor import Visitor, free_port, wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from ar.page import access_guard as guard
+from ar.page import access_guard
 from ar.page.browser import Browser
 from ar.page.messages import MessageError, check_message
 from ar.page.parts import Dropdown, Playback, SceneViewpoint, Slider, Toggle
@@ -41,7 +41,7 @@ class Page(Browser):
             host=host,
             port=free_port() if port is None else port,
             size=(64, 48),
-            limits=guard.ConnectionLimits(**limits),
+            limits=access_guard.ConnectionLimits(**limits),
             origins=origins,
         )
 
@@ -189,10 +189,10 @@ class TestDoor:
         before = set(threading.enumerate())
         with monkeypatch.context() as patch:
             patch.setattr(viser, "__version__", "2.0.0")
-            with pytest.raises(guard.UnguardedError, match=r"viser 2\.0\.0 cannot be guarded: install viser"):
+            with pytest.raises(access_guard.UnguardedError, match=r"viser 2\.0\.0 cannot be guarded: install viser"):
                 Page()
-        monkeypatch.setattr(guard, "guard_server", lambda *words: nullcontext([]))
-        with pytest.raises(guard.UnguardedError, match="cannot be guarded"):
+        monkeypatch.setattr(access_guard, "guard_server", lambda *words: nullcontext([]))
+        with pytest.raises(access_guard.UnguardedError, match="cannot be guarded"):
             Page()
         assert wait_for(lambda: set(threading.enumerate()) <= before)
 
@@ -209,19 +209,19 @@ class TestToken:
     def test_a_page_on_this_machine_asks_for_none(self, page):
         assert (
             page.token is None
-            and guard.AccessPolicy.create("localhost").token is None
-            and guard.AccessPolicy.create("127.0.0.2").token is None
+            and access_guard.AccessPolicy.create("localhost").token is None
+            and access_guard.AccessPolicy.create("127.0.0.2").token is None
         )
 
     def test_a_host_that_others_reach_too_asks_for_one(self, monkeypatch):
         found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.1", "192.0.2.1")]
         monkeypatch.setattr(socket, "getaddrinfo", lambda *words: found)
-        assert guard.AccessPolicy.create("both.example").token is not None
+        assert access_guard.AccessPolicy.create("both.example").token is not None
 
     def test_the_address_carries_the_token_and_nothing_else_gets_in(self, far):
         token = far.token
         assert len(token) >= 32 and far.address == f"http://localhost:{far.port}/?token={token}"
-        assert guard.AccessPolicy.create("0.0.0.0").token != token
+        assert access_guard.AccessPolicy.create("0.0.0.0").token != token
         for path in ("/", "/?token=", f"/?token={token[:-1]}", "/?token=%C3%A9", f"/?other={token}"):
             assert ask(far, path)[0] == 403, path
             assert knock(far, path) == 403, path

@@ -3,7 +3,7 @@
 import pytest
 from test_ar_access_guard import Page, ask, knock
 
-from ar.page import access_guard as guard
+from ar.page import access_guard
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_addresses_are_printed_with_the_token(proxied):
     ],
 )
 def test_address_is_written_as_browsers_do(text, origin):
-    assert guard.format_origin(text) == origin
+    assert access_guard.format_origin(text) == origin
 
 
 @pytest.mark.parametrize(
@@ -75,4 +75,4 @@ def test_address_is_written_as_browsers_do(text, origin):
 )
 def test_bad_address_is_rejected(text):
     with pytest.raises(ValueError, match="must be https://NAME"):
-        guard.format_origin(text)
+        access_guard.format_origin(text)

@@ -142,7 +142,7 @@ class TestSwitches:
         one, other = (
             plain.build_fem(each, TRAIN)
             .deform(each.build_loads(theatre.site, each.path(5 / 30), 5 / 30))
-            .at(nodes)
+            .restrict(nodes)
             .displacement[0]
             for each in (scene, less)
         )

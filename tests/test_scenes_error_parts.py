@@ -81,7 +81,7 @@ class Sinking:
 
     def deform(self, loads, start=None, at=None):
         self.starts.append(start)
-        (cause,), site, nodes = loads.every(Touching), self.stage.site, self.stage.tumour_vertices
+        (cause,), site, nodes = loads.get_all(Touching), self.stage.site, self.stage.tumour_vertices
         depth = np.maximum((cause.pose[:, 0, :3, 3] - site.origin) @ site.axis, 0.0)
         moved = np.broadcast_to(depth[:, None, None] * site.axis, (len(depth), len(nodes), 3))
         return build_prediction(moved, nodes, loads, [False] * len(depth), 0.0, np.full((2, len(depth)), np.nan), "")

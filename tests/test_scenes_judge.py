@@ -77,4 +77,4 @@ def test_a_tissue_that_cannot_be_read_is_a_sentence(box) -> None:
     for text in ("jelly", "{}", "[]"):
         broken = replace(theatre, models={"linear": replace(model, training={"tissue": text})})
         with pytest.raises(InputError, match="is not a tissue supported by this version"):
-            broken.deformer("linear", small())
+            broken.build_deformer("linear", small())

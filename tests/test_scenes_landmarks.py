@@ -26,7 +26,7 @@ def test_landmarks_are_tissue_points_moved_by_field(warp_out):
 def test_the_landmarks_of_a_tumour_that_is_hollow_say_so(box):
     middles = box.mesh.nodes[box.mesh.tets].mean(axis=1)
     tumour = np.flatnonzero(box.mesh.region == 2)
-    hollow = box.without(tumour[np.linalg.norm(middles[tumour] + [0.0, 0.0, 22e-3], axis=1) < 5e-3])
+    hollow = box.remove_elements(tumour[np.linalg.norm(middles[tumour] + [0.0, 0.0, 22e-3], axis=1) < 5e-3])
     moved = bump(box.mesh.nodes)
     nearest, cortex = list_landmarks(hollow, moved)
     assert nearest.name == NEAREST and cortex.name == "open cortex"

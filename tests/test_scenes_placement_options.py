@@ -12,7 +12,7 @@ from scenes.cli import main
 from scenes.options.placement_options import place_craniotomy
 from sim.bodies.label_volume import build_volume_subject
 from sim.errors import InputError
-from sim.runtime.journal import open_journal as opened_journal
+from sim.runtime.journal import open_journal
 
 
 def two_foci(folder):
@@ -57,7 +57,7 @@ def test_anatomy_lists_pieces_and_keeps_existing_data(tmp_path, capsys):
     assert "holds 8.7 % less tumour than" in noted and "ask for more nodes" in noted
     assert "2 pieces; the skull is opened over the point given" in said and "piece 2: 0.88 ml, left anterior" in said
     assert "opening: left anterior superior" in said
-    with opened_journal(tmp_path / "me.h5.partial", {"anatomy": "of another"}):
+    with open_journal(tmp_path / "me.h5.partial", {"anatomy": "of another"}):
         pass
     assert main(words) == 2 and "me.vtu: exists. Give --force" in capsys.readouterr().err
     out.rename(tmp_path / "other.vtu")

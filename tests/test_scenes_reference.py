@@ -70,8 +70,8 @@ def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path):
 
 
 def test_what_lies_beyond_is_outside_the_envelope(study):
-    training = study.converged.rows(np.flatnonzero(study.discs.train)).of(Pushed)
-    outside = study.outside.of(Pushed)
+    training = study.converged.select(np.flatnonzero(study.discs.train)).get(Pushed)
+    outside = study.outside.get(Pushed)
     assert not compute_training_range(study.patch, training).is_inside(study.patch, outside).any()
     size = np.linalg.norm(outside.force, axis=1)
     assert (size[::3] > 1.19 * np.linalg.norm(training.force, axis=1).max()).all()

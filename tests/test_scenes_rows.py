@@ -47,7 +47,7 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box,
     )
     within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
     guess = every[:, None, None] * basis.decode(machine.predict(compute_tool_features(study.patch, within)))
-    played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.played.of(Pushed).point]
+    played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.played.get(Pushed).point]
     np.testing.assert_allclose(field, guess[played], rtol=1e-3, atol=1e-9)
     wanted = 1e3 * np.linalg.norm(guess[study.discs.test] - wild[nodes], axis=2)
     mm = row.own_fem["discs"].mm
@@ -63,8 +63,8 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box,
 
 
 def test_what_is_played_lies_in_the_discs_alone(study):
-    every = replace(study, loads=10_000).played.of(Pushed)
-    some, split = study.played.of(Pushed), study.discs
+    every = replace(study, loads=10_000).played.get(Pushed)
+    some, split = study.played.get(Pushed), study.discs
     assert len(every.point) == split.test.sum() and len(some.point) == 2
     for pushed in (every, some):
         into = np.linalg.norm(pushed.point[:, None] - split.centres, axis=2).min(axis=1)

@@ -49,7 +49,9 @@ class Gated:
 def gated(monkeypatch):
     """The only finite elements, whoever asks for some."""
     made = Gated(AtRest(make_box(cells=(6, 6, 4), spacing=12e-3)))
-    monkeypatch.setattr(PatientSetup, "build_player", lambda theatre, name, scene: Player(theatre.stage(scene), made))
+    monkeypatch.setattr(
+        PatientSetup, "build_player", lambda theatre, name, scene: Player(theatre.build_stage(scene), made)
+    )
     yield made
     made.let(10_000)
 

@@ -36,5 +36,5 @@ def test_warm_starts_keep_the_live_promise(press):
     anatomy, effects, loads, converged = press
     fem, last = Fem(anatomy, effects, LIVE, "cpu", element="p1"), None
     for row in range(len(loads)):
-        last = fem.deform(loads.rows(np.array([row])), start=last)
+        last = fem.deform(loads.select(np.array([row])), start=last)
         assert np.linalg.norm(last.displacement[0] - converged[row], axis=1).max() <= PROMISED["live"][1]

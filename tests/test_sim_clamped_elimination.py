@@ -17,7 +17,7 @@ from sim.local_solvers.clamped_part import ClampedPart
 from sim.minimisers.lbfgs_kernels import DONE, LIVE
 from sim.minimisers.residual import compute_constant_gradients
 from sim.strategy.plan import SolverStep
-from sim.terms.elasticity import ElasticTerm as ElasticityTerm
+from sim.terms.elasticity import ElasticTerm
 
 BODY = base_held(box((4, 4, 4), 0.1))
 EFFECTS = (Elasticity(tissue("stable-neo-hookean")), Held(), ToolForce())
@@ -90,7 +90,7 @@ def test_the_assembled_curvature_is_the_one_that_multiplies(law: str) -> None:
     problem.linearise(u, np.zeros(1, bool))
     expected = problem.device.allocate(problem.rows, 1)
     problem.add_curvature(p, expected)
-    found = sum(term.curvature() @ p.numpy() for term in problem.terms if isinstance(term, ElasticityTerm))
+    found = sum(term.curvature() @ p.numpy() for term in problem.terms if isinstance(term, ElasticTerm))
     np.testing.assert_allclose(found, expected.numpy(), atol=1e-10 * np.abs(expected.numpy()).max())
 
 

@@ -137,7 +137,7 @@ def test_what_is_left_of_a_tumour_keeps_its_law(small_box):
     mesh = small_box.mesh
     right = mesh.nodes[mesh.tets].mean(axis=1)[:, 0] > 0.0
     halved = replace(mesh, region=np.where(small_box.in_tumour & right, NECROSIS_LABEL, mesh.region))
-    cut = Resection((tuple(np.flatnonzero(halved.within(TUMOUR_LABEL)).tolist()),))
+    cut = Resection((tuple(np.flatnonzero(halved.mark_elements(TUMOUR_LABEL)).tolist()),))
     effects = (*build_push_effects(small_box, Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})), cut)
     operated = build_fem(replace(small_box, mesh=halved), effects, element="p1")
     assert isinstance(operated, OperatedFem)

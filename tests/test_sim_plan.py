@@ -20,7 +20,7 @@ from sim.local_solvers.strained_descent import StrainedDescent
 from sim.minimisers.lbfgs import Lbfgs
 from sim.strategy import strategy
 from sim.strategy.plan import MAX_EVALUATIONS, MIN_OUTER_ITERATIONS, MIN_SHARED_CASES, SolverPlan, SolverStep
-from sim.terms.elasticity import ElasticTerm as ElasticityTerm
+from sim.terms.elasticity import ElasticTerm
 from sim.tools import Ball, Spatula
 
 BODY, PUSHED = body()[0], (Elasticity(), *EFFECTS)
@@ -85,8 +85,8 @@ def test_evaluation_budget_bounds_work_before_newton(count, more, evaluations, m
     """Counted at the element's kernels, of the whole body: a local solver's part is another problem."""
     accuracy, looks = replace(TRAIN, evaluations=evaluations, outer=MIN_OUTER_ITERATIONS, steps=0), []
     fem = Fem(BODY, PUSHED, accuracy, "cpu", **{"element": "p1", **more})
-    whole = next(term for term in fem.problem.terms if isinstance(term, ElasticityTerm))
-    inside, found = ElasticityTerm.add_gradient, strategy.find_equilibrium
+    whole = next(term for term in fem.problem.terms if isinstance(term, ElasticTerm))
+    inside, found = ElasticTerm.add_gradient, strategy.find_equilibrium
 
     def looking(term, u, out):
         if term is whole:
@@ -98,7 +98,7 @@ def test_evaluation_budget_bounds_work_before_newton(count, more, evaluations, m
         return found(*given)
 
     before = []
-    monkeypatch.setattr(ElasticityTerm, "add_gradient", looking)
+    monkeypatch.setattr(ElasticTerm, "add_gradient", looking)
     monkeypatch.setattr(strategy, "find_equilibrium", newton)
     fem.deform(loads_of(np.tile(TOTAL[3], (count, 1))))
     spent = before[0] if before else len(looks)

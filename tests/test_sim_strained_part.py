@@ -19,7 +19,7 @@ from sim.loads import Loads, Touching
 from sim.local_solvers.contact_descent import ContactDescent
 from sim.local_solvers.strained_part import STRAIN_LIMITS, StrainedModel, StrainedPart, StrainLimits
 from sim.material import Material
-from sim.terms.elasticity import ElasticTerm as ElasticityTerm
+from sim.terms.elasticity import ElasticTerm
 from sim.tools import Ball
 
 SIDE, HEIGHT, RADIUS = 0.06, 0.03, 6e-3
@@ -70,7 +70,7 @@ def stiffer(fem: Fem, u: wp.array, column: int) -> np.ndarray:
             p, out = problem.device.allocate(problem.rows, 1), problem.device.allocate(problem.rows, 1)
             p.numpy()[first] = 1.0
             for term in problem.terms:
-                if isinstance(term, ElasticityTerm):
+                if isinstance(term, ElasticTerm):
                     term.add_curvature(p, out)
             parts[-1][:, first] = out.numpy()[:, 0]
     return parts[0] - parts[1]

@@ -23,7 +23,7 @@ class Proportional:
         self.anatomy, self.pretender = pretender.anatomy, pretender
 
     def deform(self, loads, start=None, at=None):
-        answer = self.pretender.deform(loads.scaled(1e-3), start, at)
+        answer = self.pretender.deform(loads.scale(1e-3), start, at)
         return replace(answer, displacement=1e3 * answer.displacement)
 
 

@@ -34,7 +34,7 @@ def scored(data, trained):
 def test_nothing_of_held_out_loads_reaches_an_envelope(trained, scored, data):
     """Bit for bit, wherever they lie and however strong they are."""
     rows = np.flatnonzero(~trained.split.train)
-    pushed = data.loads.of(Pushed)
+    pushed = data.loads.get(Pushed)
     moved = Pushed(pushed.point.copy(), pushed.force.copy(), pushed.footprint.copy())
     moved.point[rows], moved.force[rows] = np.roll(pushed.point[rows], 1, axis=0), 2.0 * pushed.force[rows]
     moved.footprint[rows] *= 1.1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from locators import dent, in_a_skull, locator_of
 
-from surrogate.locating import iterated_conditioning as rounds
+from surrogate.locating import iterated_conditioning
 from surrogate.locating.observation import Observation, place_again
 from surrogate.locating.posterior import condition_prior
 
@@ -38,10 +38,10 @@ def test_settled_round_starts_from_the_last_result(prior, monkeypatch, named, lo
         starts.append((near, motion.copy(), bias(rest)))
         return place_again(body, observation, near, motion, bias)
 
-    monkeypatch.setattr(rounds, "condition_prior", condition)
-    monkeypatch.setattr(rounds, "place_again", place)
-    found, near = rounds.match_and_update(prior, seen, free=True)
-    assert found is results[-1] and 2 <= len(results) <= rounds.MAX_ITERATIONS + 1
+    monkeypatch.setattr(iterated_conditioning, "condition_prior", condition)
+    monkeypatch.setattr(iterated_conditioning, "place_again", place)
+    found, near = iterated_conditioning.match_and_update(prior, seen, free=True)
+    assert found is results[-1] and 2 <= len(results) <= iterated_conditioning.MAX_ITERATIONS + 1
     np.testing.assert_array_equal(near, np.arange(count))  # without the one that is off the cortex
     every = prior.restrict_shapes(np.arange(len(body.mesh.nodes)))
     for result, (points, motion, bias) in zip(results, starts, strict=False):

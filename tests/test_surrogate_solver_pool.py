@@ -83,7 +83,7 @@ def test_two_processes_on_one_card_answer_as_one(tmp_path, body):
             simulate(tmp_path / f"{len(devices)}.h5", solver.deformer, loads, SAID, 8)
         found.append(read_dataset(tmp_path / f"{len(devices)}.h5"))
     every = np.arange(len(body.mesh.nodes))
-    one, two = (data.displacement(every) for data in found)
+    one, two = (data.read_displacement(every) for data in found)
     assert all(data.good.all() for data in found) and np.abs(one - two).max() <= 2e-3 * np.abs(one).max()
     units = [data.compute_unit_response(every) for data in found]
     assert np.abs(units[0] - units[1]).max() <= 2e-3 * np.abs(units[0]).max()

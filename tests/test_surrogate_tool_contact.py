@@ -59,7 +59,7 @@ def test_a_blade_goes_on_from_where_it_was(model, box):
     on, straight = model.deform(second, start), model.deform(second)
     assert on.displacement.tobytes() == model.deform(second, start).displacement.tobytes()
     for nodes, share in ((model.nodes, 0.08), (box.tumour_nodes, 0.05)):  # on facets of 6 mm, its edge counts
-        one, other = on.at(nodes).displacement, straight.at(nodes).displacement
+        one, other = on.restrict(nodes).displacement, straight.restrict(nodes).displacement
         assert 0.0 < np.linalg.norm(one - other, axis=2).max() < share * np.linalg.norm(other, axis=2).max()
     force = straight.reaction[:, 0, :3]
     np.testing.assert_allclose(on.reaction[:, 0, :3], force, atol=0.05 * np.linalg.norm(force))
@@ -99,7 +99,7 @@ def test_pressure_is_that_of_the_finite_elements(model, box):
     truth = compute_pressure(fem, touching, fem.deform(touching))
     np.testing.assert_allclose(found[:2].max(axis=1), truth.max(axis=1), rtol=0.2)
     with pytest.raises(InputError, match="give the complete result"):
-        compute_tool_pressure(model, loads, answer.at(box.tumour_nodes))
+        compute_tool_pressure(model, loads, answer.restrict(box.tumour_nodes))
     with pytest.raises(InputError, match="train the learner contact"):
         compute_tool_pressure(replace(model, force=None), loads, answer)
 

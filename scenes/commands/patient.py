@@ -19,7 +19,7 @@ from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, Tissue
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.journal import open_journal as opened_journal
+from sim.runtime.journal import open_journal
 from sim.runtime.partial_files import to_unfinished_path
 from sim.runtime.timing import listen_to_stages
 from surrogate.data.splits import CALIBRATION_STRIDE, MIN_DISCS
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
         note.unlink(missing_ok=True)
     changed = [path.stat().st_mtime for path in _list_inputs(args) if path.exists()]
     begun = {"anatomy": shlex.join(steps[0]), "inputs": f"of {datetime.fromtimestamp(max(changed, default=0))}"}
-    with listen_to_stages() as seconds, opened_journal(note, begun) as journal:
+    with listen_to_stages() as seconds, open_journal(note, begun) as journal:
         try:
             for step in steps:
                 if (step[0], 0) in journal:
