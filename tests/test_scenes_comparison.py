@@ -76,7 +76,7 @@ class TestVerdict:
 
     def test_of_the_present_load_it_stands_plainly(self):
         said = format_comparison(self.JUDGED, False, "waits")
-        assert "mean 0.100, largest 0.200 mm" in said and "stale" not in said and "waits" not in said
+        assert "mean 0.100, maximum 0.200 mm" in said and "stale" not in said and "waits" not in said
 
     def test_of_another_load_it_is_greyed_and_says_so(self):
         said = format_comparison(self.JUDGED, True, "waits")
@@ -107,8 +107,8 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
 
     found = compare_with_fem(FemResult(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
     said = format_comparison(found, stale=False, waits="")
-    assert "error against FEM: mean 0.200, largest 0.200 mm; tip to tumour " in said
+    assert "difference from FEM: mean 0.200, maximum 0.200 mm; tip to tumour " in said
     tip = whole.draw_frame(3, whole.get_touch(3), loads, answer, 0.0).distance
     assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
-    assert " by FEM, without the error of the tumour (" in said
+    assert " mm (FEM, without its position error; " in said
     assert format_comparison(found, stale=True, waits="").startswith('<p class="stale">previous load: ')

@@ -44,10 +44,10 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
     assert demo.run(2.0) > 1
     demo.wish.set(plays=False)
     # The error belongs to the frame that the finite elements answered, and says which.
-    assert wait_for(lambda: demo.run(0.3) and f"(frame {demo.wish.number}, FEM" in report(demo))
+    assert wait_for(lambda: demo.run(0.3) and f"; frame {demo.wish.number}, FEM" in report(demo))
     text = report(demo)
-    assert "error against FEM: mean" in text
-    assert "|trained model linear|: inside the range" in text and "tip to tumour" in text and "milliseconds: " in text
+    assert "difference from FEM: mean" in text
+    assert "|fast model (linear)|: inside the range" in text and "tip to tumour" in text and "time [ms]: " in text
     truth = demo.referee.truth
     assert truth.number == demo.wish.number
     nodes = theatre.anatomy.tumour_nodes
@@ -121,7 +121,7 @@ def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
         return answer(model, loads, start, at)
 
     monkeypatch.setattr(Learned, "deform", counted)
-    run_until(demo, monkeypatch, lambda: "error against FEM: mean" in report(demo))
+    run_until(demo, monkeypatch, lambda: "difference from FEM: mean" in report(demo))
     assert len(asked) == 2  # for the picture, and for the error
 
 
@@ -133,11 +133,11 @@ def test_visitors_take_over_scrub_and_switch(running):
     visitor.set(page.inputs["direction right [deg]"], 20.0)
     visitor.set(page.inputs["place up [mm]"], -5.0)
     assert wait_for(lambda: demo.wish.touch == Touch(0.0, -5e-3, 0.31, (np.radians(20.0), 0.0)))
-    visitor.set(page.inputs["deformer"], "fem")
-    assert wait_for(lambda: "|finite elements|: converged" in report(demo))
+    visitor.set(page.inputs["deformer"], "FEM (reference)")
+    assert wait_for(lambda: "|FEM (reference)|: converged" in report(demo))
     assert wait_for(lambda: "result of the FEM solver" in report(demo))
-    visitor.set(page.inputs["deformer"], "svr")
-    assert wait_for(lambda: "|trained model svr|" in report(demo))
+    visitor.set(page.inputs["deformer"], "fast model (svr)")
+    assert wait_for(lambda: "|fast model (svr)|" in report(demo))
     assert not demo.wish.plays  # nothing moves under a hand that is still
     assert wait_for(lambda: page.button.label == "Play" and page.frame.value == demo.wish.number)
     number = (demo.wish.number + 7) % 120  # a slider that is there already is not moved
@@ -175,7 +175,7 @@ def test_the_scene_changes_without_a_new_server(demo):
     page, address = demo.browser, demo.browser.address
     assert demo.run(0.3) >= 1 and "tool" in page.meshes
     demo.wish.set(scene="brain_shift", plays=False, deformer="fem")
-    assert wait_for(lambda: demo.run(0.5) and "gravity pulls" in report(demo))
+    assert wait_for(lambda: demo.run(0.5) and "gravity towards" in report(demo))
     assert demo.stage.scene.name == "brain_shift" and "tool" not in page.meshes and "force [N]" not in page.inputs
     assert "fluid drains" in page.words.content and page.address == address
     demo.wish.set(scene="press")
@@ -198,7 +198,7 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
     asked = []
     answer = Learned.deform
     demo.run(0.3)
-    assert wait_for(lambda: demo.run(0.3) and "|error against FEM: mean" in report(demo))
+    assert wait_for(lambda: demo.run(0.3) and "|difference from FEM: mean" in report(demo))
 
     def counted(model, loads, start=None, at=None):
         asked.append(loads)
@@ -230,7 +230,7 @@ def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
     demo.wish.set(plays=False)
     demo.wish.take_over(force=0.2)
     demo.run(0.2)
-    assert said[0].startswith("computing the deformation for the manual tool, 0.20 N (trained model linear)")
+    assert said[0].startswith("computing the deformation for the manual tool, 0.20 N (fast model (linear))")
     assert said[-1] == ""
 
 
@@ -246,6 +246,6 @@ def test_model_predicts_while_fem_solves(demo, monkeypatch):
     demo.wish.set(plays=False, number=9, deformer="fem")
     assert wait_for(lambda: not demo.run(0.3) and begun == [9])
     demo.wish.set(deformer="svr")
-    assert wait_for(lambda: demo.run(0.3) and "|trained model svr|" in report(demo)) and begun == [9]
+    assert wait_for(lambda: demo.run(0.3) and "|fast model (svr)|" in report(demo)) and begun == [9]
     solved.set()
-    assert wait_for(lambda: demo.run(0.3) and "|error against FEM: mean" in report(demo)) and begun == [9]
+    assert wait_for(lambda: demo.run(0.3) and "|difference from FEM: mean" in report(demo)) and begun == [9]

@@ -62,15 +62,15 @@ class TestCauses:
         words = format_acting(
             both.build_loads(theatre.site, Touch(force=0.2), 0.0), STILL, theatre.site.anatomy.mesh.nodes
         )
-        assert "force 0.20 N" in words and "gravity pulls to the back, fluid up to" in words
+        assert "force 0.20 N" in words and "gravity towards the back, CSF level" in words
         idle = format_acting(
             both.build_loads(theatre.site, Touch(force=0.0), 0.0), STILL, theatre.site.anatomy.mesh.nodes
         )
         assert "the tool does not push" in idle and "force" not in idle
         assert format_acting(Loads((), np.zeros(1)), STILL, height) == ""
         lying = build_posture(np.array([-3.0, 0.0, 4.0]), -0.012)
-        way = "gravity pulls to the crown (0.80) and the left (0.60), fluid up to "
-        assert format_acting(lying, STILL, height) == way + "62 % of the brain's height"
+        way = "gravity towards the crown, 37 deg left, CSF level "
+        assert format_acting(lying, STILL, height) == way + "62 %"
 
 
 class TestWithoutATool:
@@ -84,10 +84,7 @@ class TestWithoutATool:
             "scenes.play.scene_costs.draw_text_panel", lambda colour, text, **given: lines.extend(text) or colour
         )
         add_cost_label(frames[-1], "fem")
-        assert any(
-            re.search(r"to the left \(0.87\) and the back \(0.50\), fluid up to \d+ % of the brain's height", line)
-            for line in lines
-        )
+        assert any(re.search(r"towards the left, 30 deg back, CSF level \d+ %", line) for line in lines)
         assert not any("0.00 N" in line for line in lines)
 
     def test_it_can_be_checked(self, theatre, frames):
@@ -115,7 +112,7 @@ class TestWithoutATool:
                 set(demo.browser.inputs) == {"scene", "deformer", "overlay", "camera", "Gravity"}
                 and "tool" not in demo.browser.meshes
             )
-            assert wait_for(lambda: demo.run(0.3) and "gravity pulls" in demo.browser.shown[2])
+            assert wait_for(lambda: demo.run(0.3) and "gravity towards" in demo.browser.shown[2])
             assert "tip to tumour" not in demo.browser.shown[2]
         finally:
             demo.close()
@@ -135,8 +132,8 @@ class TestSwitches:
         assert {"ToolForce", "Gravity"} < set(page.inputs) and not {"Held", "Elasticity"} & set(page.inputs)
         assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in page.shown[2])
         visitor.set(page.inputs["Gravity"], False)
-        assert wait_for(lambda: demo.run(0.3) and "without gravity and fluid the tumour is" in page.shown[2])
-        said = float(page.shown[2].split("the tumour is ")[1].split(" mm")[0])
+        assert wait_for(lambda: demo.run(0.3) and "without gravity and fluid the tumour moves" in page.shown[2])
+        said = float(page.shown[2].split("the tumour moves ")[1].split(" mm")[0])
         scene, nodes = demo.stage.scene, theatre.anatomy.tumour_nodes
         plain, less = replace(theatre, models={}), remove_effect(scene, Gravity())
         one, other = (
@@ -148,7 +145,7 @@ class TestSwitches:
         )
         change = 1e3 * np.linalg.norm(one - other, axis=1).mean()
         assert change > 0.1 and said == pytest.approx(change, abs=0.02)
-        assert "gravity pulls" not in page.shown[2]
+        assert "gravity towards" not in page.shown[2]
         visitor.set(page.inputs["Gravity"], True)
         assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in page.shown[2])
         visitor.wire.close()

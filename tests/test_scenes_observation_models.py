@@ -20,10 +20,11 @@ from scenes.play.reference import solve_reference_frames
 from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.observation_models import PointObservation
-from scenes.script.scene import Bounds, find_scene
+from scenes.script.scene import Bounds
 from scenes.script.shipped_files import get_template_path
 from scenes.script.tool_paths import press
 from scenes.script.uncertainty import TumourError, Uncertainty
+from scenes.script.viewpoint import OBLIQUE_VIEWPOINT
 from sim.anatomy import PART_LABELS
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
@@ -44,7 +45,7 @@ def theatre(box, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene():
-    near = replace(find_scene("press").viewpoint, width=480, height=360)
+    near = replace(OBLIQUE_VIEWPOINT, width=480, height=360)
     return replace(small(path=press(0.3, rise=1.0, hold=0.5)), viewpoint=near, sight=SIGHT)
 
 
@@ -208,8 +209,8 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     assert said[1] == f"estimate: tumour moved {1e3 * found.moved:.2f} +- {off}"
     assert f"truth: {frame.deformation.source}" in said and f"estimate: {found.source}" in said
     assert said[-1].startswith("lines: ") and not any("tumour moved" in line for line in said[2:])
-    foot = f"estimate moved {format_millimetres(found.moved, found.location.p95)}"
-    assert f"truth moved {truth:.1f} mm; estimate" in frame.remark
+    foot = f"moved {format_millimetres(found.moved, found.location.p95)}"
+    assert f"simulated motion {truth:.1f} mm; estimate" in frame.remark
     assert all(
         has_text(frame.shown, line, TEXT_SCALE) for line in wrap_line(foot, MAX_BOTTOM_WIDTH * frame.shown.shape[1])
     )
@@ -220,7 +221,7 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
 
 def test_numbers_and_errors_come_before_explanations(play, frames):
     words = report(frames[1], play.stage, "fem", "", (), 100)
-    order = "by the estimate (truly", "converged", "Tumour position error", "<b>estimate</b> from", "frame "
+    order = "estimated tumour motion", "converged", "Tumour position error", "<b>estimate</b> from", "frame "
     places = [words.index(each) for each in order]
     assert places == sorted(places)
 
@@ -238,13 +239,13 @@ def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
 
 def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
     said = format_page_legend(play.scene)
-    assert all(words in said for words in ("estimate", "truth", "95 %", "scan", "tip to tumour"))
+    assert all(words in said for words in ("estimate", "simulated", "95 %", "scan", "tip to tumour"))
     assert "estimate" not in format_page_legend(replace(play.scene, sight=None))
     found = frames[1].estimate
     words = " ".join(describe_estimate(found))
-    assert f"error {1e3 * found.off:.1f} mm; the truth is inside the ellipsoid" in words
+    assert f"error {1e3 * found.off:.1f} mm; the simulated centre is inside the 95 % region" in words
     assert f"{len(found.observation.now)} points of the cortex, and where the tool touches; no force" in words
-    assert "outside of" in " ".join(describe_estimate(replace(found, true=np.ones(3))))
+    assert "is outside the" in " ".join(describe_estimate(replace(found, true=np.ones(3))))
 
 
 def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):

@@ -97,7 +97,7 @@ class TestPalpate:
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
         answer = replace(frame.deformation, reaction_bound=np.array([[0.012], [0.02]]), outcome=(Outcome.PREDICTED,))
-        assert format_acting(frame.loads, answer, NODES) == f"tool force {reads:.2f} N within 0.02 N (model)"
+        assert format_acting(frame.loads, answer, NODES) == f"tool force {reads:.2f} +- 0.02 N (surrogate)"
         far = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
         assert format_acting(frame.loads, far, NODES) == f"tool force {reads:.2f} N"
 

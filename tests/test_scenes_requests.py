@@ -150,20 +150,20 @@ def test_each_visitor_reads_who_has_the_tool(running):
     def read():
         return [row.line.content for _, row in sorted(page.crowd.rows.items())]
 
-    assert wait_for(lambda: len(read()) == 2 and all("script moves the tool; 2 visitors" in line for line in read()))
+    assert wait_for(lambda: len(read()) == 2 and all("Automatic playback; 2 visitors" in line for line in read()))
     one.set(page.inputs["force [N]"], 0.31)
-    assert wait_for(lambda: "**you hold the tool**" in read()[0] and "another visitor (number 1) holds" in read()[1])
+    assert wait_for(lambda: "**You control the tool**" in read()[0] and "Visitor 1 controls" in read()[1])
     other.set(page.crowd.rows[1].ask, True)
     assert wait_for(lambda: page.crowd.rows[0].give.visible)
     one.set(page.crowd.rows[0].give, True)
     assert wait_for(lambda: "You lead" in read()[1])
     other.set(page.inputs["place up [mm]"], 3.0)
-    assert wait_for(lambda: "another visitor (number 2) holds" in read()[0] and "**you hold" in read()[1])
+    assert wait_for(lambda: "Visitor 2 controls" in read()[0] and "**You control" in read()[1])
     other.wire.close()
     assert wait_for(lambda: read() == [describe_holder(1, 2, {1})])
-    assert "visitor 2 held the tool and has left" in read()[0]
+    assert "Visitor 2, who controlled the tool, has left" in read()[0]
     one.set(page.inputs["tool"], SCRIPT)
-    assert wait_for(lambda: read() == ["the script moves the tool"])
+    assert wait_for(lambda: read() == ["Automatic playback"])
     one.wire.close()
 
 

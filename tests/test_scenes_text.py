@@ -11,7 +11,6 @@ from scenes.page.text import (
     RESEARCH_ONLY,
     describe_fem,
     describe_scene,
-    describe_side_of_brain,
     format_caption,
     format_trust,
     plan_words,
@@ -41,10 +40,8 @@ class TestTrust:
         assert "Surrogate error" not in said and 'class="warn"' in said and "Do not rely on this result" in said
 
     def test_a_guarded_model_says_which_of_the_two_answered(self):
-        assert format_trust(answer(Outcome.PREDICTED), GUARDED).startswith(
-            "<p><b>trained model (guarded)</b>: inside the range"
-        )
-        assert "as the error bound of the model is too large</b>: converged" in format_trust(
+        assert format_trust(answer(Outcome.PREDICTED), GUARDED).startswith("<p><b>fast model</b>: inside the range")
+        assert "because the error bound of the fast model is too large</b>: converged" in format_trust(
             answer(Outcome.CONVERGED), GUARDED
         )
 
@@ -77,7 +74,7 @@ class TestWords:
     def test_it_says_what_is_seen_and_that_it_is_research(self, theatre):
         said = format_caption(theatre, short(), "the <default> brain")
         assert RESEARCH_ONLY in said and "&lt;default&gt;" in said and "<default>" not in said
-        assert "tumour now" in said and "tumour in the scan" in said and "tip to tumour" in said
+        assert "predicted tumour" in said and "tumour in the scan" in said and "tip to tumour" in said
         assert "tip to tumour" not in format_caption(theatre, sinking(), "brain")
 
     def test_tissue_and_element_are_those_that_are_solved(self, theatre):
@@ -94,7 +91,7 @@ class TestWords:
             "Young's modulus 1.8 kPa and Poisson's ratio 0.45; the tumour of neo-hookean tissue of Young's modulus "
             "3.2 kPa and Poisson's ratio 0.45"
         )
-        assert "brain.vtu, opened" in describe_scene(theatre, short(), "brain.vtu")
+        assert "Brain: brain.vtu; " in describe_scene(theatre, short(), "brain.vtu")
 
     def test_a_plan_is_a_list_and_only_finite_elements_have_one(self, theatre):
         assert plan_words(("First <this>.", "Then that.")) == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
@@ -102,13 +99,3 @@ class TestWords:
         scene = small("resection")
         assert plan_of(theatre.build_fem(scene, scene.accuracy)) == ()
         assert plan_of(theatre.build_fem(short(), LIVE)) == theatre.build_fem(short(), LIVE).plan.explain()
-
-    def test_the_side_is_the_patient_s(self, theatre):
-        site = theatre.site
-        middle = 0.5 * (site.anatomy.mesh.nodes[:, 0].min() + site.anatomy.mesh.nodes[:, 0].max())
-        at = [replace(site, origin=np.array([middle + x, 0.0, 0.0])) for x in (0.02, -0.02, 0.0)]
-        assert [describe_side_of_brain(place) for place in at] == [
-            "on the patient's right",
-            "on the patient's left",
-            "near the midline",
-        ]

@@ -26,7 +26,7 @@ def test_the_3d_view_follows(demo, theatre):
 def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
     """A hand moves the tool: what the finite elements said of the load before it is greyed until they answer anew."""
     demo.wish.set(plays=False, number=60)
-    assert wait_for(lambda: demo.run(0.3) and "|error against FEM: mean" in report(demo))
+    assert wait_for(lambda: demo.run(0.3) and "|difference from FEM: mean" in report(demo))
     assert "previous load" not in report(demo)
     tints = []
     monkeypatch.setattr(demo.browser, "tint", lambda name, colour: tints.append(colour))
@@ -36,8 +36,8 @@ def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
     demo.run(0.5)
     assert wait_for(lambda: "force 0.25 N" in report(demo))
     said = demo.browser.shown[2]
-    assert '<p class="stale">previous load: error against FEM' in said and "<p>error against FEM" not in said
+    assert '<p class="stale">previous load: difference from FEM' in said and "<p>difference from FEM" not in said
     assert tints[-1] == STALE_COLOUR and len(asked) == 1
     FemWorker.ask(demo.referee, *asked[0])
-    assert wait_for(lambda: demo.run(0.3) and "<p>error against FEM" in demo.browser.shown[2])
+    assert wait_for(lambda: demo.run(0.3) and "<p>difference from FEM" in demo.browser.shown[2])
     assert "previous load" not in report(demo) and tints[-1] == FEM_COLOUR

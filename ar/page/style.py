@@ -38,7 +38,7 @@ RULES = """
 #SAID { font-size: 0.88rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
 #SAID .stale { opacity: 0.5 }
 #SAID .warn { color: #ff922b; font-weight: 600 }
-#SAID .number { font-size: 1.25rem; font-weight: 600 }
+#PAGE .number, #SAID .number { font-size: 1.25rem; font-weight: 600 }
 #SAID table { border-collapse: collapse; font-size: 0.8rem; margin-bottom: 0.3rem }
 #SAID .best { font-weight: 700 }
 #SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
@@ -95,7 +95,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
   :root { --low: max(17vh, 7.6rem) }
   #SAID { font-size: 0.8rem; line-height: 1.24 }
   #SAID p { margin-bottom: 0.15rem }
-  #SAID .number { font-size: 1.1rem }
+  #PAGE .number, #SAID .number { font-size: 1.1rem }
 }
 @media (min-width: 36.01em) and (max-aspect-ratio: 13/10) {
   :root { --low: max(25vh, 9rem) }

@@ -72,10 +72,10 @@ def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: s
         return f'<p class="stale">{escape(waits)}</p>'
     said = own
     if judged.mean is not None and judged.largest is not None:
-        said = f"error against FEM: mean {1e3 * judged.mean:.3f}, largest {1e3 * judged.largest:.3f} mm"
+        said = f"difference from FEM: mean {1e3 * judged.mean:.3f}, maximum {1e3 * judged.largest:.3f} mm"
     tip = "" if judged.distance is None else f"tip to tumour {format_millimetres(judged.distance)}, "
-    tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm by FEM, without the error of the tumour"
-    tail += f" (frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
+    tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm (FEM, without its position error"
+    tail += f"; frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
     tail += f", {judged.doubt})" if judged.doubt else ")"
     if stale:
         return f'<p class="stale">previous load: {said}; {tail}. {escape(waits)}</p>'
@@ -87,9 +87,7 @@ def describe_change(truth: FemResult, player: Player, shown: Deformation, off: S
     nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
     apart = truth.deformation.restrict(nodes).displacement[0] - shown.restrict(nodes).displacement[0]
     mean = 1e3 * float(np.linalg.norm(apart, axis=1).mean())
-    return (
-        f"<p>without {escape(', '.join(off))} the tumour is {mean:.2f} mm from where all effects together have it</p>"
-    )
+    return f"<p>without {escape(', '.join(off))} the tumour moves {mean:.2f} mm differently</p>"
 
 
 @dataclass

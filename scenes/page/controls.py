@@ -19,7 +19,7 @@ from ..script.scene import SCENES, Scene
 from ..script.tool_paths import IDLE_HEIGHT, Touch
 from .requests import HAND, SCRIPT, Requests
 from .side_panels import TIP, TUMOUR_MIDDLE
-from .text import describe_effect
+from .text import describe_deformer, describe_effect
 
 MAX_FORCE = 0.4  # End of the force slider [N].
 MAX_DEPTH = 8.0  # End of the depth slider [mm].
@@ -37,7 +37,7 @@ OWN_VIDEO_NOTE = (  # Text of that note.
     "<p>A camera's number instead of the video selects that camera. <code>sulcus film palpate --out film</code> makes "
     "a test video. <code>sulcus overlay --help</code> lists the command that makes each file.</p>"
 )
-MANUAL_HINT = "A slider takes the tool in your hand; 'script' gives it back."  # Hint on manual control.
+MANUAL_HINT = "Moving a slider switches to manual control; automatic returns to the script."  # Hint on manual control.
 
 
 def build_controls(
@@ -61,20 +61,21 @@ def build_controls(
         Toggle(effect, True, partial(wish.switch, effect), describe_effect(effect), "switch this effect on or off")
         for effect in list_switchable_effects(scene, site)
     )
+    models = {describe_deformer(name): name for name in names}
     slices = build_slice_control(wish.through, lambda name: wish.set(through=name))
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
     return [
-        Dropdown("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what happens to the brain"),
+        Dropdown("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what deforms the brain"),
         Dropdown(
             "deformer",
-            names,
-            wish.deformer,
-            lambda name: wish.set(deformer=name),
+            tuple(models),
+            describe_deformer(wish.deformer),
+            lambda words: wish.set(deformer=models[words]),
             "model",
-            "fem: finite elements, solved each time; the others: models that were trained on them",
+            "FEM solves every load; the fast models were trained on FEM",
         ),
         add_overlay_controls(wish.style, lambda style: wish.set(style=style)),
-        Dropdown("camera", cameras, wish.path or cameras[0], film, hint="how the camera moves"),
+        Dropdown("camera", cameras, wish.path or cameras[0], film, hint="motion of the camera"),
         *([] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]),
         *([Fold("physics effects (on/off)", switches)] if switches else []),
         Note(PLAN),
@@ -90,7 +91,7 @@ def add_overlay_controls(now: Style, choose: Callable[[Style], None]) -> Dropdow
         tuple(styles),
         STYLES[now],
         lambda words: choose(styles[words]),
-        hint="how it is drawn",
+        hint="style of the overlay",
         key=STYLE_KEY,
     )
 

@@ -10,7 +10,7 @@ from ar.overlay.styles import Style
 
 from ..script.tool_paths import Touch
 
-SCRIPT, HAND = "script", "hand"  # Control of the tool: scripted, manual.
+SCRIPT, HAND = "automatic", "manual"  # Control of the tool: scripted, manual.
 
 
 @dataclass
@@ -91,12 +91,12 @@ def describe_holder(visitor: int, holder: int | None, here: Collection[int]) -> 
         Numbers of the connected clients.
     """
     if holder is None:
-        held = "the script moves the tool"
+        held = "Automatic playback"
     elif holder == visitor:
-        held = "**you hold the tool**"
+        held = "**You control the tool**"
     elif holder in here:
-        held = f"another visitor (number {holder}) holds the tool"
+        held = f"Visitor {holder} controls the tool"
     else:
-        held = f"visitor {holder} held the tool and has left: it stays where it was put"
+        held = f"Visitor {holder}, who controlled the tool, has left: it stays in place"
     many = len(here)
-    return held if many < 2 else f"{held}; {many} visitors look, you are number {visitor}"
+    return held if many < 2 else f"{held}; {many} visitors, you are number {visitor}"

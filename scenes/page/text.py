@@ -9,6 +9,7 @@ import numpy as np
 
 from ar.overlay import hud
 from sim.anatomy import name_region
+from sim.bodies.lobes import describe_location
 from sim.deformation import Deformation, Outcome
 from sim.material import Material, Tissue
 
@@ -16,22 +17,19 @@ from ..play.deformers import GUARDED, PatientSetup
 from ..play.observer import ELLIPSOID_COLOUR, TumourEstimate
 from ..play.player import Frame, is_undeformed
 from ..play.stage import TRUTH_COLOUR, TUMOUR_COLOUR, Stage
-from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
 from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
 from .comparison import ComparisonRow
 
 IMAGE_EXPLANATION = (  # Explanation of the image.
-    "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; "
-    "the green outline shows where it is computed to be now, while the tissue moves."
+    "The tumour is hidden under the cortex: the green outline shows its predicted position while the tissue moves."
 )
 ESTIMATE_EXPLANATION = (  # Explanation of the image where the motion is estimated from the cortex.
-    "What you see: the view of a surgical camera on the open brain. The tumour is hidden under the cortex; the green "
-    "outline shows where it is estimated to be, from the dots on the cortex alone. No force and no stiffness is known."
+    "The tumour is hidden under the cortex: the green outline shows its position as estimated from the dots on the "
+    "cortex alone. No force and no stiffness is known."
 )
 RESEARCH_ONLY = "Research only. Not a medical device."  # Restriction of use.
-MIDLINE_DISTANCE = 5e-3  # Distance from the midline below which a tumour has no side [m].
 # Names of finite elements for users.
 ELEMENTS = {"p1": "linear tetrahedra", "p2": "quadratic tetrahedra", "smoothed": "smoothed linear tetrahedra"}
 EFFECTS = {
@@ -57,7 +55,8 @@ def format_caption(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
     title = " ".join(scene.title.split())
     seen = IMAGE_EXPLANATION if scene.sight is None else ESTIMATE_EXPLANATION
     return (
-        f"<p>{seen} <b>{RESEARCH_ONLY}</b></p><p>Scene: {escape(title)}</p>{format_page_legend(scene)}"
+        f'<p class="number">Simulation: {describe_location(theatre.anatomy)} tumour</p>'
+        f"<p>{escape(title)} {seen} <b>{RESEARCH_ONLY}</b></p>{format_page_legend(scene)}"
         f'<p class="dim">{escape(describe_scene(theatre, scene, anatomy))}</p>'
     )
 
@@ -68,17 +67,17 @@ def format_page_legend(scene: Scene) -> str:
     now, true, ellipsoid = (to_stroke(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
     under = (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone")
     keys = [
-        (f'{now} stroke-width="3"', "tumour now (predicted)"),
+        (f'{now} stroke-width="3"', "predicted tumour"),
         under,
         (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "95 % error band"),
         scan,
-        (f'{true} stroke-width="1.5"', "finite elements (3-D view)"),
+        (f'{true} stroke-width="1.5"', "FEM reference (3-D view)"),
     ]
     if scene.sight is not None:
         keys = [
-            (f'{now} stroke-width="3"', "tumour now (estimate)"),
+            (f'{now} stroke-width="3"', "estimated tumour"),
             under,
-            (f'{true} stroke-width="2" stroke-dasharray="8 3"', "tumour now (truth: finite elements)"),
+            (f'{true} stroke-width="2" stroke-dasharray="8 3"', "simulated tumour (FEM)"),
             (f'{ellipsoid} stroke-width="2" stroke-dasharray="5 3"', "95 % region of the tumour centre"),
             scan,
         ]
@@ -104,18 +103,7 @@ def to_stroke(colour: Sequence[float]) -> str:
 def describe_scene(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
     """Describe the anatomy, the side, and the tissue of the FEM model."""
     mesh = theatre.anatomy.mesh
-    return (
-        f"Brain: {anatomy}, opened {describe_side_of_brain(theatre.site)}; {len(mesh.nodes)} mesh points. "
-        "Finite elements: "
-        f"{describe_fem(theatre, scene)}."
-    )
-
-
-def describe_side_of_brain(site: CraniotomyFrame) -> str:
-    """Describe the side of the opening, relative to the middle of the brain's width."""
-    nodes = site.anatomy.mesh.nodes[:, 0]
-    off = float(site.origin[0] - 0.5 * (nodes.min() + nodes.max()))
-    return "near the midline" if abs(off) < MIDLINE_DISTANCE else f"on the patient's {'right' if off > 0.0 else 'left'}"
+    return f"Brain: {anatomy}; {len(mesh.nodes)} mesh points. FEM: {describe_fem(theatre, scene)}."
 
 
 def describe_fem(theatre: PatientSetup, scene: Scene) -> str:
@@ -141,8 +129,8 @@ def describe_tissue(tissue: Tissue | None) -> str:
 def describe_deformer(name: str) -> str:
     """Describe a deformer."""
     if name == GUARDED:
-        return "best trained model; finite elements if its error bound is too large"
-    return "finite elements" if name == "fem" else f"trained model {name}"
+        return "fast model with FEM check"
+    return "FEM (reference)" if name == "fem" else f"fast model ({name})"
 
 
 def describe_work(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
@@ -190,7 +178,7 @@ def format_trust(answer: Deformation, name: str) -> str:
 def _describe_guarded(outcome: Outcome) -> str:
     """Describe which of the two computed the solution of a guarded model."""
     by_model = outcome in (Outcome.PREDICTED, Outcome.EXTRAPOLATED)
-    return "trained model (guarded)" if by_model else "finite elements, as the error bound of the model is too large"
+    return "fast model" if by_model else "FEM, because the error bound of the fast model is too large"
 
 
 def format_tumour_trust(error: TumourError) -> str:
@@ -239,37 +227,37 @@ def report(
         parts.append(f"<p>{len(left.loose)} loose elements were removed with the resection.</p>")
     spent = {"deform": "deformation", "render": "rendering", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    return "".join([*parts, verdict, format_cost_table(rows), f'<p class="dim">milliseconds: {took}</p>'])
+    return "".join([*parts, verdict, format_cost_table(rows), f'<p class="dim">time [ms]: {took}</p>'])
 
 
 def format_motion(frame: Frame) -> str:
     """Describe the tumour's displacement with its errors: of the model, and of the tumour in the patient."""
-    said = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' by the estimate'}"
+    said = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' (estimate)'}"
     if frame.moved_error is not None:
-        off = f"error of the tumour {hud.bound_words(frame.moved_error, 1)}"
+        off = f"tumour position error {hud.bound_words(frame.moved_error, 1)}"
     else:
-        off = f"error of the {'answer' if frame.doubt else 'tumour'} not known"
+        off = f"{'error' if frame.doubt else 'tumour position error'} not known"
     if frame.model_error is not None and frame.estimate is None:
-        off = f"error of the model {hud.bound_words(frame.model_error, 2)}, {off}"
+        off = f"surrogate error {hud.bound_words(frame.model_error, 2)}, {off}"
     return f"{said} ({off})"
 
 
 def describe_estimate(found: TumourEstimate) -> list[str]:
     """Describe an estimate, its error and its input; or the reason of its rejection."""
-    truth = f"truly {format_unbroken(found.truly)}"
+    truth = f"simulated (FEM): {format_unbroken(found.truly)}"
     if found.location is None:
         return [
             f'<p class="number">tumour position unknown ({truth})</p>',
             f'<p class="warn">Observation rejected: {escape(found.refusal)}</p>',
         ]
     moved = format_unbroken(found.moved, found.location.p95)
-    held = "inside" if found.held else "outside of"
+    held = "inside" if found.held else "outside"
     guess = f" {found.location.doubt}" if found.location.doubt else ""
     still = "" if found.noticed else " No significant motion detected."
     return [
-        f'<p class="number">tumour moved {moved} by the estimate ({truth})</p>',
-        f"<p><b>estimate</b> from {escape(found.source)}: error {1e3 * found.off:.1f} mm; the truth is {held} the "
-        f"ellipsoid. Causes: {found.location.named_causes}.{still}{guess}</p>",
+        f'<p class="number">estimated tumour motion {moved} ({truth})</p>',
+        f"<p><b>estimate</b> from {escape(found.source)}: error {1e3 * found.off:.1f} mm; the simulated centre is "
+        f"{held} the 95 % region. Causes: {found.location.named_causes}.{still}{guess}</p>",
     ]
 
 
@@ -278,8 +266,9 @@ def format_tip_distance(distance: float, error: float | None, inside: bool) -> s
 
     None: not known.
     """
-    what = "tip inside the tumour, its edge" if inside else "tip to tumour"
-    return f'<p class="number">{what} {format_unbroken(distance, error)}</p>'
+    said = format_unbroken(distance, error)
+    what = f"tip inside the tumour, {said} below its surface" if inside else f"tip to tumour {said}"
+    return f'<p class="number">{what}</p>'
 
 
 def format_unbroken(length: float, error: float | None = None) -> str:

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ar.overlay.hud import bound_words, round_up
+from ar.overlay.composite import Overlaid
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, bound_words, lay, round_up, wrap_line
 from sim.deformation import Deformation, Outcome
 from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touching
 
@@ -49,34 +50,33 @@ def _describe_cause(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str
         case Pushed():
             return f"force {np.linalg.norm(cause.force[0]):.2f} N" if cause.force[0].any() else "the tool does not push"
         case Posture():
-            return f"gravity pulls to the {_name_direction(cause.direction[0])}, {_describe_fluid(cause, nodes)}"
+            return f"gravity towards the {_name_direction(cause.direction[0])}, {_describe_fluid(cause, nodes)}"
         case Resected():
             steps = round(float(cause.done[0]))
             return f"resection: {steps} step{'' if steps == 1 else 's'} done"
         case Touching() | Retracted() if answer.reaction.shape[1]:  # some trained models do not predict it
             bound = float(answer.reaction_bound[0, 0])
             known = answer.outcome[0].good and np.isfinite(bound)
-            within = f" within {round_up(bound, 2):.2f} N (model)" if known else ""
-            return f"tool force {np.linalg.norm(answer.reaction[0, -1, :3]):.2f} N{within}"
+            within = f" +- {round_up(bound, 2):.2f} N (surrogate)" if known else " N"
+            return f"tool force {np.linalg.norm(answer.reaction[0, -1, :3]):.2f}{within}"
         case _:
             return ""
 
 
 def _name_direction(direction: np.ndarray) -> str:
-    """Name the RAS directions of a vector (3,), largest component first, with the components if there are several."""
+    """Name the RAS directions of a vector (3,): the main one, and the angles to the others, as "back, 30 deg left"."""
     down = direction / np.linalg.norm(direction)
     axes = [axis for axis in np.argsort(-np.abs(down), kind="stable") if abs(down[axis]) > MIN_NAMED_COMPONENT]
     names = [SIDES[axis][int(down[axis] < 0.0)] for axis in axes]
-    if len(axes) == 1:
-        return names[0]
-    return " and the ".join(f"{name} ({abs(down[axis]):.2f})" for name, axis in zip(names, axes, strict=True))
+    angles = np.degrees(np.arcsin(np.abs(down[axes])))
+    return "".join([names[0], *(f", {each:.0f} deg {name}" for name, each in zip(names[1:], angles[1:], strict=True))])
 
 
 def _describe_fluid(cause: Posture, nodes: np.ndarray) -> str:
     """Describe the fluid level as a share of the brain's height."""
     height = -nodes @ (cause.direction[0] / np.linalg.norm(cause.direction[0]))
     share = float(np.clip((cause.csf_level[0] - height.min()) / np.ptp(height), 0.0, 1.0))
-    return f"fluid up to {100.0 * share:.0f} % of the brain's height"
+    return f"CSF level {100.0 * share:.0f} %"
 
 
 def shorten_source(source: str) -> str:
@@ -140,3 +140,15 @@ def find_worst(errors: Sequence[TumourError]) -> TumourError:
     if len(known) < len(errors) or not known:
         return TumourError(None)
     return max(known, key=lambda error: error.bound or 0.0)
+
+
+def annotate(over: Overlaid, number: int, remark: str) -> None:
+    """Write a remark at the bottom of a composite image and a frame's number, in place."""
+    height, width = over.taken.shape
+    lay(over.colour, over.taken, wrap_line(remark, MAX_BOTTOM_WIDTH * width), (0, height))
+    lay(over.colour, over.taken, label_frame(number), (width, height))
+
+
+def label_frame(number: int) -> list[str]:
+    """Return the lines that label an image: that it is simulated, and its frame number."""
+    return ["simulation", f"frame {number}"]

@@ -24,6 +24,7 @@ from sim.geometry.surface import is_enclosing
 from surrogate.locating.prior import compute_middle
 from surrogate.model.guarded import find_first_model
 
+from .frame_text import label_frame
 from .player import TRUE_STROKES, Frame, Player
 from .stage import ESTIMATED_LINES, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 
@@ -107,7 +108,8 @@ def _is_ground_labelled(frame: Frame, mask: np.ndarray) -> bool:
 
 def has_printed_numbers(player: Player, frame: Frame) -> bool:
     """Return True if the image shows the frame number, the distance from tip to tumour, and the estimate."""
-    if not has_text(frame.shown, f"frame {frame.number}", TEXT_SCALE) or not _estimate_printed(player, frame):
+    labelled = all(has_text(frame.shown, line, TEXT_SCALE) for line in label_frame(frame.number))
+    if not labelled or not _estimate_printed(player, frame):
         return False
     return frame.tip is None or _find_number(player, frame, frame.tip) is not None
 

@@ -116,9 +116,8 @@ class TumourEstimate:
             return ""
         still = "" if self.noticed else "no significant motion detected; "
         guess = "" if self.location.calibrated else "rough estimate; "
-        return (
-            f"{still}{guess}truth moved {format_millimetres(self.truly)}; estimate error {format_millimetres(self.off)}"
-        )
+        motion, error = format_millimetres(self.truly), format_millimetres(self.off)
+        return f"{still}{guess}simulated motion {motion}; estimate error {error}"
 
     @property
     def source(self) -> str:

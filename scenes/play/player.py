@@ -12,7 +12,6 @@ import numpy as np
 from ar.optics.camera import Camera
 from ar.overlay.composite import Overlaid, composite, draw_points, format_head_lines
 from ar.overlay.gauge import Gauge
-from ar.overlay.hud import MAX_BOTTOM_WIDTH, lay, wrap_line
 from ar.overlay.legend import LegendNames
 from ar.overlay.marks import Cover, Marks, Trace, Words
 from ar.overlay.styles import Style
@@ -34,9 +33,9 @@ from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, compute_lift
 from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
 from .cortex_layers import COTTON, GLOVE
-from .frame_text import describe_outcome, format_acting, format_errors
+from .frame_text import annotate, describe_outcome, format_acting, format_errors
 from .observer import TumourEstimate
-from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, TOOL, Stage
+from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, SIMULATED, TOOL, Stage
 from .tip_reading import read_tip_distance
 
 REJECTED_WARNING = "observation rejected, and the scan is shown: do not rely on it"  # Warning in the image.
@@ -383,17 +382,10 @@ def get_legend_names(estimate: TumourEstimate | None) -> LegendNames:
     """Return the names of the lines of an image; a rejected estimate has no ellipsoid."""
     if estimate is None:
         return PREDICTED_LINES
-    return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, traces=("truth",))
+    return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, traces=(SIMULATED,))
 
 
 def measure_gauge(tip: np.ndarray, hidden: Layer) -> Gauge:
     """From a tip (3,) [m] to the nearest point of a hidden surface, and whether it is inside."""
     corners = hidden.vertices[hidden.triangles]
     return Gauge(tip, find_closest_points(tip[None], corners).point[0], inside=is_enclosing(corners, tip))
-
-
-def annotate(over: Overlaid, number: int, remark: str) -> None:
-    """Write a remark at the bottom of a composite image and a frame's number, in place."""
-    height, width = over.taken.shape
-    lay(over.colour, over.taken, wrap_line(remark, MAX_BOTTOM_WIDTH * width), (0, height))
-    lay(over.colour, over.taken, [f"frame {number}"], (width, height))

@@ -15,7 +15,7 @@ from .stage import DRAPE, TOOL
 
 RENDERED_FRAMES = 8  # Number of frames rendered of each scene, evenly spaced; the first loads kernels and is not timed.
 IMAGE_SIZE = (480, 360)  # Width and height of an image of the sheet [pixel].
-LINE_LEGEND = "green estimate, pink truth, blue 95 % of its middle"
+LINE_LEGEND = "green estimate, pink simulated (FEM), blue 95 % of its centre"
 """Legend of the lines drawn with an estimate."""
 
 

@@ -20,6 +20,7 @@ from sim.effects import SkullContact
 from sim.loads import Loads, Resected
 
 from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
+from ..script.framing import DRAPE_HEIGHT
 from ..script.observation_models import StereoObservation
 from ..script.scene import Scene
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
@@ -41,9 +42,12 @@ DARK_SHARES = (0.33, 0.16, 0.17)  # Share of the cortex colour (RGB) that the sc
 RELIEF_DEPTH = 1.5e-3  # Depth of black below white [m].
 OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
 """Layer through which the tumour is seen, and text for the occluders."""
+SIMULATED = "simulated (FEM)"  # Name of the line of the tumour computed by FEM.
 # Names of the lines in an image of a prediction.
-PREDICTED_LINES = LegendNames("predicted tumour", "its error, 95 %", "in the scan")
-ESTIMATED_LINES = LegendNames("estimated tumour", "", "in the scan", ("95 % of its middle", "truth"), "estimate moved")
+PREDICTED_LINES = LegendNames("predicted tumour", "95 % error band", "in the scan")
+ESTIMATED_LINES = LegendNames(
+    "estimated tumour", "", "in the scan", ("95 % of its centre", SIMULATED), "estimate moved"
+)
 """Names of the lines in an image of a prediction, and in one of an estimate."""
 READING_DEPTH = (
     2.0e-3  # Depth under the surface at which the scan is read [m]: the edge of grey matter mixes with fluid.
@@ -51,7 +55,6 @@ READING_DEPTH = (
 RIM_DISTANCE = (
     10e-3  # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
 )
-DRAPE_HEIGHT = 3.0e-3  # Height of the drape above the brain [m].
 DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
 DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 
