@@ -14,7 +14,7 @@ from scenes.script.head_pose import HeadPose
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.tool import Probe
 from scenes.script.tool_paths import IDLE_HEIGHT, Touch, compute_lift
-from scenes.script.viewpoint import TARGET_DEPTH, Viewpoint
+from scenes.script.viewpoint import OBLIQUE_VIEWPOINT, TARGET_DEPTH, Viewpoint
 from sim.compile import check_causes
 from sim.errors import InputError
 from surrogate.data.cortex_patch import open_patch
@@ -126,7 +126,7 @@ class TestTool:
 
 class TestCamera:
     def test_looks_at_the_open_cortex_from_outside(self, site):
-        camera = Viewpoint().build_camera(site)
+        camera = OBLIQUE_VIEWPOINT.build_camera(site)
         assert (camera.centre - site.origin) @ site.axis < -0.1
         middle = project_cv2(camera, (site.origin + TARGET_DEPTH * site.axis)[None])[0]
         assert np.allclose(middle, [319.5, 239.5], atol=1e-6)

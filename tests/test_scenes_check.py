@@ -14,7 +14,8 @@ from ar.overlay.marks import Cover, Marks
 from ar.rendering.renderer import Picture
 from scenes.cli import main
 from scenes.play.checks import SceneFigures, measure
-from scenes.play.player import annotate, measure_gauge
+from scenes.play.frame_text import annotate
+from scenes.play.player import measure_gauge
 from scenes.play.reference import solve_reference_frames
 from scenes.play.stage import OPENING, TOOL
 from scenes.script.scene import SCENES, Bounds, find_scene
@@ -22,7 +23,8 @@ from scenes.script.tool_paths import press
 from sim.deformation import Outcome
 
 GOOD = SceneFigures(
-    overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, drawn=0.5, printed=True, labelled=True, honest=True,
+    overlap=0.99, error_mm=0.1, motion_mm=1.0, pixels=1e-9, drawn=0.5, printed=True, labelled=True, visible=0.9,
+    honest=True,
     finite=True, answered=True, in_step=True, leaked=0.0, bond=0.1, covered=0.95, removed=0.5,
 )  # fmt: skip
 SENTENCES = {
@@ -33,6 +35,7 @@ SENTENCES = {
     "drawn": (2.5, "the drawn outline is 2.5 pixels off, more than 2"),
     "printed": (False, "does not show its frame number"),
     "labelled": (False, "cut off, or far from the tip"),
+    "visible": (0.4, "40% of it is visible, less than 50%"),
     "honest": (False, "as if it were visible"),
     "finite": (False, "not finite"),
     "answered": (False, "solution is not good"),

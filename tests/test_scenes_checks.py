@@ -15,11 +15,13 @@ from ar.overlay.styles import STYLES
 from scenes.cli import main
 from scenes.play.checks import measure
 from scenes.play.deformers import open_theatre
+from scenes.play.frame_text import annotate
 from scenes.play.observer import ELLIPSOID_COLOUR
-from scenes.play.player import annotate, measure_gauge
+from scenes.play.player import measure_gauge
 from scenes.play.scene_costs import add_cost_label
 from scenes.play.stage import CORTEX_COLOUR, DRAPE, DRAPE_COLOUR, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
+from scenes.script.viewpoint import OBLIQUE_VIEWPOINT
 from sim.geometry.surface import is_enclosing
 
 LINES = {
@@ -69,7 +71,7 @@ def test_line_colours_are_distinct_for_colour_blind_eyes(eye):
 def player(size, style="window"):
     theatre = open_theatre(device="cpu")
     scene = find_scene("press")
-    scene = replace(scene, viewpoint=replace(scene.viewpoint, width=size[0], height=size[1]))
+    scene = replace(scene, viewpoint=replace(OBLIQUE_VIEWPOINT, width=size[0], height=size[1]))
     return replace(theatre.build_player("series-gp", scene), style=style)
 
 

@@ -16,11 +16,12 @@ from scenes.play.reference import solve_reference_frames
 from scenes.script.camera_paths import PATHS, Focus, Microscope
 from scenes.script.scene import Bounds
 from scenes.script.tool_paths import press
+from scenes.script.viewpoint import OBLIQUE_VIEWPOINT
 
 
 def filmed(theatre, name="fem", **view):
     scene = small(path=press(0.2, hold=0.5))
-    return player(theatre, replace(scene, viewpoint=replace(scene.viewpoint.calibrate(REAL), **view)), name)
+    return player(theatre, replace(scene, viewpoint=replace(OBLIQUE_VIEWPOINT.calibrate(REAL), **view)), name)
 
 
 def by_opencv(camera, points):

@@ -147,7 +147,7 @@ class TestRefusals:
     def test_swapped_eyes(self, observer, shot, rest):
         assert "which is which" in self.refusal(observer, replace(shot, cameras=shot.cameras[::-1]))
         later = self.refusal(observer, replace(shot, pictures=shot.pictures[::-1]))
-        assert "check that eyes are not swapped" in later or "places of the cortex" in later
+        assert "check that eyes are not swapped" in later or "calibrate the pair again" in later
         swapped = observer_of()
         first = swapped.render_pair(-1, rest)
         vars(swapped)["_first_shot"] = replace(first, pictures=first.pictures[::-1])

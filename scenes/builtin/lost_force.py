@@ -1,7 +1,5 @@
 """A tool presses with unknown force. The tumour position is estimated from the tool pose and the cortex."""
 
-import numpy as np
-
 from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.material import Material
@@ -23,7 +21,7 @@ SCENE = Scene(
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Bonded(), ToolForce()),
     sight=PointObservation(),
-    viewpoint=Viewpoint(fov=np.radians(13.0), width=800, height=600),
+    viewpoint=Viewpoint(width=800, height=600),
     # The tumour moves little more than the rigid error: in four frames 43 % of the motion is removed.
     bounds=Bounds(overlap=0.75, error=2e-3, removed=0.3),
 )

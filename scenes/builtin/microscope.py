@@ -1,7 +1,5 @@
 """Under a microscope the brain sinks and a tool presses; the tumour position is estimated from its images alone."""
 
-import numpy as np
-
 from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity, Gravity, Held, Slide, ToolForce
 from sim.material import Material
@@ -34,6 +32,6 @@ SCENE = Scene(
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),
     lying=build_drainage(2.0, to=0.2),
     sight=StereoObservation(),
-    viewpoint=Viewpoint(distance=0.3, tilt=-0.4, fov=np.radians(9.0), width=800, height=600, eye="left", field=1.0),
+    viewpoint=Viewpoint(width=800, height=600, eye="left", field=1.0),
     bounds=Bounds(overlap=0.7, error=3e-3, drawn=2.5, removed=0.5),
 )

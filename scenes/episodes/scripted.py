@@ -117,13 +117,14 @@ def _build_viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int,
     random = build_generator(seed, number, "look.camera")
     width, height = contents.size
     path = None if look["path"] == FIXED else PATHS[look["path"]](int(random.integers(2**31)))
+    field = float(np.radians(look["fov_deg"]))
     view = Viewpoint(
-        1e-3 * look["distance_mm"], float(np.radians(look["tilt_deg"])), float(np.radians(look["fov_deg"])),
-        width, height, path=path, eye="left" if random.random() < look["stereo"] else None,
+        1e-3 * look["distance_mm"], float(np.radians(look["tilt_deg"])), field, width, height, path=path,
+        eye="left" if random.random() < look["stereo"] else None,
     )  # fmt: skip
     if look["bent"] == 0.0:
         return view
-    focal = 0.5 * height / np.tan(0.5 * view.fov)
+    focal = 0.5 * height / np.tan(0.5 * field)
     # Distortion at the image corners, relative to half its diagonal, for any field of view.
     corner = float(np.hypot(width, height) / (2.0 * focal)) ** 2
     bent = look["bent"] / corner

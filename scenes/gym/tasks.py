@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from sim.material import MATERIALS
 from ..script.debulking import Debulking
 from ..script.scene import Scene
 from ..script.tool import Blade, Instrument, Probe
-from ..script.viewpoint import Viewpoint
+from ..script.viewpoint import OBLIQUE_VIEWPOINT
 
 STEP_SECONDS = 0.05
 """Duration of a step [s]."""
@@ -99,7 +99,7 @@ class GymTask:
 
     def build_scene(self, size: tuple[int, int]) -> Scene:
         """Return the scene of the task, with images of a width and height [pixel]."""
-        view = Viewpoint(width=size[0], height=size[1])
+        view = replace(OBLIQUE_VIEWPOINT, width=size[0], height=size[1])
         if self.cuts:
             effects = Elasticity(MATERIALS["drained"].tissue), Held(), SkullContact(), Gravity()
             return Scene(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 # Names of camera paths. Repeated here, so that a command's help does not import cameras.
 PATHS = ("hand-held", "microscope", "orbit")
+MAX_TILT = 75.0  # Largest tilt of the line of sight [deg].
 
 
 def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None:
@@ -32,6 +34,14 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
         metavar="WxH",
         help="scale the calibration of --camera to images of this size [pixel]",
     )
+    group.add_argument(
+        "--tilt",
+        type=float,
+        metavar="DEG",
+        help="angle of the line of sight to the axis of the craniotomy (default: the most oblique view of the tumour "
+        "through the craniotomy)",
+    )
+    group.add_argument("--distance", type=float, metavar="MM", help="distance of the camera (default: 300)")
     group.add_argument("--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})")
     group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
@@ -51,7 +61,8 @@ def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
     Raises
     ------
     InputError
-        See `read_calibration`; a size without a calibration, or of another shape; see also `HandHeld`.
+        See `read_calibration`; a size without a calibration, or of another shape; a tilt outside -75 to 75 degrees; a
+        distance outside 50 to 1000 mm; see also `HandHeld`.
     """
     from ..script.camera_paths import PATHS as MADE
     from ..tracked.calibration_file import read_calibration
@@ -67,6 +78,14 @@ def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
         view = view.calibrate(calibration)
     elif args.size is not None:
         raise InputError("--size scales the calibration of --camera: give both, or neither.")
+    if args.tilt is not None:
+        if not -MAX_TILT <= args.tilt <= MAX_TILT:
+            raise InputError(f"--tilt is {args.tilt:g}: give an angle from {-MAX_TILT:g} to {MAX_TILT:g} degrees.")
+        view = replace(view, tilt=-math.radians(args.tilt))
+    if args.distance is not None:
+        if not 50.0 <= args.distance <= 1000.0:
+            raise InputError(f"--distance is {args.distance:g}: give 50 to 1000 mm.")
+        view = replace(view, distance=1e-3 * args.distance)
     if args.path is not None:
         view = replace(view, path=MADE[args.path](args.path_seed))
     if args.eye is not None:

@@ -23,6 +23,7 @@ from .image_checks import (
     render_silhouette,
 )
 from .player import Frame, Player
+from .stage import DRAPE
 
 STILL_SHARE = 0.25  # Share of its largest motion below which the tumour counts as still.
 WORST_MISS = 0.0, np.inf, np.inf, np.inf, False
@@ -48,6 +49,8 @@ class SceneFigures:
     printed, labelled
         True if the image shows the frame number and the distance from tip to tumour as they are computed here; true if
         that distance is completely visible near the tip.
+    visible
+        Smallest share of the tumour's silhouette that drape and bone leave visible.
     honest
         True if occluded parts are drawn as a broken outline without shading, and the image names the occluder.
     finite, answered
@@ -74,6 +77,7 @@ class SceneFigures:
     drawn: float
     printed: bool
     labelled: bool
+    visible: float
     honest: bool
     finite: bool
     answered: bool
@@ -93,6 +97,8 @@ class SceneFigures:
             f"the drawn outline is {self.drawn:.1f} pixels off, more than {bounds.drawn:g}": self.drawn <= bounds.drawn,
             "an image does not show its frame number or the distance to the tumour": self.printed,
             "the distance to the tumour is cut off, or far from the tip": self.labelled,
+            f"drape and bone cover the tumour: {self.visible:.0%} of it is visible, less than {bounds.visible:.0%}; "
+            "choose another --tilt": not self.visible < bounds.visible,
             "what the drape or bone covers is drawn as if it were visible, or the image does not say so": self.honest,
             "the tumour never moves: nothing was shown": self.motion_mm > 0.0,
             "a number is not finite": self.finite,
@@ -140,6 +146,7 @@ def measure(
         drawn=max(drawn),
         printed=all(good and has_printed_numbers(player, frame) for good, frame in zip(finite, frames, strict=True)),
         labelled=all(good and has_distance_at_tip(player, frame) for good, frame in zip(finite, frames, strict=True)),
+        visible=min(_measure_visible(player, frame) for frame in frames),
         honest=all(honestly),
         finite=all(finite),
         answered=not doubts,
@@ -153,6 +160,13 @@ def measure(
         removed=_compute_removed_share(player, frames, truth) if all(finite) else np.nan,
         doubt="" if not doubts else doubts[0] + (f" ({len(doubts) - 1} more)" if doubts[1:] else ""),
     )
+
+
+def _measure_visible(player: Player, frame: Frame) -> float:
+    """Return the share of the drawn tumour's silhouette in the image that the drape does not cover."""
+    tumour = player.stage.select_stage(frame.loads).build_tumour(player.estimate_positions(frame))
+    mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles) > 0
+    return 1.0 - float(np.mean(frame.picture.segmentation[mask] == DRAPE)) if mask.any() else 0.0
 
 
 def _compute_coverage(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:

@@ -20,11 +20,12 @@ from ..script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
 from ..script.scene import find_scene
 from ..script.shipped_files import get_template_path
 from ..script.tool import Probe
-from ..script.viewpoint import Viewpoint
+from ..script.viewpoint import OBLIQUE_VIEWPOINT
 from .reference import get_reference
 from .study import ReportStudy
 
-VIEW = Viewpoint(fov=np.radians(9.0), width=400, height=300)  # View so narrow that a pixel is a tenth of a millimetre.
+FIELD = float(np.radians(9.0))  # Field of view so narrow that a pixel is a tenth of a millimetre [rad].
+VIEW = replace(OBLIQUE_VIEWPOINT, fov=FIELD, width=400, height=300)
 YELLOW = (255, 215, 50)  # Colour of the reference's outline (RGB).
 
 
@@ -45,7 +46,7 @@ def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
     site = build_craniotomy_frame(anatomy)
     scan = read_intensity(to_intensity_path(get_template_path())) if study.of_template else None
     middle = there[anatomy.tumour_nodes].mean(axis=0)
-    camera = look_at(VIEW.build_camera(site).centre, middle, site.up, VIEW.fov, VIEW.width, VIEW.height)
+    camera = look_at(VIEW.build_camera(site).centre, middle, site.up, FIELD, VIEW.width, VIEW.height)
     radius = float(pushed.footprint[worst])
     tip = find_rested_tip(site, pushed.point[worst], there, radius)
     tool = Probe(radius)

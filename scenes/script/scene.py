@@ -58,6 +58,8 @@ class Bounds:
     drawn
         Maximum distance between the outline in the image and that by FEM [pixel]. In a scene with an observation model:
         between the drawn and the computed outline of the estimate.
+    visible
+        Minimum share of the tumour's silhouette that drape and bone leave visible.
     covered, removed
         In a scene with an observation model: minimum share of frames whose ellipsoid contains the true tumour centroid.
         Minimum share of the tumour motion, over all frames, that the estimate removes.
@@ -67,6 +69,7 @@ class Bounds:
     error: float = 0.3e-3
     pixels: float = 1e-3
     drawn: float = 2.0
+    visible: float = 0.5
     covered: float = 0.9
     removed: float = 0.0
 

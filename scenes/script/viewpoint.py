@@ -13,6 +13,7 @@ from sim.errors import InputError
 
 from .camera_paths import CameraPath
 from .craniotomy_frame import CraniotomyFrame
+from .framing import Framing, compute_outward, find_framing
 
 
 @dataclass(frozen=True)
@@ -74,13 +75,19 @@ Eye = Literal["left", "right"]
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Camera pose relative to the open cortex: oblique, because a tool moves a tumour mostly downwards.
-
-    It has a distance [m] from the site, a vertical field of view [rad] and an image size [pixel]. Its tilt [rad] is
-    that of the direction to the camera, from the outward normal towards the site's `up`.
+    """Camera pose relative to the open cortex.
 
     Parameters
     ----------
+    distance
+        Distance from the target [m]: by default a usual working distance of an operating microscope.
+    tilt
+        Angle [rad] of the direction to the camera, from the outward normal towards the site's `up`. None: as oblique as
+        the tumour stays visible through the craniotomy, see `find_framing`.
+    fov
+        Vertical field of view [rad]. None: craniotomy, tumour and its error band fill the image.
+    width, height
+        Image size [pixel].
     calibration
         Calibration of a real camera, instead of the field of view.
     path
@@ -97,9 +104,9 @@ class Viewpoint:
         A calibration for another image size, another eye than left and right, or a field that is not > 0.
     """
 
-    distance: float = 0.20
-    tilt: float = -0.8
-    fov: float = np.radians(16.0)
+    distance: float = 0.30
+    tilt: float | None = None
+    fov: float | None = None
     width: int = 640
     height: int = 480
     calibration: Calibration | None = None
@@ -124,13 +131,24 @@ class Viewpoint:
 
     def find_target(self, site: CraniotomyFrame) -> np.ndarray:
         """Return the target point of the camera (3,) [m]."""
-        return site.origin + TARGET_DEPTH * site.axis
+        if self.tilt is not None and (self.fov is not None or self.calibration is not None):
+            return site.origin + TARGET_DEPTH * site.axis
+        return self.find_framing(site).target
+
+    def find_framing(self, site: CraniotomyFrame) -> Framing:
+        """Return the framing of the tumour, with this viewpoint's tilt if it has one."""
+        direction = None if self.tilt is None else (-self.tilt, 0.0)
+        return find_framing(site, self.distance, self.width / self.height, direction)
 
     def build_camera(self, site: CraniotomyFrame, time: float = 0.0) -> Camera:
         """Return the camera that looks at a site at a time [s]."""
-        outward = -np.cos(self.tilt) * site.axis + np.sin(self.tilt) * site.up
         target = self.find_target(site)
-        found = look_at(target + self.distance * outward, target, site.up, self.fov, self.width, self.height)
+        outward = self.find_framing(site).outward if self.tilt is None else compute_outward(site, -self.tilt)
+        fov = self.find_framing(site).fov if self.fov is None else self.fov
+        away = self.distance
+        if self.calibration is not None and self.tilt is None:  # far enough for its own field of view
+            away *= max(1.0, 2.0 * self.calibration.focal[1] / self.height * np.tan(0.5 * self.find_framing(site).fov))
+        found = look_at(target + away * outward, target, site.up, fov, self.width, self.height)
         if self.calibration is not None:
             found = self.calibration.build_camera(found.T_camera_world)
         if self.path is not None:
@@ -145,3 +163,5 @@ class Viewpoint:
 
 USUAL_VIEWPOINT = Viewpoint()
 """Default viewpoint of scenes."""
+OBLIQUE_VIEWPOINT = Viewpoint(distance=0.20, tilt=-0.8, fov=float(np.radians(16.0)))
+"""The same oblique view of every anatomy: for data sets, and for tracked cameras, which must see their targets."""

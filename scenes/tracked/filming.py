@@ -25,7 +25,7 @@ from sim.tools import BuiltIn
 from ..play.player import Player
 from ..play.stage import TOOL, TOOL_COLOUR
 from ..script.craniotomy_frame import CraniotomyFrame
-from ..script.viewpoint import Viewpoint
+from ..script.viewpoint import OBLIQUE_VIEWPOINT, Viewpoint
 from .registration_file import describe_scan
 from .tracked_tool import TrackedTool
 
@@ -33,7 +33,7 @@ USUAL_CALIBRATION = Calibration(
     (1400.0, 1400.0), (620.0, 540.0), 1280, 960, Lens(-0.1, 0.02, 5e-4, -3e-4), "sulcus film"
 )
 """Default camera of a video."""
-VIEW = Viewpoint(distance=0.32).calibrate(USUAL_CALIBRATION)
+VIEW = replace(OBLIQUE_VIEWPOINT, distance=0.32).calibrate(USUAL_CALIBRATION)
 """View from arm's length: it shows the opening, the reference near it and the tool's cube."""
 # Centre of the reference relative to the craniotomy, to the right, up and outwards [m].
 REFERENCE_POSITION = (-0.078, 0.010, 0.022)

@@ -1,0 +1,54 @@
+"""The camera is chosen by the tumour: its outline lies inside the craniotomy, and its error band inside the image."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenes.script.framing import BAND_MARGIN, MIN_VISIBLE, build_rims, compute_visible_share, find_framing
+from scenes.script.viewpoint import OBLIQUE_VIEWPOINT, USUAL_VIEWPOINT, Viewpoint
+
+from .theatres import REAL, template_theatre
+
+
+def count_inside(camera, points):
+    """Share of points (n, 3) that an image contains."""
+    pixels = camera.project(points)[0]
+    return ((pixels >= 0.0) & (pixels < [camera.width, camera.height])).all(axis=1).mean()
+
+
+def grow(anatomy):
+    """The points of a tumour's surface, 8 mm farther from its centre."""
+    surface = anatomy.mesh.nodes[np.unique(anatomy.tumour_surface)]
+    arm = surface - surface.mean(axis=0)
+    return surface + BAND_MARGIN * arm / np.linalg.norm(arm, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (400, 900), (1600, 300)])
+def test_outline_in_the_craniotomy_and_band_in_the_image(size):
+    site = template_theatre().site
+    view = Viewpoint(width=size[0], height=size[1])
+    camera = view.build_camera(site)
+    surface = site.anatomy.mesh.nodes[np.unique(site.anatomy.tumour_surface)]
+    assert compute_visible_share(camera, surface, build_rims(site)) >= MIN_VISIBLE - 0.03
+    assert count_inside(camera, np.vstack([grow(site.anatomy), *build_rims(site)])) == 1.0
+    assert np.linalg.norm(camera.centre - view.find_target(site)) == pytest.approx(0.3)
+    old = OBLIQUE_VIEWPOINT.build_camera(site)
+    assert compute_visible_share(old, surface, build_rims(site)) < 0.6  # the share tells views apart
+
+
+def test_the_view_is_as_oblique_as_it_may_be():
+    site = template_theatre().site
+    found = USUAL_VIEWPOINT.find_framing(site)
+    tilt = np.arccos(-found.outward @ site.axis)
+    assert 0.2 < tilt < 0.6 and found.visible >= MIN_VISIBLE
+    steeper = find_framing(site, 0.3, 4.0 / 3.0, (tilt + 0.2, 0.0))
+    assert steeper.visible < MIN_VISIBLE
+    down = find_framing(site, 0.3, 4.0 / 3.0, (0.0, 0.0))
+    assert down.outward == pytest.approx(-site.axis) and down.visible >= MIN_VISIBLE
+
+
+def test_a_calibrated_camera_stands_far_enough():
+    site = template_theatre().site
+    camera = USUAL_VIEWPOINT.calibrate(replace(REAL, lens=None)).build_camera(site)
+    assert count_inside(camera, grow(site.anatomy)) == 1.0
