@@ -9,16 +9,22 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize_scalar
 
 from ..optics.camera import Camera
-from .pose import MIN_DEVIATION, fit_least_squares
+from .pose import PoseSettings, fit_least_squares
 from .targets import DetectedCorners, Target
 
-MIN_CORNERS = 12  # Minimum number of corners in a view.
-FACTOR_BOUNDS = (0.5, 2.0)  # Search range of the factor on the focal length.
-FACTOR_TOLERANCE = 1e-3  # Tolerance of the factor.
-FACTOR_STEP = 0.02  # Step of the factor in the finite difference for the curvature of the sum of squares.
 MAX_RELATIVE_ERROR = 0.05  # Relative error above which a focal length differs.
 # Error above which a focal length differs [standard deviations], if it exceeds MAX_RELATIVE_ERROR as well.
 MAX_DEVIATIONS = 6.0
+
+
+@dataclass(frozen=True)
+class FocalFitSettings:
+    """Settings of `fit_focal_length`."""
+
+    min_corners: int = 12  # Minimum number of corners in a view.
+    factor_bounds: tuple[float, float] = (0.5, 2.0)  # Search range of the factor on the focal length.
+    factor_tolerance: float = 1e-3  # Tolerance of the factor.
+    factor_step: float = 0.02  # Step of the factor in the finite difference for the curvature of the sum of squares.
 
 
 @dataclass(frozen=True)
@@ -34,14 +40,16 @@ class FocalFit:
         return abs(self.factor - 1.0) > max(MAX_RELATIVE_ERROR, MAX_DEVIATIONS * self.deviation)
 
 
-def fit_focal_length(camera: Camera, seen: Sequence[tuple[Target, DetectedCorners]]) -> FocalFit | None:
+def fit_focal_length(
+    camera: Camera, seen: Sequence[tuple[Target, DetectedCorners]], settings: FocalFitSettings = FocalFitSettings()
+) -> FocalFit | None:
     """Estimate the factor on both focal lengths that fits targets' corners best; None: too few corners.
 
     Each target has its best-fitting pose. The deviation is that of least squares, from the curvature of the sum at its
     minimum and the residual variance of corners. Source: Triggs et al. 2000, "Bundle adjustment: a modern synthesis",
     section 6.1.
     """
-    enough = [(target, corners) for target, corners in seen if len(corners.points) >= MIN_CORNERS]
+    enough = [(target, corners) for target, corners in seen if len(corners.points) >= settings.min_corners]
     freedom = sum(2 * len(corners.points) - 6 for _, corners in enough) - 1
     if freedom <= 0:
         return None
@@ -51,11 +59,12 @@ def fit_focal_length(camera: Camera, seen: Sequence[tuple[Target, DetectedCorner
         K[[0, 1], [0, 1]] *= factor
         return sum(fit_least_squares(replace(camera, K=K), target, corners) for target, corners in enough)
 
-    found = minimize_scalar(squares, bounds=FACTOR_BOUNDS, method="bounded", options={"xatol": FACTOR_TOLERANCE})
+    options = {"xatol": settings.factor_tolerance}
+    found = minimize_scalar(squares, bounds=settings.factor_bounds, method="bounded", options=options)
     assert isinstance(found, OptimizeResult)
-    around = squares(found.x - FACTOR_STEP), squares(found.x + FACTOR_STEP)
+    around = squares(found.x - settings.factor_step), squares(found.x + settings.factor_step)
     if not np.isfinite([found.fun, *around]).all() or sum(around) <= 2.0 * found.fun:
         return None
-    bend = (sum(around) - 2.0 * found.fun) / FACTOR_STEP**2
-    variance = max(found.fun / freedom, MIN_DEVIATION**2)
+    bend = (sum(around) - 2.0 * found.fun) / settings.factor_step**2
+    variance = max(found.fun / freedom, PoseSettings.min_deviation**2)
     return FocalFit(float(found.x), float(np.sqrt(2.0 * variance / bend)))

@@ -13,14 +13,19 @@ from ..optics.camera import Camera
 from .rigid import build_cross_matrices, compute_angles
 from .targets import DetectedCorners, Detector, Target, find_window, is_seen_from_front
 
-MIN_CORNERS = 6  # Minimum number of corners of a pose.
-MIN_DEVIATION = 0.1  # Lower bound of the residual's standard deviation [pixel].
-MAX_RESIDUAL = 1.0  # Largest rms residual of a pose [pixel].
-MIN_CHI2_EXCESS = 30.0  # Excess of chi^2 over the best pose that excludes another pose.
-TURN_TOLERANCE = np.radians(2.0)  # Rotation within which two poses count as equal [rad].
-SHIFT_TOLERANCE = 1e-3  # Distance within which two poses count as equal [m].
-# Largest rotation from the previous pose that selects one of two poses [rad]; the other must be twice as far.
-MAX_POSE_TURN = np.radians(15.0)
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """Settings of `find_pose`."""
+
+    min_corners: int = 6  # Minimum number of corners of a pose.
+    min_deviation: float = 0.1  # Lower bound of the residual's standard deviation [pixel].
+    max_residual: float = 1.0  # Largest rms residual of a pose [pixel].
+    min_chi2_excess: float = 30.0  # Excess of chi^2 over the best pose that excludes another pose.
+    turn_tolerance: float = np.radians(2.0)  # Rotation within which two poses count as equal [rad].
+    shift_tolerance: float = 1e-3  # Distance within which two poses count as equal [m].
+    # Largest rotation from the previous pose that selects one of two poses [rad]; the other must be twice as far.
+    max_pose_turn: float = np.radians(15.0)
 
 
 class Verdict(Enum):
@@ -72,7 +77,11 @@ class Pose:
 
 
 def find_pose(
-    camera: Camera, target: Target, corners: DetectedCorners | None, before: np.ndarray | None = None
+    camera: Camera,
+    target: Target,
+    corners: DetectedCorners | None,
+    before: np.ndarray | None = None,
+    settings: PoseSettings = PoseSettings(),
 ) -> tuple[Verdict, Pose | None]:
     """Estimate the pose of a target; none unless it is certain.
 
@@ -89,7 +98,7 @@ def find_pose(
     before
         Previous T_camera_target (4, 4), if it was certain.
     """
-    if corners is None or len(corners.points) < MIN_CORNERS:
+    if corners is None or len(corners.points) < settings.min_corners:
         return Verdict.LOST, None
     fits = sorted(_fit_candidates(camera, target, corners), key=lambda fit: fit[1])
     if not fits:
@@ -97,15 +106,16 @@ def find_pose(
     best, squares = fits[0]
     count = len(corners.points)
     residual = float(np.sqrt(squares / count))
-    if not residual <= MAX_RESIDUAL:
+    if not residual <= settings.max_residual:
         return Verdict.POOR, None
-    variance = max(squares / (2 * count - 6), MIN_DEVIATION**2)
-    rivals = [T for T, other in fits[1:] if other < squares + MIN_CHI2_EXCESS * variance and not _is_same_pose(T, best)]
+    variance = max(squares / (2 * count - 6), settings.min_deviation**2)
+    limit = squares + settings.min_chi2_excess * variance
+    rivals = [T for T, other in fits[1:] if other < limit and not _is_same_pose(T, best, settings)]
     if rivals:
         near = sorted([best, *rivals], key=lambda T: np.inf if before is None else _turn(T, before))
         if (
             before is None
-            or _turn(near[0], before) > MAX_POSE_TURN
+            or _turn(near[0], before) > settings.max_pose_turn
             or _turn(near[1], before) < 2.0 * _turn(near[0], before)
         ):
             return Verdict.AMBIGUOUS, None
@@ -174,14 +184,20 @@ def _turn(one: np.ndarray, other: np.ndarray) -> float:
     return float(compute_angles(one[:3, :3] @ other[:3, :3].T))
 
 
-def _is_same_pose(one: np.ndarray, other: np.ndarray) -> bool:
-    return _turn(one, other) < TURN_TOLERANCE and float(np.linalg.norm(one[:3, 3] - other[:3, 3])) < SHIFT_TOLERANCE
+def _is_same_pose(one: np.ndarray, other: np.ndarray, settings: PoseSettings) -> bool:
+    shift = float(np.linalg.norm(one[:3, 3] - other[:3, 3]))
+    return _turn(one, other) < settings.turn_tolerance and shift < settings.shift_tolerance
 
 
-SEARCH_MARGIN = 0.4  # Search margin round a target's last outline, as a share of its size.
-MIN_SEARCH_MARGIN = 32.0  # Minimum search margin round a target's last outline [pixel].
-MAX_POSE_AGE = 5  # Age after which a pose is not used as the start [images].
-SEARCH_INTERVAL = 3  # Interval of searches for lost targets [images].
+@dataclass(frozen=True)
+class TrackerSettings:
+    """Settings of a `Tracker`."""
+
+    search_margin: float = 0.4  # Search margin round a target's last outline, as a share of its size.
+    min_search_margin: float = 32.0  # Minimum search margin round a target's last outline [pixel].
+    max_pose_age: int = 5  # Age after which a pose is not used as the start [images].
+    search_interval: int = 3  # Interval of searches for lost targets [images].
+    pose: PoseSettings = PoseSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,10 +232,13 @@ class Tracker:
         Calibrated camera; its pose is ignored.
     targets
         Targets with different names and different markers.
+    settings
+        Settings of the search and of the poses.
     """
 
     camera: Camera
     targets: tuple[Target, ...]
+    settings: TrackerSettings = TrackerSettings()
     _detector: Detector = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -236,14 +255,14 @@ class Tracker:
         """
         check_image_size(grey, self.camera.width, self.camera.height)
         number = 0 if before is None else before.number + 1
-        last = (
-            {} if before is None else {k: each for k, each in before.last.items() if number - each[1] <= MAX_POSE_AGE}
-        )
+        earlier = {} if before is None else before.last
+        last = {name: each for name, each in earlier.items() if number - each[1] <= self.settings.max_pose_age}
         found = self._detect_corners(grey, number, last)
         verdicts, poses = {}, {}
         for target in self.targets:
             expected = last[target.name][0] if target.name in last else None
-            verdicts[target.name], pose = find_pose(self.camera, target, found.get(target.name), expected)
+            seen = found.get(target.name)
+            verdicts[target.name], pose = find_pose(self.camera, target, seen, expected, self.settings.pose)
             if pose is not None:
                 poses[target.name] = pose
                 last[target.name] = pose.T_camera_target, number
@@ -253,16 +272,18 @@ class Tracker:
         self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]
     ) -> dict[str, DetectedCorners]:
         """Detect corners near the last poses, or in the whole image if just lost, and at intervals while lost."""
-        found: dict[str, DetectedCorners] = {}
+        settings, found = self.settings, dict[str, DetectedCorners]()
         for target in self.targets:
             if target.name in last:
-                T, outline = last[target.name][0], target.outline
-                window = find_window(self.camera, outline @ T[:3, :3].T + T[:3, 3], SEARCH_MARGIN, MIN_SEARCH_MARGIN)
+                T = last[target.name][0]
+                outline = target.outline @ T[:3, :3].T + T[:3, 3]
+                window = find_window(self.camera, outline, settings.search_margin, settings.min_search_margin)
                 seen = None if window is None else self._detector.detect_in_window(target, grey, window)
-                found |= {target.name: seen} if seen is not None and len(seen.points) >= MIN_CORNERS else {}
+                if seen is not None and len(seen.points) >= settings.pose.min_corners:
+                    found[target.name] = seen
         missing = [target.name for target in self.targets if target.name not in found]
         just_left = any(last.get(name, (None, -2))[1] == number - 1 for name in missing)
-        if missing and (just_left or number % SEARCH_INTERVAL == 0):
+        if missing and (just_left or number % settings.search_interval == 0):
             found |= self._detector.detect(grey, missing)
         return found
 
