@@ -14,9 +14,18 @@ from ..optics.camera import Camera
 from ..optics.lens import Lens
 from .targets import Detector, Face
 
-MIN_CORNERS = 8  # Minimum number of corners in a view.
-MIN_LINES = 3  # Minimum number of the board's rows and of its columns with corners in a view.
-MIN_SHARPNESS = 0.6  # Sharpness below which a view is left out, as a share of the median.
+
+@dataclass(frozen=True)
+class IntrinsicsSettings:
+    """Settings of `find_board`, `choose_views` and `calibrate_intrinsics`."""
+
+    min_corners: int = 8  # Minimum number of corners in a view.
+    min_lines: int = 3  # Minimum number of the board's rows and of its columns with corners in a view.
+    min_sharpness: float = 0.6  # Sharpness below which a view is left out, as a share of the median.
+    min_views: int = 8  # Minimum number of views for a calibration.
+    outlier_ratio: float = 3.0  # Ratio of a view's error to the median error above which it is left out.
+    min_angle: float = np.radians(12.0)  # Smallest angle between the planes of the board [rad].
+    max_focal_deviation: float = 0.02  # Largest relative standard deviation of the focal length.
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +61,19 @@ class BoardView:
         return found @ shift
 
 
-def find_board(detector: Detector, name: str, grey: np.ndarray) -> BoardView | None:
+def find_board(
+    detector: Detector, name: str, grey: np.ndarray, settings: IntrinsicsSettings = IntrinsicsSettings()
+) -> BoardView | None:
     """Detect the detector's board in an image (H, W) uint8.
 
     None if too few of its corners are visible, or all are in one or two rows.
     """
     (board,) = detector.targets
     seen = detector.detect(grey).get(board.name)
-    if seen is None or len(seen.points) < MIN_CORNERS:
+    if seen is None or len(seen.points) < settings.min_corners:
         return None
     lines = np.rint(seen.points[:, :2] / board.faces[0].square)
-    if min(len(np.unique(lines[:, axis])) for axis in (0, 1)) < MIN_LINES:
+    if min(len(np.unique(lines[:, axis])) for axis in (0, 1)) < settings.min_lines:
         return None
     view = BoardView(name, seen.points, seen.pixels, _compute_sharpness(grey, seen.pixels))
     return view if np.isfinite(view.homography).all() and np.linalg.matrix_rank(view.homography) == 3 else None
@@ -77,14 +88,16 @@ def _compute_sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
     return float(min(slopes) / max(bright - dark, 1.0))
 
 
-def choose_views(views: Sequence[BoardView], face: Face, most: int) -> list[BoardView]:
+def choose_views(
+    views: Sequence[BoardView], face: Face, most: int, settings: IntrinsicsSettings = IntrinsicsSettings()
+) -> list[BoardView]:
     """Select at most `most` of the sharp views, each as different from those before it as possible.
 
     Views are compared by the position of the board's outline in the image. Gonzalez (1985), "Clustering to minimize the
     maximum intercluster distance": the farthest view from all chosen ones comes next.
     """
     median = np.median([view.sharpness for view in views]) if views else 0.0
-    sharp = [view for view in views if view.sharpness >= MIN_SHARPNESS * median]
+    sharp = [view for view in views if view.sharpness >= settings.min_sharpness * median]
     if len(sharp) <= most:
         return sharp
     outline = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * face.size
@@ -125,10 +138,6 @@ POSE_COLUMNS = slice(0, 6)  # Columns of OpenCV's derivatives: rotation and tran
 INTRINSIC_COLUMNS = slice(6, 15)
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Parameters in the order of the covariance; focal lengths and principal point [pixel]."""
-MIN_VIEWS = 8  # Minimum number of views for a calibration.
-OUTLIER_RATIO = 3.0  # Ratio of a view's error to the median error above which it is left out.
-MIN_ANGLE = np.radians(12.0)  # Smallest angle between the planes of the board [rad].
-MAX_FOCAL_DEVIATION = 0.02  # Largest relative standard deviation of the focal length.
 # Remedy in error messages.
 REMEDY = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the image's corners."
 
@@ -206,7 +215,13 @@ class Intrinsics:
         return np.sqrt(np.diag(self.covariance))
 
 
-def calibrate_intrinsics(views: Sequence[BoardView], width: int, height: int, name: str = "") -> Intrinsics:
+def calibrate_intrinsics(
+    views: Sequence[BoardView],
+    width: int,
+    height: int,
+    name: str = "",
+    settings: IntrinsicsSettings = IntrinsicsSettings(),
+) -> Intrinsics:
     """Calibrate the camera of these views, taken in images of `width` x `height`.
 
     Zhang (2000), "A flexible new technique for camera calibration", by OpenCV; a lens of Brown and Conrady with five
@@ -219,9 +234,9 @@ def calibrate_intrinsics(views: Sequence[BoardView], width: int, height: int, na
     """
     kept, left_out = list(views), []
     while True:
-        _check_views(kept, len(left_out), width, height)
+        _check_views(kept, len(left_out), width, height, settings)
         K, coefficients, poses, errors = _solve_views(kept, width, height)
-        bad = errors > OUTLIER_RATIO * np.median(errors)
+        bad = errors > settings.outlier_ratio * np.median(errors)
         if not bad.any():
             break
         left_out += [view.name for view, worse in zip(kept, bad, strict=True) if worse]
@@ -231,30 +246,26 @@ def calibrate_intrinsics(views: Sequence[BoardView], width: int, height: int, na
         covariance, rms = compute_intrinsics_covariance(calibration, kept, poses)
     except np.linalg.LinAlgError as error:
         raise ValueError(f"the views determine no camera. {REMEDY}") from error
-    found = Intrinsics(
-        calibration,
-        covariance,
-        rms,
-        tuple(v.name for v in kept),
-        tuple(left_out),
-        measure_covered_share(kept, width, height),
-    )
+    used, covered = tuple(view.name for view in kept), measure_covered_share(kept, width, height)
+    found = Intrinsics(calibration, covariance, rms, used, tuple(left_out), covered)
     unsure = found.deviations[:2] / calibration.focal
-    if not unsure.max() <= MAX_FOCAL_DEVIATION:
+    if not unsure.max() <= settings.max_focal_deviation:
         raise ValueError(f"the views leave the focal length unknown to {100.0 * unsure.max():.0f} %. {REMEDY}")
     return found
 
 
-def _check_views(views: Sequence[BoardView], left_out: int, width: int, height: int) -> None:
+def _check_views(
+    views: Sequence[BoardView], left_out: int, width: int, height: int, settings: IntrinsicsSettings
+) -> None:
     """Raise ValueError for views that do not determine a camera."""
-    if len(views) < MIN_VIEWS:
+    if len(views) < settings.min_views:
         without = f", and {left_out} more fit badly" if left_out else ""
         raise ValueError(
-            f"{len(views)} sharp views show the board{without}, but {MIN_VIEWS} are needed: take 20 images or "
+            f"{len(views)} sharp views show the board{without}, but {settings.min_views} are needed: take 20 images or "
             "more, in good light and without motion."
         )
     angle = measure_tilt_range(views, width, height)
-    if angle < MIN_ANGLE:
+    if angle < settings.min_angle:
         raise ValueError(
             f"the board is seen from one direction in all {len(views)} views, to {np.degrees(angle):.0f} degrees. "
             f"{REMEDY}"

@@ -15,18 +15,23 @@ MAX_EXTRAPOLATION = 0.05  # Largest extrapolation after the last sample [s].
 TIME_TOLERANCE = 1e-3  # Difference below which times count as equal [s]: files round them.
 DAY_SECONDS = 86_400.0
 """Period of a 24-hour clock [s]."""
-OFFSET_STEP = 0.01  # Step of tried time offsets [s].
-MIN_IMAGES = 8  # Minimum number of images for an estimate of the time offset.
-MAX_OFFSET_RANGE = 900.0  # Largest range of tried offsets [s].
-MIN_MOTION = 1e-3  # Smallest motion of the tool that determines the offset [m].
-MIN_OFFSET_DIFFERENCE = 0.15  # Time difference beyond which a second minimum is another offset [s].
-MIN_SQUARES_RATIO = 2.0  # Smallest ratio of the sum of squares at another offset to that of the best fit.
-POSITION_NOISE = (
-    0.1e-3  # Noise level of positions [m]: lower bound of the best fit's error in the comparison of offsets.
-)
-MAX_ITERATIONS = 20  # Maximum number of Gauss-Newton iterations of the offset.
 # Remedy in error messages.
 REMEDY = "Move the tool to and fro by centimetres, quickly and unevenly, while markers and poses are both seen."
+
+
+@dataclass(frozen=True)
+class ClockSettings:
+    """Settings of `estimate_clock_by_motion`."""
+
+    offset_step: float = 0.01  # Step of tried time offsets [s].
+    min_images: int = 8  # Minimum number of images for an estimate of the time offset.
+    max_offset_range: float = 900.0  # Largest range of tried offsets [s].
+    min_motion: float = 1e-3  # Smallest motion of the tool that determines the offset [m].
+    min_offset_difference: float = 0.15  # Time difference beyond which a second minimum is another offset [s].
+    min_squares_ratio: float = 2.0  # Smallest ratio of the sum of squares at another offset to that of the best fit.
+    # Noise level of positions [m]: lower bound of the best fit's error in the comparison of offsets.
+    position_noise: float = 0.1e-3
+    max_iterations: int = 20  # Maximum number of Gauss-Newton iterations of the offset.
 
 
 def unwrap_times(times: np.ndarray) -> np.ndarray:
@@ -148,7 +153,13 @@ class Clock:
     error: float = 0.0
 
 
-def estimate_clock_by_motion(times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> Clock:
+def estimate_clock_by_motion(
+    times: np.ndarray,
+    places: np.ndarray,
+    samples: np.ndarray,
+    others: np.ndarray,
+    settings: ClockSettings = ClockSettings(),
+) -> Clock:
     """Estimate the time offset between a point's motion in images (n,) [s], (n, 3) [m], and by a tracker (m,), (m, 3).
 
     Both points may differ by a constant. The error is that of least squares, from the scatter of residuals.
@@ -159,52 +170,55 @@ def estimate_clock_by_motion(times: np.ndarray, places: np.ndarray, samples: np.
         Too few images, motion that is too small, no offset with poses for all images, or two offsets that fit about as
         well.
     """
-    if len(times) < MIN_IMAGES:
-        raise ValueError(f"{len(times)} images show what the poses have, and {MIN_IMAGES} are needed. {REMEDY}")
+    if len(times) < settings.min_images:
+        raise ValueError(
+            f"{len(times)} images show what the poses have, and {settings.min_images} are needed. {REMEDY}"
+        )
     low, high = samples[0] - times[0], samples[-1] - times[-1]
     if high < low:
         raise ValueError("the poses end before the images do: record them for longer than the video.")
-    if high - low > MAX_OFFSET_RANGE:
+    if high - low > settings.max_offset_range:
         raise ValueError(
-            f"the poses are {high - low:.0f} s longer than the video: cut them to {MAX_OFFSET_RANGE:.0f} s."
+            f"the poses are {high - low:.0f} s longer than the video: cut them to {settings.max_offset_range:.0f} s."
         )
-    tried = np.arange(low, high + OFFSET_STEP, OFFSET_STEP).clip(low, high)
+    tried = np.arange(low, high + settings.offset_step, settings.offset_step).clip(low, high)
     squares = np.array(
         [_sum_squares(_compute_differences(times + offset, places, samples, others)) for offset in tried]
     )
     if not np.isfinite(squares).any():
         raise ValueError(f"the poses have gaps of more than {MAX_GAP:g} s wherever the images are.")
     best = int(np.argmin(squares))
-    clock, least = _refine_offset(float(tried[best]), times, places, samples, others)
+    clock, least = _refine_offset(float(tried[best]), times, places, samples, others, settings)
     walled = np.pad(squares, 1, constant_values=np.inf)
     valley = (squares <= walled[:-2]) & (squares <= walled[2:])
-    far = np.where(valley & (np.abs(tried - tried[best]) > MIN_OFFSET_DIFFERENCE), squares, np.inf)
+    far = np.where(valley & (np.abs(tried - tried[best]) > settings.min_offset_difference), squares, np.inf)
     if np.isfinite(far.min()):
-        _, rival = _refine_offset(float(tried[int(np.argmin(far))]), times, places, samples, others)
-        if rival < MIN_SQUARES_RATIO * max(least, places.size * POSITION_NOISE**2):
+        _, rival = _refine_offset(float(tried[int(np.argmin(far))]), times, places, samples, others, settings)
+        if rival < settings.min_squares_ratio * max(least, places.size * settings.position_noise**2):
             raise ValueError(f"more than one offset of the clocks fits. {REMEDY}")
     return clock
 
 
 def _refine_offset(
-    offset: float, times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray
-) -> tuple[Clock, float]:
+    offset: float, times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray,
+    settings: ClockSettings,
+) -> tuple[Clock, float]:  # fmt: skip
     """Refine an offset by Gauss-Newton; return it and the remaining sum of squares [m^2]."""
     low, high = samples[0] - times[0], samples[-1] - times[-1]
     speed, off = np.zeros_like(places), np.zeros_like(places)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(settings.max_iterations):
         off = _compute_differences(times + offset, places, samples, others)
-        ahead, behind = min(offset + OFFSET_STEP, high), max(offset - OFFSET_STEP, low)
+        ahead, behind = min(offset + settings.offset_step, high), max(offset - settings.offset_step, low)
         speed = _compute_differences(times + ahead, places, samples, others) - _compute_differences(
             times + behind, places, samples, others
         )
         speed /= max(ahead - behind, np.finfo(float).tiny)
         step = -float((speed * off).sum() / max((speed**2).sum(), np.finfo(float).tiny))
-        offset = float(np.clip(offset + np.clip(step, -OFFSET_STEP, OFFSET_STEP), low, high))
+        offset = float(np.clip(offset + np.clip(step, -settings.offset_step, settings.offset_step), low, high))
         if abs(step) < 1e-6:
             break
     moved = float(np.sqrt((speed**2).sum(axis=1).mean())) * float(times[-1] - times[0])
-    if not moved > MIN_MOTION:
+    if not moved > settings.min_motion:
         raise ValueError(f"the tool moves by {1e3 * moved:.1f} mm only: that says nothing of the clocks. {REMEDY}")
     left = _sum_squares(_compute_differences(times + offset, places, samples, others))
     scatter = np.sqrt(left / max(off.size - 4, 1))

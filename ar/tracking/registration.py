@@ -12,23 +12,27 @@ from scipy.stats import chi2, f
 from .rigid import build_cross_matrices, move_about
 
 MIN_PAIRS = 3  # Minimum number of pairs of points.
-MIN_SURFACE_POINTS = 20  # Minimum number of points on the surface.
-MIN_RMS = 0.1e-3  # Lower bound of rms residuals in ratios [m]: error of a touched point.
-MAX_RMS = 5e-3  # Largest rms residual of pairs and of surface points [m].
-MIN_SPREAD_RATIO = (
-    0.05  # Smallest ratio of the second to the largest spread of points: below, the points are on a line.
-)
-MAX_SIZE_LOG_RATIO = 0.1  # Largest absolute log-ratio of the sizes of two point sets.
-MIN_SPREAD = 5e-3  # Smallest spread of points on a head [m].
-MIN_RESIDUAL_RATIO = (
-    4.0  # Ratio of residuals above which one wrong pair, a swap or a mirrored coordinate system is reported.
-)
-MAX_ITERATIONS = 50  # Maximum number of Gauss-Newton iterations on a surface.
-STEP_TOLERANCE = 1e-9  # Step below which the iterations on a surface end [m], [rad].
 LEVEL = 0.95  # Confidence level of the registration's error.
 
 Nearest = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Map from scan points (n, 3) [m] to the closest surface points (n, 3) [m] and unit normals (n, 3) there."""
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """Settings of `register_points`, `refine_registration` and `compute_pair_residuals`."""
+
+    min_surface_points: int = 20  # Minimum number of points on the surface.
+    min_rms: float = 0.1e-3  # Lower bound of rms residuals in ratios [m]: error of a touched point.
+    max_rms: float = 5e-3  # Largest rms residual of pairs and of surface points [m].
+    # Smallest ratio of the second to the largest spread of points: below, the points are on a line.
+    min_spread_ratio: float = 0.05
+    max_size_log_ratio: float = 0.1  # Largest absolute log-ratio of the sizes of two point sets.
+    min_spread: float = 5e-3  # Smallest spread of points on a head [m].
+    # Ratio of residuals above which one wrong pair, a swap or a mirrored coordinate system is reported.
+    min_residual_ratio: float = 4.0
+    max_iterations: int = 50  # Maximum number of Gauss-Newton iterations on a surface.
+    step_tolerance: float = 1e-9  # Step below which the iterations on a surface end [m], [rad].
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +94,9 @@ class Registration:
         return T[:3, :3] @ place + T[:3, 3], slope @ self.covariance @ slope.T
 
 
-def register_points(scan: np.ndarray, patient: np.ndarray) -> Registration:
+def register_points(
+    scan: np.ndarray, patient: np.ndarray, settings: RegistrationSettings = RegistrationSettings()
+) -> Registration:
     """Fit the rigid motion from points of the scan (n, 3) [m] to their positions in the reference's frame (n, 3) [m].
 
     Least squares (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A
@@ -103,16 +109,22 @@ def register_points(scan: np.ndarray, patient: np.ndarray) -> Registration:
         Fewer than three pairs, points on a line, or two sets of different size. A mirrored set, two pairs that are
         swapped, one that fits far worse than the others, or pairs that fit no rigid motion.
     """
-    _check_shape(scan, patient)
+    _check_shape(scan, patient, settings)
     T, off = _fit_rigid(scan, patient)
-    _check_fit(scan, patient, off)
+    _check_fit(scan, patient, off, settings)
     centre = scan.mean(axis=0)
     freedom = 3 * len(scan) - 6
-    J = compute_jacobian(T, scan, centre) / _scatter(off, freedom)
+    J = compute_jacobian(T, scan, centre) / _scatter(off, freedom, settings)
     return Registration(T, _widen_covariance(J.T @ J, freedom), centre, _compute_rms(off), len(scan))
 
 
-def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray, nearest: Nearest) -> Registration:
+def refine_registration(
+    scan: np.ndarray,
+    patient: np.ndarray,
+    seen: np.ndarray,
+    nearest: Nearest,
+    settings: RegistrationSettings = RegistrationSettings(),
+) -> Registration:
     """Fit as in `register_points`, with additional points `seen` (m, 3) [m] of the surface, in the reference's frame.
 
     Pairs (n, 3) and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by registration
@@ -124,27 +136,27 @@ def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray,
         See `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean
         square).
     """
-    if len(seen) < MIN_SURFACE_POINTS:
-        raise ValueError(f"{len(seen)} points of the surface are too few: trace {MIN_SURFACE_POINTS} or more.")
-    start = register_points(scan, patient)
+    if len(seen) < settings.min_surface_points:
+        raise ValueError(f"{len(seen)} points of the surface are too few: trace {settings.min_surface_points} or more.")
+    start = register_points(scan, patient, settings)
     T, centre = start.T_patient_scan, start.centre
     freedom = 3 * len(scan) - 6
-    touched = _scatter(scan @ T[:3, :3].T + T[:3, 3] - patient, freedom)
+    touched = _scatter(scan @ T[:3, :3].T + T[:3, 3] - patient, freedom, settings)
     normal, off, away = np.eye(6), np.zeros((1, 3)), np.zeros(1)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(settings.max_iterations):
         off = scan @ T[:3, :3].T + T[:3, 3] - patient
         place, outward = nearest((seen - T[:3, 3]) @ T[:3, :3])
         turned = outward @ T[:3, :3].T
         away = np.einsum("ni,ni->n", turned, place @ T[:3, :3].T + T[:3, 3] - seen)
-        traced = _scatter(away, len(seen))
+        traced = _scatter(away, len(seen), settings)
         J = compute_jacobian(T, scan, centre) / touched
         K = np.einsum("ni,nij->nj", turned, compute_jacobian(T, place, centre).reshape(-1, 3, 6)) / traced
         normal = J.T @ J + K.T @ K
         step = -np.linalg.solve(normal, J.T @ off.ravel() / touched + K.T @ away / traced)
         T = move_about(T, centre, step)
-        if np.abs(step).max() < STEP_TOLERANCE:
+        if np.abs(step).max() < settings.step_tolerance:
             break
-    if not max(_compute_rms(off), _compute_rms(away[:, None])) <= MAX_RMS:
+    if not max(_compute_rms(off), _compute_rms(away[:, None])) <= settings.max_rms:
         raise ValueError(
             f"the points stay {1e3 * _compute_rms(away[:, None]):.1f} mm (rms) from the surface, and the pairs "
             f"{1e3 * _compute_rms(off):.1f} mm: trace the surface that the scan shows, before it moves."
@@ -154,54 +166,52 @@ def refine_registration(scan: np.ndarray, patient: np.ndarray, seen: np.ndarray,
     )
 
 
-def _check_shape(scan: np.ndarray, patient: np.ndarray) -> None:
+def _check_shape(scan: np.ndarray, patient: np.ndarray, settings: RegistrationSettings) -> None:
     """Raise ValueError for points that determine no rigid motion."""
     if len(scan) < MIN_PAIRS:
         raise ValueError(f"{len(scan)} pairs are too few: touch {MIN_PAIRS} points or more, better six.")
     sizes = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (scan, patient)]
     for what, size in zip(("scan", "patient"), sizes, strict=True):
-        if not size[1] > MIN_SPREAD_RATIO * size[0]:
+        if not size[1] > settings.min_spread_ratio * size[0]:
             raise ValueError(f"the points of the {what} lie on a line: choose some that lie apart from it.")
-    if not sizes[0][0] > MIN_SPREAD:
+    if not sizes[0][0] > settings.min_spread:
         raise ValueError(f"the points lie within {2e3 * sizes[0][0]:.2g} mm of each other: give millimetres.")
     ratio = float(np.linalg.norm(sizes[1]) / np.linalg.norm(sizes[0]))
-    if abs(np.log(ratio)) > MAX_SIZE_LOG_RATIO:
+    if abs(np.log(ratio)) > settings.max_size_log_ratio:
         raise ValueError(
             f"the patient's points are {ratio:.3g} times as far apart as the scan's: give both in millimetres."
         )
 
 
-def _check_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray) -> None:
+def _check_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray, settings: RegistrationSettings) -> None:
     """Raise ValueError for a mirrored set, one wrong pair among good ones, and pairs that do not fit."""
     rms = _compute_rms(off)
     mirrored = _compute_rms(_fit_rigid(scan * [-1.0, 1.0, 1.0], patient)[1])
-    if MIN_RESIDUAL_RATIO * max(mirrored, MIN_RMS) < rms:
+    if settings.min_residual_ratio * max(mirrored, settings.min_rms) < rms:
         raise ValueError("the scan's points fit their mirror image only: one frame is left-handed. Give RAS.")
     if len(scan) > MIN_PAIRS + 1:
-        others = [
-            _compute_rms(_fit_rigid(*(np.delete(p, row, axis=0) for p in (scan, patient)))[1])
-            for row in range(len(scan))
-        ]
+        remaining = [[np.delete(points, row, axis=0) for points in (scan, patient)] for row in range(len(scan))]
+        others = [_compute_rms(_fit_rigid(*pairs)[1]) for pairs in remaining]
         row, swaps = int(np.argmin(others)), _compute_swapped_rms(scan, patient)
         one, other = min(swaps, key=lambda pair: swaps[pair])
         if (
-            rms > MAX_RMS / 2
-            and MIN_RESIDUAL_RATIO * max(swaps[one, other], MIN_RMS) < rms
+            rms > settings.max_rms / 2
+            and settings.min_residual_ratio * max(swaps[one, other], settings.min_rms) < rms
             and swaps[one, other] < others[row]
         ):
             raise ValueError(
                 f"pairs {one + 1} and {other + 1} (below the header) are swapped: the other way round all fit to "
                 f"{1e3 * swaps[one, other]:.1f} mm. Exchange their px,py,pz."
             )
-        if rms > MAX_RMS / 2 and MIN_RESIDUAL_RATIO * max(others[row], MIN_RMS) < rms:
+        if rms > settings.max_rms / 2 and settings.min_residual_ratio * max(others[row], settings.min_rms) < rms:
             raise ValueError(
                 f"pair {row + 1} (below the header) fits worse than the others (error {1e3 * others[row]:.1f} mm "
                 "without it): touch it again, or leave it out."
             )
-    if not rms <= MAX_RMS:
+    if not rms <= settings.max_rms:
         raise ValueError(
-            f"the pairs stay {1e3 * rms:.1f} mm apart (rms), and up to {1e3 * MAX_RMS:.0f} are taken: see whether "
-            "each row names the same place twice."
+            f"the pairs stay {1e3 * rms:.1f} mm apart (rms), and up to {1e3 * settings.max_rms:.0f} are taken: see "
+            "whether each row names the same place twice."
         )
 
 
@@ -239,9 +249,9 @@ def _widen_covariance(normal: np.ndarray, freedom: int) -> np.ndarray:
     return 0.5 * (inverse + inverse.T)
 
 
-def _scatter(off: np.ndarray, freedom: int) -> float:
-    """Estimate the residuals' standard deviation along one axis [m], at least `MIN_RMS`."""
-    return max(float(np.sqrt((off**2).sum() / freedom)), MIN_RMS)
+def _scatter(off: np.ndarray, freedom: int, settings: RegistrationSettings) -> float:
+    """Estimate the residuals' standard deviation along one axis [m], at least `RegistrationSettings.min_rms`."""
+    return max(float(np.sqrt((off**2).sum() / freedom)), settings.min_rms)
 
 
 def _compute_rms(off: np.ndarray) -> float:
@@ -284,7 +294,9 @@ class PairResiduals:
         return self.chance < FALSE_ALARM_RATE
 
 
-def compute_pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResiduals:
+def compute_pair_residuals(
+    scan: np.ndarray, patient: np.ndarray, settings: RegistrationSettings = RegistrationSettings()
+) -> PairResiduals:
     """Compute residuals of pairs of points (n, 3) [m], in the scan and in the reference's frame.
 
     Externally studentised residuals, of three coordinates each (Cook, Weisberg 1982, "Residuals and influence in
@@ -296,7 +308,7 @@ def compute_pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResidua
     ValueError
         See `register_points`.
     """
-    found = register_points(scan, patient)
+    found = register_points(scan, patient, settings)
     T, count = found.T_patient_scan, len(scan)
     off = scan @ T[:3, :3].T + T[:3, 3] - patient
     if count == MIN_PAIRS:
@@ -309,7 +321,7 @@ def compute_pair_residuals(scan: np.ndarray, patient: np.ndarray) -> PairResidua
     free = np.stack([np.eye(3) - hat[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(count)])
     left_out = np.linalg.solve(free, off[..., None])[..., 0]
     own = np.einsum("ni,ni->n", off, left_out)
-    others = np.maximum((np.square(off).sum() - own) / freedom, MIN_RMS**2)
+    others = np.maximum((np.square(off).sum() - own) / freedom, settings.min_rms**2)
     squares = own / (3.0 * others)
     chance = min(1.0, count * float(f.sf(squares.max(), 3, freedom)))
     return PairResiduals(np.linalg.norm(off, axis=1), np.linalg.norm(left_out, axis=1), np.sqrt(squares), chance)

@@ -8,20 +8,27 @@ import numpy as np
 
 from .rigid import build_cross_matrices, compute_angles
 
-MIN_POSES = 4  # Minimum number of pairs of poses.
-# Smallest rotation of a motion that is used [rad]: the axis of a smaller one is uncertain.
-MIN_TURN = np.radians(8.0)
-# Largest rotation of a motion that is used [rad]: near pi, the sign of its axis is uncertain.
-MAX_TURN = np.radians(170.0)
-MIN_AXIS_SPREAD = np.radians(8.0)  # Smallest root mean square angle of the axes from their closest common axis [rad].
-MAX_MOTIONS = 2000  # Maximum number of motions, the largest first.
-MAX_POSES = 300  # Maximum number of poses whose pairs are all examined, spread evenly over all.
 # Largest root mean square residual angle of motions [rad]: two trackers with noise of 0.5 degrees give 1 degree.
 MAX_RESIDUAL_TURN = np.radians(2.0)
 # Largest root mean square residual distance of motions [m]: two trackers with noise of 0.5 degrees give 7 mm over 0.7
 # m.
 MAX_RESIDUAL_SHIFT = 10e-3
 REMEDY = "Turn the bodies by 30 degrees or more, about at least two different axes."  # Remedy in error messages.
+
+
+@dataclass(frozen=True)
+class HandEyeSettings:
+    """Settings of `solve_hand_eye`."""
+
+    min_poses: int = 4  # Minimum number of pairs of poses.
+    # Smallest rotation of a motion that is used [rad]: the axis of a smaller one is uncertain.
+    min_turn: float = np.radians(8.0)
+    # Largest rotation of a motion that is used [rad]: near pi, the sign of its axis is uncertain.
+    max_turn: float = np.radians(170.0)
+    # Smallest root mean square angle of the axes from their closest common axis [rad].
+    min_axis_spread: float = np.radians(8.0)
+    max_motions: int = 2000  # Maximum number of motions, the largest first.
+    max_poses: int = 300  # Maximum number of poses whose pairs are all examined, spread evenly over all.
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +67,7 @@ class HandEye:
         return f"{found}: at most {np.degrees(MAX_RESIDUAL_TURN):.0f} and {1e3 * MAX_RESIDUAL_SHIFT:.0f} are required"
 
 
-def solve_hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
+def solve_hand_eye(first: np.ndarray, second: np.ndarray, settings: HandEyeSettings = HandEyeSettings()) -> HandEye:
     """Compute X with A X = X B for all motions A and B of two bodies, given by poses (n, 4, 4) [m] in their trackers.
 
     Motions lead from pose i to pose j: A = P_i^-1 P_j of the first, B = Q_i^-1 Q_j of the second. Daniilidis (1999),
@@ -73,14 +80,14 @@ def solve_hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
     """
     if len(first) != len(second):
         raise ValueError(f"{len(first)} and {len(second)} poses: give both bodies' poses at the same times.")
-    if len(first) < MIN_POSES:
-        raise ValueError(f"{len(first)} poses are too few: record {MIN_POSES} or more. {REMEDY}")
-    A, B, ends = _select_motions(first, second)
+    if len(first) < settings.min_poses:
+        raise ValueError(f"{len(first)} poses are too few: record {settings.min_poses} or more. {REMEDY}")
+    A, B, ends = _select_motions(first, second, settings)
     (a, a_dual), (b, b_dual) = to_dual_quaternions(A), to_dual_quaternions(B)
     axes = a[:, 1:] / np.linalg.norm(a[:, 1:], axis=1, keepdims=True)
     across = 1.0 - np.linalg.eigvalsh(axes.T @ axes / len(axes))[-1]
     spread = float(np.arcsin(np.sqrt(np.clip(across, 0.0, 1.0))))
-    if spread < MIN_AXIS_SPREAD:
+    if spread < settings.min_axis_spread:
         raise ValueError(
             f"the axes of all {len(A)} motions are parallel, to {np.degrees(spread):.1f} degrees: they leave open "
             f"where along the axis one body lies in the other. {REMEDY}"
@@ -95,19 +102,21 @@ def solve_hand_eye(first: np.ndarray, second: np.ndarray) -> HandEye:
     )
 
 
-def _select_motions(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _select_motions(
+    first: np.ndarray, second: np.ndarray, settings: HandEyeSettings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Select motions of both bodies (m, 4, 4) with the largest rotations, and the poses (2, m) that they connect."""
-    kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), MAX_POSES)).round().astype(int))
+    kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), settings.max_poses)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
     A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
     angles = np.array([compute_angles(M[:, :3, :3]) for M in (A, B)])
-    good = np.flatnonzero((angles.min(axis=0) > MIN_TURN) & (angles.max(axis=0) < MAX_TURN))
-    if len(good) < MIN_POSES:
+    good = np.flatnonzero((angles.min(axis=0) > settings.min_turn) & (angles.max(axis=0) < settings.max_turn))
+    if len(good) < settings.min_poses:
         raise ValueError(
-            f"{len(good)} motions turn the bodies by more than {np.degrees(MIN_TURN):.0f} degrees, and "
-            f"{MIN_POSES} are needed. {REMEDY}"
+            f"{len(good)} motions turn the bodies by more than {np.degrees(settings.min_turn):.0f} degrees, and "
+            f"{settings.min_poses} are needed. {REMEDY}"
         )
-    best = good[np.argsort(-angles[0, good], kind="stable")[:MAX_MOTIONS]]
+    best = good[np.argsort(-angles[0, good], kind="stable")[: settings.max_motions]]
     return A[best], B[best], kept[[start[best], end[best]]]
 
 
