@@ -268,15 +268,8 @@ class Renderer:
         draw(placed.seen, there, 0, slice(0, height), nearest, self.device, through=through)
         self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, through, pictures)
         lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
-        inputs = [
-            width,
-            nearest.flatten(),
-            stack.surfaces,
-            placed,
-            self._get_centres([camera]),
-            self.light,
-            through.pixels,
-        ]
+        centres = self._get_centres([camera])
+        inputs = [width, nearest.flatten(), stack.surfaces, placed, centres, self.light, through.pixels]
         launch_in_bands(remember, inputs, [lit_at], height * width, self.device)
         self.backdrop = Backdrop(camera, nearest, placed, pictures, lit_at)
         return self.backdrop

@@ -295,15 +295,7 @@ def _draw_bar(ink: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> N
     """Draw a line along a side of the page, whose centre is exact: `LINE_WIDTH` is a multiple of two pixels."""
     half = _to_pixels(LINE_WIDTH) // 2
     low, high = np.minimum(start, end), np.maximum(start, end)
-    ink.rectangle(
-        [
-            _to_pixels(low[0]) - half,
-            _to_pixels(low[1]) - half,
-            _to_pixels(high[0]) + half - 1,
-            _to_pixels(high[1]) + half - 1,
-        ],
-        fill=0,
-    )
+    ink.rectangle([*(_to_pixels(at) - half for at in low), *(_to_pixels(at) + half - 1 for at in high)], fill=0)
 
 
 def _to_pixels(mm: float) -> int:
