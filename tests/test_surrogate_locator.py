@@ -12,7 +12,7 @@ from surrogate.locating.ensemble import compute_surface_motion, solve_groups, so
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 from surrogate.locating.observation import Observation, to_evidence
-from surrogate.locating.prior import NO_PLACE, PLACE_COUNT, compute_middle
+from surrogate.locating.prior import NO_PLACE, PRESS, compute_middle
 
 FEW = Causes(
     poisson=(0.45, 0.485), tools=(8, 3), drainages=3, levels=(0.6, 0.3), swellings=(0.04, 0.02, -0.02),
@@ -76,7 +76,7 @@ def test_prior_shapes_move_open_cortex_by_1_mm(locator, body):
             rows = (prior.kind == 0) & (prior.skull == skull) & (prior.place == place)
             size = compute_surface_motion(body, prior.shape[rows])
             assert np.sqrt((size**2).sum()) == pytest.approx(1e-3, rel=1e-4)
-    assert prior.place.max() == PLACE_COUNT - 1 and not ((prior.kind == 0) & (prior.skull == 2)).any()
+    assert prior.place.max() == PRESS.place_count - 1 and not ((prior.kind == 0) & (prior.skull == 2)).any()
 
 
 def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):

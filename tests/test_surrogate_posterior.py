@@ -12,8 +12,7 @@ from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT_ERROR, SIGMA, SLIPPED_ERROR, TURN_PER_SHIFT, build_motion_evidence
 from surrogate.locating.observation import Observation, place_again
 from surrogate.locating.posterior import (
-    EVIDENCE_DIVISOR,
-    MAX_HYPOTHESES,
+    POSTERIOR,
     ObservedPrior,
     Posterior,
     build_observed_prior,
@@ -134,7 +133,7 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
             assert answer.mean == pytest.approx(mean, rel=1e-4, abs=1e-6)
             logs.append(log)
             density.append(multivariate_normal(cov=noise + (some.T * size**2) @ some).logpdf(evidence.value))
-    assert EVIDENCE_DIVISOR * np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
+    assert POSTERIOR.evidence_divisor * np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
 
 
 def test_axes_that_are_alike_are_whitened_as_all_rows_together(prior):
@@ -193,7 +192,7 @@ def test_a_mixture_lies_between_its_hypotheses(prior):
     found = condition_prior(prior, evidence)
     assert not len(found.outliers) and 0.2 < found.surprise < 1.6
     answers = build_observed_prior(prior, evidence).compute_posteriors()
-    assert len(answers) == MAX_HYPOTHESES and sum(answer.share for answer in answers) == pytest.approx(1.0)
+    assert len(answers) == POSTERIOR.max_hypotheses and sum(answer.share for answer in answers) == pytest.approx(1.0)
     means = np.zeros((len(answers), len(prior.kind) + 6))
     spreads = np.zeros((len(answers), *2 * means.shape[1:]))
     for mean, spread, answer in zip(means, spreads, answers, strict=True):

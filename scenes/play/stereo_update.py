@@ -14,7 +14,7 @@ from ar.stereo.disparity import Cloud, StereoView, compute_stereo_view, find_sup
 from ar.stereo.rectified import rectify
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points
-from surrogate.locating.evidence import INDEPENDENT_ERROR, SIGMA
+from surrogate.locating.evidence import NOISE, SIGMA
 from surrogate.locating.observation import Observation
 
 from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
@@ -230,7 +230,7 @@ def find_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarra
 
 def compute_deviations(sigma: np.ndarray) -> np.ndarray:
     """Scale deviations (n,) [m] of independent errors to those of a locator, which include correlated errors."""
-    return sigma * (SIGMA / INDEPENDENT_ERROR)
+    return sigma * (SIGMA / NOISE.independent_error)
 
 
 def require_points(count: int, asked: int, other_reason: str = "") -> None:

@@ -14,7 +14,7 @@ from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points
 
-from ..locating.observation import FAR_DISTANCE_NOW, Observation, to_evidence
+from ..locating.observation import LIMITS, Observation, to_evidence
 from ..locating.observed_files import PLACE, SIGMA, read_columns
 
 DEFAULT_RADIUS = 6e-3
@@ -23,11 +23,8 @@ RADIUS_RANGE = (0.5e-3, 30e-3)  # Smallest and largest tool radius [m].
 MAX_FORCE = 10.0  # Largest force of a tool on a brain [N].
 FORCE_SIGMA = 0.1
 """Default standard deviation of a measured force, relative to it."""
-FRAME_COLUMN, RADIUS_COLUMN, FORCE_COLUMN = (
-    "frame",
-    "radius",
-    "force",
-)  # Column names: number of the frame, radius of the tool, force.
+# Column names: number of the frame, radius of the tool, force.
+FRAME_COLUMN, RADIUS_COLUMN, FORCE_COLUMN = "frame", "radius", "force"
 ALLOWED_COLUMNS = {  # Allowed columns after the position, and columns with optional cells.
     (FRAME_COLUMN, *PLACE, *more)
     for more in (
@@ -109,7 +106,7 @@ def _check(anatomy: Anatomy, tool: Tool) -> None:
     if not np.isfinite(numbers).all():
         raise InputError("a tool has a number that is not finite: leave it out.")
     away = float(np.linalg.norm(find_foot(anatomy, tool) - tool.tip))
-    if away > FAR_DISTANCE_NOW:
+    if away > LIMITS.far_distance_now:
         raise InputError(
             f"a tool is {1e3 * away:.0f} mm from the open cortex, so that it cannot press on it: give millimetres, "
             "RAS, or leave it out."

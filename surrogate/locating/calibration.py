@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -31,14 +31,21 @@ EXTENT_WEIGHT = 4.0  # Weight of the extent feature.
 # Tolerance beyond the largest trial features [log units], so that 400 points, the maximum used, are covered.
 FEATURE_TOLERANCE = 0.05
 SINGLE_CAUSES = (TOOL, DRAINAGE, SWELLING, OEDEMA)  # Causes that move the brain in a trial.
-POINT_COUNTS = (20, 400)  # Range of a trial's number of points.
-COVERED_SHARES = (0.1, 1.0)  # Range of a trial's observed share of the open cortex.
-COMPLIANCE_RATIOS = (0.7, 2.0)  # Range of a trial's tissue compliance relative to the ensemble.
-ERROR_RATIOS = (0.05, 1.0)  # Range of a trial's point errors relative to `SIGMA`.
-SHIFT_RANGE = (0.05e-3, 3e-3)  # Range of a trial's rigid error along each axis [m].
-NO_SHIFT_PROBABILITY = 0.25  # Probability of no rigid error in a trial.
 MIN_MOTION_RATIO = 1e-3  # Lower bound of motion over error, so that its logarithm is finite.
-MIN_MOTION = 0.5e-3  # Minimum RMS motion of the open cortex for a member to be used in a trial [m].
+
+
+@dataclass(frozen=True)
+class TrialSettings:
+    """Settings of `run_trials`."""
+
+    point_counts: tuple[int, int] = (20, 400)  # Range of a trial's number of points.
+    covered_shares: tuple[float, float] = (0.1, 1.0)  # Range of a trial's observed share of the open cortex.
+    # Range of a trial's tissue compliance relative to the ensemble.
+    compliance_ratios: tuple[float, float] = (0.7, 2.0)
+    error_ratios: tuple[float, float] = (0.05, 1.0)  # Range of a trial's point errors relative to `SIGMA`.
+    shift_range: tuple[float, float] = (0.05e-3, 3e-3)  # Range of a trial's rigid error along each axis [m].
+    no_shift_probability: float = 0.25  # Probability of no rigid error in a trial.
+    min_motion: float = 0.5e-3  # Minimum RMS motion of the open cortex for a member to be used in a trial [m].
 
 
 def run_trials(
@@ -46,6 +53,7 @@ def run_trials(
     presses: Presses,
     progress: Callable[[int, int], object] = lambda done, total: None,
     count: int = TRIAL_COUNT,
+    settings: TrialSettings = TrialSettings(),
 ) -> np.ndarray:
     """Run `count` trials: features (`compute_likeness`) and squared Mahalanobis error of each (k, 5).
 
@@ -62,11 +70,12 @@ def run_trials(
     fold, found = assign_held_out(ensemble), []
     if fold.max() < 0:
         raise InputError("no skull has two groups to try one by the other: give causes of several Poisson's ratios.")
-    large = compute_surface_motion(ensemble.anatomy, ensemble.motion) > MIN_MOTION
+    large = compute_surface_motion(ensemble.anatomy, ensemble.motion) > settings.min_motion
     for turn, numbers in enumerate(np.array_split(np.arange(count), fold.max() + 1)):
         prior, members = build_prior(ensemble, presses, fold != turn), np.flatnonzero((fold == turn) & large)
         for number in numbers:
-            observation, middle = _simulate_trial(ensemble, members, int(number), np.random.default_rng(number))
+            random = np.random.default_rng(number)
+            observation, middle = _simulate_trial(ensemble, members, int(number), random, settings)
             progress(int(number), count)
             try:
                 posterior, _ = match_and_update(prior, observation)
@@ -121,7 +130,7 @@ def compute_likeness(evidence: Evidence) -> np.ndarray:
 
 
 def _simulate_trial(
-    ensemble: Ensemble, members: np.ndarray, number: int, random: np.random.Generator
+    ensemble: Ensemble, members: np.ndarray, number: int, random: np.random.Generator, settings: TrialSettings
 ) -> tuple[Observation, np.ndarray]:
     """Simulate the observation of one or two motions, and the true motion (3,) [m] of the tumour centroid."""
     anatomy = ensemble.anatomy
@@ -129,13 +138,13 @@ def _simulate_trial(
     several = np.intersect1d(SINGLE_CAUSES, ensemble.kind[here])
     causes = random.permutation(several)[: 1 + (number % 3 == 0)]
     chosen = [random.choice(here[ensemble.kind[here] == cause]) for cause in causes]
-    softer = np.exp(random.uniform(*np.log(COMPLIANCE_RATIOS)))
+    softer = np.exp(random.uniform(*np.log(settings.compliance_ratios)))
     motion = softer * ensemble.motion[chosen].sum(axis=0, dtype=float)
-    evidence = sample_seen_patch(
-        anatomy, motion, random, int(np.exp(random.uniform(*np.log(POINT_COUNTS)))), random.uniform(*COVERED_SHARES)
-    )
-    sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(ERROR_RATIOS))))
-    shift = 0.0 if random.uniform() < NO_SHIFT_PROBABILITY else float(np.exp(random.uniform(*np.log(SHIFT_RANGE))))
+    count = int(np.exp(random.uniform(*np.log(settings.point_counts))))
+    evidence = sample_seen_patch(anatomy, motion, random, count, random.uniform(*settings.covered_shares))
+    sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(settings.error_ratios))))
+    has_shift = random.uniform() >= settings.no_shift_probability
+    shift = float(np.exp(random.uniform(*np.log(settings.shift_range)))) if has_shift else 0.0
     evidence = replace(evidence, sigma=sigma, shift=shift)
     off = np.linalg.cholesky(evidence.compute_noise()) @ random.standard_normal(len(evidence))
     way = random.standard_normal((2, 3))

@@ -11,25 +11,31 @@ from sim.geometry.locate import Located
 
 from ..array_functions import compute_squared_distances
 
-INDEPENDENT_ERROR = 0.3e-3  # Independent part of a point's non-rigid error [m].
-CORRELATED_ERROR = 0.5e-3  # Spatially correlated part of a point's non-rigid error [m].
-SIGMA = float(np.hypot(INDEPENDENT_ERROR, CORRELATED_ERROR))
-"""Standard deviation of a point's non-rigid error along each axis [m]: independent and correlated noise together."""
-CORRELATION_LENGTH = 15e-3  # Correlation length of a point's correlated non-rigid error [m].
-INDEPENDENT_MODEL_ERROR = 0.08  # Independent model error of the shapes as a share of the observed motion.
-CORRELATED_MODEL_ERROR = 0.1  # Correlated model error of the shapes as a share of the observed motion.
-MODEL_ERROR_LENGTH = 5e-3  # Correlation length of the correlated model error [m].
 SHIFT_ERROR = 0.8e-3
 """Default standard deviation of the rigid error (registration shift) along each axis [m]."""
-TURN_PER_SHIFT = (
-    float(np.radians(0.3)) / SHIFT_ERROR
-)  # Rotation error about each axis per metre of registration shift [rad/m].
-
+# Rotation error about each axis per metre of registration shift [rad/m].
+TURN_PER_SHIFT = float(np.radians(0.3)) / SHIFT_ERROR
 SLIPPED_ERROR = 10e-3  # Rigid error of a failed registration along each axis [m].
 MIN_SHIFT = 1e-5  # Smallest rigid error of any registration along each axis [m].
-
 BLOCK_SIZE = 48  # Block size: triangular matrices with fewer than twice this many rows are inverted directly.
 (trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """Settings of the error covariance of points and shapes."""
+
+    independent_error: float = 0.3e-3  # Independent part of a point's non-rigid error [m].
+    correlated_error: float = 0.5e-3  # Spatially correlated part of a point's non-rigid error [m].
+    correlation_length: float = 15e-3  # Correlation length of a point's correlated non-rigid error [m].
+    independent_model_error: float = 0.08  # Independent model error of the shapes as a share of the observed motion.
+    correlated_model_error: float = 0.1  # Correlated model error of the shapes as a share of the observed motion.
+    model_error_length: float = 5e-3  # Correlation length of the correlated model error [m].
+
+
+NOISE = NoiseSettings()
+SIGMA = float(np.hypot(NOISE.independent_error, NOISE.correlated_error))
+"""Standard deviation of a point's non-rigid error along each axis [m]: independent and correlated noise together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +109,11 @@ class Evidence:
 
     def compute_noise(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of non-rigid errors, and of the shapes' model error for motions of `scale` [m]."""
-        share, square = (INDEPENDENT_ERROR / SIGMA) ** 2, compute_squared_distances(self.at, self.at)
-        out = compute_correlation(square, CORRELATION_LENGTH) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
-        out += compute_correlation(square, MODEL_ERROR_LENGTH) * (CORRELATED_MODEL_ERROR * scale) ** 2
+        share, square = (NOISE.independent_error / SIGMA) ** 2, compute_squared_distances(self.at, self.at)
+        out = compute_correlation(square, NOISE.correlation_length) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
+        out += compute_correlation(square, NOISE.model_error_length) * (NOISE.correlated_model_error * scale) ** 2
         out *= self.axis @ self.axis.T
-        out[np.diag_indices(len(self))] += share * self.sigma**2 + (INDEPENDENT_MODEL_ERROR * scale) ** 2
+        out[np.diag_indices(len(self))] += share * self.sigma**2 + (NOISE.independent_model_error * scale) ** 2
         return out
 
     @property
@@ -196,7 +202,7 @@ def compute_correlation(square: np.ndarray, length: float) -> np.ndarray:
     return np.exp(square * (-0.5 / length**2))
 
 
-def smooth_root(points: np.ndarray, length: float = CORRELATION_LENGTH) -> np.ndarray:
+def smooth_root(points: np.ndarray, length: float = NOISE.correlation_length) -> np.ndarray:
     """Compute the factor (n, n) from independent noise at points (n, 3) [m] to smooth noise of variance 1."""
     value, vector = np.linalg.eigh(compute_correlation(compute_squared_distances(points, points), length))
     return vector * np.sqrt(np.maximum(value, 0.0))
@@ -208,12 +214,5 @@ def build_motion_evidence(
     """Build evidence from undeformed points (n, 3) [m] and their motions (n, 3) [m]; three rows a point."""
     count = len(at)
     point = np.repeat(np.arange(count), 3)
-    return Evidence(
-        Located(place.vertices[point], place.weights[point]),
-        at[point],
-        np.tile(np.eye(3), (count, 1)),
-        motion.ravel(),
-        sigma[point],
-        point,
-        shift,
-    )
+    place, axis = Located(place.vertices[point], place.weights[point]), np.tile(np.eye(3), (count, 1))
+    return Evidence(place, at[point], axis, motion.ravel(), sigma[point], point, shift)

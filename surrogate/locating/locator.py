@@ -22,21 +22,30 @@ from .posterior import Posterior, is_within_errors
 from .prior import MotionPrior
 from .regions import Region
 
-MAX_OUTLIER_SHARE = 0.35  # Largest share of outliers.
-MAX_SURPRISE = 2.5  # Largest `surprise` that a cause of the ensemble can explain.
-# Smallest log-odds of a registration slip against a motion for which a slip is assumed possible: in synthetic tests one
-# of 432 motions, and all slips of 8 to 20 mm along the cortex (docs/notes/locate_experiments.md).
-MIN_SLIP_LOG_ODDS = -2.0
-# Smallest log-odds of a slip against a motion for which a warning names the slip. True motions have -7 in the median
-# (docs/notes/locate_experiments.md).
-WARNING_LOG_ODDS = -2.5
-MAX_RIGID_RATIO = 2.0  # Ratio to the reported rigid error above which an estimated one counts as excessive.
-SWELLING_SHARE = 0.5  # Share of swelling and oedema above which `OEDEMA_WORDS` is reported.
 OEDEMA_WORDS = (  # Warning for brains that swell.
     "The brain swells or shrinks, by what was seen. If that is oedema round the tumour alone, the tumour moves about "
     "half as far, and ellipsoids often miss it: look for it in the scan."
 )
 SAMPLE_COUNT = 4000  # Number of normal samples from which the 95 % radius is estimated.
+
+
+@dataclass(frozen=True)
+class LocationLimits:
+    """Limits beyond which a location is rejected, or has a warning."""
+
+    max_outlier_share: float = 0.35  # Largest share of outliers.
+    max_surprise: float = 2.5  # Largest `surprise` that a cause of the ensemble can explain.
+    # Smallest log-odds of a registration slip against a motion for which a slip is assumed possible: in synthetic tests
+    # one of 432 motions, and all slips of 8 to 20 mm along the cortex (docs/notes/locate_experiments.md).
+    min_slip_log_odds: float = -2.0
+    # Smallest log-odds of a slip against a motion for which a warning names the slip. True motions have -7 in the
+    # median (docs/notes/locate_experiments.md).
+    warning_log_odds: float = -2.5
+    max_rigid_ratio: float = 2.0  # Ratio to the reported rigid error above which an estimated one counts as excessive.
+    swelling_share: float = 0.5  # Share of swelling and oedema above which `OEDEMA_WORDS` is reported.
+
+
+LIMITS = LocationLimits()
 
 
 @dataclass(frozen=True)
@@ -183,7 +192,7 @@ class Location:
         """Return True if a wrong registration explains the observation nearly as well as a motion does."""
         found, checked = self.posterior, self.checked
         return self.slipped or (
-            not checked and found.evidence.beyond > MAX_RIGID_RATIO and found.slipped >= WARNING_LOG_ODDS
+            not checked and found.evidence.beyond > LIMITS.max_rigid_ratio and found.slipped >= LIMITS.warning_log_odds
         )
 
     @property
@@ -194,7 +203,7 @@ class Location:
             f"{self._rigid_words} would explain {self.rigid_alone.share:.0%}, with a brain at rest. The two cannot be "
             "distinguished. If such an error is possible, give it by --rigid."
         )
-        swells = self.causes["swelling"] + self.causes["oedema"] > SWELLING_SHARE
+        swells = self.causes["swelling"] + self.causes["oedema"] > LIMITS.swelling_share
         return tuple(said for said in (rigid if named else "", OEDEMA_WORDS if swells else "", self.doubt) if said)
 
     @property
@@ -312,7 +321,7 @@ def _is_slip_likely(anatomy: Anatomy, found: Posterior) -> bool:
     A brain that sinks by a centimetre resembles a registration shift, but moves uniformly and mostly along the
     craniotomy's axis. A slip shifts it across, or turns it.
     """
-    if found.slipped < MIN_SLIP_LOG_ODDS or found.evidence.beyond <= MAX_RIGID_RATIO:
+    if found.slipped < LIMITS.min_slip_log_odds or found.evidence.beyond <= LIMITS.max_rigid_ratio:
         return False
     evidence, axis = found.evidence, open_cortex(anatomy).axis
     shift, turn = np.split(evidence.rigid_alone, 2)
@@ -329,12 +338,12 @@ def _check_explained(found: Posterior, outliers: int, points: int) -> None:
     InputError
         Too many outliers, or residuals larger than noise.
     """
-    if outliers > MAX_OUTLIER_SHARE * points:
+    if outliers > LIMITS.max_outlier_share * points:
         raise InputError(
             f"{outliers} of {points} points lie off the open cortex, or fit no motion of the others: check that "
             "they are of this brain. If they are less sure, raise sigma."
         )
-    if found.surprise > MAX_SURPRISE:
+    if found.surprise > LIMITS.max_surprise:
         raise InputError(
             f"the observation fits no cause: point errors of {np.sqrt(found.surprise):.1f} times their sigma. "
             "Check units, frame (RAS) and sigma, or that nothing was cut out."

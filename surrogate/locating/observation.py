@@ -18,21 +18,6 @@ from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 from ..array_functions import compute_squared_distances
 from .evidence import SHIFT_ERROR, SIGMA, Evidence, build_motion_evidence
 
-MIN_POINTS = 6  # Minimum number of points, and of different places.
-MIN_SPREAD_RATIO = 0.05  # Smallest ratio of the spread of points across a line to that along it.
-NEAR_DISTANCE = 6e-3  # Largest distance of at least half of the points from the open cortex [m].
-FAR_DISTANCE = 12e-3  # Largest distance of a point from the open cortex [m]; points beyond are outliers.
-# NEAR_DISTANCE for positions on the displaced surface [m]: drained brains sink by over a centimetre.
-NEAR_DISTANCE_NOW = 18e-3
-FAR_DISTANCE_NOW = 30e-3  # FAR_DISTANCE for positions on the displaced surface, and for tool tips [m].
-PLACE_TOLERANCE = 1e-3  # Distance below which points count as one [m].
-MAX_COORDINATE = 1e6  # Largest coordinate [m].
-MAX_MOTION = 0.025  # Largest median motion of a brain [m].
-MAX_RIGID_ERROR = 0.02  # Largest rigid error of a tracker [m].
-MIN_SIGMA = 0.01e-3  # Smallest error of a point [m]: below, a file of millimetres has metres.
-MIN_MOTION = 1e-9  # Smallest motion that is not zero [m].
-# Largest median error [m]: with more, points give no information about motions of a few millimetres.
-MAX_SIGMA = 0.01
 # Likely unit errors: factor that brings the points to the cortex, hint to the user.
 UNIT_ERRORS = (  # Likely unit and axis errors: factor that brings the points to the cortex, hint to the user.
     (1.0, ""),
@@ -44,11 +29,34 @@ UNIT_ERRORS = (  # Likely unit and axis errors: factor that brings the points to
 )
 # Likely axis errors: signs of x, y and z that bring the points to the cortex, hint to the user.
 FRAME_ERRORS = (((1.0, 1.0, 1.0), ""), ((-1.0, -1.0, 1.0), "if x and y were turned: they are LPS"))
-MAX_SPAN_RATIO = (
-    6.0  # Largest ratio of the span of points to that of the open cortex, and its inverse: beyond, units are wrong.
-)
 MAX_POINTS = 400
 """Maximum number of points used, spread over those given: more add nothing, as neighbours share errors."""
+
+
+@dataclass(frozen=True)
+class ObservationLimits:
+    """Limits of a plausible observation."""
+
+    min_points: int = 6  # Minimum number of points, and of different places.
+    min_spread_ratio: float = 0.05  # Smallest ratio of the spread of points across a line to that along it.
+    near_distance: float = 6e-3  # Largest distance of at least half of the points from the open cortex [m].
+    far_distance: float = 12e-3  # Largest distance of a point from the open cortex [m]; points beyond are outliers.
+    # `near_distance` for positions on the displaced surface [m]: drained brains sink by over a centimetre.
+    near_distance_now: float = 18e-3
+    far_distance_now: float = 30e-3  # `far_distance` for positions on the displaced surface, and for tool tips [m].
+    place_tolerance: float = 1e-3  # Distance below which points count as one [m].
+    max_coordinate: float = 1e6  # Largest coordinate [m].
+    max_motion: float = 0.025  # Largest median motion of a brain [m].
+    max_rigid_error: float = 0.02  # Largest rigid error of a tracker [m].
+    min_sigma: float = 0.01e-3  # Smallest error of a point [m]: below, a file of millimetres has metres.
+    min_motion: float = 1e-9  # Smallest motion that is not zero [m].
+    # Largest median error [m]: with more, points give no information about motions of a few millimetres.
+    max_sigma: float = 0.01
+    # Largest ratio of the span of points to that of the open cortex, and its inverse: beyond, units are wrong.
+    max_span_ratio: float = 6.0
+
+
+LIMITS = ObservationLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +118,9 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
     _check(observation)
     some = choose_points(len(observation.now))
     if observation.rest is None:
-        where, near, far = observation.now[some], NEAR_DISTANCE_NOW, FAR_DISTANCE_NOW
+        where, near, far = observation.now[some], LIMITS.near_distance_now, LIMITS.far_distance_now
     else:
-        where, near, far = observation.rest[some], NEAR_DISTANCE, FAR_DISTANCE
+        where, near, far = observation.rest[some], LIMITS.near_distance, LIMITS.far_distance
     off = _compute_surface_distances(anatomy, where)
     if _is_mostly_far(off, near):
         raise InputError(_describe_mismatch(anatomy, where, float(np.median(off)), near))
@@ -120,7 +128,7 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
     if observation.rest is not None:
         _check_motions(np.linalg.norm(observation.now - observation.rest, axis=1)[some])
     for number, away in enumerate(_compute_surface_distances(anatomy, observation.tips), start=1):
-        if away > FAR_DISTANCE_NOW:
+        if away > LIMITS.far_distance_now:
             raise InputError(
                 f"tip {number} is {1e3 * away:.0f} mm from the open cortex, so that it cannot touch it: give "
                 "millimetres, RAS, or leave it out."
@@ -211,28 +219,31 @@ def _check(observation: Observation) -> None:
     if sigma.shape != (count,):
         raise InputError(f"{count} points have a sigma of shape {sigma.shape}: give one number for each point.")
     for name, array in {**arrays, "sigma": sigma}.items():
-        if not (np.abs(array) < MAX_COORDINATE).all():
+        if not (np.abs(array) < LIMITS.max_coordinate).all():
             raise InputError(
-                f"`{name}` has a value that is not finite, or beyond {MAX_COORDINATE:,.0f} m: leave such points out."
+                f"`{name}` has a value that is not finite, or beyond {LIMITS.max_coordinate:,.0f} m: leave such points "
+                "out."
             )
-    if count < MIN_POINTS:
-        raise InputError(f"{count} points say too little: give at least {MIN_POINTS}, spread over the open cortex.")
+    if count < LIMITS.min_points:
+        raise InputError(
+            f"{count} points say too little: give at least {LIMITS.min_points}, spread over the open cortex."
+        )
     if not (sigma > 0.0).all():
         raise InputError("a sigma is not positive: give each point the standard deviation of its error [mm].")
-    if sigma.min() < MIN_SIGMA:
+    if sigma.min() < LIMITS.min_sigma:
         raise InputError(
             f"a sigma is {1e3 * sigma.min():.2g} mm, which no tracker has: give each point the standard deviation of "
             "its error in millimetres, rather than metres."
         )
-    if np.median(sigma) > MAX_SIGMA:
+    if np.median(sigma) > LIMITS.max_sigma:
         raise InputError(
             f"half of the points have a sigma of {1e3 * np.median(sigma):.3g} mm or more, and so say nothing of a "
-            f"brain. Give standard deviations of up to {1e3 * MAX_SIGMA:g} mm, or leave these points out."
+            f"brain. Give standard deviations of up to {1e3 * LIMITS.max_sigma:g} mm, or leave these points out."
         )
-    if not 0.0 <= observation.rigid <= MAX_RIGID_ERROR:
+    if not 0.0 <= observation.rigid <= LIMITS.max_rigid_error:
         raise InputError(
             f"a rigid error of {1e3 * observation.rigid:g} mm is none that a tracker has: give its standard deviation "
-            f"along each axis, from 0 to {1e3 * MAX_RIGID_ERROR:g} mm."
+            f"along each axis, from 0 to {1e3 * LIMITS.max_rigid_error:g} mm."
         )
 
 
@@ -241,12 +252,12 @@ def _check_motions(length: np.ndarray) -> None:
 
     Lengths of 0 are accepted: nothing moved.
     """
-    if np.median(length) > MAX_MOTION:
+    if np.median(length) > LIMITS.max_motion:
         raise InputError(
             f"half of the points move by more than {1e3 * np.median(length):.0f} mm, which no brain does: give motions "
             "in millimetres, rather than centimetres or new positions."
         )
-    if MIN_MOTION < length.max() < 1e-3 * MAX_MOTION:
+    if LIMITS.min_motion < length.max() < 1e-3 * LIMITS.max_motion:
         raise InputError(
             f"no point moves by more than {1e3 * length.max():.2g} mm, below any noise: give motions in millimetres, "
             "rather than metres. If nothing moved, give zeros."
@@ -255,23 +266,23 @@ def _check_motions(length: np.ndarray) -> None:
 
 def _check_spread(where: np.ndarray, near: np.ndarray) -> None:
     """Raise InputError if points (n, 3) [m] have too few distinct positions, or those `near` (n,) are on a line."""
-    places = len(np.unique(np.round(where / PLACE_TOLERANCE), axis=0))
-    if places < MIN_POINTS:
+    places = len(np.unique(np.round(where / LIMITS.place_tolerance), axis=0))
+    if places < LIMITS.min_points:
         raise InputError(
-            f"{places} places a millimetre apart say too little: give {MIN_POINTS} at least, spread over the open "
-            "cortex."
+            f"{places} places a millimetre apart say too little: give {LIMITS.min_points} at least, spread over the "
+            "open cortex."
         )
     some = where[near]
     along, across, _ = np.linalg.svd(some - some.mean(axis=0), compute_uv=False)
-    if not across > MIN_SPREAD_RATIO * along:
+    if not across > LIMITS.min_spread_ratio * along:
         raise InputError("the points lie on a line: spread them over the open cortex.")
 
 
 def _compute_surface_distances(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """Compute distances (n,) [m] from the open cortex; within `NEAR_DISTANCE` of a vertex, from the nearest vertex."""
+    """Compute distances (n,) [m] from the open cortex; up to `LIMITS.near_distance`, from the nearest vertex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     away = np.sqrt(compute_squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
-    far = np.flatnonzero(away > NEAR_DISTANCE)
+    far = np.flatnonzero(away > LIMITS.near_distance)
     if len(far):
         away[far] = np.linalg.norm(find_closest_points(points[far], nodes[triangles]).point - points[far], axis=1)
     return away
@@ -290,6 +301,6 @@ def _describe_mismatch(anatomy: Anatomy, points: np.ndarray, off: float, near: f
             meant = " and ".join(filter(None, (unit_meant, frame_meant)))
             return f"{start}, and would lie on it {meant}. Give mm and RAS."
     span, own = (float(np.linalg.norm(np.ptp(some, axis=0))) for some in (points, open_cortex(anatomy).corners))
-    if not own / MAX_SPAN_RATIO < span < own * MAX_SPAN_RATIO:
+    if not own / LIMITS.max_span_ratio < span < own * LIMITS.max_span_ratio:
         return f"{start}. They span {1e3 * span:.3g} mm, and it {1e3 * own:.3g} mm: check units. Give mm and RAS."
     return f"{start}: they are of another brain or frame. Give the scan's own RAS, in millimetres."

@@ -23,14 +23,23 @@ from .evidence import SHIFT_ERROR, SLIPPED_ERROR, Evidence, invert_triangular
 from .prior import CAUSE_SETS, PLACE_SETS, RIGID_RATIOS, Hypothesis, MotionPrior
 from .whitened import Equations, WhitenedSystem, add_places, whiten
 
-MOTION_SIGNIFICANCE = 0.005  # Significance level of a motion, for each of three tests.
-OUTLIER_SIGNIFICANCE = 1e-4  # Significance level of an outlier.
-MIN_INLIERS = 4  # Number of points up to which none is tested as an outlier.
 NO_TIPS, NO_ROWS = np.zeros((0, 3)), np.zeros(0, int)  # Empty arrays: no tool tips (0, 3), no rows (0,).
-EVIDENCE_DIVISOR = 2.0  # Divisor of the log evidence, as model errors make hypotheses look too improbable.
 RIGID_KIND = -1  # Kind of the unknowns of the rigid error, next to the numbers of causes.
-MAX_HYPOTHESES = 24  # Maximum number of hypotheses in the mixture: the most probable ones.
 (potrs,) = get_lapack_funcs(("potrs",), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class PosteriorSettings:
+    """Settings of `condition_prior` and `is_within_errors`."""
+
+    motion_significance: float = 0.005  # Significance level of a motion, for each of three tests.
+    outlier_significance: float = 1e-4  # Significance level of an outlier.
+    min_inliers: int = 4  # Number of points up to which none is tested as an outlier.
+    evidence_divisor: float = 2.0  # Divisor of the log evidence, as model errors make hypotheses look too improbable.
+    max_hypotheses: int = 24  # Maximum number of hypotheses in the mixture: the most probable ones.
+
+
+POSTERIOR = PosteriorSettings()
 
 
 def is_within_errors(posterior: Posterior) -> bool:
@@ -49,10 +58,10 @@ def is_within_errors(posterior: Posterior) -> bool:
     found = np.linalg.lstsq(precision, gain, rcond=None)[0]
     together = found @ np.linalg.solve(whole, precision @ found)
     rest = ((white - rigid @ found) ** 2).sum()
-    if min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) <= MOTION_SIGNIFICANCE:
+    if min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) <= POSTERIOR.motion_significance:
         return False
     still = 0.5 * (gain @ np.linalg.solve(whole, gain) - np.linalg.slogdet(whole)[1] - white @ white)
-    return bool(posterior.moving - still - whitening.logarithm < -np.log(MOTION_SIGNIFICANCE))
+    return bool(posterior.moving - still - whitening.logarithm < -np.log(POSTERIOR.motion_significance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +182,7 @@ class ObservedPrior:
     def slipped(self) -> float:
         """Log-odds of a slip, as in `Posterior`."""
         best = self.logs.max(axis=1)
-        return EVIDENCE_DIVISOR * float(best[self._slips].max() - best[~self._slips].max())
+        return POSTERIOR.evidence_divisor * float(best[self._slips].max() - best[~self._slips].max())
 
     @property
     def moving(self) -> float:
@@ -181,7 +190,7 @@ class ObservedPrior:
 
         Odds do not count: a tip gives no information on motion.
         """
-        logs = EVIDENCE_DIVISOR * (self.logs - self.odds)[~self._slips]
+        logs = POSTERIOR.evidence_divisor * (self.logs - self.odds)[~self._slips]
         logs, rows = logs[np.isfinite(logs)], self.rows
         return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.logarithm)
 
@@ -196,7 +205,7 @@ class ObservedPrior:
         Hypotheses of a slipped registration are included if it is `free`.
         """
         logs = self.logs if free else np.where(self._slips[:, None], -np.inf, self.logs)
-        best = np.argsort(-logs, axis=None, kind="stable")[: min(MAX_HYPOTHESES, np.isfinite(logs).sum())]
+        best = np.argsort(-logs, axis=None, kind="stable")[: min(POSTERIOR.max_hypotheses, np.isfinite(logs).sum())]
         share = np.exp(logs.flat[best] - logs.flat[best[0]])
         share /= share.sum()
         found = []
@@ -230,7 +239,7 @@ class ObservedPrior:
             evidence[..., number, 0] = here.evidence
         pressed = [number for number, some in enumerate(CAUSE_SETS) if some in PLACE_SETS and some in found]
         evidence[..., pressed, 1:] = np.moveaxis(add_places([found[CAUSE_SETS[number]] for number in pressed]), 0, -2)
-        return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / EVIDENCE_DIVISOR
+        return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / POSTERIOR.evidence_divisor
 
     def _build_equations(self) -> Equations:
         """Build the normal equations of all unknowns in each skull, each over its prior standard deviation."""
@@ -295,15 +304,14 @@ def condition_prior(
         seen = build_observed_prior(prior, some, tips)
         answers = seen.compute_posteriors(free)
         odd = _compute_distances(seen.rows, answers[0], some.point)
-        excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], OUTLIER_SIGNIFICANCE)
-        if excess.max() <= 1.0 or len(excess) <= MIN_INLIERS:
+        excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], POSTERIOR.outlier_significance)
+        if excess.max() <= 1.0 or len(excess) <= POSTERIOR.min_inliers:
             break
         kept &= ~np.isin(point, np.unique(some.point)[excess >= max(1.0, 0.5 * excess.max())])
-        if len(np.unique(point[kept])) < MIN_INLIERS:
+        if len(np.unique(point[kept])) < POSTERIOR.min_inliers:
             raise InputError(
-                f"of {len(np.unique(point))} points fewer than {MIN_INLIERS} agree on a motion: check that each has "
-                "its own "
-                "motion. If they are less sure, raise sigma."
+                f"of {len(np.unique(point))} points fewer than {POSTERIOR.min_inliers} agree on a motion: check that "
+                "each has its own motion. If they are less sure, raise sigma."
             )
     unknown = np.zeros(len(prior.kind) + 6)
     for answer in answers:

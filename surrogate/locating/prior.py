@@ -23,9 +23,6 @@ from .ensemble import Ensemble, compute_surface_motion
 # Maximum number of shapes of each cause in each skull model.
 MAX_SHAPES = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}
 MIN_SHAPE_SHARE = 1e-6  # Smallest share of the variance of one shape.
-PLACE_COUNT = 30  # Number of places that one tool may press on.
-MAX_PLACE_SHAPES = 6  # Maximum number of shapes of each place.
-PLACE_DEVIATION = 6e-3  # Standard deviation of the weight of forces round a place [m].
 # Prior size of motions by cause, as a share of the observed motion. That of `TUMOUR_SWELLING` is with a swelling brain;
 # that of `TOOL` is of forces all over the cortex, which compensate for missing shapes.
 CAUSE_SIZES = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, OEDEMA: 1.0, TOOL: 0.15}
@@ -41,8 +38,21 @@ CAUSE_SETS = (
 )  # fmt: skip
 PLACE_SETS = CAUSE_SETS[:6]  # Sets with which a tool may press on one place.
 NO_PLACE = -1  # Place number of shapes that belong to no place.
-TOUCH_DEVIATION = 4e-3  # Standard deviation of the distance between a touching tip and the pressed place [m].
-NO_PLACE_PROBABILITY = 0.05  # Probability that a touching tip presses on no place.
+
+
+@dataclass(frozen=True)
+class PressSettings:
+    """Settings of the prior of a tool that presses on one place."""
+
+    place_count: int = 30  # Number of places that one tool may press on.
+    max_place_shapes: int = 6  # Maximum number of shapes of each place.
+    place_deviation: float = 6e-3  # Standard deviation of the weight of forces round a place [m].
+    # Standard deviation of the distance between a touching tip and the pressed place [m].
+    touch_deviation: float = 4e-3
+    no_place_probability: float = 0.05  # Probability that a touching tip presses on no place.
+
+
+PRESS = PressSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +193,7 @@ class MotionPrior:
         if not len(tips):
             return np.zeros(1 + len(self.centre))
         away = ((self.centre[:, None] - tips) ** 2).sum(axis=2).min(axis=1)
-        return np.append(np.log(NO_PLACE_PROBABILITY), -away / (2.0 * TOUCH_DEVIATION**2))
+        return np.append(np.log(PRESS.no_place_probability), -away / (2.0 * PRESS.touch_deviation**2))
 
     def _select_skull_rows(self, number: int) -> tuple[dict[int, np.ndarray], np.ndarray]:
         """Return rows by kind in a skull (tools: all over the cortex), and (p, q), those of a tool on each place."""
@@ -231,34 +241,18 @@ def build_prior(ensemble: Ensemble, presses: Presses, members: np.ndarray | None
                 normalise_motions(anatomy, ensemble.motion[some]) / np.float32(np.sqrt(len(some))), MAX_SHAPES[kind]
             )
             parts.append((shape, kind, skull, NO_PLACE))
-    centres = choose_spaced(presses.points, PLACE_COUNT)
+    centres = choose_spaced(presses.points, PRESS.place_count)
     for name in dict.fromkeys(TOOL_SKULLS.values()):
         skull, motion = list(SKULLS).index(name), presses.motion[name]
-        parts.append(
-            (
-                normalise_shapes(
-                    anatomy, compute_principal_parts(motion.reshape(-1, *motion.shape[-2:]), MAX_SHAPES[TOOL])
-                ),
-                TOOL,
-                skull,
-                NO_PLACE,
-            )
-        )
+        shape = compute_principal_parts(motion.reshape(-1, *motion.shape[-2:]), MAX_SHAPES[TOOL])
+        parts.append((normalise_shapes(anatomy, shape), TOOL, skull, NO_PLACE))
         for place, centre in enumerate(centres):
             away = ((presses.points - presses.points[centre]) ** 2).sum(axis=1)
-            near = np.flatnonzero(away < (3.0 * PLACE_DEVIATION) ** 2)
-            weight = np.exp(-away[near] / (2.0 * PLACE_DEVIATION**2)).astype(np.float32)
+            near = np.flatnonzero(away < (3.0 * PRESS.place_deviation) ** 2)
+            weight = np.exp(-away[near] / (2.0 * PRESS.place_deviation**2)).astype(np.float32)
             some = motion[:, near] * weight[:, None, None, None]
-            parts.append(
-                (
-                    normalise_shapes(
-                        anatomy, compute_principal_parts(some.reshape(-1, *motion.shape[-2:]), MAX_PLACE_SHAPES)
-                    ),
-                    TOOL,
-                    skull,
-                    place,
-                )
-            )
+            shape = compute_principal_parts(some.reshape(-1, *motion.shape[-2:]), PRESS.max_place_shapes)
+            parts.append((normalise_shapes(anatomy, shape), TOOL, skull, place))
     shapes, *labels = zip(*parts, strict=True)
     counts = [len(shape) for shape in shapes]
     labels = [np.repeat(label, counts) for label in labels]
