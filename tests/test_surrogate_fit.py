@@ -10,7 +10,7 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 from surrogate.fitting import fit
-from surrogate.fitting.fit import MESH_FORCE_RATIO, compute_probability, estimate_young_moduli, weigh_tissues
+from surrogate.fitting.fit import ModulusSettings, compute_probability, estimate_young_moduli, weigh_tissues
 from surrogate.fitting.frame_likelihood import find_unsupported
 from surrogate.fitting.observed_frame import ObservedFrame, Tool, find_foot
 from surrogate.fitting.responses import POISSONS, RATIOS, build_drained_loads, build_force_loads, solve_responses
@@ -95,7 +95,7 @@ def test_a_force_that_is_read_gives_the_modulus(body):
     young = estimate_young_moduli(body, [frame], FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu")
     low, middle, high = np.quantile(young, [0.025, 0.5, 0.975])
     assert low < 2.0 * YOUNG < high and middle == pytest.approx(
-        2.0 * YOUNG / MESH_FORCE_RATIO, rel=0.1
+        2.0 * YOUNG / ModulusSettings.mesh_force_ratio, rel=0.1
     )  # here on one mesh
     silent = [replace(frame, tools=(replace(tool, force=None, sigma=None),))]
     assert not len(estimate_young_moduli(body, silent, FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu"))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -40,15 +41,22 @@ EXPONENTS = (9.5, 19.0)
 """Candidate -m of Ogden's law, equally probable: tissue stiffens with indentation, so a dent alone gives no E."""
 YOUNGS = np.geomspace(300.0, 12000.0, 300)
 """Candidate Young's moduli [Pa] at small strain, equally probable."""
-FORCE_MULTIPLES = (0.6, 1.2, 2.2, 3.6, 5.5)  # Solved forces as multiples of the force that linear tissue would need.
-# Ratio of the force on finer or quadratic meshes to that on a command's mesh, for the same dent: 1.08 to 1.16 on the
-# template (docs/notes/fit_experiments.md).
-MESH_FORCE_RATIO = 1.11
-MODULUS_DEVIATION = 0.45  # Standard deviation of the logarithm of a modulus due to further errors.
-ITERATIONS = 3  # Number of iterations that recompute the errors from the estimated dent.
 # Equally probable normal quantiles of a force reading [standard deviations].
 READING_QUANTILES = np.array([-1.4, -0.7, 0.0, 0.7, 1.4])
-MODULUS_SAMPLES = 101  # Number of samples of a modulus.
+
+
+@dataclass(frozen=True)
+class ModulusSettings:
+    """Settings of `estimate_young_moduli`."""
+
+    # Solved forces as multiples of the force that linear tissue would need.
+    force_multiples: tuple[float, ...] = (0.6, 1.2, 2.2, 3.6, 5.5)
+    # Ratio of the force on finer or quadratic meshes to that on a command's mesh, for the same dent: 1.08 to 1.16 on
+    # the template (docs/notes/fit_experiments.md).
+    mesh_force_ratio: float = 1.11
+    modulus_deviation: float = 0.45  # Standard deviation of the logarithm of a modulus due to further errors.
+    iterations: int = 3  # Number of iterations that recompute the errors from the estimated dent.
+    modulus_samples: int = 101  # Number of samples of a modulus.
 
 
 def estimate_young_moduli(
@@ -58,6 +66,7 @@ def estimate_young_moduli(
     pressed: Responses | None,
     device: str = "auto",
     progress: Callable[[int, int], object] = lambda done, total: None,
+    settings: ModulusSettings = ModulusSettings(),
 ) -> np.ndarray:
     """Sample Young's moduli (k,) [Pa] of the brain, equally probable; empty if no force was measured.
 
@@ -74,19 +83,20 @@ def estimate_young_moduli(
     for done, number in enumerate(read):
         progress(done, len(read))
         evidence, own = to_evidence(anatomy, frames[number].observation), slice(columns[number], columns[number] + 3)
-        total += _compute_log_likelihood(anatomy, frames[number].tools[0], evidence, tissue, pressed, own, device)
+        tool = frames[number].tools[0]
+        total += _compute_log_likelihood(anatomy, tool, evidence, tissue, pressed, own, device, settings)
     progress(len(read), len(read))
     share = np.exp(total - total.max())
     step = float(np.log(YOUNGS[1] / YOUNGS[0]))
-    at = np.cumsum(gaussian_filter1d(share, MODULUS_DEVIATION / step))
-    return np.exp(
-        np.interp((np.arange(MODULUS_SAMPLES) + 0.5) / MODULUS_SAMPLES, at / at[-1], np.log(YOUNGS / MESH_FORCE_RATIO))
-    )
+    at = np.cumsum(gaussian_filter1d(share, settings.modulus_deviation / step))
+    quantiles = (np.arange(settings.modulus_samples) + 0.5) / settings.modulus_samples
+    return np.exp(np.interp(quantiles, at / at[-1], np.log(YOUNGS / settings.mesh_force_ratio)))
 
 
 def _compute_log_likelihood(
-    anatomy: Anatomy, tool: Tool, evidence: Evidence, tissue: FittedTissue, pressed: Responses, own: slice, device: str
-) -> np.ndarray:
+    anatomy: Anatomy, tool: Tool, evidence: Evidence, tissue: FittedTissue, pressed: Responses, own: slice,
+    device: str, settings: ModulusSettings,
+) -> np.ndarray:  # fmt: skip
     """Compute the log-likelihood of one force reading for each of `YOUNGS`."""
     name = max(tissue.skulls, key=lambda skull: tissue.skulls[skull])
     skull, (_, poisson, _), (_, ratio, _) = "slide" if name == SEPARATING_SKULL else name, tissue.poisson, tissue.ratio
@@ -104,12 +114,12 @@ def _compute_log_likelihood(
     for exponent in EXPONENTS:
         group = Group(list(SKULLS).index(skull), skull, poisson, ratio, exponent, pressed.regions)
         sizes, rows = _solve_dents(
-            anatomy, tool, group, evidence, pressed, force * np.array(FORCE_MULTIPLES), direction, device
+            anatomy, tool, group, evidence, pressed, force * np.array(settings.force_multiples), direction, device
         )
         inside.append((asked >= np.log(sizes[0])) & (asked <= np.log(sizes[-1])))
         shapes.append(CubicSpline(np.log(sizes), rows)(np.clip(asked, *np.log(sizes[[0, -1]]))))
     shape, logs = np.stack(shapes), np.zeros(0)
-    for _ in range(ITERATIONS):
+    for _ in range(settings.iterations):
         off = whiten_columns(lower, (evidence.value - shape).reshape(-1, len(value)).T)
         logs = -0.5 * (off**2).sum(axis=0).reshape(shape.shape[:-1])
         logs = np.where(inside, logs, logs.min() - 50.0)
@@ -157,28 +167,14 @@ def fit_tissue(
     frames = remove_points(frames, find_unsupported(locator, frames) if left_out is None else left_out)
     drained, pressed, regions = None, None, list_fitted_regions(locator)
     if any(not frame.tools for frame in frames):
-        drained = solve_responses(
-            anatomy,
-            build_drained_loads(anatomy),
-            device,
-            folder,
-            lambda done, total: progress("drained fluid", done, total),
-            regions,
-        )
+        loads = build_drained_loads(anatomy)
+        drained = solve_responses(anatomy, loads, device, folder, partial(progress, "drained fluid"), regions)
     tools = [tool for frame in frames for tool in frame.tools]
     if tools:
         at, radius = np.array([find_foot(anatomy, tool) for tool in tools]), np.array([tool.radius for tool in tools])
-        pressed = solve_responses(
-            anatomy,
-            build_force_loads(anatomy, at, radius),
-            device,
-            folder,
-            lambda done, total: progress("tools", done, total),
-            regions,
-        )
-    return fit_from_evidence(
-        locator, frames, drained, pressed, device, lambda done, total: progress("forces", done, total)
-    )
+        loads = build_force_loads(anatomy, at, radius)
+        pressed = solve_responses(anatomy, loads, device, folder, partial(progress, "tools"), regions)
+    return fit_from_evidence(locator, frames, drained, pressed, device, partial(progress, "forces"))
 
 
 def fit_from_evidence(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -20,13 +20,22 @@ from ..locating.prior import MotionPrior
 from .observed_frame import ObservedFrame
 from .responses import SOLVED_SKULLS, Responses
 
-# Model error of linear tissue as a share of a point's motion, in the independent and in the correlated part.
-MODEL_ERROR_SHARE = 0.05
-MODEL_ERROR_LENGTH = 10e-3  # Correlation length of the correlated part [m].
-MIN_MOTION_SHARE = 0.1  # Lower bound of a point's motion in the model error, relative to the mean motion.
-MOTION_SIZES = (0.3, 1.0, 3.0)  # Candidate sizes of motions, relative to the observation.
-EVIDENCE_DIVISOR = 2.0  # Divisor of the log evidence of drained fluid.
-TOOL_EVIDENCE_DIVISOR = 8.0  # Divisor of the log evidence of tools, whose dents are nonlinear.
+
+@dataclass(frozen=True)
+class LikelihoodSettings:
+    """Settings of the likelihood of a frame."""
+
+    # Model error of linear tissue as a share of a point's motion, in the independent and in the correlated part.
+    model_error_share: float = 0.05
+    model_error_length: float = 10e-3  # Correlation length of the correlated part [m].
+    min_motion_share: float = 0.1  # Lower bound of a point's motion in the model error, relative to the mean motion.
+    # Candidate sizes of motions, relative to the observation.
+    motion_sizes: tuple[float, float, float] = (0.3, 1.0, 3.0)
+    evidence_divisor: float = 2.0  # Divisor of the log evidence of drained fluid.
+    tool_evidence_divisor: float = 8.0  # Divisor of the log evidence of tools, whose dents are nonlinear.
+
+
+LIKELIHOOD = LikelihoodSettings()
 
 
 def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
@@ -39,7 +48,7 @@ def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) ->
     found = {name: _compute_log_evidence(each / size, evidence, lower, seen) for name, each in rows.items()}
     found["contact"] = _compute_log_evidence((lets_go / _compute_size(lets_go))[None, None], evidence, lower, seen)
     shape = found[SOLVED_SKULLS[0]].shape
-    return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / EVIDENCE_DIVISOR
+    return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / LIKELIHOOD.evidence_divisor
 
 
 def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
@@ -54,19 +63,14 @@ def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -
     found = {name: _compute_log_evidence(each / size, evidence, lower, seen) for name, each in rows.items()}
     found = {name: logsumexp(each) - np.log(each.size) for name, each in found.items()}
     found["contact"] = found["slide"]
-    return np.array([found[name] for name in SKULLS])[:, None, None] / TOOL_EVIDENCE_DIVISOR
+    return np.array([found[name] for name in SKULLS])[:, None, None] / LIKELIHOOD.tool_evidence_divisor
 
 
 def predict_seen(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
     """Compute the observed displacements (poissons, ratios, loads, m) [m] of responses."""
     column = np.searchsorted(responses.nodes, evidence.place.vertices)
-    return np.einsum(
-        "prlmki,mk,mi->prlm",
-        responses.motion[skull][..., column, :],
-        evidence.place.weights,
-        evidence.axis,
-        optimize=True,
-    )
+    motion = responses.motion[skull][..., column, :]
+    return np.einsum("prlmki,mk,mi->prlm", motion, evidence.place.weights, evidence.axis, optimize=True)
 
 
 def _compute_size(rows: np.ndarray) -> float:
@@ -82,14 +86,10 @@ def factorise_errors(evidence: Evidence, believed: np.ndarray | None = None) -> 
     value = evidence.value if believed is None else believed
     length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]
     seen = float(np.sqrt((value**2).mean()))
-    off = MODEL_ERROR_SHARE * np.maximum(length, MIN_MOTION_SHARE * np.sqrt(3.0) * seen)
-    axes = evidence.axis @ evidence.axis.T
-    noise = (
-        evidence.compute_noise()
-        + np.outer(off, off)
-        * compute_correlation(compute_squared_distances(evidence.at, evidence.at), MODEL_ERROR_LENGTH)
-        * axes
-    )
+    off = LIKELIHOOD.model_error_share * np.maximum(length, LIKELIHOOD.min_motion_share * np.sqrt(3.0) * seen)
+    square = compute_squared_distances(evidence.at, evidence.at)
+    correlation = compute_correlation(square, LIKELIHOOD.model_error_length)
+    noise = evidence.compute_noise() + np.outer(off, off) * correlation * (evidence.axis @ evidence.axis.T)
     noise[np.diag_indices(len(noise))] += off**2
     rigid = evidence.rigid * evidence.rigid_scale
     return cholesky(noise + rigid @ rigid.T, lower=True), max(seen, 1e-6)
@@ -105,11 +105,11 @@ def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarra
     motion = seen * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
     gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.value)
     logs = []
-    for times in MOTION_SIZES:
+    for times in LIKELIHOOD.motion_sizes:
         root = np.linalg.cholesky(np.eye(gram.shape[-1]) + times**2 * gram)
         half = np.linalg.solve(root, times * pull[..., None])[..., 0]
         logs.append(0.5 * (half**2).sum(axis=-1) - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1))
-    return logsumexp(logs, axis=0) - np.log(len(MOTION_SIZES))
+    return logsumexp(logs, axis=0) - np.log(len(LIKELIHOOD.motion_sizes))
 
 
 def find_unsupported(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple[np.ndarray, ...]:

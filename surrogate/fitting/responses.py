@@ -118,13 +118,8 @@ def _get_motions(
     stated = anatomy.digest, recommend_element(anatomy.mesh), tissue, ACCURACY, compute_digest(*numbers)
     path = find_kept_path(folder, "", device, *stated)
     skull, poisson, ratio, regions = tissue
-    effects = (
-        build_tissue(build_linear_tissue, poisson, ratio, regions),
-        Held(),
-        SKULLS[skull],
-        ToolForce(),
-        Gravity(),
-    )
+    law = build_tissue(build_linear_tissue, poisson, ratio, regions)
+    effects = (law, Held(), SKULLS[skull], ToolForce(), Gravity())
 
     def solved() -> dict[str, np.ndarray]:
         answer = Fem(anatomy, effects, ACCURACY, device).deform(loads)
