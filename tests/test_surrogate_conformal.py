@@ -9,6 +9,7 @@ from surrogate.model.conformal import (
     LEVELS,
     MAX_GROWTH,
     USUAL_GROWTH,
+    BoundSettings,
     compute_conformal_quantile,
     fit_bound,
     fit_growth,
@@ -118,7 +119,7 @@ def placed(count, seed, discs=None):
 def test_scale_from_few_discs_stays_bounded_between_them(curved):
     discs = np.array([[-12.0, -9.0, 5.0], [2.0, 11.0, -8.0], [13.0, -4.0, 9.0]])
     features, _, error = placed(400, 5, discs)
-    bound = fit_bound((features, error), *placed(1000, 6), curved=curved)
+    bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(curved=curved))
     features, force, error = placed(5000, 7)
     stated = bound.evaluate(features, force, lying(len(force)))
     assert abs(np.mean(error <= stated[0]) - 0.95) < 0.02
@@ -130,7 +131,7 @@ def test_scale_from_few_discs_stays_bounded_between_them(curved):
 @pytest.mark.parametrize("curved", [True, False])
 def test_a_scale_is_of_the_load_and_the_same_everywhere(curved):
     features, _, error = placed(400, 5)
-    bound = fit_bound((features, error), *placed(1000, 6), curved=curved)
+    bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(curved=curved))
     elsewhere = features + [0.0, 0.0, 0.0, 0.0, 9.0, -9.0, 30.0]
     at = [bound.evaluate(some, np.full(400, 0.2), lying(400)) for some in (features, elsewhere)]
     np.testing.assert_array_equal(*at)

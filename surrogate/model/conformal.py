@@ -20,17 +20,27 @@ from ..regressors.protocol import compute_standardisation
 from .training_range import Measured, Outside
 
 LEVELS = (0.95, 0.99)  # Nominal coverage of the bounds.
-CLASS_LOADS = 200  # Default minimum number of calibration loads in a class of force.
-MAX_CLASSES = 10  # Maximum number of classes of force.
-RIDGE_WEIGHT = 1e-2  # Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
 LOAD_FEATURES = 4  # Number of features of the load itself: force, radius, angle, overhang. The others are its position.
-MIN_QUADRATIC_ERRORS = 150  # Minimum number of errors for a quadratic scale: ten per term.
 FEATURE_LIMIT = 4.0  # Limit of standardised features [standard deviations].
-MIN_ERROR_SHARE = 1e-3  # Smallest error as a share of the mean error.
 GROWTH = 4.0  # Relative growth of a bound beyond the training range, per unit of `Outside.beyond`.
 # Default growth with the distance from the nearest training load, where no loads determine it [1/m].
 USUAL_GROWTH = 1e3
 MAX_GROWTH = 2e4  # Maximum growth with the distance from the nearest training load [1/m].
+
+
+@dataclass(frozen=True)
+class BoundSettings:
+    """Settings of `fit_bound`."""
+
+    # Minimum number of calibration loads in a class of force: fewer than 99 give no guarantee at 0.99.
+    class_loads: int = 200
+    # True if the scale's logarithm is quadratic in the load's features, given `min_quadratic_errors`; else linear.
+    curved: bool = True
+    max_classes: int = 10  # Maximum number of classes of force.
+    # Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
+    ridge_weight: float = 1e-2
+    min_quadratic_errors: int = 150  # Minimum number of seen loads for a quadratic scale: ten per term.
+    min_error_share: float = 1e-3  # Smallest error as a share of the mean error.
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +84,8 @@ def fit_bound(
     features: np.ndarray,
     force: np.ndarray,
     error: np.ndarray,
-    each: int = CLASS_LOADS,
+    settings: BoundSettings = BoundSettings(),
     *,
-    curved: bool = True,
     away: np.ndarray | float = 0.0,
     growth: float = 0.0,
 ) -> Bound:
@@ -92,25 +101,21 @@ def fit_bound(
         Features (m, f) and largest errors (m,) [m] of loads that are not in the model's training.
     features, force, error
         Features (n, f), forces (n,) [N] and maximum errors (n,) [m] of the calibration loads.
-    each
-        Minimum number of calibration loads in a class of force: fewer than 99 give no guarantee at 0.99.
-    curved
-        True if the scale's logarithm is quadratic in the load's features, given `MIN_QUADRATIC_ERRORS` seen loads; else
-        linear.
     away, growth
         Distances (n,) [m] of the calibration loads from the nearest training load; growth of the bound with it [1/m].
     """
     mean, deviation = compute_standardisation(seen[0])
-    used = _mask_monomials(len(mean), LOAD_FEATURES if curved and len(seen[1]) >= MIN_QUADRATIC_ERRORS else 0)
+    curved = settings.curved and len(seen[1]) >= settings.min_quadratic_errors
+    used = _mask_monomials(len(mean), LOAD_FEATURES if curved else 0)
     design = _compute_monomials(_normalise_features(seen[0], mean, deviation))[:, used]
-    wanted = np.log(np.maximum(seen[1], max(MIN_ERROR_SHARE * seen[1].mean(), np.finfo(float).tiny)))
-    penalty = RIDGE_WEIGHT * len(design) * np.eye(design.shape[1])
+    wanted = np.log(np.maximum(seen[1], max(settings.min_error_share * seen[1].mean(), np.finfo(float).tiny)))
+    penalty = settings.ridge_weight * len(design) * np.eye(design.shape[1])
     penalty[0, 0] = 0.0  # the constant is free
     weights = np.zeros(len(used))
     weights[used] = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
     scale = np.exp(_compute_monomials(_normalise_features(features, mean, deviation)) @ weights)
     ratio = error / (scale * (1.0 + growth * away))
-    count = int(np.clip(len(ratio) // each, 1, MAX_CLASSES))
+    count = int(np.clip(len(ratio) // settings.class_loads, 1, settings.max_classes))
     edges = np.unique(np.quantile(force, np.arange(1, count) / count))
     edges = edges[edges < force.max()]  # equal forces are of one class
     count, member = len(edges) + 1, np.searchsorted(edges, force)

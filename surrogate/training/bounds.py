@@ -17,7 +17,7 @@ from ..data.load_histories import read_series
 from ..data.splits import DiscSplit
 from ..evaluation.coverage import Coverage, measure_covered
 from ..evaluation.score import compute_force_errors, compute_point_errors
-from ..model.conformal import CLASS_LOADS, Bound, compute_features, fit_bound, fit_growth
+from ..model.conformal import Bound, BoundSettings, compute_features, fit_bound, fit_growth
 from ..model.learned import Learned, get_only_pushes
 from ..model.relaxation import follow_relaxation
 from ..model.tip_distance import MAX_CONDITIONING_LOADS, TipModel, fit_correction
@@ -26,7 +26,7 @@ from .examples import Examples
 from .expansion import Expansion
 
 SCALE_STRIDE = 3  # One in this many calibration loads fits the scale of a bound; the others fit its quantiles.
-MIN_SCALE_LOADS = CLASS_LOADS  # Number of calibration loads below which all fit the quantiles.
+MIN_SCALE_LOADS = BoundSettings.class_loads  # Number of calibration loads below which all fit the quantiles.
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +48,8 @@ def compute_distance_errors(model: Learned, known: KnownDistances) -> np.ndarray
 
 def add_correction(model: Learned, patch: Patch, known: KnownDistances) -> Learned:
     """Add a correction of distances to a model, trained on its training loads or some of them."""
-    plain, some = (
-        replace(model, tip=TipModel()),
-        known.select(slice(None, None, -(-len(known.loads) // MAX_CONDITIONING_LOADS))),
-    )
+    plain, stride = replace(model, tip=TipModel()), -(-len(known.loads) // MAX_CONDITIONING_LOADS)
+    some = known.select(slice(None, None, stride))
     off = some.distance - plain.predict_distance(some.loads).value
     return replace(model, tip=TipModel(fit_correction(patch, model.to_input(some.loads), off)))
 
@@ -66,19 +64,11 @@ def correct_if_better(
     return candidates[best], error[best]
 
 
-@dataclass(frozen=True)
-class BoundFit:
-    """Settings of a bound: calibration loads in a class of force, and whether its scale is quadratic in the load."""
-
-    each: int
-    curved: bool
-
-
-TUMOUR_FIT = BoundFit(CLASS_LOADS, True)  # Settings of the bound of the tumour.
+TUMOUR_FIT = BoundSettings()  # Settings of the bound of the tumour.
 # Settings of the bound of the tip distance. The tip sometimes snaps through with the cortex, so that the tail of its
 # errors grows with the force: classes are as small as a 99 % bound allows, and the scale's logarithm is linear.
-TIP_FIT = BoundFit(100, False)
-FORCE_FIT = BoundFit(CLASS_LOADS, True)  # Settings of the bound of the force of a tool moved by pose.
+TIP_FIT = BoundSettings(class_loads=100, curved=False)
+FORCE_FIT = BoundSettings()  # Settings of the bound of the force of a tool moved by pose.
 BOUND_FITS = {"tumour": TUMOUR_FIT, "tip": TIP_FIT, "force": FORCE_FIT}  # Settings of all bounds, by name.
 
 
@@ -121,16 +111,11 @@ class Missed:
 def collect_missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> Missed:
     """Combine errors (B,) [m] of a model with its input loads."""
     known, envelope = measure_loads(patch, pushed), model.envelope
-    return Missed(
-        pushed,
-        known,
-        envelope.locate_outside(pushed, known),
-        compute_features(pushed, envelope.clip_to_range(known)),
-        error,
-    )
+    features = compute_features(pushed, envelope.clip_to_range(known))
+    return Missed(pushed, known, envelope.locate_outside(pushed, known), features, error)
 
 
-def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = None) -> Bound:
+def bound_by(near: Missed, way: BoundSettings, growth: float, seen: Missed | None = None) -> Bound:
     """Calibrate a bound on loads `near` the training loads, with a `growth` [1/m] by distance from these.
 
     One in `SCALE_STRIDE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
@@ -141,17 +126,17 @@ def bound_by(near: Missed, way: BoundFit, growth: float, seen: Missed | None = N
         fits = _select_scale_loads(near)
         seen, near = near.select(fits), near.select(~fits)
     known = near.features, near.force, near.error
-    return fit_bound(
-        (seen.features, seen.error), *known, way.each, curved=way.curved, away=near.outside.away, growth=growth
-    )
+    return fit_bound((seen.features, seen.error), *known, way, away=near.outside.away, growth=growth)
 
 
-def compute_growth(near: Missed, far: Missed, way: BoundFit) -> float:
+def compute_growth(near: Missed, far: Missed, way: BoundSettings) -> float:
     """Compute the growth [1/m] with which a bound has equal coverage `far` from training loads and near them."""
     return fit_growth(*_compute_relative_errors(near, far, way))
 
 
-def compute_held_out_bounds(model: Learned, near: Missed, far: Missed, split: DiscSplit, way: BoundFit) -> np.ndarray:
+def compute_held_out_bounds(
+    model: Learned, near: Missed, far: Missed, split: DiscSplit, way: BoundSettings
+) -> np.ndarray:
     """Compute bounds (2, B) [m] of loads on held-out discs, each with the growth estimated from the other discs."""
     known, (ratio, away) = _compute_relative_errors(near, far, way)
     disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
@@ -168,7 +153,7 @@ def measure_coverage_by(bound: np.ndarray, far: Missed) -> Coverage:
     return measure_covered(far.force, far.error, bound, int(far.extrapolated.sum()))
 
 
-def _compute_relative_errors(near: Missed, far: Missed, way: BoundFit) -> list[tuple[np.ndarray, np.ndarray]]:
+def _compute_relative_errors(near: Missed, far: Missed, way: BoundSettings) -> list[tuple[np.ndarray, np.ndarray]]:
     """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
     plain = bound_by(near, way, 0.0)
     return [
