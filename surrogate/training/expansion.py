@@ -42,18 +42,25 @@ from .fem_tables import add_edge_midpoints, choose_radii, condense_contact, find
 COARSE_BASIS = (1e-3, 60)  # Truncation tolerance and maximum number of modes of a model's basis.
 # Truncation tolerance and maximum number of modes of the series beyond the exact orders, 2 % of the motion.
 ADDED_BASIS = (5e-3, 160)
-TABLE_TOLERANCE = 1e-4  # Truncation tolerance of the compliance matrix.
-SECOND_ORDER_TOLERANCE = 3e-3  # Truncation tolerance of the second order's modes: 0.1 % of the motion.
-WIDE_BASIS = (1e-5, 192)  # Truncation tolerance and maximum number of modes of the series' table.
-TABLE_PLACES = 40  # Number of places, far apart, that span the series' table.
 # Models that use the contact on linear tissue; the second is trained on its residual.
 CONTACT_MODELS = ("contact", "contact-gp")
 SERIES_MODELS = ("series", "series-gp")  # Models that use the power series; the second is trained on its residual.
-# Rounding of the second order's table relative to its largest entry. On the template this and SERIES_STEP move the
-# tumour's worst vertex by at most 0.01 mm in 95 % of loads, a ninth of the model's error.
-PAIR_STEP = 1e-3
-SERIES_STEP = 2e-3  # Rounding of the series' tables relative to their largest motion at the largest force.
-STRIP_SIZE = 1536  # Number of motion components that are read at once: limits memory.
+
+
+@dataclass(frozen=True)
+class ExpansionSettings:
+    """Settings of an `Expansion`."""
+
+    table_tolerance: float = 1e-4  # Truncation tolerance of the compliance matrix.
+    second_order_tolerance: float = 3e-3  # Truncation tolerance of the second order's modes: 0.1 % of the motion.
+    # Truncation tolerance and maximum number of modes of the series' table.
+    wide_basis: tuple[float, int] = (1e-5, 192)
+    table_places: int = 40  # Number of places, far apart, that span the series' table.
+    # Rounding of the second order's table relative to its largest entry. On the template this and `series_step` move
+    # the tumour's worst vertex by at most 0.01 mm in 95 % of loads, a ninth of the model's error.
+    pair_step: float = 1e-3
+    series_step: float = 2e-3  # Rounding of the series' tables relative to their largest motion at the largest force.
+    strip_size: int = 1536  # Number of motion components that are read at once: limits memory.
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +86,8 @@ class Expansion:
         Maximum number of load cases solved together; None: as many as fit now, on a GPU that no other process uses.
     begun
         Journal of the table's rows while it is computed, so that an interrupted run resumes; the caller removes it.
+    settings
+        Accuracy of tables and bases; a file that is `kept` must have been written with the same.
     """
 
     data: Dataset
@@ -88,6 +97,7 @@ class Expansion:
     most_pairs: int = 150_000
     batch: int | None = None
     begun: Path | None = None
+    settings: ExpansionSettings = ExpansionSettings()
 
     @cached_property
     def patch(self) -> Patch:
@@ -127,7 +137,7 @@ class Expansion:
             Data without a tissue.
         """
         known = self.tabulated
-        table = Rounded.round_table(known.second, PAIR_STEP * np.abs(known.second).max())
+        table = Rounded.round_table(known.second, self.settings.pair_step * np.abs(known.second).max())
         return ModelPart("rooted", ForcePairs(known.pairs, table), known.pair_basis)
 
     @cached_property
@@ -170,7 +180,7 @@ class Expansion:
             every = fill_table(self.places, added @ (wide.modes @ basis.modes.T), left_out)
             for order in ORDER_COLUMNS[: len(parts)]:
                 every[inside, order] = 0.0
-            step = SERIES_STEP * (np.abs(every).max(axis=(0, 1, 3)) * unit).max() / unit
+            step = self.settings.series_step * (np.abs(every).max(axis=(0, 1, 3)) * unit).max() / unit
             found.append(Series.round_table(self.patch.points, triangles, self.radii, every, step))
         return found
 
@@ -209,7 +219,7 @@ class Expansion:
 
     def _build_compliance(self, nodes: np.ndarray) -> ModelPart:
         response = self.data.compute_unit_response(nodes)
-        basis = reduce(nodes, response, TABLE_TOLERANCE, len(response))
+        basis = reduce(nodes, response, self.settings.table_tolerance, len(response))
         return ModelPart("nodal", Linear().fit(np.eye(len(response)), round_to_half(basis.encode(response))), basis)
 
     @cached_property
@@ -252,7 +262,7 @@ class Expansion:
         nodes = self.patch.nodes
         units = fem.build_reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
         pairs, table = compute_second_order(fem.problem, units.answers, reading.answers, near)
-        turn = reduce(basis.nodes, table, SECOND_ORDER_TOLERANCE, len(basis.modes)).modes
+        turn = reduce(basis.nodes, table, self.settings.second_order_tolerance, len(basis.modes)).modes
         return pairs, table @ turn.T, Basis(basis.nodes, round_to_half(turn @ basis.modes))
 
     def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray, bool]:
@@ -261,17 +271,18 @@ class Expansion:
         The last value is True if the whole table was computed now.
         """
         count = len(self.places)
-        few = np.sort(spread(self.places, TABLE_PLACES))
+        few = np.sort(spread(self.places, self.settings.table_places))
         every, motions = np.concatenate(self._known), []
-        for first in range(0, 3 * len(every), STRIP_SIZE):
-            components = np.eye(3 * len(every))[first : first + STRIP_SIZE].reshape(-1, len(every), 3)
+        for first in range(0, 3 * len(every), self.settings.strip_size):
+            components = np.eye(3 * len(every))[first : first + self.settings.strip_size].reshape(-1, len(every), 3)
             reading = fem.build_reading(every, components)
             motions.append(tabulate(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
         cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
         parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
         # The cortex's first order is given by its compliance.
         orders = (ORDER_COLUMNS, ORDER_COLUMNS[1:])
-        bases = [_build_wide_basis(*each) for each in zip(self._known, parts, orders, strict=False)]
+        wide = self.settings.wide_basis
+        bases = [_build_wide_basis(*each, wide) for each in zip(self._known, parts, orders, strict=False)]
         whole = join_bases(bases)
         reading = fem.build_reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
         table = np.empty((count, *parts[0].shape[1:3], reading.count), np.float32)
@@ -361,8 +372,10 @@ def _square_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
     return np.stack(both, axis=1)
 
 
-def _build_wide_basis(nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice]) -> Basis:
+def _build_wide_basis(
+    nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice], wide: tuple[float, int]
+) -> Basis:
     """Compute the wide basis of motions (F, R, 19, 3 n) of vertices (n,), with equal weight for each of some orders."""
     rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in orders]
     tiny = np.finfo(np.float32).tiny
-    return reduce(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *WIDE_BASIS)
+    return reduce(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *wide)

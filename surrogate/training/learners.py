@@ -84,11 +84,15 @@ class SharedInputs:
         return np.zeros(len(points), bool) if self.split is None else self.split.is_covered(points)
 
 
-INNER_DISCS = 6  # Number of discs, far apart, that inner fits hold out.
-INNER_SHARE = 0.2  # Share of the loads in the held-out discs of inner fits.
-MIN_SELECTION_LOADS = 40  # Minimum number of loads for a selection of settings.
-MAX_SELECTION_LOADS = 600  # Maximum number of loads used for a selection of settings.
-SELECTION_OUTPUTS = 8  # Number of outputs, the strongest, used for a selection of settings.
+@dataclass(frozen=True)
+class SelectionSettings:
+    """Settings of the selection by `Tuned`."""
+
+    inner_discs: int = 6  # Number of discs, far apart, that inner fits hold out.
+    inner_share: float = 0.2  # Share of the loads in the held-out discs of inner fits.
+    min_selection_loads: int = 40  # Minimum number of loads for a selection of settings.
+    max_selection_loads: int = 600  # Maximum number of loads used for a selection of settings.
+    selection_outputs: int = 8  # Number of outputs, the strongest, used for a selection of settings.
 
 
 @dataclass(frozen=True)
@@ -101,9 +105,12 @@ class Tuned:
     ----------
     settings
         Regressors to select from; the first is used with few rows.
+    selection
+        Settings of the selection.
     """
 
     settings: tuple[Callable[[], RegressorFactory], ...]
+    selection: SelectionSettings = SelectionSettings()
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
         """Fit the best of the regressors to rows X (n, f) of `compute_tool_features`, Y (n, r)."""
@@ -111,11 +118,12 @@ class Tuned:
 
     def find_best(self, X: np.ndarray, Y: np.ndarray) -> int:
         """Return the index of the settings with the smallest squared error on the discs; deterministic."""
-        if len(X) < MIN_SELECTION_LOADS or len(self.settings) == 1:
+        if len(X) < self.selection.min_selection_loads or len(self.settings) == 1:
             return 0
-        X, Y = X[:MAX_SELECTION_LOADS], Y[:MAX_SELECTION_LOADS]
-        left_out = find_inner_discs(X[:, :3])
-        strongest = Y[:, np.sort(np.argsort(-Y.std(axis=0), kind="stable")[:SELECTION_OUTPUTS])]
+        X, Y = X[: self.selection.max_selection_loads], Y[: self.selection.max_selection_loads]
+        left_out = find_inner_discs(X[:, :3], self.selection)
+        columns = np.sort(np.argsort(-Y.std(axis=0), kind="stable")[: self.selection.selection_outputs])
+        strongest = Y[:, columns]
         errors = []
         for make in self.settings:
             model = make().fit(X[~left_out], strongest[~left_out])
@@ -123,10 +131,10 @@ class Tuned:
         return int(np.argmin(errors))
 
 
-def find_inner_discs(points: np.ndarray) -> np.ndarray:
-    """Return the mask (n,) of points in discs round `INNER_DISCS` of the points (n, 3), far from each other."""
-    distance = find_nearest(points, points[spread(points, INNER_DISCS)])[1]
-    return distance <= np.quantile(distance, INNER_SHARE)
+def find_inner_discs(points: np.ndarray, selection: SelectionSettings = SelectionSettings()) -> np.ndarray:
+    """Return the mask (n,) of points in discs round `inner_discs` of the points (n, 3), far from each other."""
+    distance = find_nearest(points, points[spread(points, selection.inner_discs)])[1]
+    return distance <= np.quantile(distance, selection.inner_share)
 
 
 # Candidate networks, the default first: units in a layer and weight decay.
