@@ -30,30 +30,39 @@ if TYPE_CHECKING:
     from sim.discretisation.nearest_points import PlacedBox
 
 MEAN_GAP = 0.5 * ToolContact((Ball(1.0),)).gap  # Mean gap that FEM keeps between tissue and tool [m].
-CANDIDATE_DISTANCE = 1.5  # Distance from a tool's core within which facets are contact candidates [radii].
-BALL_TOLERANCE = 1e-6  # Penetration tolerance of a ball [m].
-MIN_SEARCH_MOTION = 3.0  # Smallest motion that continues the contact search [tolerances].
-MAX_ITERATIONS = 60  # Maximum number of iterations of the contact search.
-PATH_STEP = 0.5  # Step of a rod or a blade on its path [radii], so that tissue stays before it.
-ROD_TOLERANCE = 1e-5  # Penetration tolerance of a rod or a blade [m].
-# Number of iterations at intermediate steps: more change the result by less than its error, in twice the time.
-PATH_ITERATIONS = 3
 MAX_STORED_POINTS = 128  # Maximum number of contact points stored for a warm start: the strongest.
-# Number of iterations after which constraints without force stay, so that there are no cycles. Until then they are
-# dropped, which is faster.
-DROPPING_ITERATIONS = 15
-# Compliance of a point relative to the nodes' mean, below which it counts as bone, which the tool enters: no force, or
-# an unbounded one, would keep it out.
-MIN_COMPLIANCE = 0.02
 # LAPACK's factorisation and solves: the problems are so small that a wrapper takes longer than the work.
 FACTORISE, SOLVE_TRIANGULAR, SOLVE_POSITIVE = get_lapack_funcs(("potrf", "trtrs", "posv"), dtype=np.float64)
-MAX_EXCHANGES = 10  # Maximum number of exchanges of the active set.
-INACTIVE_TOLERANCE = 1e-8  # Penetration of an inactive point that is tolerated [m].
-# Candidate regularisations relative to the mean diagonal, as points of neighbouring facets on a common edge coincide.
-# The first one that gives a positive definite matrix in single precision is used.
-REGULARISATIONS = (1e-6, 1e-5, 1e-4)
 BALL_FEATURES = 8  # Number of features of a ball.
 ROD_FEATURES = 17  # Number of features of a rod or a blade.
+
+
+@dataclass(frozen=True)
+class ContactSearchSettings:
+    """Settings of the search for contact points in `RigidContact`."""
+
+    candidate_distance: float = 1.5  # Distance from a tool's core within which facets are contact candidates [radii].
+    ball_tolerance: float = 1e-6  # Penetration tolerance of a ball [m].
+    rod_tolerance: float = 1e-5  # Penetration tolerance of a rod or a blade [m].
+    min_search_motion: float = 3.0  # Smallest motion that continues the contact search [tolerances].
+    max_iterations: int = 60  # Maximum number of iterations of the contact search.
+    path_step: float = 0.5  # Step of a rod or a blade on its path [radii], so that tissue stays before it.
+    # Number of iterations at intermediate steps: more change the result by less than its error, in twice the time.
+    path_iterations: int = 3
+    # Number of iterations after which constraints without force stay, so that there are no cycles. Until then they are
+    # dropped, which is faster.
+    dropping_iterations: int = 15
+    # Compliance of a point relative to the nodes' mean, below which it counts as bone, which the tool enters: no force,
+    # or an unbounded one, would keep it out.
+    min_compliance: float = 0.02
+    max_exchanges: int = 10  # Maximum number of exchanges of the active set.
+    inactive_tolerance: float = 1e-8  # Penetration of an inactive point that is tolerated [m].
+    # Candidate regularisations relative to the mean diagonal, as points of neighbouring facets on a common edge
+    # coincide. The first one that gives a positive definite matrix in single precision is used.
+    regularisations: tuple[float, float, float] = (1e-6, 1e-5, 1e-4)
+
+
+SEARCH = ContactSearchSettings()
 
 
 @dataclass(eq=False)
@@ -102,11 +111,8 @@ class RigidContact:
 
     def compute_linear(self, X: np.ndarray) -> np.ndarray:
         """Compute the coefficients (B, r) for linear tissue."""
-        return (
-            self.compute_nodal_forces(X).astype(np.float32)
-            @ self.answers
-            / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
-        )
+        force = self.compute_nodal_forces(X).astype(np.float32)
+        return force @ self.answers / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
 
     def predict_force(self, X: np.ndarray) -> np.ndarray:
         """Predict the force (B, 3) [N/m] that the tool exerts, per metre of depth; `grip` must have been fitted."""
@@ -204,7 +210,7 @@ class RigidContact:
         point, direction, depth, radius = x[:3], x[3:6], x[6], x[7]
         if not len(self.core):
             return [PlacedBox(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + MEAN_GAP, None
-        there, stride = self._place_box(x), PATH_STEP * self.core[3]
+        there, stride = self._place_box(x), SEARCH.path_step * self.core[3]
         steps, last = int(np.ceil(depth / stride)), x[self._width :]
         if len(last) and last[6] > 0.0:
             begun = self._place_box(last)
@@ -233,8 +239,8 @@ class RigidContact:
         nearest = Nearest(len(facets))
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
-        least, own = MIN_COMPLIANCE * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
-        tolerance = ROD_TOLERANCE if len(self.core) else BALL_TOLERANCE
+        least, own = SEARCH.min_compliance * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
+        tolerance = SEARCH.rod_tolerance if len(self.core) else SEARCH.ball_tolerance
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
         facet, share, bears = np.zeros(0, int), np.zeros((0, 3)), np.zeros(0)
         if begun is not None:
@@ -244,7 +250,7 @@ class RigidContact:
             facet, share = np.searchsorted(facets, places[:, 0]), places[:, 1:]
         for station in stations:
             settled = begun is None
-            for iteration in range(MAX_ITERATIONS if station is stations[-1] else PATH_ITERATIONS):
+            for iteration in range(SEARCH.max_iterations if station is stations[-1] else SEARCH.path_iterations):
                 corners = (self.points[nodes] + moved)[table]
                 near = nearest.to(station, corners)
                 entered = np.flatnonzero(near.distance < radius - tolerance)
@@ -262,9 +268,9 @@ class RigidContact:
                 bears = _compute_bearing_forces(lever @ compliance @ lever.T, radius - distance + lever @ moved.ravel())
                 force = bears @ lever
                 last, moved = moved, (compliance @ force).reshape(-1, 3)
-                kept = (bears > 0.0) | (iteration >= DROPPING_ITERATIONS)
+                kept = (bears > 0.0) | (iteration >= SEARCH.dropping_iterations)
                 facet, share, bears = facet[kept], share[kept], bears[kept]
-                settled = bool(np.abs(moved - last).max() < MIN_SEARCH_MOTION * tolerance)
+                settled = bool(np.abs(moved - last).max() < SEARCH.min_search_motion * tolerance)
         whole, places = np.zeros(len(self.compliance)), np.full((MAX_STORED_POINTS, 4), -1.0)
         whole[rows] = force
         strongest = np.argsort(-bears)[:MAX_STORED_POINTS]
@@ -276,7 +282,7 @@ class RigidContact:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Select facets (S,) within reach of a tool; return their nodes (n,), positions (S, 3), compliance rows."""
         around, wide = self._rounds
-        reach = CANDIDATE_DISTANCE * radius
+        reach = SEARCH.candidate_distance * radius
         far = wide + reach + np.linalg.norm(stations[0].half)
         ends = [stations[k] for k in sorted({0, len(stations) // 2, len(stations) - 1})]
         some = np.flatnonzero(np.any([np.linalg.norm(around - each.middle, axis=1) < far for each in ends], axis=0))
@@ -304,15 +310,15 @@ def _compute_bearing_forces(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     if not count:
         return wanted
     mean = np.trace(gain) / count
-    for apart in REGULARISATIONS:
+    for apart in SEARCH.regularisations:
         firm = gain + apart * mean * np.eye(count)
         bearing = np.ones(count, bool)
-        for _ in range(MAX_EXCHANGES):
+        for _ in range(SEARCH.max_exchanges):
             free, bears = np.flatnonzero(bearing), np.zeros(count)
             _, bears[free], failed = SOLVE_POSITIVE(firm[np.ix_(free, free)], wanted[free])
             if failed:
                 break
-            wrong = np.where(bearing, bears < 0.0, wanted - firm @ bears > INACTIVE_TOLERANCE)
+            wrong = np.where(bearing, bears < 0.0, wanted - firm @ bears > SEARCH.inactive_tolerance)
             if not wrong.any():
                 return bears
             bearing ^= wrong
