@@ -21,7 +21,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis, compute_core_features, compute_tool_features
 from surrogate.data.indentation import Indented, get_poses, to_indentation
 from surrogate.data.simulate import simulate
-from surrogate.data.tool_poses import MAX_BLADE_DEPTH, MAX_BLADE_TILT, MAX_ROD_DEPTH, MIN_DEPTH_RATIO, draw_poses
+from surrogate.data.tool_poses import ToolPoseSettings, draw_poses
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.applicability import find_rejection
 from surrogate.model.store import load, save
@@ -63,7 +63,9 @@ def test_drawn_poses_go_in_from_where_they_touch_first(box, preset):
     few = get_poses(draw_poses(preset, box, 9, 3, tool), tool)
     np.testing.assert_allclose(few, pose[:9], atol=1e-12)
     assert not np.allclose(get_poses(draw_poses(preset, box, 9, 4, tool), tool), pose[:9])
-    deepest = MAX_ROD_DEPTH * ROD_OF_4.radius if isinstance(tool, Capsule) else MAX_BLADE_DEPTH * SMALL_BLADE.width
+    known = ToolPoseSettings()
+    rod, blade = known.max_rod_depth * ROD_OF_4.radius, known.max_blade_depth * SMALL_BLADE.width
+    deepest = rod if isinstance(tool, Capsule) else blade
     surface = np.einsum("qc,scx->sqx", build_barycentric_lattice(4), patch.points[patch.triangles]).reshape(-1, 3)
     back = np.arange(0.0, 2.0 * deepest, 2e-5)
     for each in pose:
@@ -71,9 +73,9 @@ def test_drawn_poses_go_in_from_where_they_touch_first(box, preset):
         way[:, :3, 3] += back[:, None] * each[:3, 2]
         touches = [bool(compute_distances(tool, one, surface).min() < 0.0) for one in way]
         depth = back[np.flatnonzero(touches)[-1]]
-        assert MIN_DEPTH_RATIO * get_core(tool).radius - 4e-5 < depth < deepest + 4e-5
+        assert known.min_depth_ratio * get_core(tool).radius - 4e-5 < depth < deepest + 4e-5
         cosine = -patch.find_normals(each[None, :3, 3])[0] @ each[:3, 2]
-        assert cosine >= np.cos(MAX_BLADE_TILT if isinstance(tool, Spatula) else np.pi / 4.0) - 1e-9
+        assert cosine >= np.cos(known.max_blade_tilt if isinstance(tool, Spatula) else np.pi / 4.0) - 1e-9
 
 
 def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box):

@@ -9,8 +9,8 @@ from surrogate.data.cortex_patch import Patch
 from surrogate.data.tool_loads import (
     MAX_PRESSURE,
     PLANE_MODULUS,
-    PUBLISHED_FOOTPRINT,
     TOOLS,
+    PublishedSettings,
     compute_rejected_share,
     describe_rejected,
     draw,
@@ -84,7 +84,7 @@ def test_published_protocol(box):
     assert len(loads.point) == 11 * 30 * 20
     assert len(np.unique(loads.point, axis=0)) == 11 and distance.min() >= 20e-3 and distance.max() <= 28e-3
     assert np.allclose(np.unique(magnitude.round(9)), np.arange(0.10, 1.051, 0.05))
-    assert (loads.footprint == PUBLISHED_FOOTPRINT).all()
+    assert (loads.footprint == PublishedSettings.footprint).all()
     rows = np.column_stack([loads.point, loads.force]).round(9)
     assert len(np.unique(rows, axis=0)) == len(rows)
 

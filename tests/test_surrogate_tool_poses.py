@@ -20,7 +20,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.indentation import to_indentation
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import TOOLS, draw
-from surrogate.data.tool_poses import MAX_BALL_DEPTH, MIN_DEPTH_RATIO, choose_ball, compute_poses, draw_poses
+from surrogate.data.tool_poses import ToolPoseSettings, choose_ball, compute_poses, draw_poses
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.applicability import find_rejection
 from surrogate.model.learned import Learned
@@ -44,8 +44,8 @@ def test_draws_are_each_of_their_own_number(box):
     assert other is not None
     assert not np.array_equal(some.pose, other.pose)
     depth = np.linalg.norm(to_indentation(many, BALL, open_patch(box)).force, axis=1) / BALL.radius
-    assert depth.min() >= MIN_DEPTH_RATIO * np.cos(TOOLS["palpation"].cone) - 1e-9
-    assert depth.max() <= MAX_BALL_DEPTH + 1e-9
+    assert depth.min() >= ToolPoseSettings.min_depth_ratio * np.cos(TOOLS["palpation"].cone) - 1e-9
+    assert depth.max() <= ToolPoseSettings.max_ball_depth + 1e-9
 
 
 @dataclass(frozen=True)

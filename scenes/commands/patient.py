@@ -22,7 +22,7 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.journal import open_journal
 from sim.runtime.partial_files import to_unfinished_path
 from sim.runtime.timing import listen_to_stages
-from surrogate.data.splits import CALIBRATION_STRIDE, MIN_DISCS
+from surrogate.data.splits import CALIBRATION_STRIDE, DiscSettings
 from surrogate.data.tool_loads import PRESETS
 
 from ..options.outputs import add_force, check_output_path
@@ -108,9 +108,9 @@ def run(args: argparse.Namespace) -> int:
         check_output_path(path, suffix, args.force, _list_inputs(args), resumed)
     parse_device_names(args.device)
     check_learners(parse_learners(args.learners), of_poses=False, where=str(data))
-    if args.count - args.count // CALIBRATION_STRIDE < MIN_DISCS + 1:
+    if args.count - args.count // CALIBRATION_STRIDE < DiscSettings.min_discs + 1:
         raise InputError(
-            f"--count {args.count} is too few to learn from and to leave {MIN_DISCS} discs out: give more."
+            f"--count {args.count} is too few to learn from and to leave {DiscSettings.min_discs} discs out: give more."
         )
     force = ["--force"] if args.force else []
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]

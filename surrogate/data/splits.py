@@ -13,14 +13,21 @@ from .cortex_patch import Patch, find_nearest
 from .encode import split_forces
 from .tool_loads import find_perpendiculars, spread
 
-MIN_DISCS = 6  # Minimum number of held-out discs.
-MAX_POSITIONS = 200  # Maximum number of candidate positions for the discs' centres.
-HELD_OUT_SHARE = 0.15  # Share of the patch's area that the discs should cover.
 CALIBRATION_STRIDE = 4  # One of this many loads is set aside from every split to calibrate bounds.
 MAX_CALIBRATION_LOADS = 2000  # Maximum number of loads set aside to calibrate bounds.
-DISC_RADII = (6e-3, 5e-3, 4e-3, 3e-3, 2e-3, 1e-3)  # Candidate radii of the discs, the default first [m].
 SECTOR_COUNT = 8  # Number of sectors, of which two opposite ones are held out.
 MIN_SECTOR_ANGLE = 10.0  # Angle to the normal below which a force is in no sector [deg].
+
+
+@dataclass(frozen=True)
+class DiscSettings:
+    """Settings of `leave_discs_out`."""
+
+    min_discs: int = 6  # Minimum number of held-out discs.
+    max_positions: int = 200  # Maximum number of candidate positions for the discs' centres.
+    held_out_share: float = 0.15  # Share of the patch's area that the discs should cover.
+    # Candidate radii of the discs, the default first [m].
+    disc_radii: tuple[float, ...] = (6e-3, 5e-3, 4e-3, 3e-3, 2e-3, 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +73,7 @@ class DiscSplit:
         )
 
 
-def leave_discs_out(points: np.ndarray, patch: Patch) -> DiscSplit:
+def leave_discs_out(points: np.ndarray, patch: Patch, settings: DiscSettings = DiscSettings()) -> DiscSplit:
     """Hold out discs of 6 mm radius round distant load points (B, 3) [m]: at least 6, and 15 % of the patch.
 
     No disc beyond the sixth is taken if it would leave fewer than half of the loads to train on. At a small craniotomy,
@@ -78,21 +85,23 @@ def leave_discs_out(points: np.ndarray, patch: Patch) -> DiscSplit:
     InputError
         Fewer than seven positions.
     """
-    order = spread(points, MAX_POSITIONS) if len(points) else np.zeros(0, int)
-    if len(order) < MIN_DISCS + 1:
+    order = spread(points, settings.max_positions) if len(points) else np.zeros(0, int)
+    if len(order) < settings.min_discs + 1:
         raise InputError(
-            f"the loads that converged have {len(order)} positions, too few to leave {MIN_DISCS} discs out: simulate "
-            "more."
+            f"the loads that converged have {len(order)} positions, too few to leave {settings.min_discs} discs out: "
+            "simulate more."
         )
-    splits = [_build_discs(points, points[order], patch, radius) for radius in DISC_RADII]
+    splits = [_build_discs(points, points[order], patch, radius, settings) for radius in settings.disc_radii]
     fewest = min(splits, key=lambda split: split.test.mean())
     return next((split for split in splits if split.test.mean() <= 0.5), fewest)
 
 
-def _build_discs(points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
-    split = _split(points, candidates[:MIN_DISCS], patch, radius)
-    for count in range(MIN_DISCS + 1, len(candidates)):
-        if split.share >= HELD_OUT_SHARE:
+def _build_discs(
+    points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: float, settings: DiscSettings
+) -> DiscSplit:
+    split = _split(points, candidates[: settings.min_discs], patch, radius)
+    for count in range(settings.min_discs + 1, len(candidates)):
+        if split.share >= settings.held_out_share:
             break
         more = _split(points, candidates[:count], patch, radius)
         if more.test.mean() > 0.5:
@@ -150,9 +159,5 @@ def leave_sectors_out(pushed: Pushed, patch: Patch) -> Sectors:
             f"of {len(force)} loads {int(left_out.sum())} point into the directions to leave out: simulate more, or "
             "loads of more directions."
         )
-    return Sectors(
-        np.stack([first, -first]),
-        np.pi / SECTOR_COUNT,
-        np.where(left_out, sector // (SECTOR_COUNT // 2), -1),
-        2.0 / SECTOR_COUNT,
-    )
+    disc = np.where(left_out, sector // (SECTOR_COUNT // 2), -1)
+    return Sectors(np.stack([first, -first]), np.pi / SECTOR_COUNT, disc, 2.0 / SECTOR_COUNT)

@@ -130,13 +130,10 @@ def compute_rejected_share(preset: str) -> float:
     tools = {**{name: [tool] for name, tool in TOOLS.items()}, "mixed": list(TOOLS.values())}.get(preset, [])
     middles = (np.arange(LATTICE_SIZE) + 0.5) / LATTICE_SIZE
     first, second = (axis.ravel() for axis in np.meshgrid(middles, middles))
-    shares = [
-        1.0
-        - tool.is_surgical(
-            np.exp(interpolate_ends(np.log(tool.force), first)), interpolate_ends(tool.footprint, second)
-        ).mean()
-        for tool in tools
-    ]
+    shares = []
+    for tool in tools:
+        force, footprint = np.exp(interpolate_ends(np.log(tool.force), first)), interpolate_ends(tool.footprint, second)
+        shares.append(1.0 - tool.is_surgical(force, footprint).mean())
     return float(np.mean(shares)) if shares else 0.0
 
 
@@ -224,14 +221,22 @@ def build_axes_about(shaft: np.ndarray) -> np.ndarray:
     return np.stack([*find_perpendiculars(shaft), shaft], axis=2)
 
 
-POSITION_COUNT = 11  # Number of positions of the published loads.
-DIRECTION_COUNT = 30  # Number of directions of the published loads.
 PUBLISHED_FORCES = np.linspace(0.10, 1.05, 20)  # Forces of the published loads [N].
-PUBLISHED_FOOTPRINT = 7e-3  # Radius of the area of one free surface node of the published mesh [m].
-PUBLISHED_CONE = np.pi / 3.0  # Largest angle between a published force and the inward normal [rad].
 
 
-def _build_published_loads(anatomy: Anatomy, patch: Patch, count: int, seed: int) -> Loads:
+@dataclass(frozen=True)
+class PublishedSettings:
+    """Settings of the published loads."""
+
+    positions: int = 11  # Number of positions of the published loads.
+    directions: int = 30  # Number of directions of the published loads.
+    footprint: float = 7e-3  # Radius of the area of one free surface node of the published mesh [m].
+    cone: float = np.pi / 3.0  # Largest angle between a published force and the inward normal [rad].
+
+
+def _build_published_loads(
+    anatomy: Anatomy, patch: Patch, count: int, seed: int, settings: PublishedSettings = PublishedSettings()
+) -> Loads:
     """Build the published loads: 11 positions 20-28 mm from the tumour's centre x 30 directions x 20 sizes, shuffled.
 
     The authors do not print their directions: a spherical Fibonacci lattice within 60 degrees of the inward normal
@@ -241,27 +246,23 @@ def _build_published_loads(anatomy: Anatomy, patch: Patch, count: int, seed: int
         raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
     centre = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
     distance = np.linalg.norm(patch.points - centre, axis=1)
-    inside = patch.compute_edge_distance(patch.points) >= PUBLISHED_FOOTPRINT
+    inside = patch.compute_edge_distance(patch.points) >= settings.footprint
     near = np.flatnonzero((distance >= 20e-3) & (distance <= 28e-3) & inside)
     if not len(near):
         raise InputError(
             f"the open cortex is {1e3 * distance.min():.1f}-{1e3 * distance.max():.1f} mm from the tumour's centre. "
-            f"No node at 20-28 mm lies {1e3 * PUBLISHED_FOOTPRINT:g} mm inside its rim: make the anatomy with --preset "
+            f"No node at 20-28 mm lies {1e3 * settings.footprint:g} mm inside its rim: make the anatomy with --preset "
             "seed, or choose another --preset here."
         )
-    near = near[spread(patch.points[near], POSITION_COUNT)]
-    golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(DIRECTION_COUNT) / (2.0 * np.pi)
-    lattice = np.column_stack([(np.arange(DIRECTION_COUNT) + 0.5) / DIRECTION_COUNT, golden % 1.0])
-    direction = np.array(
-        [
-            _sample_in_cone(np.broadcast_to(patch.inward[node], (DIRECTION_COUNT, 3)), PUBLISHED_CONE, lattice)
-            for node in near
-        ]
-    )
-    whole = np.random.default_rng(seed).permutation(len(near) * DIRECTION_COUNT * len(PUBLISHED_FORCES))[:count]
-    position, way, magnitude = np.unravel_index(whole, (len(near), DIRECTION_COUNT, len(PUBLISHED_FORCES)))
+    near = near[spread(patch.points[near], settings.positions)]
+    golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(settings.directions) / (2.0 * np.pi)
+    lattice = np.column_stack([(np.arange(settings.directions) + 0.5) / settings.directions, golden % 1.0])
+    axes = [np.broadcast_to(patch.inward[node], (settings.directions, 3)) for node in near]
+    direction = np.array([_sample_in_cone(axis, settings.cone, lattice) for axis in axes])
+    whole = np.random.default_rng(seed).permutation(len(near) * settings.directions * len(PUBLISHED_FORCES))[:count]
+    position, way, magnitude = np.unravel_index(whole, (len(near), settings.directions, len(PUBLISHED_FORCES)))
     force = PUBLISHED_FORCES[magnitude, None] * direction[position, way]
-    return Loads((Pushed(patch.points[near[position]], force, np.full(len(whole), PUBLISHED_FOOTPRINT)),))
+    return Loads((Pushed(patch.points[near[position]], force, np.full(len(whole), settings.footprint)),))
 
 
 def spread(points: np.ndarray, count: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -16,17 +16,22 @@ from .cortex_patch import Patch, build_barycentric_lattice, open_patch
 from .tool_loads import TOOLS, build_axes_about, draw, find_perpendiculars, interpolate_ends, sample_pushes
 
 BALL_PRESETS = ("palpation", "bipolar", "dissector")  # Presets that a ball can represent.
-MIN_DEPTH_RATIO = 0.05  # Smallest depth as a share of the tool's radius.
-MAX_BALL_DEPTH = (
-    0.9  # Largest depth of a ball as a share of its radius: deeper, a ball without shaft would be swallowed.
-)
-MAX_ROD_DEPTH = 2.0  # Largest depth of a rod [radii].
-MAX_BLADE_DEPTH = 2.0 / 3.0  # Largest depth of a blade [widths].
-MAX_BLADE_TILT = np.radians(20.0)  # Largest tilt of a blade [rad].
-CONTACT_TOLERANCE = 1e-6  # Distance that counts as contact when a tool is lowered [m].
-MAX_STEPS = 200  # Maximum number of steps when a tool is lowered.
-SAMPLE_ROWS = 4  # Rows of surface sample points in a triangle when a tool is lowered.
-MIN_SEARCH_RADIUS = 10e-3  # Lower bound of a third of the search radius round the tool [m].
+
+
+@dataclass(frozen=True)
+class ToolPoseSettings:
+    """Settings of `draw_poses`."""
+
+    min_depth_ratio: float = 0.05  # Smallest depth as a share of the tool's radius.
+    # Largest depth of a ball as a share of its radius: deeper, a ball without shaft would be swallowed.
+    max_ball_depth: float = 0.9
+    max_rod_depth: float = 2.0  # Largest depth of a rod [radii].
+    max_blade_depth: float = 2.0 / 3.0  # Largest depth of a blade [widths].
+    max_blade_tilt: float = np.radians(20.0)  # Largest tilt of a blade [rad].
+    contact_tolerance: float = 1e-6  # Distance that counts as contact when a tool is lowered [m].
+    max_steps: int = 200  # Maximum number of steps when a tool is lowered.
+    sample_rows: int = 4  # Rows of surface sample points in a triangle when a tool is lowered.
+    min_search_radius: float = 10e-3  # Lower bound of a third of the search radius round the tool [m].
 
 
 def choose_ball(preset: str) -> Ball:
@@ -45,7 +50,14 @@ def choose_ball(preset: str) -> Ball:
     return Ball(0.5 * sum(TOOLS[preset].footprint))
 
 
-def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: BuiltIn | None = None) -> Loads:
+def draw_poses(
+    preset: str,
+    anatomy: Anatomy,
+    count: int,
+    seed: int,
+    tool: BuiltIn | None = None,
+    settings: ToolPoseSettings = ToolPoseSettings(),
+) -> Loads:
     """Sample `count` poses of a tool, pressed into the open cortex; load i depends on the same as in `surrogate.draw`.
 
     Positions are uniform by area, and the tool's end is inside the edge. For a ball, positions and directions are those
@@ -69,21 +81,20 @@ def draw_poses(preset: str, anatomy: Anatomy, count: int, seed: int, tool: Built
     if isinstance(tool, Ball):
         (pushed,) = draw(preset, anatomy, count, seed).get_all(Pushed)
         direction = pushed.force / np.linalg.norm(pushed.force, axis=1, keepdims=True)
-        depth = interpolate_ends(
-            (MIN_DEPTH_RATIO * tool.radius, min(MAX_BALL_DEPTH * tool.radius, TOOLS[preset].depth)),
-            source.random(count),
-        )
+        deepest = min(settings.max_ball_depth * tool.radius, TOOLS[preset].depth)
+        depth = interpolate_ends((settings.min_depth_ratio * tool.radius, deepest), source.random(count))
         return Loads((compute_poses(tool, pushed.point, patch.find_normals(pushed.point), depth[:, None] * direction),))
     if isinstance(tool, Capsule):
-        room, deepest, cone = tool.radius, MAX_ROD_DEPTH * tool.radius, TOOLS[preset].cone
+        room, deepest, cone = tool.radius, settings.max_rod_depth * tool.radius, TOOLS[preset].cone
     else:
-        room, deepest, cone = compute_extent(tool), MAX_BLADE_DEPTH * tool.width, MAX_BLADE_TILT
+        room, deepest, cone = compute_extent(tool), settings.max_blade_depth * tool.width, settings.max_blade_tilt
     kind = replace(TOOLS[preset], name=type(tool).__name__, footprint=(room, room), cone=cone)
     point, direction = sample_pushes(kind, patch, count, seed)
     share = source.random((count, 2))
-    depth = interpolate_ends((MIN_DEPTH_RATIO * get_core(tool).radius, min(deepest, TOOLS[preset].depth)), share[:, 0])
+    shallowest = settings.min_depth_ratio * get_core(tool).radius
+    depth = interpolate_ends((shallowest, min(deepest, TOOLS[preset].depth)), share[:, 0])
     rotation = _build_rotations(-direction, 2.0 * np.pi * share[:, 1])
-    return Loads((_move_to_contact(tool, patch, point, rotation, depth),))
+    return Loads((_move_to_contact(tool, patch, point, rotation, depth, settings),))
 
 
 def compute_poses(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarray) -> Touching:
@@ -104,24 +115,25 @@ def _build_rotations(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _move_to_contact(
-    tool: Capsule | Spatula, patch: Patch, point: np.ndarray, rotation: np.ndarray, depth: np.ndarray
-) -> Touching:
+    tool: Capsule | Spatula, patch: Patch, point: np.ndarray, rotation: np.ndarray, depth: np.ndarray,
+    settings: ToolPoseSettings,
+) -> Touching:  # fmt: skip
     """Lower a tool along its shaft over point (B, 3) until contact, and on by depth (B,) [m]; return the poses.
 
     Each step is the distance to the surface's nearest point (Hart 1996, "Sphere tracing", Visual Comput. 12:527-545).
-    The surface is sampled by `SAMPLE_ROWS`^2 points a triangle.
+    The surface is sampled by `ToolPoseSettings.sample_rows`^2 points a triangle.
     """
-    share = build_barycentric_lattice(SAMPLE_ROWS)
+    share = build_barycentric_lattice(settings.sample_rows)
     surface = np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
     reach, tree = compute_extent(tool), KDTree(surface)
     pose = np.tile(np.eye(4), (len(point), 1, 1, 1))
     pose[:, 0, :3, :3] = rotation
     for here, start, shaft, deep in zip(pose[:, 0], point, rotation[:, :, 2], depth, strict=True):
-        near = surface[tree.query_ball_point(start, 3.0 * max(reach, MIN_SEARCH_RADIUS))]
+        near = surface[tree.query_ball_point(start, 3.0 * max(reach, settings.min_search_radius))]
         here[:3, 3] = start + reach * shaft
-        for _ in range(MAX_STEPS):
+        for _ in range(settings.max_steps):
             room = float(compute_distances(tool, here, near).min())
-            if room < CONTACT_TOLERANCE:
+            if room < settings.contact_tolerance:
                 break
             here[:3, 3] -= room * shaft
         here[:3, 3] -= deep * shaft
