@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import ndimage
 from scipy.optimize import minimize
 
 from .extension import smooth
 
-MIN_DETERMINANT = 0.05  # Jacobian determinant below which a cell is corrected
-TARGET_DETERMINANT = 0.15  # target determinant of the correction
-FOLD_MARGIN = 2  # margin of movable nodes around such a cell
-MAX_ATTEMPTS = 12  # maximum attempts
-MAX_ITERATIONS = 200  # maximum iterations per attempt
-FIRST_SMOOTHED_ATTEMPT = 4  # attempt from which folds are smoothed first, to leave local minima
-SMOOTHING_ITERATIONS = 3  # smoothing iterations of such an attempt
-# Weights of a node's squared move [spacings] relative to a cell's squared volume deficit.
-BODY_WEIGHT = 1.0  # in the body
-COLLAR_WEIGHT = 0.1  # in the collar
-OUTER_WEIGHT = 1e-4  # elsewhere
+
+@dataclass(frozen=True)
+class UnfoldingSettings:
+    """Settings of `unfold`."""
+
+    min_determinant: float = 0.05  # Jacobian determinant below which a cell is corrected
+    target_determinant: float = 0.15  # target determinant of the correction
+    margin: int = 2  # margin of movable nodes around such a cell
+    max_attempts: int = 12  # maximum attempts
+    max_iterations: int = 200  # maximum iterations per attempt
+    first_smoothed_attempt: int = 4  # attempt from which folds are smoothed first, to leave local minima
+    smoothing_iterations: int = 3  # smoothing iterations of such an attempt
+    # Weights of a node's squared move [spacings] relative to a cell's squared volume deficit.
+    body_weight: float = 1.0  # in the body
+    collar_weight: float = 0.1  # in the collar
+    outer_weight: float = 1e-4  # elsewhere
+
+
+UNFOLDING = UnfoldingSettings()
 # Relative edge change below which no corner of a cell can fold.
 MAX_SAFE_CHANGE = 0.15
 # Slices per block, to limit memory.
@@ -56,9 +66,7 @@ def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
         ax, by, cz = ax + 1.0, by + 1.0, cz + 1.0
         least = ax * (by * cz - bz * cy) - ay * (bx * cz - bz * cx) + az * (bx * cy - by * cx)
         strong = np.argwhere(most > MAX_SAFE_CHANGE)
-        places = part.reshape(3, -1).T.astype(np.float64) + np.moveaxis(np.indices(part.shape[1:]), 0, -1).reshape(
-            -1, 3
-        )
+        places = (part + np.indices(part.shape[1:], np.float64)).reshape(3, -1).T
         least[tuple(strong.T)] = compute_corner_volumes(places, find_corner_nodes(strong, part.shape[1:])).min(axis=1)
         found[first : first + BLOCK_SLICES] = least
     return found
@@ -75,7 +83,9 @@ def compute_corner_volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarra
     return CORNER_SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
 
 
-def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
+def unfold(
+    field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float, settings: UnfoldingSettings = UNFOLDING
+) -> float:
     """Remove folds of a field (3, I, J, K) [m] in place, and return the least determinant that remains.
 
     Nodes inside the body (I, J, K) move least, then those of the collar (I, J, K) around it, since the body's surface
@@ -84,11 +94,11 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
     tried again; there the body itself may fold.
     """
     found = compute_jacobians(field, spacing)
-    for turn in range(MAX_ATTEMPTS):
-        bad = found < MIN_DETERMINANT
+    for turn in range(settings.max_attempts):
+        bad = found < settings.min_determinant
         if not bad.any():
             break
-        grown = FOLD_MARGIN + turn
+        grown = settings.margin + turn
         labels = np.empty(bad.shape, np.int32)
         ndimage.label(ndimage.maximum_filter(bad, 2 * grown + 5), output=labels)
         for where in ndimage.find_objects(labels):
@@ -96,15 +106,18 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
             part = field[(slice(None), *window)]
             nodes = np.pad(bad[where], [(0, 1)] * 3)
             near = ndimage.maximum_filter(nodes, 2 * grown + 2)
-            if turn >= FIRST_SMOOTHED_ATTEMPT:
-                smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), SMOOTHING_ITERATIONS)
-            stiff = np.where(inside[window], BODY_WEIGHT, np.where(collar[window], COLLAR_WEIGHT, OUTER_WEIGHT))
-            _repair_cells(part, near, stiff, spacing)
+            if turn >= settings.first_smoothed_attempt:
+                smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), settings.smoothing_iterations)
+            outer = np.where(collar[window], settings.collar_weight, settings.outer_weight)
+            stiff = np.where(inside[window], settings.body_weight, outer)
+            _repair_cells(part, near, stiff, spacing, settings)
             found[where] = compute_jacobians(part, spacing)
     return float(found.min())
 
 
-def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float) -> None:
+def _repair_cells(
+    part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float, settings: UnfoldingSettings
+) -> None:
     """Move nodes marked `near` (I, J, K) of a field part (3, I, J, K) [m] until its cells have positive volume."""
     shape = near.shape
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
@@ -124,7 +137,7 @@ def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing
         at = places[corners]
         a, b, c = np.moveaxis(at[:, 1:] - at[:, :1], 1, 0)
         ends = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-        lack = np.maximum(TARGET_DETERMINANT - signs * (a * ends[:, 0]).sum(axis=1), 0.0)
+        lack = np.maximum(settings.target_determinant - signs * (a * ends[:, 0]).sum(axis=1), 0.0)
         some = np.flatnonzero(lack > 0.0)
         pull = -2.0 * (signs[some] * lack[some])[:, None, None] * ends[some]
         pulls, pulled = np.concatenate([-pull.sum(axis=1, keepdims=True), pull], axis=1), corners[some].ravel()
@@ -132,7 +145,8 @@ def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing
         size = float((lack * lack).sum() + (held * change * change).sum())
         return size, (slope[free] + 2.0 * held * change).ravel()
 
-    found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options={"maxiter": MAX_ITERATIONS})
+    options = {"maxiter": settings.max_iterations}
+    found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options=options)
     change = (spacing * found.x.reshape(-1, 3).T).astype(part.dtype)
     for values, more in zip(part, change, strict=True):
         values[np.unravel_index(used[free], shape)] += more

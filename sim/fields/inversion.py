@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from .grid import Grid
 
-INVERSION_TOLERANCE = 1e-6  # tolerance [m]
-MAX_ITERATIONS = 25  # maximum iterations
-MAX_NEWTON_STEP = 2.0  # maximum Newton step [spacings]
-# Required contraction of fixed-point steps; points that miss it use Newton's method.
-MAX_CHANGE_RATIO = 0.6
+
+@dataclass(frozen=True)
+class InversionSettings:
+    """Settings of `invert_field`."""
+
+    tolerance: float = 1e-6  # tolerance [m]
+    max_iterations: int = 25  # maximum iterations
+    max_newton_step: float = 2.0  # maximum Newton step [spacings]
+    max_change_ratio: float = 0.6  # Required contraction of fixed-point steps; points that miss it use Newton's method.
 
 
-def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
+INVERSION = InversionSettings()
+
+
+def invert_field(
+    grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray, settings: InversionSettings = INVERSION
+) -> np.ndarray:
     """Solve d = -forward(y + d) for d (n, 3) [m] at points y (n, 3) [m], from a guess (n, 3).
 
     Most points converge by fixed-point iteration. It diverges where tissue is sheared by more than 45
@@ -21,26 +32,28 @@ def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.
     """
     found, going, left = guess.copy(), np.arange(len(points)), []
     last = np.full(len(points), np.inf)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(settings.max_iterations):
         new = -grid.read(forward, points[going] + found[going])
         change = np.linalg.norm(new - found[going], axis=1)
-        nearer = change < MAX_CHANGE_RATIO * last[going]
+        nearer = change < settings.max_change_ratio * last[going]
         left.append(going[~nearer])
         found[going[nearer]], last[going[nearer]] = new[nearer], change[nearer]
-        going = going[nearer & (change > INVERSION_TOLERANCE)]
+        going = going[nearer & (change > settings.tolerance)]
         if not len(going):
             break
     hard = np.concatenate([*left, going])
-    found[hard] = invert_by_newton(grid, forward, points[hard], guess[hard])
+    found[hard] = invert_by_newton(grid, forward, points[hard], guess[hard], settings)
     return found
 
 
-def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
+def invert_by_newton(
+    grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray, settings: InversionSettings = INVERSION
+) -> np.ndarray:
     """Invert as `invert_field`, by Newton's method; a point that does not converge returns its best iterate."""
     best, least = guess.copy(), np.full(len(points), np.inf)
     trial, going, share = guess.copy(), np.arange(len(points)), np.ones(len(points))
     step = np.zeros_like(guess)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(settings.max_iterations):
         at = points[going] + trial[going]
         rest = trial[going] + grid.read(forward, at)
         size = np.linalg.norm(rest, axis=1)
@@ -48,15 +61,17 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
         best[going[good]], least[going[good]] = trial[going[good]], size[good]
         share[going] = np.where(good, 1.0, 0.5 * share[going])  # halve a step that increased the residual
         fresh = going[good]
-        step[fresh] = _compute_newton_step(grid, forward, points[fresh] + best[fresh], rest[good])
-        going = going[least[going] > INVERSION_TOLERANCE]
+        step[fresh] = _compute_newton_step(grid, forward, points[fresh] + best[fresh], rest[good], settings)
+        going = going[least[going] > settings.tolerance]
         if not len(going):
             break
         trial[going] = best[going] + share[going, None] * step[going]
     return best
 
 
-def _compute_newton_step(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _compute_newton_step(
+    grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray, settings: InversionSettings
+) -> np.ndarray:
     """Return the Newton step (n, 3) [m] at places (n, 3) [m] with residuals `rest` (n, 3)."""
     half = 0.25 * grid.spacing
     columns = []
@@ -68,4 +83,4 @@ def _compute_newton_step(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: 
     matrix[flat] = np.eye(3)
     step = -np.linalg.solve(matrix, rest[..., None])[..., 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
-    return step * np.minimum(1.0, MAX_NEWTON_STEP * grid.spacing / np.maximum(length, 1e-30))
+    return step * np.minimum(1.0, settings.max_newton_step * grid.spacing / np.maximum(length, 1e-30))

@@ -15,21 +15,26 @@ from scipy.sparse.linalg import cg
 from ..geometry.tetmesh import find_single_faces
 from .grid import Grid
 
-# Interpolation error above which tetrahedra are fitted [m].
-FIT_TOLERANCE = 2e-5
-TEST_DENSITY = 1.0  # points per grid spacing along a tetrahedron's longest edge, in the error test
-FIT_DENSITY = 1.5  # the same in the fit
 MAX_SUBDIVISIONS = 10  # maximum subdivisions of an edge
-SURFACE_DENSITY = 2.0  # points per grid spacing along a surface triangle's longest edge
-SURFACE_WEIGHT = 10.0  # weight of a cell face of surface, relative to a cell's volume
 # Points per block, to limit memory.
 BLOCK_POINTS = 200_000
-# Penalty weights relative to the squared error.
-CHANGE_WEIGHT = 1e-3  # change of the field
-DIFFERENCE_WEIGHT = 1e-2  # differences of the change between nodes
-CURVATURE_WEIGHT = 3e-3  # second differences of the field in the collar
-SOLVER_TOLERANCE = 1e-3  # relative tolerance of the linear solver
-MAX_ITERATIONS = 300  # maximum iterations of the linear solver
+
+
+@dataclass(frozen=True)
+class ProjectionSettings:
+    """Settings of `project`."""
+
+    fit_tolerance: float = 2e-5  # Interpolation error above which tetrahedra are fitted [m].
+    test_density: float = 1.0  # points per grid spacing along a tetrahedron's longest edge, in the error test
+    fit_density: float = 1.5  # the same in the fit
+    surface_density: float = 2.0  # points per grid spacing along a surface triangle's longest edge
+    surface_weight: float = 10.0  # weight of a cell face of surface, relative to a cell's volume
+    # Penalty weights relative to the squared error.
+    change_weight: float = 1e-3  # change of the field
+    difference_weight: float = 1e-2  # differences of the change between nodes
+    curvature_weight: float = 3e-3  # second differences of the field in the collar
+    solver_tolerance: float = 1e-3  # relative tolerance of the linear solver
+    max_iterations: int = 300  # maximum iterations of the linear solver
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +55,14 @@ class _Samples(NamedTuple):
     simplex: np.ndarray
 
 
-def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: NodalField) -> None:
+def project(
+    grid: Grid,
+    field: np.ndarray,
+    inside: np.ndarray,
+    collar: np.ndarray,
+    body: NodalField,
+    settings: ProjectionSettings = ProjectionSettings(),
+) -> None:
     """Fit a field (3, I, J, K), sampled in a body (mask `inside`) and its `collar`, to the body's field between nodes.
 
     Changed in place are nodes at interpolation errors above 0.02 mm, in the collar only where it moves. The squared
@@ -60,11 +72,12 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     """
     flat = field.reshape(3, -1)
     bad = np.zeros(len(body.tets), bool)
-    for some in _sample_tetrahedra(grid, body, np.arange(len(body.tets)), TEST_DENSITY):
+    for some in _sample_tetrahedra(grid, body, np.arange(len(body.tets)), settings.test_density):
         numbers, weights = grid.find_corners(some.points)
-        bad[some.simplex[np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1) > FIT_TOLERANCE]] = True
+        error = np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1)
+        bad[some.simplex[error > settings.fit_tolerance]] = True
     free = np.zeros(flat.shape[1], bool)
-    for some in _sample_tetrahedra(grid, body, np.flatnonzero(bad), FIT_DENSITY):
+    for some in _sample_tetrahedra(grid, body, np.flatnonzero(bad), settings.fit_density):
         free[grid.find_corners(some.points)[0]] = True
     free &= inside.reshape(-1) | (collar.reshape(-1) & flat.any(axis=0))
     nodes = np.flatnonzero(free)
@@ -72,11 +85,10 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
         return
     column = np.full(len(free), -1)
     column[nodes] = np.arange(len(nodes))
-    touched = np.zeros(len(body.nodes), bool)
-    touched[body.tets[bad]] = True
-    matrix, side = _build_penalties(grid, flat, nodes, column, inside.reshape(-1), collar.reshape(-1))
-    within = _sample_tetrahedra(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), FIT_DENSITY)
-    for some in chain(within, _sample_surface(grid, body, touched)):
+    touched = np.isin(np.arange(len(body.nodes)), body.tets[bad])
+    matrix, side = _build_penalties(grid, flat, column, inside.reshape(-1), collar.reshape(-1), settings)
+    within = _sample_tetrahedra(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), settings.fit_density)
+    for some in chain(within, _sample_surface(grid, body, touched, settings)):
         numbers, weights = grid.find_corners(some.points)
         rows = _build_rows(column, numbers, weights)
         weighted = rows.T.multiply(some.weights).tocsr()
@@ -85,7 +97,7 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     scale = sparse.diags(1.0 / np.asarray(matrix.diagonal(), np.float64))
     change = np.zeros_like(field)
     for part, right in zip(change.reshape(3, -1), side.T, strict=True):
-        part[nodes] = cg(matrix, right, rtol=SOLVER_TOLERANCE, maxiter=MAX_ITERATIONS, M=scale)[0]
+        part[nodes] = cg(matrix, right, rtol=settings.solver_tolerance, maxiter=settings.max_iterations, M=scale)[0]
     field += change
 
 
@@ -102,13 +114,15 @@ def _sample_tetrahedra(grid: Grid, body: NodalField, which: np.ndarray, density:
         yield some._replace(simplex=which[some.simplex])
 
 
-def _sample_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
+def _sample_surface(
+    grid: Grid, body: NodalField, touched: np.ndarray, settings: ProjectionSettings
+) -> Iterator[_Samples]:
     """Yield points of the surface triangles with a vertex in `touched` (V,)."""
     faces = find_single_faces(body.tets)
     faces = faces[touched[faces].any(axis=1)]
     a, b, c = body.nodes[faces].transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / (2.0 * grid.spacing**2)
-    return _sample_simplices(grid, body, faces, SURFACE_WEIGHT * areas, SURFACE_DENSITY)
+    return _sample_simplices(grid, body, faces, settings.surface_weight * areas, settings.surface_density)
 
 
 def _sample_simplices(
@@ -151,10 +165,15 @@ def _build_rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) ->
 
 
 def _build_penalties(
-    grid: Grid, flat: np.ndarray, nodes: np.ndarray, column: np.ndarray, inside: np.ndarray, collar: np.ndarray
+    grid: Grid,
+    flat: np.ndarray,
+    column: np.ndarray,
+    inside: np.ndarray,
+    collar: np.ndarray,
+    settings: ProjectionSettings,
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Return matrix and right side (n, 3) of the penalties on size, unevenness and curvature."""
-    pairs, bends = [], []
+    nodes, pairs, bends = np.flatnonzero(column >= 0), [], []
     for index, side, stride in zip(
         np.unravel_index(nodes, grid.shape), grid.shape, (grid.shape[1] * grid.shape[2], grid.shape[2], 1), strict=True
     ):
@@ -164,13 +183,11 @@ def _build_penalties(
     pair, bend = np.concatenate(pairs), np.concatenate(bends)
     pair = pair[(column[pair] >= 0).all(axis=1)]
     bend = bend[(inside | collar)[bend].all(axis=1) & collar[bend].any(axis=1)]
-    even, straight = (
-        _build_rows(column, pair, np.array([1.0, -1.0])),
-        _build_rows(column, bend, np.array([1.0, -2.0, 1.0])),
-    )
+    even = _build_rows(column, pair, np.array([1.0, -1.0]))
+    straight = _build_rows(column, bend, np.array([1.0, -2.0, 1.0]))
     matrix = (
-        CHANGE_WEIGHT * sparse.identity(len(nodes))
-        + DIFFERENCE_WEIGHT * even.T @ even
-        + CURVATURE_WEIGHT * straight.T @ straight
+        settings.change_weight * sparse.identity(len(nodes))
+        + settings.difference_weight * even.T @ even
+        + settings.curvature_weight * straight.T @ straight
     )
-    return matrix.tocsr(), -CURVATURE_WEIGHT * straight.T @ (flat[:, bend] @ np.array([1.0, -2.0, 1.0])).T
+    return matrix.tocsr(), -settings.curvature_weight * straight.T @ (flat[:, bend] @ np.array([1.0, -2.0, 1.0])).T

@@ -18,15 +18,23 @@ from .inversion import invert_field
 from .near_surface import extrapolate_beyond_surface
 from .projection import NodalField, project
 
-MIN_FADE_DISTANCE = 5e-3  # constant part of the distance over which the field fades to zero [m]
-FADE_FACTOR = 2.0  # variable part of that distance [maximum displacements]
-GRID_MARGIN = 3  # margin of the grid beyond that distance [nodes]
-INVERSION_THRESHOLD = 1e-5  # displacement below which no inverse is computed [m]
 MIN_DIVISOR = 1e-30  # guard against division by 0
-ZEROING_THRESHOLD = 2e-5
-"""Displacement below which it is set to 0 [m]; above twice the limit it is unchanged."""
-ZEROING_FRACTION = 2.5e-3
-"""Maximum of that limit, as a fraction of the maximum displacement."""
+
+
+@dataclass(frozen=True)
+class WarpFieldSettings:
+    """Settings of the grid of a warp and of its small displacements."""
+
+    min_fade_distance: float = 5e-3  # constant part of the distance over which the field fades to zero [m]
+    fade_factor: float = 2.0  # variable part of that distance [maximum displacements]
+    grid_margin: int = 3  # margin of the grid beyond that distance [nodes]
+    inversion_threshold: float = 1e-5  # displacement below which no inverse is computed [m]
+    # Displacement below which it is set to 0 [m]; above twice the limit it is unchanged.
+    zeroing_threshold: float = 2e-5
+    zeroing_fraction: float = 2.5e-3  # Maximum of that limit, as a fraction of the maximum displacement.
+
+
+WARP_FIELDS = WarpFieldSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +73,14 @@ class WarpFields:
 
 def compute_reach(displacement: np.ndarray) -> float:
     """Return the distance [m] over which the field of displacements (..., 3) [m] fades to zero."""
-    return MIN_FADE_DISTANCE + FADE_FACTOR * float(np.linalg.norm(displacement, axis=-1).max())
+    return WARP_FIELDS.min_fade_distance + WARP_FIELDS.fade_factor * float(np.linalg.norm(displacement, axis=-1).max())
 
 
 def compute_faint_threshold(displacement: np.ndarray) -> float:
     """Return the limit [m] below which displacements (..., 3) [m] are neglected, so that the grid can be smaller."""
-    return min(ZEROING_THRESHOLD, ZEROING_FRACTION * float(np.linalg.norm(displacement, axis=-1).max()))
+    return min(
+        WARP_FIELDS.zeroing_threshold, WARP_FIELDS.zeroing_fraction * float(np.linalg.norm(displacement, axis=-1).max())
+    )
 
 
 def remove_faint(displacement: np.ndarray) -> np.ndarray:
@@ -90,7 +100,7 @@ def warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Gr
     places = [mesh.nodes[held], *(mesh.nodes[held] + displacements[:, held])]
     for some in (mesh.nodes[outer], *(mesh.nodes[outer] + displacements[:, outer])):
         places += [some - reach, some + reach]
-    return build_grid_around(np.concatenate(places), spacing, GRID_MARGIN * spacing)
+    return build_grid_around(np.concatenate(places), spacing, WARP_FIELDS.grid_margin * spacing)
 
 
 def find_collar(inside: np.ndarray) -> np.ndarray:
@@ -125,7 +135,7 @@ def invert_on_grid(
     """
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
     field, inside = interpolate_in_tetrahedra(grid, now, tets, -displacement)
-    numbers = np.flatnonzero(~inside & (np.abs(forward).max(axis=0) > INVERSION_THRESHOLD))
+    numbers = np.flatnonzero(~inside & (np.abs(forward).max(axis=0) > WARP_FIELDS.inversion_threshold))
     flat = field.reshape(3, -1)
     guess = -forward.reshape(3, -1)[:, numbers].T.astype(np.float64)
     flat[:, numbers] = invert_field(grid, forward, grid.compute_points(numbers), guess).T
