@@ -19,7 +19,7 @@ from sim.local_solvers.clamped_elimination import ClampedElimination
 from sim.local_solvers.strained_descent import StrainedDescent
 from sim.minimisers.lbfgs import Lbfgs
 from sim.strategy import strategy
-from sim.strategy.plan import MAX_EVALUATIONS, MIN_OUTER_ITERATIONS, MIN_SHARED_CASES, SolverPlan, SolverStep
+from sim.strategy.plan import PLAN_LIMITS, SolverPlan, SolverStep
 from sim.terms.elasticity import ElasticTerm
 from sim.tools import Ball, Spatula
 
@@ -44,15 +44,15 @@ def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accura
         ({"element": "p2", "live": True}, (SolverStep.CLAMPED, *LAST), LAST, LAST),
         ({**WIDE, "live": True}, LAST, LAST, LAST),
         ({"effects": (*PUSHED, Inertia()), "live": True}, LAST, LAST, LAST),
-        ({"accuracy": replace(TRAIN, outer=MIN_OUTER_ITERATIONS - 1)}, *3 * [(SolverStep.NEWTON,)]),
+        ({"accuracy": replace(TRAIN, outer=PLAN_LIMITS.min_outer_iterations - 1)}, *3 * [(SolverStep.NEWTON,)]),
         (POSED, *3 * [(SolverStep.NEWTON,)]),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
 def test_the_table(more, one, few, many):
     plan = planned(**more)
-    assert [plan.list_steps(count) for count in (1, 2, MIN_SHARED_CASES)] == [one, few, many]
-    assert plan.list_steps(MIN_SHARED_CASES, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
+    assert [plan.list_steps(count) for count in (1, 2, PLAN_LIMITS.min_shared_cases)] == [one, few, many]
+    assert plan.list_steps(PLAN_LIMITS.min_shared_cases, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
 
 
 def test_contact_is_solved_apart_for_one_tool_kind_only():
@@ -64,10 +64,10 @@ def test_contact_is_solved_apart_for_one_tool_kind_only():
 @pytest.mark.parametrize(
     ("avoid", "steps"),
     [
-        (SolverStep.NEAR, {MIN_SHARED_CASES: LAST}),
+        (SolverStep.NEAR, {PLAN_LIMITS.min_shared_cases: LAST}),
         (SolverStep.STRAINED, {1: LAST}),
-        (SolverStep.LBFGS, {1: (SolverStep.NEWTON,), MIN_SHARED_CASES: (SolverStep.NEWTON,)}),
-        (SolverStep.NEWTON, {1: (SolverStep.STRAINED, *LAST), MIN_SHARED_CASES: (SolverStep.NEAR, *LAST)}),
+        (SolverStep.LBFGS, {1: (SolverStep.NEWTON,), PLAN_LIMITS.min_shared_cases: (SolverStep.NEWTON,)}),
+        (SolverStep.NEWTON, {1: (SolverStep.STRAINED, *LAST), PLAN_LIMITS.min_shared_cases: (SolverStep.NEAR, *LAST)}),
     ],
 )
 def test_what_is_avoided_is_not_tried(avoid, steps):
@@ -79,11 +79,12 @@ def test_what_is_avoided_is_not_tried(avoid, steps):
 
 @pytest.mark.parametrize("evaluations", [0, 1, 7])
 @pytest.mark.parametrize(
-    ("count", "more"), [(1, {"live": True, "element": "smoothed"}), (MIN_SHARED_CASES, {}), (1, {"element": "p2"})]
+    ("count", "more"),
+    [(1, {"live": True, "element": "smoothed"}), (PLAN_LIMITS.min_shared_cases, {}), (1, {"element": "p2"})],
 )
 def test_evaluation_budget_bounds_work_before_newton(count, more, evaluations, monkeypatch):
     """Counted at the element's kernels, of the whole body: a local solver's part is another problem."""
-    accuracy, looks = replace(TRAIN, evaluations=evaluations, outer=MIN_OUTER_ITERATIONS, steps=0), []
+    accuracy, looks = replace(TRAIN, evaluations=evaluations, outer=PLAN_LIMITS.min_outer_iterations, steps=0), []
     fem = Fem(BODY, PUSHED, accuracy, "cpu", **{"element": "p1", **more})
     whole = next(term for term in fem.problem.terms if isinstance(term, ElasticTerm))
     inside, found = ElasticTerm.add_gradient, strategy.find_equilibrium
@@ -118,13 +119,13 @@ def test_quadratic_loads_go_one_by_one():
     [
         (1, {"live": True, "element": "smoothed"}),
         (2, {"live": True}),
-        (MIN_SHARED_CASES, {}),
+        (PLAN_LIMITS.min_shared_cases, {}),
         (1, {"element": "p2"}),
     ],
 )
 def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     """Each step that is asked passes every load on, so that all are heard."""
-    tried, left = [], [MAX_EVALUATIONS]
+    tried, left = [], [PLAN_LIMITS.max_evaluations]
     kinds = {
         BatchElimination: SolverStep.NEAR,
         StrainedDescent: SolverStep.STRAINED,
@@ -165,9 +166,9 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
         (
             {},
             (
-                f"Batches of {MIN_SHARED_CASES} loads and more",
+                f"Batches of {PLAN_LIMITS.min_shared_cases} loads and more",
                 "L-BFGS",
-                f"at most {MAX_EVALUATIONS} evaluations",
+                f"at most {PLAN_LIMITS.max_evaluations} evaluations",
                 "sparse factor",
             ),
             ("A single load",),

@@ -11,15 +11,22 @@ from scipy import ndimage
 from .conventions import CONVENTIONS, Convention
 from .label_map import LabelMap
 
-# Minimum oedema volume, as a fraction of all labelled voxels; smaller ones are noise.
-MIN_OEDEMA_FRACTION = 0.02
-# Fraction of an oedema's surface that faces neither tumour nor oedema.
-MIN_OUTER_FRACTION = 0.2  # below it in no tumour
-CERTAIN_OUTER_FRACTION = 0.4  # above it in every tumour
-# Significant difference between two such fractions.
-MIN_DIFFERENCE = 0.1
-# Fraction of the enhancing tumour's surface at necrosis above which the necrosis lies outside.
-MAX_WRAPPED_FRACTION = 0.7
+
+@dataclass(frozen=True)
+class ContradictionSettings:
+    """Thresholds of `find_contradiction`."""
+
+    # Minimum oedema volume, as a fraction of all labelled voxels; smaller ones are noise.
+    min_oedema_fraction: float = 0.02
+    # Fraction of an oedema's surface that faces neither tumour nor oedema.
+    min_outer_fraction: float = 0.2  # below it in no tumour
+    certain_outer_fraction: float = 0.4  # above it in every tumour
+    min_difference: float = 0.1  # Significant difference between two such fractions.
+    # Fraction of the enhancing tumour's surface at necrosis above which the necrosis lies outside.
+    max_wrapped_fraction: float = 0.7
+
+
+CONTRADICTION = ContradictionSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +72,9 @@ class Contradiction:
     certain: bool = True
 
 
-def find_contradiction(contacts: Contacts, convention: Convention) -> Contradiction | None:
+def find_contradiction(
+    contacts: Contacts, convention: Convention, settings: ContradictionSettings = CONTRADICTION
+) -> Contradiction | None:
     """Return a contradiction of a convention with the anatomy, or None.
 
     Necrosis must lie inside enhancing tumour, oedema and cortex outside. Either may be missing or at the brain surface.
@@ -78,19 +87,19 @@ def find_contradiction(contacts: Contacts, convention: Convention) -> Contradict
     for label in there.intersection(convention.deepest):
         least = min((contacts.share({one}, {0}) for one in there.intersection(convention.known) - {label}), default=1.0)
         found = contacts.share({label}, {0})
-        if found > least + MIN_DIFFERENCE:
+        if found > least + settings.min_difference:
             return Contradiction(f"label {label} lies outside of the others, {found:.0%} of its surface at no label")
-    if oedema and tumour and contacts.compute_share(oedema) >= MIN_OEDEMA_FRACTION:
+    if oedema and tumour and contacts.compute_share(oedema) >= settings.min_oedema_fraction:
         found = contacts.share(oedema, outside)
-        if found < MIN_OUTER_FRACTION or found < min(
-            CERTAIN_OUTER_FRACTION, contacts.share(necrosis, outside) - MIN_DIFFERENCE
+        if found < settings.min_outer_fraction or found < min(
+            settings.certain_outer_fraction, contacts.share(necrosis, outside) - settings.min_difference
         ):
             return Contradiction(
                 f"label {_to_text(oedema)} would be oedema and lies inside the tumour, {found:.0%} of its surface at "
                 "healthy tissue"
             )
     found = contacts.share(tumour - necrosis, necrosis)
-    if found > max(MAX_WRAPPED_FRACTION, contacts.share(necrosis, tumour)):
+    if found > max(settings.max_wrapped_fraction, contacts.share(necrosis, tumour)):
         return Contradiction(
             f"label {_to_text(necrosis)} would be necrosis and lies round the enhancing tumour, of whose surface it "
             f"covers {found:.0%}",
@@ -99,7 +108,9 @@ def find_contradiction(contacts: Contacts, convention: Convention) -> Contradict
     return None
 
 
-def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
+def build_contradiction_check(
+    whole: LabelMap, chosen: Convention, settings: ContradictionSettings = CONTRADICTION
+) -> Callable[[Convention], str]:
     """Return a function that gives the reason why the anatomy contradicts a convention; empty if it does not.
 
     A contradiction that rare tumours show counts against the `chosen` convention only if another convention fits.
@@ -110,21 +121,21 @@ def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[
     rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.is_compatible(whole.labels)]
 
     def reason(one: Convention) -> str:
-        found = find_contradiction(contacts, one)
+        found = find_contradiction(contacts, one, settings)
         if found is None or not (found.certain or one is not chosen or any(map(shown, rivals))):
             return ""
         return found.reason
 
     def shown(one: Convention) -> bool:
-        return not reason(one) and _has_oedema_outside(contacts, one)
+        return not reason(one) and _has_oedema_outside(contacts, one, settings)
 
     return reason
 
 
-def _has_oedema_outside(contacts: Contacts, convention: Convention) -> bool:
+def _has_oedema_outside(contacts: Contacts, convention: Convention, settings: ContradictionSettings) -> bool:
     there = set(contacts.labels.tolist())
     outside = there.difference(convention.tumour, convention.oedema)
-    return contacts.share(there.intersection(convention.oedema), outside) >= CERTAIN_OUTER_FRACTION
+    return contacts.share(there.intersection(convention.oedema), outside) >= settings.certain_outer_fraction
 
 
 def _to_text(labels: Collection[int]) -> str:

@@ -25,11 +25,21 @@ from .captured_frame import MAX_FRAME_EVALUATIONS
 
 Alone = ClampedElimination | StrainedDescent
 """Local solver for a single load."""
-MIN_SHARED_CASES = 16  # Load cases from which the set-up of a shared local subproblem pays.
-MAX_EVALUATIONS = 60  # Maximum residual evaluations before Newton-CG on the CPU.
-# The same on CUDA, where a small batch costs almost as much as one load case, so that Newton-CG comes late.
-MAX_CUDA_EVALUATIONS = 800
-MIN_OUTER_ITERATIONS = 10  # With a smaller budget of outer iterations only Newton-CG is used: its steps are longer.
+
+
+@dataclass(frozen=True)
+class PlanLimits:
+    """Limits at which the choice of solvers changes."""
+
+    min_shared_cases: int = 16  # Load cases from which the set-up of a shared local subproblem pays.
+    max_evaluations: int = 60  # Maximum residual evaluations before Newton-CG on the CPU.
+    # The same on CUDA, where a small batch costs almost as much as one load case, so that Newton-CG comes late.
+    max_cuda_evaluations: int = 800
+    # With a smaller budget of outer iterations only Newton-CG is used: its steps are longer.
+    min_outer_iterations: int = 10
+
+
+PLAN_LIMITS = PlanLimits()
 
 
 class SolverStep(Enum):
@@ -53,7 +63,7 @@ class SolverPlan:
     preconditioner
         Name of the preconditioner, from `name_of`.
     many, single
-        Local solver that is tried first for `MIN_SHARED_CASES` loads or more, and for one; None: no local solver.
+        Local solver that is tried first for `PLAN_LIMITS.min_shared_cases` loads or more, and for one; or None.
     contact
         Solver that is tried first for loads with tools moved by pose; None without such tools.
     quick
@@ -81,7 +91,7 @@ class SolverPlan:
 
     def choose_local(self, count: int) -> SolverStep | None:
         """Return the local solver that is tried first for `count` loads together, if any."""
-        return self.many if count >= MIN_SHARED_CASES else self.single if count == 1 else None
+        return self.many if count >= PLAN_LIMITS.min_shared_cases else self.single if count == 1 else None
 
     def list_steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
         """List the solvers for `count` loads together, in order; `imposed` if the loads prescribe motion."""
@@ -103,7 +113,7 @@ class SolverPlan:
             lines.append(f"Every load is solved by {SolverStep.NEWTON.value}, in at most {self.outer} iterations.")
         else:
             if self.many:
-                lines.append(f"Batches of {MIN_SHARED_CASES} loads and more begin with {self.many.value}.")
+                lines.append(f"Batches of {PLAN_LIMITS.min_shared_cases} loads and more begin with {self.many.value}.")
             if self.single:
                 lines.append(f"A single load begins with {self.single.value}.")
             lines.append(f"{SolverStep.LBFGS.value} takes what is left, in at most {self.evaluations} evaluations.")
@@ -150,9 +160,9 @@ def plan_for(
         one = len(problem.barriers) == 1 and isinstance(problem.barriers[0], Local)
         contact = SolverStep.CONTACT if one and alike else SolverStep.NEWTON
     following = cuda and exact and elastic and can_follow(space, accuracy) and wp.is_conditional_graph_supported()
-    quick = not problem.steep and not problem.barriers and accuracy.outer >= MIN_OUTER_ITERATIONS
+    quick = not problem.steep and not problem.barriers and accuracy.outer >= PLAN_LIMITS.min_outer_iterations
     single, contact = None if single in avoid else single, SolverStep.NEWTON if contact in avoid else contact
-    most = MAX_CUDA_EVALUATIONS if cuda else MAX_EVALUATIONS
+    most = PLAN_LIMITS.max_cuda_evaluations if cuda else PLAN_LIMITS.max_evaluations
     most = most if accuracy.evaluations is None else min(most, accuracy.evaluations)
     return SolverPlan(
         preconditioner=name_of(preconditioner),
@@ -171,7 +181,7 @@ def plan_for(
 
 def can_follow(space: Discretisation, accuracy: Accuracy) -> bool:
     """Return True if frames can be captured: nodes are mesh vertices, and the iteration budget admits L-BFGS."""
-    return not len(space.edges) and accuracy.outer >= MIN_OUTER_ITERATIONS
+    return not len(space.edges) and accuracy.outer >= PLAN_LIMITS.min_outer_iterations
 
 
 def build_local_solvers(
