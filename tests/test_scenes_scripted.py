@@ -7,7 +7,7 @@ from test_scenes_plan import TINY
 from scenes.episodes.make import choose_body
 from scenes.episodes.plan import plan_from
 from scenes.episodes.scripted import sample_episode
-from scenes.gym.episode import ABORT_REWARD
+from scenes.gym.episode import REWARD
 from scenes.gym.tasks import PALPATE
 from sim.errors import InputError
 
@@ -24,7 +24,7 @@ def test_scripted_policy_palpates_until_limit():
         _, reward, terminated, truncated, truth = environment.step(DOWN)
         assert not truncated
         rewards.append(reward)
-    assert truth["load"] > 1.25 and truth["violations"] > 0 and rewards[-1] < ABORT_REWARD + 1.0
+    assert truth["load"] > 1.25 and truth["violations"] > 0 and rewards[-1] < REWARD.abort_reward + 1.0
     with pytest.raises(InputError, match=r"call reset\(\)"):
         environment.unwrapped.step(DOWN)
 

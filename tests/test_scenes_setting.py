@@ -9,15 +9,7 @@ from gym_examples import SIZE, made, played
 from programs import main
 from theatres import put, theatre_of
 
-from scenes.gym.episode import (
-    ABORT_REWARD,
-    LIMIT_PENALTY,
-    MAX_POTENTIAL_DISTANCE,
-    SHARE_REWARD,
-    STEP_PENALTY,
-    EpisodeScore,
-    compute_reward,
-)
+from scenes.gym.episode import REWARD, EpisodeScore, compute_reward
 from scenes.gym.model_responses import PressedModel
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
@@ -33,18 +25,22 @@ STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
 
 def test_a_reward_is_a_difference_of_potentials_and_its_limits():
     near, far = EpisodeScore(0.002, 0.1, 0, 0.5), EpisodeScore(0.012, 0.6, 0, 0.5)
-    assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - STEP_PENALTY)
-    assert compute_reward(near, near, False, False) == pytest.approx(-STEP_PENALTY)
-    assert compute_reward(near, replace(near, load=1.1), False, False) == pytest.approx(-STEP_PENALTY - LIMIT_PENALTY)
-    assert compute_reward(near, near, False, True) == pytest.approx(ABORT_REWARD - STEP_PENALTY)
-    assert compute_reward(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * SHARE_REWARD - STEP_PENALTY)
+    assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - REWARD.step_penalty)
+    assert compute_reward(near, near, False, False) == pytest.approx(-REWARD.step_penalty)
+    assert compute_reward(near, replace(near, load=1.1), False, False) == pytest.approx(
+        -REWARD.step_penalty - REWARD.limit_penalty
+    )
+    assert compute_reward(near, near, False, True) == pytest.approx(REWARD.abort_reward - REWARD.step_penalty)
+    assert compute_reward(near, replace(near, cut=2), False, False) == pytest.approx(
+        2.0 * REWARD.share_reward - REWARD.step_penalty
+    )
     lost, farther = (
-        EpisodeScore(MAX_POTENTIAL_DISTANCE, 1.0, 0, 0.5),
-        EpisodeScore(2.0 * MAX_POTENTIAL_DISTANCE, 5.0, 0, 0.5),
+        EpisodeScore(REWARD.max_potential_distance, 1.0, 0, 0.5),
+        EpisodeScore(2.0 * REWARD.max_potential_distance, 5.0, 0, 0.5),
     )  # beyond, all count alike
     assert (
         compute_reward(farther, lost, False, False)
-        == pytest.approx(-STEP_PENALTY)
+        == pytest.approx(-REWARD.step_penalty)
         != compute_reward(lost, near, False, False)
     )
 

@@ -20,21 +20,25 @@ from sim.material import Tissue
 
 from ..options.tissue_options import check_stiffness
 
-MIN_BRAIN_ML = 850.0  # Smallest volume of an adult brain with its ventricles [ml]: below, a mask lacks a part.
-MAX_BRAIN_ML = (
-    2000.0  # Largest volume of an adult brain with its ventricles [ml]: above, a mask contains more than brain.
-)
-MAX_TUMOUR_SHARE = (
-    0.25  # Largest volume of a tumour relative to the brain: labels of another convention are often larger.
-)
-MAX_TUMOUR_DISTANCE = (
-    0.040  # Distance from the craniotomy to the tumour above which pressing the cortex moves nothing there [m].
-)
-MAX_VOXEL_RATIO = (
-    2.5  # Ratio of the longest to the shortest edge of a voxel above which surfaces show steps along one axis.
-)
-MIN_T1_COVERAGE = 0.98  # Smallest share of the brain that a T1 in the same space covers.
-MAX_SHEET_ML = 40.0  # Largest volume of a sheet of dura, a few voxels thick [ml].
+
+@dataclass(frozen=True)
+class InspectionLimits:
+    """Limits beyond which `inspect_subject` warns."""
+
+    # Smallest volume of an adult brain with its ventricles [ml]: below, a mask lacks a part.
+    min_brain_ml: float = 850.0
+    # Largest volume of an adult brain with its ventricles [ml]: above, a mask contains more than brain.
+    max_brain_ml: float = 2000.0
+    # Largest volume of a tumour relative to the brain: labels of another convention are often larger.
+    max_tumour_share: float = 0.25
+    # Distance from the craniotomy to the tumour above which pressing the cortex moves nothing there [m].
+    max_tumour_distance: float = 0.040
+    # Ratio of the longest to the shortest edge of a voxel above which surfaces show steps along one axis.
+    max_voxel_ratio: float = 2.5
+    min_t1_coverage: float = 0.98  # Smallest share of the brain that a T1 in the same space covers.
+    max_sheet_ml: float = 40.0  # Largest volume of a sheet of dura, a few voxels thick [ml].
+
+
 AXES = ("LR", "PA", "IS")  # Letters of the negative and positive direction of each RAS axis.
 MAX_LISTED_PIECES = 4  # Maximum number of pieces that are listed.
 
@@ -128,7 +132,9 @@ class Inspection:
         }
 
 
-def inspect_subject(masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue]) -> Inspection:
+def inspect_subject(
+    masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue], limits: InspectionLimits = InspectionLimits()
+) -> Inspection:
     """Inspect `masks` and the `subject` in them, with tissues of regions by label."""
     affine = masks.affine
     edges, voxel = 1e3 * np.linalg.norm(affine[:3, :3], axis=0), 1e6 * abs(float(np.linalg.det(affine[:3, :3])))
@@ -153,7 +159,7 @@ def inspect_subject(masks: HeadMasks, subject: Subject, regions: Mapping[int, Ti
         warnings=(),
     )
     stiffness = (f"{name_region(label)}: {doubt}" for label, one in regions.items() if (doubt := check_stiffness(one)))
-    return replace(found, warnings=(*subject.notes, *stiffness, *_find_warnings(found, subject)))
+    return replace(found, warnings=(*subject.notes, *stiffness, *_find_warnings(found, subject, limits)))
 
 
 def _describe_tissue(label: int, regions: Mapping[int, Tissue]) -> str:
@@ -173,18 +179,17 @@ def describe_axes(affine: np.ndarray) -> str:
     return "".join(letters)
 
 
-def _find_warnings(found: Inspection, subject: Subject) -> Iterator[str]:
-    if not MIN_BRAIN_ML <= found.brain <= MAX_BRAIN_ML:
-        word, ask = (
-            ("small", "is the mask whole") if found.brain < MIN_BRAIN_ML else ("large", "does the mask hold the skull")
-        )
+def _find_warnings(found: Inspection, subject: Subject, limits: InspectionLimits) -> Iterator[str]:
+    if not limits.min_brain_ml <= found.brain <= limits.max_brain_ml:
+        small = found.brain < limits.min_brain_ml
+        word, ask = ("small", "is the mask whole") if small else ("large", "does the mask hold the skull")
         yield f"a brain of {found.brain:.0f} ml is {word} for an adult: {ask}?"
-    if found.tumour > MAX_TUMOUR_SHARE * found.brain:
+    if found.tumour > limits.max_tumour_share * found.brain:
         yield f"the tumour has {100.0 * found.tumour / found.brain:.0f} % of the brain: are these its labels?"
     if found.depth <= max(found.voxel):
         yield "the tumour touches the cortex"
     for septum in subject.septa:
-        if found.parts[septum.name] > MAX_SHEET_ML:
+        if found.parts[septum.name] > limits.max_sheet_ml:
             yield f"a {septum.name} of {found.parts[septum.name]:.0f} ml is no sheet: are these its labels?"
         if KDTree(septum.points).query(subject.interface)[0].min() <= 1e-3 * max(found.voxel):
             yield f"the tumour touches the {septum.name}, where it does not move"
@@ -193,13 +198,13 @@ def _find_warnings(found: Inspection, subject: Subject) -> Iterator[str]:
             f"the tumour lies in {len(found.pieces)} pieces, and the skull is opened over one of them: --opening-over "
             "chooses another"
         )
-    if 1e-3 * found.distance > MAX_TUMOUR_DISTANCE:
+    if 1e-3 * found.distance > limits.max_tumour_distance:
         yield f"the opening lies {found.distance:.0f} mm from the tumour: pressing there will hardly move it"
-    if max(found.voxel) > MAX_VOXEL_RATIO * min(found.voxel):
+    if max(found.voxel) > limits.max_voxel_ratio * min(found.voxel):
         yield f"voxels are up to {max(found.voxel):.1f} mm long: surfaces have steps of that size"
     if subject.intensity is not None:
         covered = share_on(subject.intensity.values.shape, subject.intensity.affine, subject.cortex)
-        if covered < MIN_T1_COVERAGE:
+        if covered < limits.min_t1_coverage:
             yield f"the T1 holds {100.0 * covered:.0f} % of the brain's surface: is it of the same space?"
 
 

@@ -18,14 +18,21 @@ from .tasks import MAX_LOAD_RATIO, STEP_SECONDS, Goal
 from .tissue_requests import TissueRequest, Touched
 from .tool_motion import RobotTool, build_tool_frame, compute_lever, lay_tool, move_tool, shift_pose
 
-STEP_PENALTY = 0.01  # Penalty of a step.
-LIMIT_PENALTY = 0.5  # Penalty of a step with a load over its limit.
-SUCCESS_REWARD = 10.0  # Reward of success.
-ABORT_REWARD = -10.0  # Reward of the end of an episode at a limit.
-SHARE_REWARD = 3.0
-"""Reward of each share of the tumour that is resected."""
-MAX_POTENTIAL_DISTANCE = 0.03  # Distance beyond which the potential no longer falls [m].
-POTENTIAL_LENGTH = 0.01  # Distance that lowers the potential by 1 [m].
+
+@dataclass(frozen=True)
+class RewardSettings:
+    """Settings of `compute_reward`."""
+
+    step_penalty: float = 0.01  # Penalty of a step.
+    limit_penalty: float = 0.5  # Penalty of a step with a load over its limit.
+    success_reward: float = 10.0  # Reward of success.
+    abort_reward: float = -10.0  # Reward of the end of an episode at a limit.
+    share_reward: float = 3.0  # Reward of each share of the tumour that is resected.
+    max_potential_distance: float = 0.03  # Distance beyond which the potential no longer falls [m].
+    potential_length: float = 0.01  # Distance that lowers the potential by 1 [m].
+
+
+REWARD = RewardSettings()
 MAX_TREMOR = 1e-4  # Largest standard deviation of the tremor [m].
 START_HEIGHTS = (5e-3, 8e-3)  # Range of the initial height of a tool above the cortex [m].
 START_OFFSETS = (3e-3, 8e-3)  # Range of the initial lateral distance of a tool from its goal [m].
@@ -56,15 +63,16 @@ class EpisodeScore:
     @property
     def potential(self) -> float:
         """Potential whose differences are rewarded."""
-        return SHARE_REWARD * self.cut - min(self.away, MAX_POTENTIAL_DISTANCE) / POTENTIAL_LENGTH - min(self.off, 1.0)
+        away = min(self.away, REWARD.max_potential_distance) / REWARD.potential_length
+        return REWARD.share_reward * self.cut - away - min(self.off, 1.0)
 
 
 def compute_reward(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
     """Return the reward of a step from one state to the next; `ended`: at a limit, without success."""
-    reward = now.potential - before.potential - STEP_PENALTY
+    reward = now.potential - before.potential - REWARD.step_penalty
     if now.load > 1.0:
-        reward -= LIMIT_PENALTY
-    return float(reward + (SUCCESS_REWARD if success else ABORT_REWARD if ended else 0.0))
+        reward -= REWARD.limit_penalty
+    return float(reward + (REWARD.success_reward if success else REWARD.abort_reward if ended else 0.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,73 +18,89 @@ from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.tool import build_capsule
 from ..script.viewpoint import Cottonoid
 
-VOXEL_ACROSS = 0.2e-3  # Edge of a voxel across the axis of the craniotomy [m].
-VOXEL_ALONG = 1e-3  # Edge of a voxel along the axis of the craniotomy [m].
-VOXEL_MARGIN = 10e-3  # Margin of the voxels round the craniotomy [m].
-HEIGHT_ABOVE = 5e-3  # Height of the voxels above the centre of the craniotomy [m].
-DEPTH_BELOW = 14e-3  # Depth of the voxels below the centre of the craniotomy [m].
-TRUNK_COUNT = 14  # Number of vessels that enter at the border.
-MAX_VESSEL_WIDTH = 0.8e-3  # Largest width of a vessel [m].
-MIN_VESSEL_WIDTH = 0.2e-3  # Width at which a vessel ends [m].
-VESSEL_STEP = 0.2e-3  # Step of a vessel's path [m].
-BRANCH_PROBABILITY = 0.05  # Probability of a branch in each step.
-TURN_DEVIATION = 0.12  # Standard deviation of the turn in each step [rad].
-WIDTH_FACTOR = 0.998  # Factor on the width in each step.
-BRANCH_WIDTH_RATIO = 0.72  # Width of a branch relative to its parent.
-MAX_ABSORPTION = 0.75  # Largest share of the light that a vessel absorbs.
-MOTTLE_CONTRAST = 0.12  # Contrast of the mottle: vessels too fine to be drawn.
-MOTTLE_LENGTH = 0.35e-3  # Length scale of the mottle [m].
+
+@dataclass(frozen=True)
+class VesselSettings:
+    """Settings of `add_vessels`."""
+
+    voxel_across: float = 0.2e-3  # Edge of a voxel across the axis of the craniotomy [m].
+    voxel_along: float = 1e-3  # Edge of a voxel along the axis of the craniotomy [m].
+    margin: float = 10e-3  # Margin of the voxels round the craniotomy [m].
+    height_above: float = 5e-3  # Height of the voxels above the centre of the craniotomy [m].
+    depth_below: float = 14e-3  # Depth of the voxels below the centre of the craniotomy [m].
+    trunk_count: int = 14  # Number of vessels that enter at the border.
+    max_width: float = 0.8e-3  # Largest width of a vessel [m].
+    min_width: float = 0.2e-3  # Width at which a vessel ends [m].
+    step: float = 0.2e-3  # Step of a vessel's path [m].
+    branch_probability: float = 0.05  # Probability of a branch in each step.
+    turn_deviation: float = 0.12  # Standard deviation of the turn in each step [rad].
+    width_factor: float = 0.998  # Factor on the width in each step.
+    branch_width_ratio: float = 0.72  # Width of a branch relative to its parent.
+    max_absorption: float = 0.75  # Largest share of the light that a vessel absorbs.
+    mottle_contrast: float = 0.12  # Contrast of the mottle: vessels too fine to be drawn.
+    mottle_length: float = 0.35e-3  # Length scale of the mottle [m].
 
 
 @lru_cache(maxsize=2)
 def add_vessels(
-    intensity: Intensity | None, site: CraniotomyFrame, seed: int, dark: tuple[float, float, float], relief: float
+    intensity: Intensity | None,
+    site: CraniotomyFrame,
+    seed: int,
+    dark: tuple[float, float, float],
+    relief: float,
+    settings: VesselSettings = VesselSettings(),
 ) -> Solid:
     """Return the scan round an opening as a solid texture with vessels upon it, which the seed draws.
 
     They go with the tissue, and have no height. Without a scan, tissue is evenly bright. `dark` and `relief` as of
     `Solid`.
     """
-    half = site.radius + VOXEL_MARGIN
-    across, along = np.arange(-half, half, VOXEL_ACROSS), np.arange(-HEIGHT_ABOVE, DEPTH_BELOW, VOXEL_ALONG)
+    half = site.radius + settings.margin
+    wide, tall = settings.voxel_across, settings.voxel_along
+    across, along = np.arange(-half, half, wide), np.arange(-settings.height_above, settings.depth_below, tall)
     T = np.eye(4)
-    T[:3, :3] = np.column_stack([VOXEL_ACROSS * site.right, VOXEL_ACROSS * site.up, VOXEL_ALONG * site.axis])
+    T[:3, :3] = np.column_stack([wide * site.right, wide * site.up, tall * site.axis])
     T[:3, 3] = site.origin + across[0] * (site.right + site.up) + along[0] * site.axis
     scan = np.ones((len(across), len(across), len(along)), np.float32)
     if intensity is not None:
         grey, inside = intensity.apply_window(site.anatomy.mesh), np.linalg.inv(intensity.affine) @ T
         scan = affine_transform(grey, inside, output_shape=scan.shape, order=1, mode="nearest")
-    light = 1.0 - compute_vessel_absorption(across, np.random.default_rng([seed, 1])).astype(np.float32)
+    light = 1.0 - compute_vessel_absorption(across, np.random.default_rng([seed, 1]), settings).astype(np.float32)
     return Solid(scan * light[:, :, None], np.linalg.inv(T), dark, relief, height=scan)
 
 
-def compute_vessel_absorption(across: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def compute_vessel_absorption(
+    across: np.ndarray, random: np.random.Generator, settings: VesselSettings = VesselSettings()
+) -> np.ndarray:
     """Share of the light that vessels take, (n, n), at places `across` (n,) [m] from the middle, both ways."""
-    points, widths = sample_vessel_paths(float(np.abs(across).max()), random)
+    points, widths = sample_vessel_paths(float(np.abs(across).max()), random, settings)
     here = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1)
-    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * MAX_VESSEL_WIDTH)
-    width = np.append(widths, MAX_VESSEL_WIDTH)[nearest]
-    vessels = MAX_ABSORPTION * np.exp(-2.0 * (away / width) ** 2)
-    mottle = gaussian_filter(random.standard_normal(away.shape), MOTTLE_LENGTH / VOXEL_ACROSS)
-    return np.clip(vessels + (1.0 - vessels) * MOTTLE_CONTRAST * mottle / mottle.std(), 0.0, 0.95)
+    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * settings.max_width)
+    width = np.append(widths, settings.max_width)[nearest]
+    vessels = settings.max_absorption * np.exp(-2.0 * (away / width) ** 2)
+    mottle = gaussian_filter(random.standard_normal(away.shape), settings.mottle_length / settings.voxel_across)
+    return np.clip(vessels + (1.0 - vessels) * settings.mottle_contrast * mottle / mottle.std(), 0.0, 0.95)
 
 
-def sample_vessel_paths(half: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def sample_vessel_paths(
+    half: float, random: np.random.Generator, settings: VesselSettings = VesselSettings()
+) -> tuple[np.ndarray, np.ndarray]:
     """Points (k, 2) [m] of vessels that come in at the border of a square, wander and branch; their widths (k,) [m]."""
-    angles = 2.0 * np.pi * (np.arange(TRUNK_COUNT) + random.uniform(0.0, 0.7, TRUNK_COUNT)) / TRUNK_COUNT
+    count = settings.trunk_count
+    angles = 2.0 * np.pi * (np.arange(count) + random.uniform(0.0, 0.7, count)) / count
     rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
-    ends = list(zip(rim, angles + np.pi, MAX_VESSEL_WIDTH * random.uniform(0.5, 1.0, TRUNK_COUNT), strict=True))
+    ends = list(zip(rim, angles + np.pi, settings.max_width * random.uniform(0.5, 1.0, count), strict=True))
     points, widths = [], []
     while ends:
         at, way, width = ends.pop()
-        while width > MIN_VESSEL_WIDTH and np.abs(at).max() <= half:
+        while width > settings.min_width and np.abs(at).max() <= half:
             points.append(at)
             widths.append(width)
-            way = way + TURN_DEVIATION * random.standard_normal()
-            at, width = at + VESSEL_STEP * np.array([np.cos(way), np.sin(way)]), WIDTH_FACTOR * width
-            if random.uniform() < BRANCH_PROBABILITY:
+            way = way + settings.turn_deviation * random.standard_normal()
+            at, width = at + settings.step * np.array([np.cos(way), np.sin(way)]), settings.width_factor * width
+            if random.uniform() < settings.branch_probability:
                 side = random.choice([-1.0, 1.0])
-                ends.append((at, way + side * random.uniform(0.5, 1.2), BRANCH_WIDTH_RATIO * width))
+                ends.append((at, way + side * random.uniform(0.5, 1.2), settings.branch_width_ratio * width))
                 way, width = way - 0.2 * side, 0.95 * width
     return np.array(points), np.array(widths)
 
@@ -94,10 +110,16 @@ COTTON, GLOVE = 5, 6
 COTTON_COLOUR, GLOVE_COLOUR = (0.93, 0.92, 0.88), (0.86, 0.80, 0.66)  # Colours (RGB, 0 to 1).
 SQUARE_VERTICES = 9  # Number of vertices along a side of a cotton square.
 SQUARE_HEIGHT = 0.7e-3  # Height of a cotton square above the cortex [m].
-FINGER_RADIUS = 7e-3  # Radius of a finger [m].
-FINGER_LENGTH = 70e-3  # Length of a finger [m].
-FINGER_OVERHANG = 4e-3  # Length of a finger beyond the edge of the craniotomy [m].
-FINGER_HEIGHT = 7e-3  # Height of a finger above the cortex [m].
+
+
+@dataclass(frozen=True)
+class FingerSettings:
+    """Settings of `build_finger`."""
+
+    radius: float = 7e-3  # Radius of a finger [m].
+    length: float = 70e-3  # Length of a finger [m].
+    overhang: float = 4e-3  # Length of a finger beyond the edge of the craniotomy [m].
+    height: float = 7e-3  # Height of a finger above the cortex [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,12 +156,12 @@ def build_squares(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> Squ
     )  # fmt: skip
 
 
-def build_finger(site: CraniotomyFrame, angle: float) -> Layer:
+def build_finger(site: CraniotomyFrame, angle: float, settings: FingerSettings = FingerSettings()) -> Layer:
     """Build a motionless gloved finger over the craniotomy edge, from a direction in the tangent plane [rad]."""
     out = np.cos(angle) * site.right + np.sin(angle) * site.up
-    tip = site.origin + (site.clearance - FINGER_OVERHANG) * out - FINGER_HEIGHT * site.axis
+    tip = site.origin + (site.clearance - settings.overhang) * out - settings.height * site.axis
     way = normalise_vectors((out - 0.35 * site.axis)[None])[0]
     side = normalise_vectors(np.cross(way, site.axis)[None])[0]
-    vertices, triangles = build_capsule(FINGER_RADIUS, FINGER_LENGTH)
+    vertices, triangles = build_capsule(settings.radius, settings.length)
     turned = vertices @ np.stack([side, np.cross(way, side), way])
     return Layer("glove", GLOVE, turned + tip, triangles, GLOVE_COLOUR, gloss=0.3, still=True)

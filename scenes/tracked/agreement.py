@@ -9,14 +9,22 @@ import numpy as np
 
 from ar.tracking.pose import Pose
 
-MAX_TARGET_DISTANCE = 0.2  # Largest distance of a printed target from the body that carries it [m].
-MAX_TARGET_MOTION = 5e-3  # Largest motion of a printed target on the body that carries it [m].
-MAX_POSE_DEVIATION = 2e-3  # Largest standard deviation of a usable target pose [m].
-MAX_KEPT_IMAGES = 30  # Number of last images kept.
-MIN_IMAGES = 4  # Minimum number of images for a warning about a moving target.
-SWAP_RATIO = 3.0  # Factor by which bodies must be closer to the target with swapped files for a warning.
-MIN_SWAP_DISTANCE = 0.02  # Smallest distance of a target from its body for a warning about swapped files [m].
-MOTION_PERCENTILE = 90.0  # Percentile of the kept images that is used [%]: one in ten may be misread.
+
+@dataclass(frozen=True)
+class AgreementSettings:
+    """Settings of `Agreement`."""
+
+    max_target_distance: float = 0.2  # Largest distance of a printed target from the body that carries it [m].
+    max_target_motion: float = 5e-3  # Largest motion of a printed target on the body that carries it [m].
+    max_pose_deviation: float = 2e-3  # Largest standard deviation of a usable target pose [m].
+    max_kept_images: int = 30  # Number of last images kept.
+    min_images: int = 4  # Minimum number of images for a warning about a moving target.
+    swap_ratio: float = 3.0  # Factor by which bodies must be closer to the target with swapped files for a warning.
+    # Smallest distance of a target from its body for a warning about swapped files [m].
+    min_swap_distance: float = 0.02
+    motion_percentile: float = 90.0  # Percentile of the kept images that is used [%]: one in ten may be misread.
+
+
 REMEDY = "see --poses and --clock"  # Remedy in warnings.
 
 
@@ -30,10 +38,13 @@ class Agreement:
         Positions in the body's frame (n, 3) [m], by the target's name.
     doubts
         Inconsistency of the poses with the last image of the target, by its name; empty: none.
+    settings
+        Limits of the warnings.
     """
 
     places: Mapping[str, np.ndarray] = field(default_factory=dict)
     doubts: Mapping[str, str] = field(default_factory=dict)
+    settings: AgreementSettings = AgreementSettings()
 
     @property
     def doubt(self) -> str:
@@ -45,13 +56,13 @@ class Agreement:
 
         All are in one frame. A target whose position is too uncertain is skipped.
         """
-        if np.linalg.eigvalsh(target.covariance[:3, :3])[-1] > MAX_POSE_DEVIATION**2:
+        if np.linalg.eigvalsh(target.covariance[:3, :3])[-1] > self.settings.max_pose_deviation**2:
             return self
         place, other = (None if each is None else _compute_target_position(target, each) for each in (body, swapped))
         assert place is not None
-        places = np.vstack([self.places.get(name, np.empty((0, 3))), place])[-MAX_KEPT_IMAGES:]
-        doubt = _describe_doubt(name, places, other)
-        return Agreement({**self.places, name: places}, {**self.doubts, name: doubt})
+        places = np.vstack([self.places.get(name, np.empty((0, 3))), place])[-self.settings.max_kept_images :]
+        doubt = _describe_doubt(name, places, other, self.settings)
+        return Agreement({**self.places, name: places}, {**self.doubts, name: doubt}, self.settings)
 
 
 def _compute_target_position(target: Pose, body: Pose) -> np.ndarray:
@@ -59,14 +70,15 @@ def _compute_target_position(target: Pose, body: Pose) -> np.ndarray:
     return (np.linalg.inv(body.T_camera_target) @ target.T_camera_target)[:3, 3]
 
 
-def _describe_doubt(name: str, places: np.ndarray, swapped: np.ndarray | None) -> str:
+def _describe_doubt(name: str, places: np.ndarray, swapped: np.ndarray | None, settings: AgreementSettings) -> str:
     """Describe the inconsistency of positions (n, 3) [m] of a target on its body; the newest is the last."""
     away = float(np.linalg.norm(places[-1]))
-    if swapped is not None and away > MIN_SWAP_DISTANCE and SWAP_RATIO * np.linalg.norm(swapped) < away:
+    nearer = swapped is not None and settings.swap_ratio * np.linalg.norm(swapped) < away
+    if nearer and away > settings.min_swap_distance:
         return f"the {name}'s target is seen {1e3 * away:.0f} mm from its poses: are the two files of --poses swapped?"
-    if away > MAX_TARGET_DISTANCE:
+    if away > settings.max_target_distance:
         return f"the {name}'s target is seen {1e3 * away:.0f} mm from its poses: {REMEDY}"
-    moved = np.percentile(np.linalg.norm(places - np.median(places, axis=0), axis=1), MOTION_PERCENTILE)
-    if len(places) >= MIN_IMAGES and moved > MAX_TARGET_MOTION:
+    moved = np.percentile(np.linalg.norm(places - np.median(places, axis=0), axis=1), settings.motion_percentile)
+    if len(places) >= settings.min_images and moved > settings.max_target_motion:
         return f"the {name}'s target moves by {1e3 * moved:.0f} mm on the body that its poses have: {REMEDY}"
     return ""
