@@ -14,7 +14,7 @@ from theatres import template_theatre
 from ar.tracking.pose import Pose, TrackedTargets
 from ar.tracking.registration import Registration
 from scenes.script.scene import find_scene
-from scenes.tracked.follower import HOLD_TIME, PATIENT, TumourState, compute_tip_covariance
+from scenes.tracked.follower import PATIENT, FollowerSettings, TumourState, compute_tip_covariance
 from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.run import to_aged
 from scenes.tracked.tracked_tool import TrackedTool
@@ -58,7 +58,8 @@ def test_a_reference_that_was_never_seen_has_no_overlay(follower, stage):
     foot = painted[600:]
     assert np.array_equal(painted[:600], blank[:600]) and not np.array_equal(foot, blank[600:])
     seen = follower.step(next(iter(pictures())).picture.grey, 0.0)
-    frozen, gone = (follower.step(blank[..., 0], time, seen) for time in (HOLD_TIME, HOLD_TIME + 0.01))
+    hold = FollowerSettings().hold_time
+    frozen, gone = (follower.step(blank[..., 0], time, seen) for time in (hold, hold + 0.01))
     assert frozen.camera is seen.camera and frozen.words == "reference lost: drawn where it was"
     assert frozen.band is None and not frozen.relied and gone.camera is None  # a band is promised of no frozen overlay
     with pytest.raises(ValueError, match="calibrate it at this size"):

@@ -9,7 +9,7 @@ import pytest
 from scenes.cli import main
 from scenes.warp.deformed_anatomy import Cause, DeformedAnatomy
 from scenes.warp.landmarks import list_landmarks
-from scenes.warp.places import FIELD_TOLERANCE, MIN_SPACING, compute_fields, find_finer_spacing, find_folds, list_places
+from scenes.warp.places import MIN_SPACING, SpacingSettings, compute_fields, find_finer_spacing, find_folds, list_places
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.errors import InputError
@@ -65,7 +65,8 @@ def test_a_spacing_follows_from_the_tumours_error(kinked, fields):
     assert MIN_SPACING <= finer < fields.grid.spacing
     found = compute_fields(kinked, None, lambda more: None)
     places = list_places(kinked)
-    assert places.compute_errors(found)[places.tumour].max() <= FIELD_TOLERANCE and found.grid.spacing < 1e-3
+    worst = places.compute_errors(found)[places.tumour].max()
+    assert worst <= SpacingSettings().tolerance and found.grid.spacing < 1e-3
     assert find_finer_spacing(kinked, found) is None
     still = choose_moment(kinked.anatomy, 1e-2 * kinked.displacement)
     assert compute_fields(still, None, lambda more: None).grid.spacing == 1e-3
@@ -92,7 +93,7 @@ def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
 def test_a_spacing_follows_from_the_landmarks_error_too(dented):
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = list_places(dented)
-    assert places.compute_errors(fields)[places.tumour].max() < FIELD_TOLERANCE / 10.0
+    assert places.compute_errors(fields)[places.tumour].max() < SpacingSettings().tolerance / 10.0
     finer = find_finer_spacing(dented, fields)
     assert finer is not None and finer < 1.5e-3
 

@@ -181,15 +181,14 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
 def _show_camera(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
     from ar.tracking.live_camera import open_camera, read_camera_images, read_newest
 
-    from ..tracked.follower import MAX_GAP
+    from ..tracked.follower import FollowerSettings
 
     again = partial(open_camera, int(args.pictures), parts.calibration.width, parts.calibration.height)
     name, source = f"camera {args.pictures}", again()
     if not source.isOpened():
         raise InputError(f"{name} cannot be opened: plug it in, see that no other program has it, and give its number.")
-    return _build_page(args, parts, closing, name).watch(
-        read_newest(read_camera_images(source, name, again), MAX_GAP), args.seconds
-    )
+    images = read_newest(read_camera_images(source, name, again), FollowerSettings().max_gap)
+    return _build_page(args, parts, closing, name).watch(images, args.seconds)
 
 
 def _show_video(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:

@@ -16,9 +16,9 @@ from ar.tracking.registration import Registration
 
 from ..script.uncertainty import LEVEL
 from ..tracked.follower import (
-    MAX_OVERLAY_ERROR,
     UNCHECKED_WARNING,
     UNKNOWN_WARNING,
+    FollowerSettings,
     TrackingResult,
     TumourState,
     compute_tip_covariance,
@@ -223,7 +223,7 @@ class PoseResponder:
 
 def add_bound(known: TrackingResult, band: float, parts: dict[str, float]) -> TrackingResult:
     """Add a bound [m] on the position, and its parts, to a result; beyond 5 mm it is unreliable."""
-    if band <= MAX_OVERLAY_ERROR:
+    if band <= FollowerSettings().max_overlay_error:
         return replace(known, band=band, parts=parts)
     return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band), band=None, parts={})
 

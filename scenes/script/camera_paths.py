@@ -13,10 +13,18 @@ from ar.optics.camera import Camera
 from sim.errors import InputError
 
 BREATHING_FREQUENCY = 0.25  # Breathing frequency [Hz]: fifteen breaths a minute.
-DRIFT_FREQUENCIES = (0.2, 2.5)  # Frequencies of the slow drift of a hand that holds a camera [Hz].
-TREMOR_FREQUENCIES = (8.0, 12.0)  # Frequencies of a hand's tremor [Hz] (Elble and Koller 1990, "Tremor").
-WAVE_COUNT = 8  # Number of waves of drift, and of tremor.
-TREMOR_SHARE = 0.1  # Size of the tremor relative to the drift.
+
+
+@dataclass(frozen=True)
+class HandSettings:
+    """Settings of `sample_wandering`."""
+
+    # Frequencies of the slow drift of a hand that holds a camera [Hz].
+    drift_frequencies: tuple[float, float] = (0.2, 2.5)
+    # Frequencies of a hand's tremor [Hz] (Elble and Koller 1990, "Tremor").
+    tremor_frequencies: tuple[float, float] = (8.0, 12.0)
+    wave_count: int = 8  # Number of waves of drift, and of tremor.
+    tremor_share: float = 0.1  # Size of the tremor relative to the drift.
 
 
 class CameraPath(Protocol):
@@ -144,17 +152,18 @@ class Microscope:
 
 
 @lru_cache(maxsize=16)
-def sample_waves(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample_waves(seed: int, settings: HandSettings = HandSettings()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frequencies [Hz], phases [rad] and amplitudes of a hand's motion, each (6, n), for 3 shifts and 3 turns."""
     random = np.random.default_rng(seed)
-    bands = [random.uniform(*band, (6, WAVE_COUNT)) for band in (DRIFT_FREQUENCIES, TREMOR_FREQUENCIES)]
-    sizes = [np.full((6, WAVE_COUNT), size * np.sqrt(2.0 / WAVE_COUNT)) for size in (1.0, TREMOR_SHARE)]
-    return np.hstack(bands), random.uniform(0.0, 2.0 * np.pi, (6, 2 * WAVE_COUNT)), np.hstack(sizes)
+    count, frequencies = settings.wave_count, (settings.drift_frequencies, settings.tremor_frequencies)
+    bands = [random.uniform(*band, (6, count)) for band in frequencies]
+    sizes = [np.full((6, count), size * np.sqrt(2.0 / count)) for size in (1.0, settings.tremor_share)]
+    return np.hstack(bands), random.uniform(0.0, 2.0 * np.pi, (6, 2 * count)), np.hstack(sizes)
 
 
-def sample_wandering(seed: int, time: float) -> np.ndarray:
+def sample_wandering(seed: int, time: float, settings: HandSettings = HandSettings()) -> np.ndarray:
     """Six numbers (6,) that wander with time [s] about 0, with a standard deviation of 1."""
-    frequencies, phases, sizes = sample_waves(seed)
+    frequencies, phases, sizes = sample_waves(seed, settings)
     return (sizes * np.sin(2.0 * np.pi * frequencies * time + phases)).sum(axis=1)
 
 

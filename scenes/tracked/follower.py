@@ -24,27 +24,32 @@ from .plausible import describe_implausible, describe_misplaced_tool
 from .tool_motion import BrainMotion, ToolMotion
 from .tracked_tool import TrackedTool
 
-# Time for which the overlay keeps its position after the reference is lost [s]: hand-held, its error is then less than
-# LIMIT.
-HOLD_TIME = 0.1
-MAX_GAP = 0.2  # Longest gap between images [s].
-MAX_GAP_INTERVALS = 1.5  # Longest gap of a slow video [intervals].
 MAX_INTERVAL = 1.0  # Maximum interval between images [s].
 TIME_ROUNDING = 1e-6  # Rounding of image times [s].
-MAX_OVERLAY_ERROR = 5e-3  # Largest position error of a reliable overlay [m].
-UNKNOWN_WARNING = "scan position, tissue motion unknown: do not rely on it"  # Warning in the image.
-# Overlay error as a share of the motion during the readout of a rolling shutter: measured in
-# docs/notes/overlay_experiments.md, "Rolling shutter".
-SHUTTER_FACTOR = 0.5
-# Factor on the overlay error of a rolling shutter for a tool's tip, which is far from its cube: the same page.
-TIP_FACTOR = 2.0
-SPEED_DECAY = 0.1  # Factor on the estimate of a maximum hand speed after one second without faster motion.
-UNCHECKED_WARNING = (
-    "not checked whose registration this is: make one by `sulcus register --anatomy`"  # Warning in the image.
-)
-NO_PACE_WARNING = (
-    "a rolling shutter, and how the camera moves is not known yet: do not rely on it"  # Warning in the image.
-)
+
+
+@dataclass(frozen=True)
+class FollowerSettings:
+    """Settings of a `Follower`."""
+
+    # Time for which the overlay keeps its position after the reference is lost [s]: hand-held, its error is then less
+    # than `max_overlay_error`.
+    hold_time: float = 0.1
+    max_gap: float = 0.2  # Longest gap between images [s].
+    max_gap_intervals: float = 1.5  # Longest gap of a slow video [intervals].
+    max_overlay_error: float = 5e-3  # Largest position error of a reliable overlay [m].
+    # Overlay error as a share of the motion during the readout of a rolling shutter: measured in
+    # docs/notes/overlay_experiments.md, "Rolling shutter".
+    shutter_factor: float = 0.5
+    # Factor on the overlay error of a rolling shutter for a tool's tip, which is far from its cube: the same page.
+    tip_factor: float = 2.0
+    speed_decay: float = 0.1  # Factor on the estimate of a maximum hand speed after one second without faster motion.
+
+
+# Warnings in the image.
+UNKNOWN_WARNING = "scan position, tissue motion unknown: do not rely on it"
+UNCHECKED_WARNING = "not checked whose registration this is: make one by `sulcus register --anatomy`"
+NO_PACE_WARNING = "a rolling shutter, and how the camera moves is not known yet: do not rely on it"
 TOOL, PATIENT = build_tool_cube().name, build_patient_reference().name  # Names of the targets.
 
 
@@ -75,7 +80,7 @@ class TrackingResult:
     motion
         Estimated motion of the brain.
     camera
-        Camera with T_camera_scan; None if the reference has been lost for longer than `HOLD_TIME`.
+        Camera with T_camera_scan; None if the reference has been lost for longer than `FollowerSettings.hold_time`.
     T_scan_tool, tip_covariance
         Pose (4, 4) [m] and covariance (3, 3) [m^2], if the tool is visible.
     band
@@ -135,6 +140,8 @@ class Follower:
         Poses of an external tracker, which replace the cube's; with a tracked camera, the reference's, too.
     intrinsic
         Covariance (9, 9) of the camera's calibration, of `ar.tracking.intrinsics.PARAMETERS`; None: not available.
+    settings
+        Limits and factors.
     """
 
     calibration: Calibration
@@ -143,6 +150,7 @@ class Follower:
     motion: ToolMotion
     elsewhere: ExternalTracker | None = None
     intrinsic: np.ndarray | None = None
+    settings: FollowerSettings = FollowerSettings()
 
     @cached_property
     def tracker(self) -> Tracker:
@@ -178,7 +186,8 @@ class Follower:
     def _compute_result(self, grey: np.ndarray, time: float, before: TrackingResult | None) -> TrackingResult:
         """Compute the result of `step`, for any intervals."""
         apart = None if before is None else time - before.time
-        longest = MAX_GAP if before is None else max(MAX_GAP, MAX_GAP_INTERVALS * before.interval)
+        usual = 0.0 if before is None else before.interval
+        longest = max(self.settings.max_gap, self.settings.max_gap_intervals * usual)
         stale = apart is not None and not 0.0 < apart <= longest
         forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
         tracked = self.tracker.track(grey, None if before is None or forgotten else before.tracked)
@@ -189,7 +198,7 @@ class Follower:
         T_patient_scan = self.registration.T_patient_scan
         camera = self.calibration.build_camera(reference.T_camera_target @ T_patient_scan)
         pace = self._compute_pace(reference, time, None if forgotten else before)
-        shutter = SHUTTER_FACTOR * self.calibration.readout * (pace or 0.0)
+        shutter = self.settings.shutter_factor * self.calibration.readout * (pace or 0.0)
         known = self._compute_motion(tracked, reference, time, before, shutter)
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
         band, parts = self._compute_band(reference, middle, known.motion, shutter)
@@ -207,7 +216,7 @@ class Follower:
         if stale and apart is not None:
             why = f"no image for {apart:.1f} s" if apart > 0.0 else "the camera repeats an image"
             return replace(known, state=TumourState.STALE, words=f"stale, {why}: do not rely on it")
-        if known.state in (TumourState.GOOD, TumourState.REST) and band > MAX_OVERLAY_ERROR:
+        if known.state in (TumourState.GOOD, TumourState.REST) and band > self.settings.max_overlay_error:
             return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band))
         return known
 
@@ -227,7 +236,7 @@ class Follower:
         """Return the result without a visible reference: the overlay keeps its position for a short time."""
         seen = None if before is None else before.seen
         motion = self.motion.rest if before is None else before.motion
-        held = before is not None and seen is not None and 0.0 <= time - seen < HOLD_TIME + TIME_ROUNDING
+        held = before is not None and seen is not None and 0.0 <= time - seen < self.settings.hold_time + TIME_ROUNDING
         camera = before.camera if before is not None and held else None
         why = self._describe_age(time) or ("not seen yet" if seen is None else "lost")
         what = "nothing is drawn" if camera is None else "drawn where it was"
@@ -247,7 +256,7 @@ class Follower:
         scan = self.registration.T_patient_scan @ np.append(self.motion.stage.site.origin, 1.0)
         now, then = ((pose.T_camera_target @ scan)[:2] for pose in (reference, last))
         speed = float(np.linalg.norm(now - then)) / (time - before.time)
-        return max(speed, SPEED_DECAY ** (time - before.time) * (before.pace or 0.0))
+        return max(speed, self.settings.speed_decay ** (time - before.time) * (before.pace or 0.0))
 
     def _compute_motion(
         self, tracked: TrackedTargets, reference: Pose, time: float, before: TrackingResult | None, shutter: float
@@ -265,9 +274,8 @@ class Follower:
             return TrackingResult(time, TumourState.NO_TOOL, words, tracked, last, felt=felt)
         into = np.linalg.inv(self.registration.T_patient_scan)
         pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
-        spread = compute_tip_covariance(self.registration, self.tool, beside) + (
-            TIP_FACTOR * shutter / BOUND_DEVIATIONS
-        ) ** 2 * np.eye(3)
+        spread = compute_tip_covariance(self.registration, self.tool, beside)
+        spread = spread + (self.settings.tip_factor * shutter / BOUND_DEVIATIONS) ** 2 * np.eye(3)
         motion = self.motion.compute_motion(pose, spread, last)
         moved = TumourState.GOOD if motion.moved > 0.0 else TumourState.REST
         state = TumourState.UNSURE if motion.doubt else moved if motion.known else TumourState.UNKNOWN

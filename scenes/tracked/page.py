@@ -23,7 +23,7 @@ from ..page.controls import add_overlay_controls, build_slice_control
 from ..page.view import STALE_COLOUR, build_brain, choose_viewpoint, list_orientation_labels
 from ..play.stage import TOOL_COLOUR, TUMOUR_COLOUR
 from ..play.waiting_notice import Busy
-from .follower import MAX_GAP, MAX_INTERVAL, Follower, TrackingResult, TumourState
+from .follower import MAX_INTERVAL, Follower, TrackingResult, TumourState
 from .overlay_painter import GREY_STATES, Painter
 from .overlay_panels import list_lines, render_slices, sample_of
 from .overlay_text import describe_overlay, report
@@ -199,7 +199,7 @@ class OverlayPage:
     def _report_silence(self, seconds: float) -> None:
         """Report that a camera has given no image for `seconds`."""
         if seconds < UNPLUGGED_TIME:
-            self._mark_outdated(f"no image for {MAX_GAP:g} s")
+            self._mark_outdated(f"no image for {self.follower.settings.max_gap:g} s")
         else:
             self._mark_outdated(f"no image for {seconds:.0f} s", f"Is {self.name} plugged in? This page waits for it.")
 

@@ -21,7 +21,7 @@ from .landmarks import CENTROID, Landmark, compute_centroid
 from .markups import write_markups
 from .meshes import build_surface_mesh, write_glb, write_stl, write_vtp
 from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation
-from .places import FIELD_TOLERANCE, Folded, SamplePlaces, compute_fields, find_folds, list_places
+from .places import Folded, SamplePlaces, SpacingSettings, compute_fields, find_folds, list_places
 from .readme import write_readme
 
 MESH_COLOURS = {
@@ -219,7 +219,7 @@ def _list_warnings(largest: float, of_tumour: float, folds: Sequence[Folded]) ->
             f"the finite elements fold {1e9 * fold.volume:.2f} mm3 at {x}, {y}, {z} mm in the scan (RAS). The fields "
             f"do not: there they differ by up to {1e3 * fold.off:.2f} mm, and are not to be relied on."
         )
-    if of_tumour > max(MAX_GRID_ERROR * largest, 1e3 * FIELD_TOLERANCE):
+    if of_tumour > max(MAX_GRID_ERROR * largest, 1e3 * SpacingSettings().tolerance):
         found.append(
             f"the grid is coarse for this tumour: its error of {of_tumour:.2f} mm is more than a tenth of the largest "
             f"motion, {largest:.2f} mm. Give a smaller --spacing."

@@ -21,17 +21,24 @@ from sim.fields.warp_fields import WarpFields
 
 from .nrrd_files import DIGITS
 
-MIN_BRAIN_SHARES = (
-    0.98,
-    0.5,
-)  # Smallest shares of the brain inside an image, and on voxels that are not 0, without a warning.
-BRIGHT_PERCENTILE = 99.0  # Percentile of the positive values that counts as bright [%].
-DARK_RATIO = 0.1  # Threshold of dark voxels (air with noise), relative to the value at BRIGHTEST.
-MIN_FLIP_GAIN = 0.05  # Smallest gain of brain on bright voxels when x and y are negated.
-MIN_FLIPPED_SHARE = 0.7  # Smallest share of brain on bright voxels when x and y are negated.
-MAX_LABEL_VALUES = 120  # Largest number of distinct integers of a label map.
 SAMPLING_STRIDE = 3  # Sampling stride along each axis [voxels].
-MIN_EQUAL_NEIGHBOURS = 0.5  # Smallest share of neighbours of one value in a label map: labels fill areas.
+
+
+@dataclass(frozen=True)
+class ImageWarningSettings:
+    """Settings of `list_warnings`."""
+
+    min_inside_share: float = 0.98  # Smallest share of the brain inside an image without a warning.
+    min_nonzero_share: float = 0.5  # Smallest share of the brain on voxels that are not 0 without a warning.
+
+    bright_percentile: float = 99.0  # Percentile of the positive values that counts as bright [%].
+    dark_ratio: float = 0.1  # Threshold of dark voxels (air with noise), relative to the value at `bright_percentile`.
+    min_flip_gain: float = 0.05  # Smallest gain of brain on bright voxels when x and y are negated.
+    min_flipped_share: float = 0.7  # Smallest share of brain on bright voxels when x and y are negated.
+    max_label_values: int = 120  # Largest number of distinct integers of a label map.
+    min_equal_neighbours: float = 0.5  # Smallest share of neighbours of one value in a label map: labels fill areas.
+
+
 SUFFIXES = (".seg.nrrd", *READERS)  # Endings of image files.
 ORDERS = {"nearest": 0, "linear": 1, "cubic": 3}
 """Spline degree by the name of the interpolation."""
@@ -49,28 +56,34 @@ def measure_shown_share(affine: np.ndarray, shape: tuple[int, ...], anatomy: Ana
     return float(np.average(inside, weights=anatomy.mesh.volumes))
 
 
-def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatomy) -> list[str]:
+def list_warnings(
+    values: np.ndarray,
+    affine: np.ndarray,
+    labels: bool,
+    anatomy: Anatomy,
+    settings: ImageWarningSettings = ImageWarningSettings(),
+) -> list[str]:
     """List warnings, as predicates, about an image (I, J, K) that shows a part of a brain."""
     found, middles, volumes = [], _compute_centroids(anatomy), anatomy.mesh.volumes
     index, inside = _find_voxels(affine, values.shape, middles)
     share = float(np.average(inside, weights=volumes))
-    if share < MIN_BRAIN_SHARES[0]:
+    if share < settings.min_inside_share:
         found.append(f"shows {share:.0%} of the brain; what lies outside is not in it")
     empty = float(np.average(values[tuple(index[inside].T)] == 0, weights=volumes[inside]))
-    turned = _is_turned(values, affine, labels, middles, volumes)
+    turned = _is_turned(values, affine, labels, middles, volumes, settings)
     if turned:
         found.append(
             f"fits the brain in {turned[0]:.0%} of its volume, but in {turned[1]:.0%} with x and y negated: "
             "it may be LPS marked as RAS"
         )
-    elif not labels and 1.0 - empty < MIN_BRAIN_SHARES[1]:
+    elif not labels and 1.0 - empty < settings.min_nonzero_share:
         found.append(
             f"is 0 in {empty:.0%} of the brain's volume: it may be in another space than the labels that the anatomy "
             "was made from"
         )
-    if not labels and _is_label_like(values):
+    if not labels and _is_label_like(values, settings):
         found.append("holds few values, all whole, as label maps do: give one by --labels, or labels are mixed")
-    elif labels and (alike := _compute_equal_share(values)) < MIN_EQUAL_NEIGHBOURS:
+    elif labels and (alike := _compute_equal_share(values)) < settings.min_equal_neighbours:
         found.append(
             f"has the same value in {alike:.0%} of neighbouring voxels, as intensities do: give them by --image, or "
             "values are not interpolated"
@@ -82,28 +95,29 @@ def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy:
 
 
 def _is_turned(
-    values: np.ndarray, affine: np.ndarray, labels: bool, middles: np.ndarray, volumes: np.ndarray
+    values: np.ndarray,
+    affine: np.ndarray,
+    labels: bool,
+    middles: np.ndarray,
+    volumes: np.ndarray,
+    settings: ImageWarningSettings,
 ) -> tuple[float, float] | None:
     """Return shares of the brain on bright voxels, unchanged and with x and y negated, if the latter is much larger."""
     part = np.nan_to_num(values[::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE].astype(float))
-    air = (
-        0.0
-        if labels
-        else DARK_RATIO * float(np.percentile(part[part > 0.0], BRIGHT_PERCENTILE))
-        if (part > 0.0).any()
-        else 0.0
-    )
+    air, bright = 0.0, part[part > 0.0]
+    if len(bright) and not labels:
+        air = settings.dark_ratio * float(np.percentile(bright, settings.bright_percentile))
     shares = []
     for points in (middles, middles * LPS):
         index, inside = _find_voxels(affine, values.shape, points)
         shares.append(float(np.average(inside & (values[tuple(index.T)] > air), weights=volumes)))
     as_is, turned = shares
-    return (as_is, turned) if turned > MIN_FLIPPED_SHARE and turned - as_is > MIN_FLIP_GAIN else None
+    return (as_is, turned) if turned > settings.min_flipped_share and turned - as_is > settings.min_flip_gain else None
 
 
-def _is_label_like(values: np.ndarray) -> bool:
+def _is_label_like(values: np.ndarray, settings: ImageWarningSettings) -> bool:
     part = values[::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE]
-    return 1 < len(np.unique(part)) <= MAX_LABEL_VALUES and np.array_equal(part, np.rint(part))
+    return 1 < len(np.unique(part)) <= settings.max_label_values and np.array_equal(part, np.rint(part))
 
 
 def _compute_equal_share(values: np.ndarray) -> float:

@@ -23,14 +23,19 @@ INNER_WEIGHTS = 0.55 * np.eye(4) + 0.15 * (1.0 - np.eye(4))
 FACE_WEIGHTS = 0.58 * np.eye(3) + 0.21 * (1.0 - np.eye(3))
 MIN_SPACING = 0.3e-3  # Smallest spacing of a field [m].
 MAX_SPACING = 5e-3  # Largest spacing of a field [m].
-FIRST_SPACING = 1e-3  # Spacing that is tried first [m].
-FIELD_TOLERANCE = 0.05e-3
-"""Tolerance of the error of tumour and landmarks in the search for a spacing [m]."""
-MAX_NODES = 32_000_000  # Maximum number of nodes in the search for a spacing. A million take 12 MB of memory.
 MAX_REQUESTED_NODES = 96_000_000  # Maximum number of nodes at a spacing given by the user.
-SPACING_STEP = 0.05e-3  # Step of the spacing in the search [m].
-SAFETY_FACTOR = 0.95  # Safety factor of the spacing in the search.
-MAX_TRIALS = 3  # Maximum number of trials in the search for a spacing.
+
+
+@dataclass(frozen=True)
+class SpacingSettings:
+    """Settings of the search for a spacing in `compute_fields`."""
+
+    first: float = 1e-3  # Spacing that is tried first [m].
+    tolerance: float = 0.05e-3  # Tolerance of the error of tumour and landmarks in the search for a spacing [m].
+    max_nodes: int = 32_000_000  # Maximum number of nodes in the search for a spacing. A million take 12 MB of memory.
+    step: float = 0.05e-3  # Step of the spacing in the search [m].
+    safety_factor: float = 0.95  # Safety factor of the spacing in the search.
+    max_trials: int = 3  # Maximum number of trials in the search for a spacing.
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +82,8 @@ def list_places(moment: DeformedAnatomy) -> SamplePlaces:
         return np.concatenate([values[used], *between, np.reshape(landmarks, (-1, 3))])
 
     tumour, cortex = np.zeros((2, len(part)), bool)
-    tumour[part == 0], tumour[part == 1] = (
-        np.isin(used, body.tumour_nodes),
-        np.repeat(body.in_tumour, len(INNER_WEIGHTS)),
-    )
+    tumour[part == 0] = np.isin(used, body.tumour_nodes)
+    tumour[part == 1] = np.repeat(body.in_tumour, len(INNER_WEIGHTS))
     cortex[part == 0], cortex[part == 2] = np.isin(used, body.open_surface), True
     rest = at(mesh.nodes, [one.rest for one in marks])
     moved = at(moment.displacement, [one.now - one.rest for one in marks])
@@ -123,12 +126,17 @@ def find_folds(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...
     return tuple(sorted(found, key=lambda fold: -fold.volume))
 
 
-def count_steps(spacing: float | None) -> int:
+def count_steps(spacing: float | None, settings: SpacingSettings = SpacingSettings()) -> int:
     """Return the number of steps of `compute_fields`: two fields for each tried spacing."""
-    return 2 * (1 + (MAX_TRIALS if spacing is None else 0))
+    return 2 * (1 + (settings.max_trials if spacing is None else 0))
 
 
-def compute_fields(moment: DeformedAnatomy, spacing: float | None, step: Callable[[int], object]) -> WarpFields:
+def compute_fields(
+    moment: DeformedAnatomy,
+    spacing: float | None,
+    step: Callable[[int], object],
+    settings: SpacingSettings = SpacingSettings(),
+) -> WarpFields:
     """Compute the fields of a moment at a spacing [m]; None: 1 mm, or finer until tumour and landmarks are accurate.
 
     `step` receives the number of newly finished steps of `count_steps`.
@@ -143,27 +151,28 @@ def compute_fields(moment: DeformedAnatomy, spacing: float | None, step: Callabl
             f"--spacing {1e3 * spacing:g}: the fields would have {nodes / 1e6:.0f} million nodes, and "
             f"{MAX_REQUESTED_NODES / 1e6:.0f} million are the most. Give a larger one."
         )
-    left = count_steps(spacing) - 2
-    fields = _compute_fields(moment, spacing or FIRST_SPACING, step)
-    while left and (finer := find_finer_spacing(moment, fields)) is not None:
+    left = count_steps(spacing, settings) - 2
+    fields = _compute_fields(moment, spacing or settings.first, step)
+    while left and (finer := find_finer_spacing(moment, fields, settings)) is not None:
         fields, left = _compute_fields(moment, finer, step), left - 2
     step(left)
     return fields
 
 
-def find_finer_spacing(moment: DeformedAnatomy, fields: WarpFields) -> float | None:
+def find_finer_spacing(
+    moment: DeformedAnatomy, fields: WarpFields, settings: SpacingSettings = SpacingSettings()
+) -> float | None:
     """Return a spacing [m] at which both are exact enough, or as near as size allows; None where no finer one helps."""
     now = fields.grid.spacing
     places = list_places(moment)
     worst = float(places.compute_errors(fields)[places.tumour | places.landmarks].max(initial=0.0))
-    if worst <= FIELD_TOLERANCE:
+    if worst <= settings.tolerance:
         return None
-    steps = max(
-        math.floor(SAFETY_FACTOR * now * FIELD_TOLERANCE / worst / SPACING_STEP), round(MIN_SPACING / SPACING_STEP)
-    )
-    while _count_nodes(moment, SPACING_STEP * steps) > MAX_NODES:
+    steps = math.floor(settings.safety_factor * now * settings.tolerance / worst / settings.step)
+    steps = max(steps, round(MIN_SPACING / settings.step))
+    while _count_nodes(moment, settings.step * steps) > settings.max_nodes:
         steps += 1
-    return SPACING_STEP * steps if steps < round(now / SPACING_STEP) else None
+    return settings.step * steps if steps < round(now / settings.step) else None
 
 
 def _count_nodes(moment: DeformedAnatomy, spacing: float) -> float:
