@@ -72,34 +72,30 @@ class Contradiction:
     certain: bool = True
 
 
-def find_contradiction(
-    contacts: Contacts, convention: Convention, settings: ContradictionSettings = CONTRADICTION
-) -> Contradiction | None:
+def find_contradiction(contacts: Contacts, convention: Convention) -> Contradiction | None:
     """Return a contradiction of a convention with the anatomy, or None.
 
     Necrosis must lie inside enhancing tumour, oedema and cortex outside. Either may be missing or at the brain surface.
     """
     there = set(contacts.labels.tolist()) - {0}
-    tumour, oedema, necrosis = (
-        there.intersection(of) for of in (convention.tumour, convention.oedema, convention.necrosis)
-    )
+    known = convention.tumour, convention.oedema, convention.necrosis
+    tumour, oedema, necrosis = map(there.intersection, known)
     outside = {0, *there} - tumour - oedema
     for label in there.intersection(convention.deepest):
         least = min((contacts.share({one}, {0}) for one in there.intersection(convention.known) - {label}), default=1.0)
         found = contacts.share({label}, {0})
-        if found > least + settings.min_difference:
+        if found > least + CONTRADICTION.min_difference:
             return Contradiction(f"label {label} lies outside of the others, {found:.0%} of its surface at no label")
-    if oedema and tumour and contacts.compute_share(oedema) >= settings.min_oedema_fraction:
+    if oedema and tumour and contacts.compute_share(oedema) >= CONTRADICTION.min_oedema_fraction:
         found = contacts.share(oedema, outside)
-        if found < settings.min_outer_fraction or found < min(
-            settings.certain_outer_fraction, contacts.share(necrosis, outside) - settings.min_difference
-        ):
+        least = contacts.share(necrosis, outside) - CONTRADICTION.min_difference
+        if found < max(CONTRADICTION.min_outer_fraction, min(CONTRADICTION.certain_outer_fraction, least)):
             return Contradiction(
                 f"label {_to_text(oedema)} would be oedema and lies inside the tumour, {found:.0%} of its surface at "
                 "healthy tissue"
             )
     found = contacts.share(tumour - necrosis, necrosis)
-    if found > max(settings.max_wrapped_fraction, contacts.share(necrosis, tumour)):
+    if found > max(CONTRADICTION.max_wrapped_fraction, contacts.share(necrosis, tumour)):
         return Contradiction(
             f"label {_to_text(necrosis)} would be necrosis and lies round the enhancing tumour, of whose surface it "
             f"covers {found:.0%}",
@@ -108,9 +104,7 @@ def find_contradiction(
     return None
 
 
-def build_contradiction_check(
-    whole: LabelMap, chosen: Convention, settings: ContradictionSettings = CONTRADICTION
-) -> Callable[[Convention], str]:
+def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
     """Return a function that gives the reason why the anatomy contradicts a convention; empty if it does not.
 
     A contradiction that rare tumours show counts against the `chosen` convention only if another convention fits.
@@ -121,21 +115,21 @@ def build_contradiction_check(
     rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.is_compatible(whole.labels)]
 
     def reason(one: Convention) -> str:
-        found = find_contradiction(contacts, one, settings)
+        found = find_contradiction(contacts, one)
         if found is None or not (found.certain or one is not chosen or any(map(shown, rivals))):
             return ""
         return found.reason
 
     def shown(one: Convention) -> bool:
-        return not reason(one) and _has_oedema_outside(contacts, one, settings)
+        return not reason(one) and _has_oedema_outside(contacts, one)
 
     return reason
 
 
-def _has_oedema_outside(contacts: Contacts, convention: Convention, settings: ContradictionSettings) -> bool:
+def _has_oedema_outside(contacts: Contacts, convention: Convention) -> bool:
     there = set(contacts.labels.tolist())
     outside = there.difference(convention.tumour, convention.oedema)
-    return contacts.share(there.intersection(convention.oedema), outside) >= settings.certain_outer_fraction
+    return contacts.share(there.intersection(convention.oedema), outside) >= CONTRADICTION.certain_outer_fraction
 
 
 def _to_text(labels: Collection[int]) -> str:

@@ -83,9 +83,7 @@ def compute_corner_volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarra
     return CORNER_SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
 
 
-def unfold(
-    field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float, settings: UnfoldingSettings = UNFOLDING
-) -> float:
+def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
     """Remove folds of a field (3, I, J, K) [m] in place, and return the least determinant that remains.
 
     Nodes inside the body (I, J, K) move least, then those of the collar (I, J, K) around it, since the body's surface
@@ -94,11 +92,11 @@ def unfold(
     tried again; there the body itself may fold.
     """
     found = compute_jacobians(field, spacing)
-    for turn in range(settings.max_attempts):
-        bad = found < settings.min_determinant
+    for turn in range(UNFOLDING.max_attempts):
+        bad = found < UNFOLDING.min_determinant
         if not bad.any():
             break
-        grown = settings.margin + turn
+        grown = UNFOLDING.margin + turn
         labels = np.empty(bad.shape, np.int32)
         ndimage.label(ndimage.maximum_filter(bad, 2 * grown + 5), output=labels)
         for where in ndimage.find_objects(labels):
@@ -106,18 +104,16 @@ def unfold(
             part = field[(slice(None), *window)]
             nodes = np.pad(bad[where], [(0, 1)] * 3)
             near = ndimage.maximum_filter(nodes, 2 * grown + 2)
-            if turn >= settings.first_smoothed_attempt:
-                smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), settings.smoothing_iterations)
-            outer = np.where(collar[window], settings.collar_weight, settings.outer_weight)
-            stiff = np.where(inside[window], settings.body_weight, outer)
-            _repair_cells(part, near, stiff, spacing, settings)
+            if turn >= UNFOLDING.first_smoothed_attempt:
+                smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), UNFOLDING.smoothing_iterations)
+            outer = np.where(collar[window], UNFOLDING.collar_weight, UNFOLDING.outer_weight)
+            stiff = np.where(inside[window], UNFOLDING.body_weight, outer)
+            _repair_cells(part, near, stiff, spacing)
             found[where] = compute_jacobians(part, spacing)
     return float(found.min())
 
 
-def _repair_cells(
-    part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float, settings: UnfoldingSettings
-) -> None:
+def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float) -> None:
     """Move nodes marked `near` (I, J, K) of a field part (3, I, J, K) [m] until its cells have positive volume."""
     shape = near.shape
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
@@ -137,7 +133,7 @@ def _repair_cells(
         at = places[corners]
         a, b, c = np.moveaxis(at[:, 1:] - at[:, :1], 1, 0)
         ends = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-        lack = np.maximum(settings.target_determinant - signs * (a * ends[:, 0]).sum(axis=1), 0.0)
+        lack = np.maximum(UNFOLDING.target_determinant - signs * (a * ends[:, 0]).sum(axis=1), 0.0)
         some = np.flatnonzero(lack > 0.0)
         pull = -2.0 * (signs[some] * lack[some])[:, None, None] * ends[some]
         pulls, pulled = np.concatenate([-pull.sum(axis=1, keepdims=True), pull], axis=1), corners[some].ravel()
@@ -145,7 +141,7 @@ def _repair_cells(
         size = float((lack * lack).sum() + (held * change * change).sum())
         return size, (slope[free] + 2.0 * held * change).ravel()
 
-    options = {"maxiter": settings.max_iterations}
+    options = {"maxiter": UNFOLDING.max_iterations}
     found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options=options)
     change = (spacing * found.x.reshape(-1, 3).T).astype(part.dtype)
     for values, more in zip(part, change, strict=True):

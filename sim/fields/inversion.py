@@ -22,9 +22,7 @@ class InversionSettings:
 INVERSION = InversionSettings()
 
 
-def invert_field(
-    grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray, settings: InversionSettings = INVERSION
-) -> np.ndarray:
+def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
     """Solve d = -forward(y + d) for d (n, 3) [m] at points y (n, 3) [m], from a guess (n, 3).
 
     Most points converge by fixed-point iteration. It diverges where tissue is sheared by more than 45
@@ -32,28 +30,26 @@ def invert_field(
     """
     found, going, left = guess.copy(), np.arange(len(points)), []
     last = np.full(len(points), np.inf)
-    for _ in range(settings.max_iterations):
+    for _ in range(INVERSION.max_iterations):
         new = -grid.read(forward, points[going] + found[going])
         change = np.linalg.norm(new - found[going], axis=1)
-        nearer = change < settings.max_change_ratio * last[going]
+        nearer = change < INVERSION.max_change_ratio * last[going]
         left.append(going[~nearer])
         found[going[nearer]], last[going[nearer]] = new[nearer], change[nearer]
-        going = going[nearer & (change > settings.tolerance)]
+        going = going[nearer & (change > INVERSION.tolerance)]
         if not len(going):
             break
     hard = np.concatenate([*left, going])
-    found[hard] = invert_by_newton(grid, forward, points[hard], guess[hard], settings)
+    found[hard] = invert_by_newton(grid, forward, points[hard], guess[hard])
     return found
 
 
-def invert_by_newton(
-    grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray, settings: InversionSettings = INVERSION
-) -> np.ndarray:
+def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
     """Invert as `invert_field`, by Newton's method; a point that does not converge returns its best iterate."""
     best, least = guess.copy(), np.full(len(points), np.inf)
     trial, going, share = guess.copy(), np.arange(len(points)), np.ones(len(points))
     step = np.zeros_like(guess)
-    for _ in range(settings.max_iterations):
+    for _ in range(INVERSION.max_iterations):
         at = points[going] + trial[going]
         rest = trial[going] + grid.read(forward, at)
         size = np.linalg.norm(rest, axis=1)
@@ -61,17 +57,15 @@ def invert_by_newton(
         best[going[good]], least[going[good]] = trial[going[good]], size[good]
         share[going] = np.where(good, 1.0, 0.5 * share[going])  # halve a step that increased the residual
         fresh = going[good]
-        step[fresh] = _compute_newton_step(grid, forward, points[fresh] + best[fresh], rest[good], settings)
-        going = going[least[going] > settings.tolerance]
+        step[fresh] = _compute_newton_step(grid, forward, points[fresh] + best[fresh], rest[good])
+        going = going[least[going] > INVERSION.tolerance]
         if not len(going):
             break
         trial[going] = best[going] + share[going, None] * step[going]
     return best
 
 
-def _compute_newton_step(
-    grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray, settings: InversionSettings
-) -> np.ndarray:
+def _compute_newton_step(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Return the Newton step (n, 3) [m] at places (n, 3) [m] with residuals `rest` (n, 3)."""
     half = 0.25 * grid.spacing
     columns = []
@@ -83,4 +77,4 @@ def _compute_newton_step(
     matrix[flat] = np.eye(3)
     step = -np.linalg.solve(matrix, rest[..., None])[..., 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
-    return step * np.minimum(1.0, settings.max_newton_step * grid.spacing / np.maximum(length, 1e-30))
+    return step * np.minimum(1.0, INVERSION.max_newton_step * grid.spacing / np.maximum(length, 1e-30))

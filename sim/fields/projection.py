@@ -15,7 +15,6 @@ from scipy.sparse.linalg import cg
 from ..geometry.tetmesh import find_single_faces
 from .grid import Grid
 
-MAX_SUBDIVISIONS = 10  # maximum subdivisions of an edge
 # Points per block, to limit memory.
 BLOCK_POINTS = 200_000
 
@@ -27,6 +26,7 @@ class ProjectionSettings:
     fit_tolerance: float = 2e-5  # Interpolation error above which tetrahedra are fitted [m].
     test_density: float = 1.0  # points per grid spacing along a tetrahedron's longest edge, in the error test
     fit_density: float = 1.5  # the same in the fit
+    max_subdivisions: int = 10  # maximum subdivisions of an edge
     surface_density: float = 2.0  # points per grid spacing along a surface triangle's longest edge
     surface_weight: float = 10.0  # weight of a cell face of surface, relative to a cell's volume
     # Penalty weights relative to the squared error.
@@ -35,6 +35,9 @@ class ProjectionSettings:
     curvature_weight: float = 3e-3  # second differences of the field in the collar
     solver_tolerance: float = 1e-3  # relative tolerance of the linear solver
     max_iterations: int = 300  # maximum iterations of the linear solver
+
+
+PROJECTION = ProjectionSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +58,7 @@ class _Samples(NamedTuple):
     simplex: np.ndarray
 
 
-def project(
-    grid: Grid,
-    field: np.ndarray,
-    inside: np.ndarray,
-    collar: np.ndarray,
-    body: NodalField,
-    settings: ProjectionSettings = ProjectionSettings(),
-) -> None:
+def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: NodalField) -> None:
     """Fit a field (3, I, J, K), sampled in a body (mask `inside`) and its `collar`, to the body's field between nodes.
 
     Changed in place are nodes at interpolation errors above 0.02 mm, in the collar only where it moves. The squared
@@ -72,12 +68,12 @@ def project(
     """
     flat = field.reshape(3, -1)
     bad = np.zeros(len(body.tets), bool)
-    for some in _sample_tetrahedra(grid, body, np.arange(len(body.tets)), settings.test_density):
+    for some in _sample_tetrahedra(grid, body, np.arange(len(body.tets)), PROJECTION.test_density):
         numbers, weights = grid.find_corners(some.points)
         error = np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1)
-        bad[some.simplex[error > settings.fit_tolerance]] = True
+        bad[some.simplex[error > PROJECTION.fit_tolerance]] = True
     free = np.zeros(flat.shape[1], bool)
-    for some in _sample_tetrahedra(grid, body, np.flatnonzero(bad), settings.fit_density):
+    for some in _sample_tetrahedra(grid, body, np.flatnonzero(bad), PROJECTION.fit_density):
         free[grid.find_corners(some.points)[0]] = True
     free &= inside.reshape(-1) | (collar.reshape(-1) & flat.any(axis=0))
     nodes = np.flatnonzero(free)
@@ -86,9 +82,9 @@ def project(
     column = np.full(len(free), -1)
     column[nodes] = np.arange(len(nodes))
     touched = np.isin(np.arange(len(body.nodes)), body.tets[bad])
-    matrix, side = _build_penalties(grid, flat, column, inside.reshape(-1), collar.reshape(-1), settings)
-    within = _sample_tetrahedra(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), settings.fit_density)
-    for some in chain(within, _sample_surface(grid, body, touched, settings)):
+    matrix, side = _build_penalties(grid, flat, nodes, column, inside.reshape(-1), collar.reshape(-1))
+    within = _sample_tetrahedra(grid, body, np.flatnonzero(touched[body.tets].any(axis=1)), PROJECTION.fit_density)
+    for some in chain(within, _sample_surface(grid, body, touched)):
         numbers, weights = grid.find_corners(some.points)
         rows = _build_rows(column, numbers, weights)
         weighted = rows.T.multiply(some.weights).tocsr()
@@ -97,7 +93,7 @@ def project(
     scale = sparse.diags(1.0 / np.asarray(matrix.diagonal(), np.float64))
     change = np.zeros_like(field)
     for part, right in zip(change.reshape(3, -1), side.T, strict=True):
-        part[nodes] = cg(matrix, right, rtol=settings.solver_tolerance, maxiter=settings.max_iterations, M=scale)[0]
+        part[nodes] = cg(matrix, right, rtol=PROJECTION.solver_tolerance, maxiter=PROJECTION.max_iterations, M=scale)[0]
     field += change
 
 
@@ -114,15 +110,13 @@ def _sample_tetrahedra(grid: Grid, body: NodalField, which: np.ndarray, density:
         yield some._replace(simplex=which[some.simplex])
 
 
-def _sample_surface(
-    grid: Grid, body: NodalField, touched: np.ndarray, settings: ProjectionSettings
-) -> Iterator[_Samples]:
+def _sample_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
     """Yield points of the surface triangles with a vertex in `touched` (V,)."""
     faces = find_single_faces(body.tets)
     faces = faces[touched[faces].any(axis=1)]
     a, b, c = body.nodes[faces].transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / (2.0 * grid.spacing**2)
-    return _sample_simplices(grid, body, faces, settings.surface_weight * areas, settings.surface_density)
+    return _sample_simplices(grid, body, faces, PROJECTION.surface_weight * areas, PROJECTION.surface_density)
 
 
 def _sample_simplices(
@@ -133,7 +127,7 @@ def _sample_simplices(
     size = simplices.shape[1]
     first, second = np.triu_indices(size, 1)
     longest = np.linalg.norm(corners[:, first] - corners[:, second], axis=2).max(axis=1, initial=0.0)
-    orders = np.clip(np.ceil(density * longest / grid.spacing), 1, MAX_SUBDIVISIONS).astype(int)
+    orders = np.clip(np.ceil(density * longest / grid.spacing), 1, PROJECTION.max_subdivisions).astype(int)
     for order in np.unique(orders):
         lattice, alike = _build_lattice(order, size), np.flatnonzero(orders == order)
         step = max(1, BLOCK_POINTS // len(lattice))
@@ -165,15 +159,10 @@ def _build_rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) ->
 
 
 def _build_penalties(
-    grid: Grid,
-    flat: np.ndarray,
-    column: np.ndarray,
-    inside: np.ndarray,
-    collar: np.ndarray,
-    settings: ProjectionSettings,
+    grid: Grid, flat: np.ndarray, nodes: np.ndarray, column: np.ndarray, inside: np.ndarray, collar: np.ndarray
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Return matrix and right side (n, 3) of the penalties on size, unevenness and curvature."""
-    nodes, pairs, bends = np.flatnonzero(column >= 0), [], []
+    pairs, bends = [], []
     for index, side, stride in zip(
         np.unravel_index(nodes, grid.shape), grid.shape, (grid.shape[1] * grid.shape[2], grid.shape[2], 1), strict=True
     ):
@@ -183,11 +172,11 @@ def _build_penalties(
     pair, bend = np.concatenate(pairs), np.concatenate(bends)
     pair = pair[(column[pair] >= 0).all(axis=1)]
     bend = bend[(inside | collar)[bend].all(axis=1) & collar[bend].any(axis=1)]
-    even = _build_rows(column, pair, np.array([1.0, -1.0]))
-    straight = _build_rows(column, bend, np.array([1.0, -2.0, 1.0]))
+    second = np.array([1.0, -2.0, 1.0])
+    even, straight = _build_rows(column, pair, np.array([1.0, -1.0])), _build_rows(column, bend, second)
     matrix = (
-        settings.change_weight * sparse.identity(len(nodes))
-        + settings.difference_weight * even.T @ even
-        + settings.curvature_weight * straight.T @ straight
+        PROJECTION.change_weight * sparse.identity(len(nodes))
+        + PROJECTION.difference_weight * even.T @ even
+        + PROJECTION.curvature_weight * straight.T @ straight
     )
-    return matrix.tocsr(), -settings.curvature_weight * straight.T @ (flat[:, bend] @ np.array([1.0, -2.0, 1.0])).T
+    return matrix.tocsr(), -PROJECTION.curvature_weight * straight.T @ (flat[:, bend] @ second).T

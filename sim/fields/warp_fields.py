@@ -73,14 +73,14 @@ class WarpFields:
 
 def compute_reach(displacement: np.ndarray) -> float:
     """Return the distance [m] over which the field of displacements (..., 3) [m] fades to zero."""
-    return WARP_FIELDS.min_fade_distance + WARP_FIELDS.fade_factor * float(np.linalg.norm(displacement, axis=-1).max())
+    largest = float(np.linalg.norm(displacement, axis=-1).max())
+    return WARP_FIELDS.min_fade_distance + WARP_FIELDS.fade_factor * largest
 
 
 def compute_faint_threshold(displacement: np.ndarray) -> float:
     """Return the limit [m] below which displacements (..., 3) [m] are neglected, so that the grid can be smaller."""
-    return min(
-        WARP_FIELDS.zeroing_threshold, WARP_FIELDS.zeroing_fraction * float(np.linalg.norm(displacement, axis=-1).max())
-    )
+    largest = float(np.linalg.norm(displacement, axis=-1).max())
+    return min(WARP_FIELDS.zeroing_threshold, WARP_FIELDS.zeroing_fraction * largest)
 
 
 def remove_faint(displacement: np.ndarray) -> np.ndarray:

@@ -188,9 +188,8 @@ def build_local_solvers(
     plan: SolverPlan, problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> tuple[Callable[[], BatchElimination | None], Alone | None]:
     """Build a plan's local solvers: a function that builds the one for many loads at its first call; that for one."""
-    near = cache(
-        partial(build_batch_elimination, problem, preconditioner, effects, space) if plan.many else lambda: None
-    )
+    build = partial(build_batch_elimination, problem, preconditioner, effects, space)
+    near = cache(build if plan.many else lambda: None)
     if plan.single is SolverStep.CLAMPED:
         return near, ClampedElimination(problem, preconditioner, effects, space)
     if plan.single is SolverStep.STRAINED:
