@@ -7,8 +7,7 @@ from contextlib import asynccontextmanager, suppress
 import pytest
 from links import HOST, NOW, Peer, peers, played
 
-from scenes.link import clients as limits
-from scenes.link.clients import LinkClients
+from scenes.link.clients import CLIENT_LIMITS, LinkClients
 from scenes.link.frame import HEADER, BadMessageError, pack_message
 from scenes.link.messages import encode_string
 
@@ -55,7 +54,7 @@ def test_slow_client_gets_newest_and_blocks_nobody():
             slow.connect((HOST, port))
             async with peers(port, 1) as (quick,):
                 await until(lambda: len(clients) == 2)
-                await asyncio.sleep(1.2 * limits.GREETING_TIME)
+                await asyncio.sleep(1.2 * CLIENT_LIMITS.greeting_time)
                 for number in range(count):
                     clients.publish("a", [pack_message("STRING", f"{number}", large, NOW)])
                     assert (await quick.next())[0].name == f"{number}"
@@ -101,7 +100,7 @@ def test_what_is_no_good_message_is_said_to_its_sender_alone(sent, why, goes_on)
                     await bad.next()
             await until(lambda: len(heard) == 1 + goes_on)
             assert sorted(heard) == sorted(["fine", *["next"] * goes_on])
-            await asyncio.sleep(1.2 * limits.GREETING_TIME)
+            await asyncio.sleep(1.2 * CLIENT_LIMITS.greeting_time)
             clients.publish("a", [pack_message("STRING", "A", b"", 0)])
             assert (await good.next())[0].kind == "STRING"  # and no STATUS before it
 

@@ -63,6 +63,7 @@ def test_places_in_necrosis_are_the_tumours(kinked):
 def test_a_spacing_follows_from_the_tumours_error(kinked, fields):
     finer = find_finer_spacing(kinked, fields)
     assert MIN_SPACING <= finer < fields.grid.spacing
+    assert find_finer_spacing(kinked, fields, SpacingSettings(tolerance=1.0)) is None
     found = compute_fields(kinked, None, lambda more: None)
     places = list_places(kinked)
     worst = places.compute_errors(found)[places.tumour].max()

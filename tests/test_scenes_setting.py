@@ -25,24 +25,15 @@ STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
 
 def test_a_reward_is_a_difference_of_potentials_and_its_limits():
     near, far = EpisodeScore(0.002, 0.1, 0, 0.5), EpisodeScore(0.012, 0.6, 0, 0.5)
-    assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - REWARD.step_penalty)
-    assert compute_reward(near, near, False, False) == pytest.approx(-REWARD.step_penalty)
-    assert compute_reward(near, replace(near, load=1.1), False, False) == pytest.approx(
-        -REWARD.step_penalty - REWARD.limit_penalty
-    )
-    assert compute_reward(near, near, False, True) == pytest.approx(REWARD.abort_reward - REWARD.step_penalty)
-    assert compute_reward(near, replace(near, cut=2), False, False) == pytest.approx(
-        2.0 * REWARD.share_reward - REWARD.step_penalty
-    )
-    lost, farther = (
-        EpisodeScore(REWARD.max_potential_distance, 1.0, 0, 0.5),
-        EpisodeScore(2.0 * REWARD.max_potential_distance, 5.0, 0, 0.5),
-    )  # beyond, all count alike
-    assert (
-        compute_reward(farther, lost, False, False)
-        == pytest.approx(-REWARD.step_penalty)
-        != compute_reward(lost, near, False, False)
-    )
+    step, most = REWARD.step_penalty, REWARD.max_potential_distance
+    assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - step)
+    assert compute_reward(near, near, False, False) == pytest.approx(-step)
+    assert compute_reward(near, replace(near, load=1.1), False, False) == pytest.approx(-step - REWARD.limit_penalty)
+    assert compute_reward(near, near, False, True) == pytest.approx(REWARD.abort_reward - step)
+    assert compute_reward(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * REWARD.share_reward - step)
+    lost, farther = EpisodeScore(most, 1.0, 0, 0.5), EpisodeScore(2.0 * most, 5.0, 0, 0.5)  # beyond, all count alike
+    beyond = compute_reward(farther, lost, False, False)
+    assert beyond == pytest.approx(-step) != compute_reward(lost, near, False, False)
 
 
 def test_debulk_goal_tracks_remaining_tumour(boxed):

@@ -27,6 +27,7 @@ BODY, PUSHED = body()[0], (Elasticity(), *EFFECTS)
 WIDE = {"anatomy": base_held(box((3, 3, 3), 0.1)), "effects": (Elasticity(), Held(), ToolForce())}
 POSED = {"anatomy": make_box(), "effects": (Elasticity(), Held(), ToolContact((Ball(7e-3),)))}
 LAST = (SolverStep.LBFGS, SolverStep.NEWTON)
+MANY = PLAN_LIMITS.min_shared_cases
 
 
 def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accuracy = TRAIN, **more) -> SolverPlan:
@@ -51,8 +52,8 @@ def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accura
 )
 def test_the_table(more, one, few, many):
     plan = planned(**more)
-    assert [plan.list_steps(count) for count in (1, 2, PLAN_LIMITS.min_shared_cases)] == [one, few, many]
-    assert plan.list_steps(PLAN_LIMITS.min_shared_cases, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
+    assert [plan.list_steps(count) for count in (1, 2, MANY)] == [one, few, many]
+    assert plan.list_steps(MANY, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
 
 
 def test_contact_is_solved_apart_for_one_tool_kind_only():
@@ -64,10 +65,10 @@ def test_contact_is_solved_apart_for_one_tool_kind_only():
 @pytest.mark.parametrize(
     ("avoid", "steps"),
     [
-        (SolverStep.NEAR, {PLAN_LIMITS.min_shared_cases: LAST}),
+        (SolverStep.NEAR, {MANY: LAST}),
         (SolverStep.STRAINED, {1: LAST}),
-        (SolverStep.LBFGS, {1: (SolverStep.NEWTON,), PLAN_LIMITS.min_shared_cases: (SolverStep.NEWTON,)}),
-        (SolverStep.NEWTON, {1: (SolverStep.STRAINED, *LAST), PLAN_LIMITS.min_shared_cases: (SolverStep.NEAR, *LAST)}),
+        (SolverStep.LBFGS, {1: (SolverStep.NEWTON,), MANY: (SolverStep.NEWTON,)}),
+        (SolverStep.NEWTON, {1: (SolverStep.STRAINED, *LAST), MANY: (SolverStep.NEAR, *LAST)}),
     ],
 )
 def test_what_is_avoided_is_not_tried(avoid, steps):
@@ -79,8 +80,7 @@ def test_what_is_avoided_is_not_tried(avoid, steps):
 
 @pytest.mark.parametrize("evaluations", [0, 1, 7])
 @pytest.mark.parametrize(
-    ("count", "more"),
-    [(1, {"live": True, "element": "smoothed"}), (PLAN_LIMITS.min_shared_cases, {}), (1, {"element": "p2"})],
+    ("count", "more"), [(1, {"live": True, "element": "smoothed"}), (MANY, {}), (1, {"element": "p2"})]
 )
 def test_evaluation_budget_bounds_work_before_newton(count, more, evaluations, monkeypatch):
     """Counted at the element's kernels, of the whole body: a local solver's part is another problem."""
@@ -116,12 +116,7 @@ def test_quadratic_loads_go_one_by_one():
 
 @pytest.mark.parametrize(
     ("count", "more"),
-    [
-        (1, {"live": True, "element": "smoothed"}),
-        (2, {"live": True}),
-        (PLAN_LIMITS.min_shared_cases, {}),
-        (1, {"element": "p2"}),
-    ],
+    [(1, {"live": True, "element": "smoothed"}), (2, {"live": True}), (MANY, {}), (1, {"element": "p2"})],
 )
 def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     """Each step that is asked passes every load on, so that all are heard."""
@@ -166,7 +161,7 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
         (
             {},
             (
-                f"Batches of {PLAN_LIMITS.min_shared_cases} loads and more",
+                f"Batches of {MANY} loads and more",
                 "L-BFGS",
                 f"at most {PLAN_LIMITS.max_evaluations} evaluations",
                 "sparse factor",

@@ -42,9 +42,8 @@ def compute_scripted_actions(task: str, states: np.ndarray, settings: PolicySett
         down = off[..., 2]
     elif known == RETRACT:
         direction = states[..., 16:19]
-        beyond = (settings.blade_motion_ratio + settings.blade_ratio_increase * states[..., 12]) * asked - np.einsum(
-            "...i,...i->...", -off, direction
-        )
+        ratio = settings.blade_motion_ratio + settings.blade_ratio_increase * states[..., 12]
+        beyond = ratio * asked - np.einsum("...i,...i->...", -off, direction)
         off = np.where(touches[..., None], beyond[..., None] * direction, off)
         down = np.where(touches, off[..., 2], -known.step)
     else:

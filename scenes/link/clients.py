@@ -24,14 +24,22 @@ from .messages import Code, encode_status
 REJECTED_DEVICE = "SulcusRefused"
 """Device name of each STATUS that is sent to one client."""
 MAX_BODY_BYTES = 1 << 28  # Maximum size of a message body [bytes]; a longer one ends the connection.
-CLIENT_TIMEOUT = 10.0  # Time limit for an announced body to arrive, and for a client to read its messages [s].
-GREETING_TIME = 0.2  # Time in which a new client may send a request before everything is sent to it [s].
-FAREWELL_TIME = 1.0  # Time for sending the reason of a rejection, and for ending a connection [s].
-LAST_MESSAGE_TIME = 0.1  # Time to read the last message when a server ends [s].
-CLIENT_BUFFER_BYTES = (
-    1 << 18
-)  # Size of a slow client's system buffer [bytes]: its content is not replaced by newer messages.
-CHUNK_BYTES = 1 << 16  # Size of the chunks in which a body is skipped [bytes].
+
+
+@dataclass(frozen=True)
+class ClientLimits:
+    """Limits of a connection."""
+
+    timeout: float = 10.0  # Time limit for an announced body to arrive, and for a client to read its messages [s].
+    greeting_time: float = 0.2  # Time in which a new client may send a request before everything is sent to it [s].
+    farewell_time: float = 1.0  # Time for sending the reason of a rejection, and for ending a connection [s].
+    last_message_time: float = 0.1  # Time to read the last message when a server ends [s].
+    # Size of a slow client's system buffer [bytes]: its content is not replaced by newer messages.
+    buffer_bytes: int = 1 << 18
+    chunk_bytes: int = 1 << 16  # Size of the chunks in which a body is skipped [bytes].
+
+
+CLIENT_LIMITS = ClientLimits()
 # First letters of the message types that are requests, and of those that ask for selected messages.
 REQUESTS, QUERIES = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
 
@@ -129,7 +137,7 @@ class LinkClients:
         """Send what waits, for a moment, and end all connections."""
         for client in self._clients.values():
             client.leave()
-        for patience in (LAST_MESSAGE_TIME, FAREWELL_TIME):
+        for patience in (CLIENT_LIMITS.last_message_time, CLIENT_LIMITS.farewell_time):
             if self._attending:
                 await asyncio.wait(self._attending, timeout=patience)
             for client in self._clients.values():
@@ -156,7 +164,7 @@ class LinkClients:
             await asyncio.wait((sending, reading), return_when=asyncio.FIRST_COMPLETED)
             if reading.done() and not sending.done():
                 client.leave()
-                await asyncio.wait((sending,), timeout=FAREWELL_TIME)
+                await asyncio.wait((sending,), timeout=CLIENT_LIMITS.farewell_time)
         finally:
             del self._clients[client.number]
             for task in (sending, reading):
@@ -167,7 +175,7 @@ class LinkClients:
     async def _send(self, client: Client) -> None:
         """Send what waits, as fast as the client reads it."""
         try:
-            async with asyncio.timeout(GREETING_TIME):
+            async with asyncio.timeout(CLIENT_LIMITS.greeting_time):
                 await client.spoke.wait()
         except TimeoutError:
             pass
@@ -181,7 +189,7 @@ class LinkClients:
                 while client.waiting:
                     messages = client.waiting.pop(next(iter(client.waiting)))
                     client.writer.writelines(messages)
-                    async with asyncio.timeout(CLIENT_TIMEOUT):
+                    async with asyncio.timeout(CLIENT_LIMITS.timeout):
                         await client.writer.drain()
         except TimeoutError:
             self._count("client that does not read")
@@ -199,7 +207,7 @@ class LinkClients:
                     raise BadMessageError(
                         f"{_format_name(header)} announces {header.size} bytes; {MAX_BODY_BYTES} are the most"
                     )
-                async with asyncio.timeout(CLIENT_TIMEOUT):
+                async with asyncio.timeout(CLIENT_LIMITS.timeout):
                     await self._hear(client, reader, header)
                 await asyncio.sleep(0)  # a client that sends without pause blocks no other
         except TimeoutError:
@@ -231,10 +239,8 @@ class LinkClients:
             self._receive(client.number, replace(header, metadata=read_metadata(header, body)), content)
         except BadMessageError as error:
             code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
-            # # The text after a colon differs from message to message.
-            self.reject(
-                client.number, code, str(error).partition(":")[0], f"{_format_name(header)} is rejected: {error}"
-            )
+            why = str(error).partition(":")[0]  # The text after a colon differs from message to message.
+            self.reject(client.number, code, why, f"{_format_name(header)} is rejected: {error}")
 
     def _ask(self, client: Client, header: Header) -> None:
         """Send a client without stream its requested messages only."""
@@ -274,21 +280,21 @@ def _format_name(header: Header) -> str:
 async def _pass_over(reader: asyncio.StreamReader, size: int) -> None:
     """Read `size` bytes, and discard them."""
     while size:
-        size -= len(await reader.readexactly(min(size, CHUNK_BYTES)))
+        size -= len(await reader.readexactly(min(size, CLIENT_LIMITS.chunk_bytes)))
 
 
 def _hold_little(writer: asyncio.StreamWriter) -> None:
     """Limit the system's send buffer for unread bytes, and enable keep-alive to detect lost clients."""
     writer.transport.set_write_buffer_limits(high=0)
     own = writer.get_extra_info("socket")
-    own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_BUFFER_BYTES)
+    own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_LIMITS.buffer_bytes)
     own.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
 
 async def _close(writer: asyncio.StreamWriter) -> None:
     try:
         writer.close()
-        async with asyncio.timeout(FAREWELL_TIME):
+        async with asyncio.timeout(CLIENT_LIMITS.farewell_time):
             await writer.wait_closed()
     except (OSError, TimeoutError):
         writer.transport.abort()

@@ -41,23 +41,21 @@ class VesselSettings:
     mottle_length: float = 0.35e-3  # Length scale of the mottle [m].
 
 
+VESSELS = VesselSettings()
+
+
 @lru_cache(maxsize=2)
 def add_vessels(
-    intensity: Intensity | None,
-    site: CraniotomyFrame,
-    seed: int,
-    dark: tuple[float, float, float],
-    relief: float,
-    settings: VesselSettings = VesselSettings(),
+    intensity: Intensity | None, site: CraniotomyFrame, seed: int, dark: tuple[float, float, float], relief: float
 ) -> Solid:
     """Return the scan round an opening as a solid texture with vessels upon it, which the seed draws.
 
     They go with the tissue, and have no height. Without a scan, tissue is evenly bright. `dark` and `relief` as of
     `Solid`.
     """
-    half = site.radius + settings.margin
-    wide, tall = settings.voxel_across, settings.voxel_along
-    across, along = np.arange(-half, half, wide), np.arange(-settings.height_above, settings.depth_below, tall)
+    half = site.radius + VESSELS.margin
+    wide, tall = VESSELS.voxel_across, VESSELS.voxel_along
+    across, along = np.arange(-half, half, wide), np.arange(-VESSELS.height_above, VESSELS.depth_below, tall)
     T = np.eye(4)
     T[:3, :3] = np.column_stack([wide * site.right, wide * site.up, tall * site.axis])
     T[:3, 3] = site.origin + across[0] * (site.right + site.up) + along[0] * site.axis
@@ -65,42 +63,38 @@ def add_vessels(
     if intensity is not None:
         grey, inside = intensity.apply_window(site.anatomy.mesh), np.linalg.inv(intensity.affine) @ T
         scan = affine_transform(grey, inside, output_shape=scan.shape, order=1, mode="nearest")
-    light = 1.0 - compute_vessel_absorption(across, np.random.default_rng([seed, 1]), settings).astype(np.float32)
+    light = 1.0 - compute_vessel_absorption(across, np.random.default_rng([seed, 1])).astype(np.float32)
     return Solid(scan * light[:, :, None], np.linalg.inv(T), dark, relief, height=scan)
 
 
-def compute_vessel_absorption(
-    across: np.ndarray, random: np.random.Generator, settings: VesselSettings = VesselSettings()
-) -> np.ndarray:
+def compute_vessel_absorption(across: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Share of the light that vessels take, (n, n), at places `across` (n,) [m] from the middle, both ways."""
-    points, widths = sample_vessel_paths(float(np.abs(across).max()), random, settings)
+    points, widths = sample_vessel_paths(float(np.abs(across).max()), random)
     here = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1)
-    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * settings.max_width)
-    width = np.append(widths, settings.max_width)[nearest]
-    vessels = settings.max_absorption * np.exp(-2.0 * (away / width) ** 2)
-    mottle = gaussian_filter(random.standard_normal(away.shape), settings.mottle_length / settings.voxel_across)
-    return np.clip(vessels + (1.0 - vessels) * settings.mottle_contrast * mottle / mottle.std(), 0.0, 0.95)
+    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * VESSELS.max_width)
+    width = np.append(widths, VESSELS.max_width)[nearest]
+    vessels = VESSELS.max_absorption * np.exp(-2.0 * (away / width) ** 2)
+    mottle = gaussian_filter(random.standard_normal(away.shape), VESSELS.mottle_length / VESSELS.voxel_across)
+    return np.clip(vessels + (1.0 - vessels) * VESSELS.mottle_contrast * mottle / mottle.std(), 0.0, 0.95)
 
 
-def sample_vessel_paths(
-    half: float, random: np.random.Generator, settings: VesselSettings = VesselSettings()
-) -> tuple[np.ndarray, np.ndarray]:
+def sample_vessel_paths(half: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points (k, 2) [m] of vessels that come in at the border of a square, wander and branch; their widths (k,) [m]."""
-    count = settings.trunk_count
+    count = VESSELS.trunk_count
     angles = 2.0 * np.pi * (np.arange(count) + random.uniform(0.0, 0.7, count)) / count
     rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
-    ends = list(zip(rim, angles + np.pi, settings.max_width * random.uniform(0.5, 1.0, count), strict=True))
+    ends = list(zip(rim, angles + np.pi, VESSELS.max_width * random.uniform(0.5, 1.0, count), strict=True))
     points, widths = [], []
     while ends:
         at, way, width = ends.pop()
-        while width > settings.min_width and np.abs(at).max() <= half:
+        while width > VESSELS.min_width and np.abs(at).max() <= half:
             points.append(at)
             widths.append(width)
-            way = way + settings.turn_deviation * random.standard_normal()
-            at, width = at + settings.step * np.array([np.cos(way), np.sin(way)]), settings.width_factor * width
-            if random.uniform() < settings.branch_probability:
+            way = way + VESSELS.turn_deviation * random.standard_normal()
+            at, width = at + VESSELS.step * np.array([np.cos(way), np.sin(way)]), VESSELS.width_factor * width
+            if random.uniform() < VESSELS.branch_probability:
                 side = random.choice([-1.0, 1.0])
-                ends.append((at, way + side * random.uniform(0.5, 1.2), settings.branch_width_ratio * width))
+                ends.append((at, way + side * random.uniform(0.5, 1.2), VESSELS.branch_width_ratio * width))
                 way, width = way - 0.2 * side, 0.95 * width
     return np.array(points), np.array(widths)
 

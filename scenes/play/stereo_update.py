@@ -19,25 +19,33 @@ from surrogate.locating.observation import Observation
 
 from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
 
-RESOLUTION = 6000.0  # Resolution of the rectified images [pixel/m of cortex].
-HALF_WIDTH = 1.05  # Half-width of the rectified images [radii of the craniotomy].
-MIN_DRAPE_DISTANCE = (
-    1.5e-3  # Minimum distance of points from the drape [m]: it is above the cortex, and its disparity differs.
-)
-# Largest median distance of the first pair's points from the scan's cortex [m]: beyond, the calibration is of other
-# cameras.
-MAX_CORTEX_DISTANCE = 2.5e-3
-MAX_MOTION = 10e-3  # Search range of motions [m]; if half of them seem larger, eyes were swapped.
+
+@dataclass(frozen=True)
+class StereoUpdateSettings:
+    """Settings of `observe_first`, `observe_points` and `observe_point_cloud`."""
+
+    resolution: float = 6000.0  # Resolution of the rectified images [pixel/m of cortex].
+    half_width: float = 1.05  # Half-width of the rectified images [radii of the craniotomy].
+    # Minimum distance of points from the drape [m]: it is above the cortex, and its disparity differs.
+    min_drape_distance: float = 1.5e-3
+    # Largest median distance of the first pair's points from the scan's cortex [m]: beyond, the calibration is of other
+    # cameras.
+    max_cortex_distance: float = 2.5e-3
+    max_motion: float = 10e-3  # Search range of motions [m]; if half of them seem larger, eyes were swapped.
+    min_found_share: float = 0.3  # Smallest share of the points that must be found again.
+    # Maximum number of points in the static surroundings of the craniotomy that are examined.
+    max_static_points: int = 60
+    min_static_points: int = 15  # Minimum number of points found in the static surroundings.
+    # Motion within which a quarter of the surroundings must stay [m]; the others are at the edge of the drape.
+    static_tolerance: float = 2e-3
+
+
+STEREO = StereoUpdateSettings()
 LARGE_MOTION_HINT = (
-    f" Or the cortex has moved by about {1e3 * MAX_MOTION:g} mm or more since the first pair, farther than it is "
-    "searched for: begin with a new scan."
+    f" Or the cortex has moved by about {1e3 * STEREO.max_motion:g} mm or more since the first pair, farther than "
+    "it is searched for: begin with a new scan."
 )
 """Reasons why points of the first pair may not be found again."""
-MIN_FOUND_SHARE = 0.3  # Smallest share of the points that must be found again.
-MAX_STATIC_POINTS = 60  # Maximum number of points in the static surroundings of the craniotomy that are examined.
-MIN_STATIC_POINTS = 15  # Minimum number of points found in the static surroundings.
-# Motion within which a quarter of the surroundings must stay [m]; the others are at the edge of the drape.
-STATIC_TOLERANCE = 2e-3
 Rigid = Callable[[np.ndarray], np.ndarray]
 """Takes places (n, 3) [m] to where a tracked microscope has them."""
 
@@ -69,7 +77,7 @@ class StereoPair:
         masks = None if self.tool is None else tuple(compute_silhouette(camera, *self.tool) for camera in self.cameras)
         target = cast(tuple[float, float, float], tuple(site.origin.tolist()))
         try:
-            geometry = rectify(*self.cameras, target, HALF_WIDTH * site.radius, RESOLUTION)
+            geometry = rectify(*self.cameras, target, STEREO.half_width * site.radius, STEREO.resolution)
             return compute_stereo_view(geometry, *self.pictures, cast(tuple[np.ndarray, np.ndarray] | None, masks))
         except ValueError as error:
             raise InputError(str(error)) from error
@@ -110,7 +118,7 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
     found = triangulate_seen_points(site, view, pixels)
     points = rigid(found.points)
     rest, off = find_on_cortex(site, points)
-    if len(off) and np.median(off) > MAX_CORTEX_DISTANCE:
+    if len(off) and np.median(off) > STEREO.max_cortex_distance:
         raise InputError(
             f"the first image pair shows a cortex {1e3 * np.median(off):.1f} mm from the scan's: check that eyes "
             "are not swapped, or calibrate them again."
@@ -139,7 +147,7 @@ def observe_points(
     good = find_supported(rest, now - rest)
     require_points(int(good.sum()), first.asked, LARGE_MOTION_HINT)
     motion = float(np.median(np.linalg.norm(now - rest, axis=1)))
-    if motion > MAX_MOTION:
+    if motion > STEREO.max_motion:
         raise InputError(
             f"half of the points seem to have moved by {1e3 * motion:.0f} mm, farther than they are searched for: "
             "check that eyes are not swapped, or begin with a new scan."
@@ -166,7 +174,7 @@ def observe_point_cloud(
 
 def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.ndarray:
     """Build a regular grid of about `count` pixels (n, 2) of the left window, over the drape's hole."""
-    reach = HOLE_RATIO * site.clearance - MIN_DRAPE_DISTANCE
+    reach = HOLE_RATIO * site.clearance - STEREO.min_drape_distance
     step = reach * np.sqrt(np.pi / count)
     ticks = np.arange(-np.floor(reach / step), np.floor(reach / step) + 1) * step
     x, y = (each.ravel() for each in np.meshgrid(ticks, ticks))
@@ -187,7 +195,7 @@ def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.
         found = triangulate_cloud(view, pixels)
     except ValueError as error:
         raise InputError(str(error)) from error
-    inside = site.compute_axis_distance(found.points) < HOLE_RATIO * site.clearance - MIN_DRAPE_DISTANCE
+    inside = site.compute_axis_distance(found.points) < HOLE_RATIO * site.clearance - STEREO.min_drape_distance
     return Cloud(found.which[inside], found.points[inside], found.sigma[inside])
 
 
@@ -197,7 +205,7 @@ def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarr
     pixels = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     found = triangulate_cloud(view, pixels)
     outside = np.flatnonzero(site.compute_axis_distance(found.points) > HOLE_RATIO * site.clearance)
-    some = outside[np.linspace(0, len(outside) - 1, min(MAX_STATIC_POINTS, len(outside))).astype(int)]
+    some = outside[np.linspace(0, len(outside) - 1, min(STEREO.max_static_points, len(outside))).astype(int)]
     return pixels[found.which[some]], found.points[some]
 
 
@@ -208,11 +216,11 @@ def check_no_motion(first: First, view: StereoView, rigid: Rigid) -> None:
         found = triangulate_cloud(view, there)
     except ValueError as error:
         raise InputError(str(error)) from error
-    if len(found.which) < MIN_STATIC_POINTS:
+    if len(found.which) < STEREO.min_static_points:
         return
     motion = np.linalg.norm(rigid(found.points) - first.still[which[found.which]], axis=1)
     moved = float(np.quantile(motion, 0.25))
-    if moved > STATIC_TOLERANCE:
+    if moved > STEREO.static_tolerance:
         raise InputError(
             f"what lies round the opening seems to have moved by {1e3 * moved:.1f} mm: check that eyes are not "
             "swapped, and calibrate and track the microscope again."
@@ -235,7 +243,7 @@ def compute_deviations(sigma: np.ndarray) -> np.ndarray:
 
 def require_points(count: int, asked: int, other_reason: str = "") -> None:
     """Raise InputError if too few of the searched points are visible; `other_reason` is added to the message."""
-    if count < MIN_FOUND_SHARE * asked:
+    if count < STEREO.min_found_share * asked:
         raise InputError(
             f"both eyes see {count} of {asked} places of the cortex surely: check light, focus and texture, and what "
             f"hides it.{other_reason}"

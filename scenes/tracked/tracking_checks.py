@@ -22,16 +22,24 @@ from .rendered_video import DrawnFilm
 from .run import STALE_AGE, Timed, overlay_one
 from .tool_motion import ToolMotion
 
-MAX_SEARCH_IMAGES = (
-    3  # Maximum number of images until a returned target is found: lost ones are searched in every third image.
-)
-MAX_OUTLINE_ERROR = 2.0  # Maximum error of a drawn outline [pixel].
-MIN_LINE_PIXELS = 5  # Number of pixels of an outline's colour below which there is no line.
 LOST_TEXTS = {"reference": "reference lost", "tool": "tool lost"}  # Text required in an image, by covered target.
 STALE_TEXT = "stale"  # Text required in a stale image.
-REPEATED_TIME = 0.1  # Time of the repeated image [s].
-DELAYED_TIME = 0.2  # Time of the delayed image [s].
-IMAGE_DELAY = 2.5 * STALE_AGE  # Delay of the delayed image [s].
+
+
+@dataclass(frozen=True)
+class TrackingCheckSettings:
+    """Settings of `measure_tracking`, and limits of its figures."""
+
+    # Maximum number of images until a returned target is found: lost ones are searched in every third image.
+    max_search_images: int = 3
+    max_outline_error: float = 2.0  # Maximum error of a drawn outline [pixel].
+    min_line_pixels: int = 5  # Number of pixels of an outline's colour below which there is no line.
+    repeated_time: float = 0.1  # Time of the repeated image [s].
+    delayed_time: float = 0.2  # Time of the delayed image [s].
+    image_delay: float = 2.5 * STALE_AGE  # Delay of the delayed image [s].
+
+
+CHECK = TrackingCheckSettings()
 
 
 @dataclass(frozen=True)
@@ -61,13 +69,12 @@ class TrackingFigures:
 
     def find_violations(self) -> list[str]:
         """Return a sentence for each bound that is not kept."""
+        back, near = self.back <= CHECK.max_search_images, self.off <= CHECK.max_outline_error
         rules = {
             f"{self.confident} images draw a lost or old position as if it were known": self.confident == 0,
             f"{self.unsaid} images do not say that something is lost or old": self.unsaid == 0,
-            f"the tumour is back after {self.back:g} images, more than {MAX_SEARCH_IMAGES}": self.back
-            <= MAX_SEARCH_IMAGES,
-            f"a place drawn as known is {self.off:.1f} pixels off, more than {MAX_OUTLINE_ERROR:g}": self.off
-            <= MAX_OUTLINE_ERROR,
+            f"the tumour is back after {self.back:g} images, more than {CHECK.max_search_images}": back,
+            f"a place drawn as known is {self.off:.1f} pixels off, more than {CHECK.max_outline_error:g}": near,
         }
         return [sentence for sentence, kept in rules.items() if not kept]
 
@@ -93,9 +100,9 @@ def replay_events(film: DrawnFilm) -> Iterator[Event]:
         words = next((LOST_TEXTS[kind] for kind in LOST_TEXTS if kind in covered), "")
         if shot.time - before > STALE_AGE:
             words = STALE_TEXT
-        late = IMAGE_DELAY if np.isclose(shot.time, DELAYED_TIME) else 0.0
+        late = CHECK.image_delay if np.isclose(shot.time, CHECK.delayed_time) else 0.0
         yield Event(shot, late, STALE_TEXT if late else words)
-        if np.isclose(shot.time, REPEATED_TIME):
+        if np.isclose(shot.time, CHECK.repeated_time):
             yield Event(shot, words=STALE_TEXT)
         before = shot.time
 
@@ -117,7 +124,7 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
         begun = clock.perf_counter() - event.shot.time - event.late if event.late else None
         shown = overlay_one(Timed(film.get_image(event.shot), True), begun, known, follower, painter)
         known = shown.known
-        drawn = bool(np.count_nonzero(find_ink(shown.colour, compute_ink(TUMOUR_COLOUR))) >= MIN_LINE_PIXELS)
+        drawn = bool(np.count_nonzero(find_ink(shown.colour, compute_ink(TUMOUR_COLOUR))) >= CHECK.min_line_pixels)
         if event.words:
             confident += drawn
             unsaid += not _has_warning(shown.colour, known.words, event.words)

@@ -30,13 +30,15 @@ class ImageWarningSettings:
 
     min_inside_share: float = 0.98  # Smallest share of the brain inside an image without a warning.
     min_nonzero_share: float = 0.5  # Smallest share of the brain on voxels that are not 0 without a warning.
-
     bright_percentile: float = 99.0  # Percentile of the positive values that counts as bright [%].
     dark_ratio: float = 0.1  # Threshold of dark voxels (air with noise), relative to the value at `bright_percentile`.
     min_flip_gain: float = 0.05  # Smallest gain of brain on bright voxels when x and y are negated.
     min_flipped_share: float = 0.7  # Smallest share of brain on bright voxels when x and y are negated.
     max_label_values: int = 120  # Largest number of distinct integers of a label map.
     min_equal_neighbours: float = 0.5  # Smallest share of neighbours of one value in a label map: labels fill areas.
+
+
+IMAGE_WARNINGS = ImageWarningSettings()
 
 
 SUFFIXES = (".seg.nrrd", *READERS)  # Endings of image files.
@@ -56,34 +58,28 @@ def measure_shown_share(affine: np.ndarray, shape: tuple[int, ...], anatomy: Ana
     return float(np.average(inside, weights=anatomy.mesh.volumes))
 
 
-def list_warnings(
-    values: np.ndarray,
-    affine: np.ndarray,
-    labels: bool,
-    anatomy: Anatomy,
-    settings: ImageWarningSettings = ImageWarningSettings(),
-) -> list[str]:
+def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatomy) -> list[str]:
     """List warnings, as predicates, about an image (I, J, K) that shows a part of a brain."""
     found, middles, volumes = [], _compute_centroids(anatomy), anatomy.mesh.volumes
     index, inside = _find_voxels(affine, values.shape, middles)
     share = float(np.average(inside, weights=volumes))
-    if share < settings.min_inside_share:
+    if share < IMAGE_WARNINGS.min_inside_share:
         found.append(f"shows {share:.0%} of the brain; what lies outside is not in it")
     empty = float(np.average(values[tuple(index[inside].T)] == 0, weights=volumes[inside]))
-    turned = _is_turned(values, affine, labels, middles, volumes, settings)
+    turned = _is_turned(values, affine, labels, middles, volumes)
     if turned:
         found.append(
             f"fits the brain in {turned[0]:.0%} of its volume, but in {turned[1]:.0%} with x and y negated: "
             "it may be LPS marked as RAS"
         )
-    elif not labels and 1.0 - empty < settings.min_nonzero_share:
+    elif not labels and 1.0 - empty < IMAGE_WARNINGS.min_nonzero_share:
         found.append(
             f"is 0 in {empty:.0%} of the brain's volume: it may be in another space than the labels that the anatomy "
             "was made from"
         )
-    if not labels and _is_label_like(values, settings):
+    if not labels and _is_label_like(values):
         found.append("holds few values, all whole, as label maps do: give one by --labels, or labels are mixed")
-    elif labels and (alike := _compute_equal_share(values)) < settings.min_equal_neighbours:
+    elif labels and (alike := _compute_equal_share(values)) < IMAGE_WARNINGS.min_equal_neighbours:
         found.append(
             f"has the same value in {alike:.0%} of neighbouring voxels, as intensities do: give them by --image, or "
             "values are not interpolated"
@@ -95,37 +91,31 @@ def list_warnings(
 
 
 def _is_turned(
-    values: np.ndarray,
-    affine: np.ndarray,
-    labels: bool,
-    middles: np.ndarray,
-    volumes: np.ndarray,
-    settings: ImageWarningSettings,
+    values: np.ndarray, affine: np.ndarray, labels: bool, middles: np.ndarray, volumes: np.ndarray
 ) -> tuple[float, float] | None:
     """Return shares of the brain on bright voxels, unchanged and with x and y negated, if the latter is much larger."""
     part = np.nan_to_num(values[::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE].astype(float))
     air, bright = 0.0, part[part > 0.0]
     if len(bright) and not labels:
-        air = settings.dark_ratio * float(np.percentile(bright, settings.bright_percentile))
+        air = IMAGE_WARNINGS.dark_ratio * float(np.percentile(bright, IMAGE_WARNINGS.bright_percentile))
     shares = []
     for points in (middles, middles * LPS):
         index, inside = _find_voxels(affine, values.shape, points)
         shares.append(float(np.average(inside & (values[tuple(index.T)] > air), weights=volumes)))
     as_is, turned = shares
-    return (as_is, turned) if turned > settings.min_flipped_share and turned - as_is > settings.min_flip_gain else None
+    flips = turned > IMAGE_WARNINGS.min_flipped_share and turned - as_is > IMAGE_WARNINGS.min_flip_gain
+    return (as_is, turned) if flips else None
 
 
-def _is_label_like(values: np.ndarray, settings: ImageWarningSettings) -> bool:
+def _is_label_like(values: np.ndarray) -> bool:
     part = values[::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE]
-    return 1 < len(np.unique(part)) <= settings.max_label_values and np.array_equal(part, np.rint(part))
+    return 1 < len(np.unique(part)) <= IMAGE_WARNINGS.max_label_values and np.array_equal(part, np.rint(part))
 
 
 def _compute_equal_share(values: np.ndarray) -> float:
     """Return the share of voxels, but for those that are 0, that have the value of the next along the first axis."""
-    one, two = (
-        values[:-1:SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE],
-        values[1::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE],
-    )
+    thin = values[:, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE]
+    one, two = thin[:-1:SAMPLING_STRIDE], thin[1::SAMPLING_STRIDE]
     full = (one != 0) & (two != 0)
     return float((one == two)[full].mean()) if full.any() else 1.0
 
