@@ -209,7 +209,7 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     assert said[1] == f"estimate: tumour moved {1e3 * found.moved:.2f} +- {off}"
     assert f"truth: {frame.deformation.source}" in said and f"estimate: {found.source}" in said
     assert said[-1].startswith("lines: ") and not any("tumour moved" in line for line in said[2:])
-    foot = f"moved {format_millimetres(found.moved, found.location.p95)}"
+    foot = f"estimate moved {format_millimetres(found.moved, found.location.p95)}"
     assert f"simulated motion {truth:.1f} mm; estimate" in frame.remark
     assert all(
         has_text(frame.shown, line, TEXT_SCALE) for line in wrap_line(foot, MAX_BOTTOM_WIDTH * frame.shown.shape[1])

@@ -43,10 +43,19 @@ from ..script.tool_paths import Path, Touch
 from ..script.uncertainty import LEVEL, Uncertainty, mark_of
 
 ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)  # Samples with inverted tetrahedra are counted, not left out.
-SOLVED_TIMES = 5  # Number of times of a scene that are solved.
-MIN_SOLVED_SHARE = 0.8  # Minimum share of the samples with an equilibrium.
-LOAD_STEPS = 4  # Number of load steps for a time that is not reached in one step.
-SHIFT_COUNT = 200  # Number of sampled errors of registration and segmentation for each body.
+
+
+@dataclass(frozen=True)
+class EnsembleSettings:
+    """Settings of an ensemble and of its rigid errors."""
+
+    solved_times: int = 5  # Number of times of a scene that are solved.
+    min_solved_share: float = 0.8  # Minimum share of the samples with an equilibrium.
+    load_steps: int = 4  # Number of load steps for a time that is not reached in one step.
+    shift_count: int = 200  # Number of sampled errors of registration and segmentation for each body.
+
+
+ENSEMBLE = EnsembleSettings()
 SKULL_EFFECTS = Bonded | Slide | SkullContact  # Effects of the skull on the brain.
 
 
@@ -179,7 +188,7 @@ def _shift_path(path: Path, tip: Sequence[float]) -> Path:
 
 def list_moments(scene: Scene) -> tuple[float, ...]:
     """Return the times [s] of a scene that are solved."""
-    return tuple(np.linspace(0.0, scene.duration, SOLVED_TIMES).tolist())
+    return tuple(np.linspace(0.0, scene.duration, ENSEMBLE.solved_times).tolist())
 
 
 def solve_nominal(theatre: PatientSetup, scene: Scene) -> SurfaceMotions:
@@ -207,14 +216,8 @@ def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
 
     If the step from the previous moment does not converge, intermediate times are solved.
     """
-    fem, last, found, stage, before = (
-        theatre.build_fem(scene, ACCURACY, batch=1),
-        None,
-        [],
-        Stage(scene, theatre.site),
-        0.0,
-    )
-    inverted = 0
+    fem, stage = theatre.build_fem(scene, ACCURACY, batch=1), Stage(scene, theatre.site)
+    last, found, before, inverted = None, [], 0.0, 0
 
     def gone_to(times: Sequence[float], start: Deformation | None) -> Deformation | None:
         for time in times:
@@ -226,17 +229,13 @@ def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
     for time in list_moments(scene):
         answer = gone_to([time], last)
         if answer is None and time > before:
-            answer = gone_to(np.linspace(before, time, 1 + LOAD_STEPS)[1:].tolist(), last)
+            answer = gone_to(np.linspace(before, time, 1 + ENSEMBLE.load_steps)[1:].tolist(), last)
         if answer is None:
             return None
         last, before, inverted = answer, time, max(inverted, int(answer.inverted[0]))
         loads = scene.build_loads(theatre.site, scene.path(time), time)
-        found.append(_get_tumour_motion(stage.select_stage(loads), last))
+        found.append(last.restrict(stage.select_stage(loads).tumour_vertices).displacement[0])
     return SolvedMotions(tuple(found), inverted)
-
-
-def _get_tumour_motion(stage: Stage, answer: Deformation) -> np.ndarray:
-    return answer.restrict(stage.tumour_vertices).displacement[0]
 
 
 def solve_ensemble(theatre: PatientSetup, scene: Scene, draws: Sequence[PatientSample]) -> Iterator[Answer]:
@@ -259,7 +258,7 @@ def filter_sound_draws(scene: Scene, draws: Sequence[PatientSample], answers: It
         Too few draws with an equilibrium.
     """
     sound = find_sound_draws(draws, answers)
-    if len(sound) < MIN_SOLVED_SHARE * len(draws):
+    if len(sound) < ENSEMBLE.min_solved_share * len(draws):
         raise InputError(f"of {len(draws)} draws of the scene {scene.name} {len(sound)} have an equilibrium: too few.")
     return sound
 
@@ -282,7 +281,7 @@ def estimate_uncertainty(
     answers = tuple(answers)
     sound = filter_sound_draws(scene, draws, answers)
     folded = sum(answer is not None and answer.inverted > 0 for answer in answers)
-    kept, shifts = [draw for draw, _ in sound], sample_rigid_errors(SHIFT_COUNT, seed)
+    kept, shifts = [draw for draw, _ in sound], sample_rigid_errors(ENSEMBLE.shift_count, seed)
     meshes = sample_mesh_errors(scene, kept)
     rows = []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
@@ -385,15 +384,14 @@ def measure_coverage(
             f"{len(sound)} of {len(draws)} synthetic patients of the scene {scene.name} have an equilibrium: too few."
         )
     meshes, inside = sample_mesh_errors(scene, [draw for draw, _ in sound]), []
-    shift, wide = sample_rigid_errors(SHIFT_COUNT * len(sound), seed)  # a different one for each patient
-    each = list(zip(shift.reshape(len(sound), SHIFT_COUNT, 3), wide.reshape(len(sound), SHIFT_COUNT), strict=True))
+    shape = len(sound), ENSEMBLE.shift_count  # different errors for each patient
+    shift, wide = sample_rigid_errors(shape[0] * shape[1], seed)
+    each = list(zip(shift.reshape(*shape, 3), wide.reshape(shape), strict=True))
     for moment in range(1, len(still.times)):
         motion = np.stack([answer[moment] for _, answer in sound])
         off = compute_error(motion, still.fields[moment], meshes)
-        normals = still.normals[moment]
-        worst = [
-            compute_worst_distances(one[None], normals, *errors)[0][0] for one, errors in zip(off, each, strict=True)
-        ]
+        pairs, normals = zip(off, each, strict=True), still.normals[moment]
+        worst = [compute_worst_distances(one[None], normals, *errors)[0][0] for one, errors in pairs]
         inside.append(np.array(worst) <= stated.worst[moment])
     shares = np.mean(inside, axis=(0, 2))  # errors of one patient depend on each other
     deviation = float(shares.std(ddof=1) / np.sqrt(len(shares)))

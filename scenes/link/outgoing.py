@@ -34,9 +34,8 @@ MAX_PLACES = 1000
 """Maximum number of points in one request."""
 UNTRACKED_POINTS = "places that are not in or on the tumour, nor on open cortex, so that their motion is not known"
 """Reason why points are not tracked."""
-INSIDE_TOLERANCE = (
-    1e-6  # Largest distance of a point from its position by barycentric coordinates, to be inside the tetrahedron [m].
-)
+# Largest distance of a point from its position by barycentric coordinates, to be inside the tetrahedron [m].
+INSIDE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,8 @@ from .frame import NAME_BYTES, TICKS, BadMessageError
 
 ROTATION_TOLERANCE = 2e-3  # Tolerance of axes from length 1 and right angles: matrices have single precision.
 MAX_COORDINATE = 10.0  # Largest coordinate of a tracked body [m].
-MAX_CLOCK_STEP = (
-    5.0  # Difference from the last time stamp above which an earlier one means that the clock was set back [s].
-)
+# Difference from the last time stamp above which an earlier one means that the clock was set back [s].
+MAX_CLOCK_STEP = 5.0
 # Number of earlier transforms of one name that are kept, for images that arrive later than the poses around them.
 MAX_KEPT_TRANSFORMS = 32
 

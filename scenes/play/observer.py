@@ -29,9 +29,8 @@ from ..script.tool import build_sphere
 
 TOUCH_DISTANCE = 1e-3  # Distance from the cortex within which a tool touches it [m].
 HIDING_DISTANCE = 4e-3  # Distance from a tool within which points are hidden [m].
-SEARCHED_CORNERS = (
-    32  # Number of tool corners, nearest to those of the cortex, that are searched for the contact point.
-)
+# Number of tool corners, nearest to those of the cortex, that are searched for the contact point.
+SEARCHED_CORNERS = 32
 ELLIPSOID_COLOUR = (0.21, 0.30, 0.90)  # Colour of the ellipsoid (RGB, 0 to 1).
 ELLIPSOID = 5
 """Segmentation id of the ellipsoid's layer, which no image contains."""

@@ -49,12 +49,10 @@ ESTIMATED_LINES = LegendNames(
     "estimated tumour", "", "in the scan", ("95 % of its centre", SIMULATED), "estimate moved"
 )
 """Names of the lines in an image of a prediction, and in one of an estimate."""
-READING_DEPTH = (
-    2.0e-3  # Depth under the surface at which the scan is read [m]: the edge of grey matter mixes with fluid.
-)
-RIM_DISTANCE = (
-    10e-3  # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
-)
+# Depth under the surface at which the scan is read [m]: the edge of grey matter mixes with fluid.
+READING_DEPTH = 2.0e-3
+# Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
+RIM_DISTANCE = 10e-3
 DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
 DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 

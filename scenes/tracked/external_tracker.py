@@ -24,9 +24,8 @@ from .pose_file import TrackedRow
 
 REST_POSE = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 """Pose of the camera in its own coordinate system."""
-MAX_TIME_GAP = (
-    1.0  # Time between poses and an image beyond which they belong to another clock or another recording [s].
-)
+# Time between poses and an image beyond which they belong to another clock or another recording [s].
+MAX_TIME_GAP = 1.0
 
 
 def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:

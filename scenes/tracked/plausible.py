@@ -15,9 +15,8 @@ from .tracked_tool import TrackedTool
 MAX_REFERENCE_DISTANCE = 0.3  # Largest distance of a reference from the craniotomy [m].
 NEAR_DISTANCE = 0.2  # Distance from the head within which a tool in use comes at some time [m].
 MAX_TOOL_DEPTH = 0.03  # Largest depth of a tool's tip or markers inside the brain [m]: no model includes such a cut.
-MAX_TOOL_DISTANCE = (
-    1.0  # Largest distance of a laid-down tool from the head [m]: beyond, no tracker of this patient sees it.
-)
+# Largest distance of a laid-down tool from the head [m]: beyond, no tracker of this patient sees it.
+MAX_TOOL_DISTANCE = 1.0
 
 
 def describe_implausible(registration: Registration, stage: Stage, camera: Camera) -> str:

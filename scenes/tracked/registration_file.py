@@ -19,9 +19,8 @@ FORMAT = "sulcus registration 1"  # Name and version of the file format.
 REMEDY = "Make one by `sulcus register`."  # Remedy in error messages.
 MAX_FILE_BYTES = 1 << 16  # Maximum size of a valid file [bytes].
 ROTATION_TOLERANCE = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles.
-EIGENVALUE_TOLERANCE = (
-    1e-9  # Share of its largest eigenvalue by which a covariance's smallest may be below 0, by rounding.
-)
+# Share of its largest eigenvalue by which a covariance's smallest may be below 0, by rounding.
+EIGENVALUE_TOLERANCE = 1e-9
 SCAN_TOLERANCE = 5e-3  # Largest difference of bounds and tumour between two meshes of one scan [m].
 _UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres and radians to millimetres and radians.
 

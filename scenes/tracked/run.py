@@ -22,9 +22,8 @@ from .truth import OverlayError
 
 LATENCY_EDGES = (0, 20, 40, 60, 80, 100, 150, 200, 300, 500, 1000)  # Edges of the histogram of latencies [ms].
 STALE_AGE = 0.2  # Age at which an image is stale [s].
-MIN_OCCLUDER_GREY = (
-    32  # Smallest grey level of an occluder in a mask video, where black is not exactly 0; in a mask PNG it is 1.
-)
+# Smallest grey level of an occluder in a mask video, where black is not exactly 0; in a mask PNG it is 1.
+MIN_OCCLUDER_GREY = 32
 # Column names of the table of results.
 COLUMNS = (
     "time_s", "state", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", "motion_off_mm", "within_mm",

@@ -17,9 +17,8 @@ from ..play.stage import Stage
 from ..script.uncertainty import BOUND_DEVIATIONS
 
 NO_ERROR_WARNING = "the model states no error: do not rely on it"  # Warning in the image.
-TOO_DEEP_WARNING = (
-    "the tool is farther inside the brain than the model knows: do not rely on it"  # Warning in the image.
-)
+# Warning in the image.
+TOO_DEEP_WARNING = "the tool is farther inside the brain than the model knows: do not rely on it"
 
 
 @dataclass(frozen=True, eq=False)
