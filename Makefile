@@ -9,7 +9,7 @@ PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py tests/test_scenes_ov
 QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile scenes_solve \
 	sim_readme surrogate_conformal surrogate_store ar_camera ar_rasteriser ar_outlines scenes_tissue_options scenes_outputs
 
-.PHONY: demo quick test test-of test-gpu docs lint template locator bench bench-check clean
+.PHONY: demo quick test test-of test-gpu docs thumbnails lint template locator bench bench-check clean
 
 demo: $(STAMP)
 	$(VENV)/bin/sulcus demo
@@ -65,6 +65,10 @@ bench-check: $(STAMP)
 # The pages for the browser, from docs/: open build/docs/index.html. Warnings are errors.
 docs: $(STAMP)
 	$(VENV)/bin/python -m sphinx -W --keep-going docs build/docs
+
+# Images of the examples in docs/examples: each script runs. Two minutes on two cores.
+thumbnails: $(STAMP)
+	CUDA_VISIBLE_DEVICES= MPLBACKEND=agg $(VENV)/bin/python docs/extensions/thumbnails.py $(NAME)
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

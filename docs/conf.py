@@ -52,7 +52,9 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "show_signature": False,
     "write_computation_times": False,
-    "default_thumb_file": str(Path(__file__).parent / "static/example.png"),
+    # Of docs/examples, by `make thumbnails`.
+    "thumbnail_size": (320, 224),
+    "remove_config_comments": True,
 }
 
 html_theme = "pydata_sphinx_theme"

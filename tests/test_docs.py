@@ -82,6 +82,15 @@ def test_every_source_is_a_page_and_every_example_too(pages):
     assert not {"generated/examples/gone", "generated/sim/gone"} & set(pages)
 
 
+def test_every_example_has_an_image_of_its_own(site):
+    shown = (site / "generated/examples/index.html").read_text()
+    names = {path.stem for path in (HOUSE / "examples").glob("*.py")}
+    images = {path.stem: path.read_bytes() for path in (HOUSE / "docs/examples").iterdir()}
+    assert set(images) == names and len(set(images.values())) == len(names)
+    assert max(map(len, images.values())) <= 15_000
+    assert set(re.findall(r"sphx_glr_(\w+)_thumb\.webp", shown)) == names
+
+
 def test_who_wants_to_contribute_finds_how(site, pages):
     assert "generated/contributing.html" in pages["develop"].links
     assert "Structure" in (site / "generated/contributing.html").read_text()

@@ -1,4 +1,4 @@
-"""The scripts in examples/ as sphinx-gallery wants them: what their docstrings begin with is the title, underlined."""
+"""The scripts in examples/ as sphinx-gallery wants them: an underlined title, and the image of docs/examples."""
 
 from __future__ import annotations
 
@@ -34,4 +34,5 @@ def copy_scripts(source: Path, target: Path, header: str) -> None:
         old.unlink()
     (target / "GALLERY_HEADER.rst").write_text(header)
     for script in sorted(source.glob("*.py")):
-        (target / script.name).write_text(gallery_script(script.read_text()))
+        image = f"# sphinx_gallery_thumbnail_path = 'examples/{script.stem}.webp'\n"
+        (target / script.name).write_text(gallery_script(script.read_text()) + image)
