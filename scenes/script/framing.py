@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from ar.optics.camera import Camera, look_at
 from sim.geometry.closest_point import find_closest_points
@@ -102,7 +102,7 @@ def build_rims(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray]:
 
 def compute_visible_share(camera: Camera, surface: np.ndarray, rims: tuple[np.ndarray, np.ndarray]) -> float:
     """Return the share of a surface's outline inside the opening, as a camera sees it; surface (n, 3) [m]."""
-    hull = _build_hull(camera.project(surface)[0])
+    hull = _find_hull(camera.project(surface)[0])
     steps = np.linalg.norm(np.roll(hull, -1, axis=0) - hull, axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     at = np.linspace(0.0, along[-1], OUTLINE_COUNT, endpoint=False)
@@ -110,7 +110,7 @@ def compute_visible_share(camera: Camera, surface: np.ndarray, rims: tuple[np.nd
     outline = np.stack([np.interp(at, along, closed[:, axis]) for axis in (0, 1)], axis=1)
     inside = np.ones(OUTLINE_COUNT, bool)
     for rim in rims:
-        polygon = _build_hull(camera.project(rim)[0])
+        polygon = _find_hull(camera.project(rim)[0])
         edge = np.roll(polygon, -1, axis=0) - polygon
         arm = outline[:, None] - polygon
         side = edge[:, 0] * arm[..., 1] - edge[:, 1] * arm[..., 0]
@@ -118,8 +118,8 @@ def compute_visible_share(camera: Camera, surface: np.ndarray, rims: tuple[np.nd
     return float(inside.mean())
 
 
-def _build_hull(points: np.ndarray) -> np.ndarray:
-    return cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)
+def _find_hull(points: np.ndarray) -> np.ndarray:
+    return points[ConvexHull(points).vertices]
 
 
 def fit_field(
