@@ -1,5 +1,9 @@
 """Controls of the page: sliders, styles, scenes and manual control of the tool."""
 
+from typing import cast
+
+import numpy as np
+import pytest
 from theatres import short, sinking, small
 
 from ar.page.parts import Dropdown, Fold, Slider
@@ -32,7 +36,7 @@ class TestControls:
             control.label
             for control in build_controls(short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
         ]
-        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-4] == "slices"
+        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-5] == "slices"
 
     def test_every_overlay_style_is_offered(self, theatre):
         wish = Requests("fem", Touch())
@@ -57,7 +61,11 @@ class TestControls:
             seen.append(wish.path)
         assert seen == ["", "stays", "hand-held", "microscope", "orbit"]
         slices.changed(TIP)
-        assert wish.look == ("window", "orbit", TIP)
+        tilt, distance = cast(Fold, found["camera position"]).controls
+        assert isinstance(tilt, Slider) and isinstance(distance, Slider) and distance.start == 300.0
+        tilt.changed(20.0)
+        distance.changed(200.0)
+        assert wish.look == ("window", "orbit", TIP, pytest.approx(-np.radians(20.0)), pytest.approx(0.2))
         assert "slices" not in {
             each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, print, print)
         }

@@ -32,6 +32,8 @@ from sim.loads import Loads, Posture, Pushed, build_posture, stack
 EFFECTS = (Elasticity(), Held(), Slide())
 STILL = guess(np.zeros((1, 3, 3)))
 
+CAMERA = "camera tilt [deg]", "camera distance [mm]"
+
 
 @pytest.fixture(scope="module")
 def frames(theatre):
@@ -109,7 +111,7 @@ class TestWithoutATool:
         demo = Demo(theatre, sinking(), "fem", "127.0.0.1", free_port())
         try:
             assert (
-                set(demo.browser.inputs) == {"scene", "deformer", "overlay", "camera", "Gravity"}
+                set(demo.browser.inputs) == {"scene", "deformer", "overlay", "camera", *CAMERA, "Gravity"}
                 and "tool" not in demo.browser.meshes
             )
             assert wait_for(lambda: demo.run(0.3) and "gravity towards" in demo.browser.shown[2])

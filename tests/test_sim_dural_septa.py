@@ -23,7 +23,7 @@ from sim.fem import Fem
 from sim.loads import push
 from sim.material import BRAIN
 
-PLAN = MeshPlan(nodes=2100)
+PLAN = MeshPlan(nodes=2100, craniotomy=0.050)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.mesher import Meshing
-from sim.bodies.subject import MeshPlan, make_anatomy
+from sim.bodies.subject import MeshPlan, choose_craniotomy, make_anatomy
 from sim.bodies.template import Head, Tumour, build_template_subject
 from sim.errors import InputError
 from sim.geometry.geodesic import compute_geodesic_distances
@@ -105,6 +105,15 @@ def test_seeds_vary_the_lobed_shape_but_not_its_volume():
     for shape in (first, other):
         assert (shape.compute_radius(directions) ** 3).mean() == pytest.approx(0.012**3, rel=5e-3)
         assert np.ptp(shape.compute_radius(directions)) > 3e-3
+
+
+def test_the_craniotomy_is_wider_than_the_tumour(subject):
+    assert (
+        choose_craniotomy(subject, MeshPlan()) == 0.05 and choose_craniotomy(subject, MeshPlan(craniotomy=0.03)) == 0.03
+    )
+    larger = [build_template_subject(Tumour(radius=radius)) for radius in (0.02, 0.03)]
+    sizes = [choose_craniotomy(each, MeshPlan()) for each in larger]
+    assert sizes == pytest.approx([0.06, 0.08], abs=1e-3)
 
 
 def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):

@@ -25,7 +25,13 @@ from sim.geometry.tetmesh import TetMesh, compute_dihedral_angles
 from sim.runtime.timing import time_stage
 
 from ..options.outputs import add_force, check_no_foreign_files, check_output_path
-from ..options.placement_options import add_opening_arguments, describe_opening, place_craniotomy
+from ..options.placement_options import (
+    CRANIOTOMY_HELP,
+    add_opening_arguments,
+    describe_opening,
+    place_craniotomy,
+    to_metres,
+)
 from ..options.shared_options import add_json
 from ..options.subject_options import (
     add_drawn_arguments,
@@ -42,7 +48,7 @@ DEFAULTS = {  # Default values of the options; lengths in millimetres, as on the
     "cover": 10.0,
     "tumour_shape": "sphere",
     "site": "central",
-    "craniotomy": 50.0,
+    "craniotomy": None,
 }
 PRESETS = {  # Values of the options that differ from the default, by preset.
     "default": {},
@@ -66,9 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of mesh nodes, 2000 to 250000",
     )
-    parser.add_argument(
-        "--craniotomy", type=float, metavar="MM", help="diameter of the opening along the cortex [mm] (default: 50)"
-    )
+    parser.add_argument("--craniotomy", type=float, metavar="MM", help=CRANIOTOMY_HELP)
     parser.add_argument(
         "--preset", choices=tuple(PRESETS), default="default", help="values of the options that are not given"
     )
@@ -92,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     beside = to_intensity_path(args.out)
     check_output_path(beside, ".gz", args.force, read)
     chosen = {**DEFAULTS, **PRESETS[args.preset], **_get_given_options(args)}
-    plan = MeshPlan(args.nodes, 1e-3 * chosen["craniotomy"], fine_opening=args.fine_opening)
+    plan = MeshPlan(args.nodes, to_metres(chosen["craniotomy"]), fine_opening=args.fine_opening)
     with time_stage("labels" if args.labels else "head" if args.mask or args.head else "template"):
         subject = place_craniotomy(_build_subject(args, chosen), args)
     for note in subject.notes:

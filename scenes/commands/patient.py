@@ -14,7 +14,7 @@ from pathlib import Path
 from sim.anatomy import PART_LABELS, REGION_NAMES
 from sim.bodies.head_masks import read_head_masks
 from sim.bodies.label_volume import build_masked_subject
-from sim.bodies.subject import MeshPlan, find_opened_cortex
+from sim.bodies.subject import MeshPlan, choose_craniotomy, find_opened_cortex
 from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, Tissue
@@ -27,9 +27,11 @@ from surrogate.data.tool_loads import PRESETS
 
 from ..options.outputs import add_force, check_output_path
 from ..options.placement_options import (
+    CRANIOTOMY_HELP,
     add_opening_arguments,
     get_trajectory_option,
     place_craniotomy,
+    to_metres,
     to_opening_options,
 )
 from ..options.shared_options import add_devices, add_json
@@ -49,12 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="anatomy to write, PATIENT.vtu; data (.h5) and models (.model.npz) are written next to it",
     )
     parser.add_argument("--nodes", type=int, default=5300, help="number of mesh nodes, 2000 to 250000")
-    parser.add_argument(
-        "--craniotomy",
-        type=float,
-        default=50.0,
-        help="diameter of the opening along the cortex [mm]",
-    )
+    parser.add_argument("--craniotomy", type=float, metavar="MM", help=CRANIOTOMY_HELP)
     add_opening_arguments(parser)
     parser.add_argument(
         "--inspect",
@@ -82,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; the same command resumes an interrupted run."""
     # Report problems now, not after minutes of reading and meshing.
-    plan = MeshPlan(args.nodes, 1e-3 * args.craniotomy, fine_opening=args.fine_opening)
+    plan = MeshPlan(args.nodes, to_metres(args.craniotomy), fine_opening=args.fine_opening)
     regions = parse_region_tissues(args.region, replace(BRAIN, law=args.material))
     strange = set(regions) - set(REGION_NAMES.values())
     if strange:
@@ -116,7 +113,8 @@ def run(args: argparse.Namespace) -> int:
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
     steps = [
         ["anatomy", *label_words(args), *t1,
-         "--nodes", str(args.nodes), "--craniotomy", str(args.craniotomy), *to_opening_options(args),
+         "--nodes", str(args.nodes), *([] if args.craniotomy is None else ["--craniotomy", str(args.craniotomy)]),
+         *to_opening_options(args),
          "--out", str(args.out)],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--tool-preset", args.tool_preset,
          "--device", args.device, "--material", args.material,
@@ -173,8 +171,9 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
     masks = read_head_masks(parse_sources(args))
     subject = place_craniotomy(build_masked_subject(masks, args.t1, regions=parse_regions(args)), args)
     found = inspect_subject(masks, subject, regions)
+    opened = find_opened_cortex(subject, choose_craniotomy(subject, plan))
     with write_atomically(picture, ".png") as partial:
-        write_png(partial, draw_inspection_sheet(found, masks, subject, find_opened_cortex(subject, plan.craniotomy)))
+        write_png(partial, draw_inspection_sheet(found, masks, subject, opened))
     took = round(time.perf_counter() - began, 2)
     if args.json:
         print(json.dumps({**found.to_json(), "picture": str(picture), "seconds": took}))

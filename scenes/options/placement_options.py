@@ -14,6 +14,9 @@ from sim.bodies.subject import Subject
 from sim.errors import InputError
 
 Point = tuple[float, float, float]
+CRANIOTOMY_HELP = (  # Help text of --craniotomy.
+    "diameter of the opening along the cortex [mm] (default: 20 mm more than the tumour, at least 50)"
+)
 LINE_POINTS = 2000  # Number of points of a trajectory that are compared with the brain.
 
 
@@ -70,6 +73,11 @@ def get_trajectory_option(args: argparse.Namespace) -> Path | None:
     """Return the file of the trajectory that the options name, if they name one."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     return given if isinstance(given, Path) and read_markup(given).kind == "Line" else None
+
+
+def to_metres(millimetres: float | None) -> float | None:
+    """Return a length [m] given in millimetres; None stays None."""
+    return None if millimetres is None else 1e-3 * millimetres
 
 
 def describe_opening(args: argparse.Namespace) -> str:

@@ -9,7 +9,6 @@ from html import escape
 import numpy as np
 
 from ar.overlay.hud import format_millimetres
-from ar.overlay.styles import Style
 from sim.deformation import Deformation
 from sim.loads import Pushed
 from surrogate.evaluation.choose import find_pareto_front
@@ -19,6 +18,7 @@ from ..play.player import Frame, Player
 from ..play.tip_reading import measure_tip_distance
 from ..script.tool_paths import compute_lift
 from .fem_worker import FemResult
+from .requests import Look
 
 # Texts: the displayed result is FEM's; FEM's result is the reference.
 FEM_SHOWN, FEM_REFERENCE = "this is the result of the FEM solver", "the truth is the result of the FEM solver"
@@ -101,7 +101,7 @@ class PageState:
     asked: tuple | None = None
     shown: FemResult | None = None
     rests: bool = False
-    look: tuple[Style, str, str] | None = None
+    look: Look | None = None
     load: str = ""
     frame: Frame | None = None
     picture: np.ndarray | None = None

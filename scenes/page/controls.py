@@ -77,6 +77,7 @@ def build_controls(
         add_overlay_controls(wish.style, lambda style: wish.set(style=style)),
         Dropdown("camera", cameras, wish.path or cameras[0], film, hint="motion of the camera"),
         *([] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]),
+        Fold("camera position", build_camera_sliders(scene, site, wish)),
         *([Fold("physics effects (on/off)", switches)] if switches else []),
         Note(PLAN),
         Note(OWN_FILM, OWN_VIDEO_NOTE),
@@ -101,6 +102,24 @@ def build_slice_control(now: str, choose: Callable[[str], None]) -> Dropdown:
     places = TUMOUR_MIDDLE, TIP
     hint = "position of the scan slices (tab slices)"
     return Dropdown("slices", places, now or places[0], choose, hint=hint)
+
+
+def build_camera_sliders(scene: Scene, site: CraniotomyFrame, wish: Requests) -> tuple[Slider, Slider]:
+    """Build the sliders of the camera's tilt and distance, at the scene's own."""
+    camera = scene.viewpoint.build_camera(site)
+    away = camera.centre - scene.viewpoint.find_target(site)
+    length = float(np.linalg.norm(away))
+    tilt = np.degrees(np.arccos(np.clip(-away @ site.axis / length, -1.0, 1.0)))
+    return (
+        Slider(
+            "camera tilt [deg]", -60.0, 60.0, 1.0, round(float(tilt)), lambda value: wish.set(tilt=-np.radians(value)),
+            words="tilt [deg]", hint="angle between the line of sight and the axis of the craniotomy",
+        ),
+        Slider(
+            "camera distance [mm]", 150.0, 600.0, 10.0, round(1e3 * length, -1),
+            lambda value: wish.set(distance=1e-3 * value), words="distance [mm]", hint="a smaller distance magnifies",
+        ),
+    )  # fmt: skip
 
 
 def list_switchable_effects(scene: Scene, site: CraniotomyFrame) -> list[str]:

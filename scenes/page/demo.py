@@ -35,7 +35,7 @@ from .comparison import (
 )
 from .controls import PLAN, build_controls, is_animated, to_slider_values
 from .fem_worker import FemResult, FemWorker
-from .requests import HAND, SCRIPT, Requests, describe_holder
+from .requests import HAND, SCRIPT, Look, Requests, describe_holder
 from .scene_solvers import SceneSolvers
 from .side_panels import list_lines, render_slices, sample_of
 from .text import describe_effect, describe_work, format_caption, format_pending, plan_words, report
@@ -285,11 +285,10 @@ class Demo:
         now.picture = render_page_image(now.frame)
         self._show_side_panels(now.frame, player)
 
-    def _get_player(self, asked: tuple, look: tuple[Style, str, str]) -> Player:
+    def _get_player(self, asked: tuple, look: Look) -> Player:
         """Return the player of a request, in the given style."""
         _, name, _, off = asked
-        style, path, _ = look
-        return replace(self.cast.get_player_on_path("fem" if off else name, off, path), style=style)
+        return replace(self.cast.get_player_with_camera("fem" if off else name, off, look), style=look.style)
 
     def _show_side_panels(self, frame: Frame, player: Player) -> None:
         """Show slices of a frame, and the chart of recent values, when there is time for it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from ar.overlay.styles import Style
 
@@ -13,12 +14,23 @@ from ..script.tool_paths import Touch
 SCRIPT, HAND = "automatic", "manual"  # Control of the tool: scripted, manual.
 
 
+class Look(NamedTuple):
+    """Display style of a solution: of the overlay, the camera's path, position of the slices, and camera position."""
+
+    style: Style
+    path: str = ""
+    through: str = ""
+    tilt: float | None = None
+    distance: float | None = None
+
+
 @dataclass
 class Requests:
     """Requests of the users, written by the page's threads and read by the loop, under its lock.
 
-    `path` is the name of the camera's motion; "": the scene's own. `through` is the position of the slices.
-    `clocked` is true if the scene evolves without tool input: otherwise manual control pauses the script.
+    `path` is the name of the camera's motion; "": the scene's own. `tilt` [rad] and `distance` [m] move the camera;
+    None: as the scene has it. `through` is the position of the slices. `clocked` is true if
+    the scene evolves without tool input: otherwise manual control pauses the script.
     """
 
     deformer: str
@@ -32,6 +44,8 @@ class Requests:
     style: Style = "window"
     path: str = ""
     through: str = ""
+    tilt: float | None = None
+    distance: float | None = None
     clocked: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -61,10 +75,10 @@ class Requests:
             self.off = self.off - {effect} if on else self.off | {effect}
 
     @property
-    def look(self) -> tuple[Style, str, str]:
-        """Display style of a solution: the overlay's style, the camera's path, and the position of the slices."""
+    def look(self) -> Look:
+        """Display style of a solution."""
         with self.lock:
-            return self.style, self.path, self.through
+            return Look(self.style, self.path, self.through, self.tilt, self.distance)
 
     def read_current(self) -> tuple[int, str, Touch | None, frozenset[str]]:
         """Frame number, deformer, hand-set touch (None: the script's) and effects that are off."""

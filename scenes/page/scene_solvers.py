@@ -17,6 +17,7 @@ from ..play.stage import Stage
 from ..script.camera_paths import PATHS
 from ..script.scene import Scene
 from .fem_worker import FemResult, FemWorker, Question
+from .requests import Look
 
 ALL_ACTIVE: frozenset[str] = frozenset()
 """Disabled effects when all effects are active."""
@@ -40,7 +41,7 @@ class SceneSolvers:
         # Not on a GPU: rendering while a solver's thread records a CUDA graph would be recorded, too.
         self.stages = {ALL_ACTIVE: replace(theatre.build_stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
-        self.filmed: dict[tuple[frozenset[str], str], Stage] = {}
+        self.filmed: dict[tuple, Stage] = {}
         self.last: dict[str, Deformation] = {}
         self.sessions: dict[str, ReplaySession] = {}
         self.solvers: dict[frozenset[str], FemWorker] = {}
@@ -79,15 +80,22 @@ class SceneSolvers:
             self.players[name, off] = Player(stage, deformer, uncertainty=uncertainty)
         return self.players[name, off]
 
-    def get_player_on_path(self, name: str, off: frozenset[str], path: str) -> Player:
-        """Return the same, with the camera on a path of that name; "" as the scene has it."""
-        player = self.get_player(name, off)
-        if not path:
+    def get_player_with_camera(self, name: str, off: frozenset[str], look: Look) -> Player:
+        """Return the same, with the camera of a display style."""
+        player, key = self.get_player(name, off), (off, look.path, look.tilt, look.distance)
+        if key[1:] == ("", None, None):
             return player
-        if (off, path) not in self.filmed:
-            view = replace(player.scene.viewpoint, path=PATHS[path](0) if path in PATHS else None)
-            self.filmed[off, path] = replace(player.stage, scene=replace(player.scene, viewpoint=view))
-        return replace(player, stage=self.filmed[off, path])
+        if key not in self.filmed:
+            view = player.scene.viewpoint
+            if look.path:
+                view = replace(view, path=PATHS[look.path](0) if look.path in PATHS else None)
+            if look.tilt is not None:
+                view = replace(view, tilt=look.tilt)
+            if look.distance is not None:
+                view = replace(view, distance=look.distance)
+            # Only the newest is kept: a slider passes through many.
+            self.filmed = {key: replace(player.stage, scene=replace(player.scene, viewpoint=view))}
+        return replace(player, stage=self.filmed[key])
 
     def _build_trained(self, name: str, scene: Scene) -> Deformer:
         """Return a trained model. Its FEM fallback is built under `turn`, on the CPU like the stages."""

@@ -150,5 +150,5 @@ def annotate(over: Overlaid, number: int, remark: str) -> None:
 
 
 def label_frame(number: int) -> list[str]:
-    """Return the lines that label an image: that it is simulated, and its frame number."""
-    return ["simulation", f"frame {number}"]
+    """Return the lines that label an image: its frame number, and that it is simulated."""
+    return [f"frame {number}", "simulation"]

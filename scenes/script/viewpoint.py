@@ -69,6 +69,7 @@ PLAIN_APPEARANCE = Appearance()
 """Default look of scenes."""
 
 
+WORKING_DISTANCE = 0.30  # Distance of an operating microscope from the cortex [m].
 TARGET_DEPTH = 10e-3  # Depth under the cortex of the camera's target [m]: between the tool and the tumour.
 Eye = Literal["left", "right"]
 
@@ -80,12 +81,13 @@ class Viewpoint:
     Parameters
     ----------
     distance
-        Distance from the target [m]: by default a usual working distance of an operating microscope.
+        Distance from the target [m]: by default the working distance of an operating microscope.
     tilt
         Angle [rad] of the direction to the camera, from the outward normal towards the site's `up`. None: as oblique as
         the tumour stays visible through the craniotomy, see `find_framing`.
     fov
-        Vertical field of view [rad]. None: craniotomy, tumour and its error band fill the image.
+        Vertical field of view [rad]. None: the image contains craniotomy, tumour and error band, if the distance is
+        the default.
     width, height
         Image size [pixel].
     calibration
@@ -104,7 +106,7 @@ class Viewpoint:
         A calibration for another image size, another eye than left and right, or a field that is not > 0.
     """
 
-    distance: float = 0.30
+    distance: float = WORKING_DISTANCE
     tilt: float | None = None
     fov: float | None = None
     width: int = 640
@@ -138,7 +140,7 @@ class Viewpoint:
     def find_framing(self, site: CraniotomyFrame) -> Framing:
         """Return the framing of the tumour, with this viewpoint's tilt if it has one."""
         direction = None if self.tilt is None else (-self.tilt, 0.0)
-        return find_framing(site, self.distance, self.width / self.height, direction)
+        return find_framing(site, WORKING_DISTANCE, self.width / self.height, direction)
 
     def build_camera(self, site: CraniotomyFrame, time: float = 0.0) -> Camera:
         """Return the camera that looks at a site at a time [s]."""

@@ -26,6 +26,8 @@ MAX_NODES = 250_000  # maximum mesh nodes
 SAMPLE_WEIGHTS = np.array([corners for corners in product(range(4), repeat=4) if sum(corners) == 3]) / 4.0 + 1.0 / 16.0
 MIN_CRANIOTOMY = 0.015  # minimum diameter [m]
 MAX_CRANIOTOMY = 0.120  # maximum diameter [m]
+USUAL_CRANIOTOMY = 0.050  # smallest diameter that is chosen [m]
+TUMOUR_MARGIN = 10e-3  # distance of the chosen edge from the tumour, as seen from outside [m]
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class MeshPlan:
     nodes
         Requested number of nodes.
     craniotomy
-        Diameter of the craniotomy along the cortex [m].
+        Diameter of the craniotomy along the cortex [m]. None: by the tumour, see `choose_craniotomy`.
     meshing
         Mesh generation and smoothing.
     placement
@@ -52,7 +54,7 @@ class MeshPlan:
     """
 
     nodes: int = 5300
-    craniotomy: float = 0.050
+    craniotomy: float | None = None
     meshing: Meshing = field(default_factory=Meshing)
     placement: Placement = field(default_factory=Placement)
     fine_opening: bool = False
@@ -60,7 +62,7 @@ class MeshPlan:
     def __post_init__(self) -> None:
         if not MIN_NODES <= self.nodes <= MAX_NODES:
             raise InputError(f"{self.nodes} nodes are outside {MIN_NODES} to {MAX_NODES}: choose a number between.")
-        if not MIN_CRANIOTOMY <= self.craniotomy <= MAX_CRANIOTOMY:
+        if self.craniotomy is not None and not MIN_CRANIOTOMY <= self.craniotomy <= MAX_CRANIOTOMY:
             raise InputError(
                 f"a craniotomy of {self.craniotomy * 1e3:g} mm is outside {MIN_CRANIOTOMY * 1e3:g} to "
                 f"{MAX_CRANIOTOMY * 1e3:g} mm: choose a diameter between."
@@ -129,14 +131,26 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     InputError
         Input that `build_mesh` or `add_boundary_conditions` rejects.
     """
-    opening = subject.cortex[find_opened_cortex(subject, plan.craniotomy)]
+    craniotomy = choose_craniotomy(subject, plan)
+    opening = subject.cortex[find_opened_cortex(subject, craniotomy)]
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     solids = Solids(
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
     mesh = _assign_parts(build_mesh(solids, plan.nodes, plan.meshing), subject)
-    made = add_boundary_conditions(mesh, subject.site, plan.craniotomy, plan.placement, subject.outline, subject.septa)
+    made = add_boundary_conditions(mesh, subject.site, craniotomy, plan.placement, subject.outline, subject.septa)
     return refine(made, near_opening=True) if plan.fine_opening else made
+
+
+def choose_craniotomy(subject: Subject, plan: MeshPlan) -> float:
+    """Return the plan's diameter of the craniotomy [m], or 10 mm more than the tumour on all sides; 50 to 120 mm."""
+    if plan.craniotomy is not None:
+        return plan.craniotomy
+    centre = subject.interface.mean(axis=0)
+    axis = (centre - subject.site) / max(float(np.linalg.norm(centre - subject.site)), 1e-9)
+    arm = subject.interface - centre
+    aside = np.linalg.norm(arm - np.outer(arm @ axis, axis), axis=1)
+    return float(np.clip(2.0 * (np.percentile(aside, 95.0) + TUMOUR_MARGIN), USUAL_CRANIOTOMY, MAX_CRANIOTOMY))
 
 
 def _assign_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
