@@ -43,12 +43,7 @@ class Outcome(Enum):
     @property
     def good(self) -> bool:
         """Return True if the result is reliable."""
-        return self in (
-            Outcome.CONVERGED,
-            Outcome.CONVERGED_ANEW,
-            Outcome.CONVERGED_IN_STEPS,
-            Outcome.PREDICTED,
-        )
+        return self in (Outcome.CONVERGED, Outcome.CONVERGED_ANEW, Outcome.CONVERGED_IN_STEPS, Outcome.PREDICTED)
 
 
 @dataclass(frozen=True)

@@ -105,13 +105,7 @@ BuiltIn = Pushed | Displaced | Nodal | Prescribed | Posture | Resected | Touchin
 Cause = BuiltIn | OwnCause  # all causes
 C = TypeVar("C", bound=Cause)
 # Array of each cause that scales with the load; the others give its location. Tools move with `Cases.share`.
-MAGNITUDE = {
-    Pushed: "force",
-    Displaced: "displacement",
-    Nodal: "force",
-    Prescribed: "displacement",
-    Posture: "share",
-}
+MAGNITUDE = {Pushed: "force", Displaced: "displacement", Nodal: "force", Prescribed: "displacement", Posture: "share"}
 # arrays with one number per load case
 SCALARS = ("footprint", "csf_level", "share", "done")
 MIN_FOOTPRINT = 1e-4  # minimum footprint radius [m], below a needle's tip

@@ -4,9 +4,7 @@ import json
 
 import pytest
 
-from scenes.analysis.error_budget import (
-    CLINICAL,
-)
+from scenes.analysis.error_budget import CLINICAL
 from scenes.cli import main
 from scenes.script.uncertainty import SURROGATE
 from sim.bodies.meshfile import write_anatomy

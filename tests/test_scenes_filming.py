@@ -53,10 +53,7 @@ def grey(shot):
 def test_both_targets_are_seen_where_they_are(player, shots):
     mounts = mount_targets(player)
     seen = Tracker(SMALL.build_camera(np.eye(4)), TARGETS).track(grey(shots[0]))
-    wanted = {
-        "tool": shots[0].T_scan_tool @ np.linalg.inv(mounts.tool.T_cube_tool),
-        "patient": mounts.T_scan_patient,
-    }
+    wanted = {"tool": shots[0].T_scan_tool @ np.linalg.inv(mounts.tool.T_cube_tool), "patient": mounts.T_scan_patient}
     assert set(seen.poses) == set(wanted)
     for name, T_scan_target in wanted.items():
         off = seen.poses[name].T_camera_target - shots[0].T_camera_scan @ T_scan_target

@@ -83,12 +83,7 @@ class TestOpenings:
     def test_what_lies_elsewhere_or_is_of_another_kind_is_refused(self, folder, capsys):
         for option, points, kind, reason in (
             ("--opening-at", [[0.0, 0.0, 90.0]], "Fiducial", "from the nearest cortex"),
-            (
-                "--opening-at",
-                [[0.0, 0.0, 55.0]] * 2,
-                "Fiducial",
-                "holds a list of 2 points; --opening-at takes one",
-            ),
+            ("--opening-at", [[0.0, 0.0, 55.0]] * 2, "Fiducial", "holds a list of 2 points; --opening-at takes one"),
             ("--opening-at", curve(), "Curve", "holds an open curve; --opening-at takes one point or"),
             ("--opening-at", [[0.0, 0.0, 55.0]], "Plane", "holds a plane; --opening-at takes"),
             ("--opening-over", curve(), "ClosedCurve", "--opening-over takes one point or a line of two points"),

@@ -160,16 +160,7 @@ def test_a_scene_costs_its_effects_and_nothing_else(witnessed, scene):
 
 
 @pytest.mark.parametrize(
-    "more",
-    [
-        "Inertia",
-        "Pulsation",
-        "NodalForce",
-        "ToolDisplacement",
-        "ToolContact",
-        "Retraction",
-        "Inertia+Gravity",
-    ],
+    "more", ["Inertia", "Pulsation", "NodalForce", "ToolDisplacement", "ToolContact", "Retraction", "Inertia+Gravity"]
 )
 def test_one_more_effect_costs_itself_alone(witnessed, more):
     check(witnessed("press", more), [*effects_of("press"), *more.split("+")], get_law_name("press"))

@@ -203,10 +203,7 @@ IMPORT = "from scenes.script.scene import Scene"
             f"{IMPORT}\nSCENE = Scene('a', '', duration=1e12)",
             r"line 2: the scene a lasts 1e\+12 s at 30 frames a second: that is more than 108,000 frames\.",
         ),
-        (
-            f"{IMPORT}\nSCENE = Scene('a', '', duration='long')",
-            "line 2: the scene a has duration 'long': give",
-        ),
+        (f"{IMPORT}\nSCENE = Scene('a', '', duration='long')", "line 2: the scene a has duration 'long': give"),
         (f"{IMPORT}\nSCENE = Scene('a', '', frames_per_second=0)", "has frames_per_second 0: give a number above 0"),
         (f"{IMPORT}\nSCENE = Scene('a', '', lambda t: None)", "my.py: at 0 s its path gives a NoneType. Make it a"),
         (f"{IMPORT}\nSCENE = Scene('a', '', lambda t: 1 / t)", "my.py, line 2: raised ZeroDivisionError"),

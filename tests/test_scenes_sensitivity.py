@@ -229,11 +229,7 @@ def test_the_command(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (["--out", "table.txt"], ".csv"),
-        (["--anatomy", "none.vtu"], "no such file"),
-    ],
+    ("words", "reason"), [(["--out", "table.txt"], ".csv"), (["--anatomy", "none.vtu"], "no such file")]
 )
 def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -3,10 +3,7 @@
 from test_scenes_engine import PLAN
 from tiny_work import Made, tiny_run
 
-from scenes.episodes.run_folder import (
-    begin,
-    describe_versions,
-)
+from scenes.episodes.run_folder import begin, describe_versions
 from scenes.episodes.tasks import try_task
 
 

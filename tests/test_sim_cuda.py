@@ -32,10 +32,7 @@ from sim.strategy.frame_sequence import Kept
 from sim.tools import Ball, Spatula
 from surrogate.data.tool_loads import draw
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here"),
-]
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")]
 BOUND = {"float64": 1e-6, "float32": 2e-3}
 """Largest difference over the largest motion: both stop at a residual, not at the same iterate."""
 

@@ -260,13 +260,7 @@ def test_no_load_is_exactly_no_motion() -> None:
 
 def test_an_overload_says_how_far_it_got() -> None:
     """A hundred times too much, and next to no time for it."""
-    case = Hard(
-        "",
-        BLOCK,
-        soft("neo-hookean"),
-        100.0 * pressed(),
-        accuracy=Accuracy(TOLERANCE, outer=6, steps=6),
-    )
+    case = Hard("", BLOCK, soft("neo-hookean"), 100.0 * pressed(), accuracy=Accuracy(TOLERANCE, outer=6, steps=6))
     found = case.solve()
     assert found.outcome[0] in STOPPED
     assert 0.0 < found.reached[0] < 1.0

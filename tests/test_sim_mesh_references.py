@@ -76,11 +76,7 @@ def test_hdf5_of_a_mesh_holds_its_arrays_itself(tmp_path: Path, name: str, way: 
             file.create_virtual_dataset(place[0], layout)
         if way == "declared":  # chunks that are missing are zeros
             file.create_dataset(place[0], (100_000_000, 3), "f8", chunks=(100_000, 3))
-    words = {
-        "external": "lies in another file",
-        "virtual": "lies in another file",
-        "declared": "more than it holds",
-    }
+    words = {"external": "lies in another file", "virtual": "lies in another file", "declared": "more than it holds"}
     with pytest.raises(InputError, match=words.get(way, "is a link of .* to another place")):
         read_mesh(path)
 

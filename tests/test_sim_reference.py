@@ -54,12 +54,7 @@ def reference(name: str, law: str) -> Reference:
 
 @pytest.mark.parametrize(
     ("name", "law"),
-    [
-        ("base", "neo-hookean"),
-        ("incl", "neo-hookean"),
-        ("snh", "stable-neo-hookean"),
-        ("corot", "corotational"),
-    ],
+    [("base", "neo-hookean"), ("incl", "neo-hookean"), ("snh", "stable-neo-hookean"), ("corot", "corotational")],
 )
 def test_matches_the_independent_solution(name: str, law: str) -> None:
     case = reference(name, law)

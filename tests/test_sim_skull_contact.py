@@ -147,10 +147,7 @@ def test_a_body_that_turns_slides_along_a_round_skull() -> None:
 
 @pytest.mark.parametrize(
     ("effects", "sentence"),
-    [
-        ((Slide(), SkullContact()), "Slide and SkullContact"),
-        ((SkullContact(), SkullContact(2e-4)), "2 times"),
-    ],
+    [((Slide(), SkullContact()), "Slide and SkullContact"), ((SkullContact(), SkullContact(2e-4)), "2 times")],
 )
 def test_contradictions_are_sentences(effects: tuple[Effect, ...], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):

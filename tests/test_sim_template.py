@@ -161,9 +161,6 @@ def test_what_cannot_be_placed_is_refused(subject):
             Tumour(**values)
     with pytest.raises(InputError, match="reaches out of the brain"):
         build_template_subject(Tumour(radius=0.035, cover=0.06, site="frontal"))
-    for values, reason in (
-        ({"nodes": 100}, "100 nodes are outside"),
-        ({"craniotomy": 0.2}, "outside 15 to 120 mm"),
-    ):
+    for values, reason in (({"nodes": 100}, "100 nodes are outside"), ({"craniotomy": 0.2}, "outside 15 to 120 mm")):
         with pytest.raises(InputError, match=reason):
             MeshPlan(**values)

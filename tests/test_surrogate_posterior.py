@@ -11,13 +11,7 @@ from sim.geometry.locate import Located
 from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT_ERROR, SIGMA, SLIPPED_ERROR, TURN_PER_SHIFT, build_motion_evidence
 from surrogate.locating.observation import Observation, place_again
-from surrogate.locating.posterior import (
-    POSTERIOR,
-    ObservedPrior,
-    Posterior,
-    build_observed_prior,
-    condition_prior,
-)
+from surrogate.locating.posterior import POSTERIOR, ObservedPrior, Posterior, build_observed_prior, condition_prior
 from surrogate.locating.prior import CAUSE_SETS, NO_PLACE, OTHER_CAUSES, PLACE_SETS, RIGID_RATIOS, MotionPrior
 from surrogate.locating.whitened import whiten
 

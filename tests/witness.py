@@ -31,10 +31,7 @@ from sim.tools import Ball, Spatula
 
 LAUNCHED: set[str] = set()
 PACKAGES = ("sim.terms.contact", "sim.terms.laws")
-TISSUES = {
-    "ogden": Ogden(((1340.0, -2.0),), 3e4),
-    "prony": Material("neo-hookean", 3000.0, 0.45, ((0.4, 0.5),)),
-}
+TISSUES = {"ogden": Ogden(((1340.0, -2.0),), 3e4), "prony": Material("neo-hookean", 3000.0, 0.45, ((0.4, 0.5),))}
 MADE = {"ToolContact": known.ToolContact((Ball(7e-3),)), "Retraction": known.Retraction(Spatula(12e-3, 20e-3, 1e-3))}
 HEAVY = ("torch", "sim.linalg.dense_inverse", "pyamg", "sim.linalg.amg", "viser", "sklearn", "onnx")
 

@@ -31,12 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--points", type=int, default=100, help="that are seen in a frame")
     parser.add_argument("--cover", type=int, default=80, help="share of the open cortex [%%]")
     parser.add_argument(
-        "--noise",
-        nargs="+",
-        type=int,
-        default=[0, 1, 2],
-        choices=(0, 1, 2),
-        help="levels, as of `benchmarks locate`",
+        "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2), help="levels, as of `benchmarks locate`"
     )
     add_seed(parser, "the patients")
     add_device(parser)

@@ -73,10 +73,7 @@ def steps(*presets: str) -> tuple[Reading, ...]:
     )
 
 
-TOGETHER = (
-    _larger("the tools together", "loads/s", "tools", 0, "rate"),
-    _smaller("set-up", "s", "tools", 0, "set_up"),
-)
+TOGETHER = (_larger("the tools together", "loads/s", "tools", 0, "rate"), _smaller("set-up", "s", "tools", 0, "set_up"))
 """All tools of `bench throughput` on its first tissue."""
 
 LIVE = tuple(

@@ -129,11 +129,7 @@ def from_angles(angular: np.ndarray) -> np.ndarray:
 
 
 def published_model(
-    name: str,
-    anatomy: Anatomy,
-    loads: Loads,
-    truth: np.ndarray,
-    progress: Callable[[], object] = lambda: None,
+    name: str, anatomy: Anatomy, loads: Loads, truth: np.ndarray, progress: Callable[[], object] = lambda: None
 ) -> Published:
     """Fit a learner of `MACHINES` to displacements `truth` (B, k, 3) [m] of `published_nodes`; vertices side by side.
 

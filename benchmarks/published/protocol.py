@@ -66,11 +66,7 @@ def positions_of(loads: Loads) -> np.ndarray:
 
 
 def trained_in_turn(
-    name: str,
-    anatomy: Anatomy,
-    loads: Loads,
-    truth: np.ndarray,
-    progress: Callable[[], object] = lambda: None,
+    name: str, anatomy: Anatomy, loads: Loads, truth: np.ndarray, progress: Callable[[], object] = lambda: None
 ) -> InTurn:
     """Train `name` once for each position, on the loads at the others; `truth` (B, k, 3) [m] is of `published_nodes`.
 

@@ -6,8 +6,5 @@ from ..script.scene import Scene
 from ..script.tool_paths import draw
 
 SCENE = Scene(
-    "draw",
-    __doc__ or "",
-    draw(force=0.25, tilt=np.radians(38.0), rise=1.2, hold=0.8, at=(-0.008, 0.0)),
-    duration=4.2,
+    "draw", __doc__ or "", draw(force=0.25, tilt=np.radians(38.0), rise=1.2, hold=0.8, at=(-0.008, 0.0)), duration=4.2
 )

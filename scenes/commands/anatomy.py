@@ -65,13 +65,7 @@ MIN_REPORTED_LOSS = 3.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("--out", required=True, type=Path, metavar="MESH.vtu", help="mesh to write [m, RAS]")
-    parser.add_argument(
-        "--nodes",
-        type=int,
-        default=5300,
-        metavar="N",
-        help="number of mesh nodes, 2000 to 250000",
-    )
+    parser.add_argument("--nodes", type=int, default=5300, metavar="N", help="number of mesh nodes, 2000 to 250000")
     parser.add_argument("--craniotomy", type=float, metavar="MM", help=CRANIOTOMY_HELP)
     parser.add_argument(
         "--preset", choices=tuple(PRESETS), default="default", help="values of the options that are not given"

@@ -62,22 +62,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--registration", type=Path, metavar="R.json",
         help="from `sulcus register` (default: a published 1.56 mm along each axis)",
     )  # fmt: skip
-    parser.add_argument(
-        "--corner-noise",
-        type=float,
-        default=0.1,
-        help="standard deviation of a marker corner [pixel]",
-    )
+    parser.add_argument("--corner-noise", type=float, default=0.1, help="standard deviation of a marker corner [pixel]")
     parser.add_argument(
         "--latency", type=float, default=0.0,
         help="delay between the tracked and the drawn image [ms]",
     )  # fmt: skip
-    parser.add_argument(
-        "--time-noise",
-        type=float,
-        default=5.0,
-        help="standard deviation of image and pose times [ms]",
-    )
+    parser.add_argument("--time-noise", type=float, default=5.0, help="standard deviation of image and pose times [ms]")
     parser.add_argument(
         "--readout", type=float,
         help="readout time of a rolling shutter [ms] (default: `readout_time` of --camera, or none)",

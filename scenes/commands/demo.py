@@ -30,9 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_camera(parser)
     add_style(parser)
     parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="network address of the server; users of other machines need a token",
+        "--host", default="127.0.0.1", help="network address of the server; users of other machines need a token"
     )
     parser.add_argument("--port", type=int, default=8080, help="port, or the next free one")
     add_address(parser)

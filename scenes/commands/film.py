@@ -44,11 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, help="duration of the recorded part of the scene [s] (default: all)")
     parser.add_argument("--png", action="store_true", help="write lossless DIR/frames/*.png instead of film.mp4")
     parser.add_argument(
-        "--blur",
-        type=float,
-        default=0.5,
-        metavar="PX",
-        help="standard deviation of the lens blur [pixel]",
+        "--blur", type=float, default=0.5, metavar="PX", help="standard deviation of the lens blur [pixel]"
     )
     parser.add_argument("--noise", type=float, default=2.0, help="standard deviation of the pixel noise, of 255")
     parser.add_argument(

@@ -67,19 +67,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     names = parser.add_argument_group(what)
     names.add_argument("--tool-name", default="StylusTipToReference", help="name of the incoming tool transform")
     names.add_argument(
-        "--reference-name",
-        default="ReferenceToTracker",
-        help="name of the incoming reference transform, AToTracker",
+        "--reference-name", default="ReferenceToTracker", help="name of the incoming reference transform, AToTracker"
     )
+    names.add_argument("--camera-name", default="CameraToReference", help="name of the incoming camera transform")
     names.add_argument(
-        "--camera-name",
-        default="CameraToReference",
-        help="name of the incoming camera transform",
-    )
-    names.add_argument(
-        "--registration-name",
-        default="ReferenceToRas",
-        help="name of the incoming scan registration, RAS",
+        "--registration-name", default="ReferenceToRas", help="name of the incoming scan registration, RAS"
     )
     parser.add_argument(
         "--registration",

@@ -26,11 +26,7 @@ def add_force(parser: argparse.ArgumentParser) -> None:
 
 
 def check_output_path(
-    path: str | Path,
-    suffix: str,
-    force: bool = False,
-    inputs: Sequence[str | Path | None] = (),
-    resumed: bool = False,
+    path: str | Path, suffix: str, force: bool = False, inputs: Sequence[str | Path | None] = (), resumed: bool = False
 ) -> Path:
     """Check that a file can be written and, unless `force`, does not exist; return its path without creating files.
 

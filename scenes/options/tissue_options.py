@@ -92,12 +92,7 @@ def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] =
         "contact": "frictionless sliding with separation",
     }
     said = "; ".join(f"{name}: {words[name]}" for name in choices)
-    parser.add_argument(
-        "--skull",
-        choices=choices,
-        default=choices[0],
-        help=f"boundary condition at the skull; {said}",
-    )
+    parser.add_argument("--skull", choices=choices, default=choices[0], help=f"boundary condition at the skull; {said}")
 
 
 def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMENDED) -> None:

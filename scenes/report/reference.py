@@ -95,10 +95,7 @@ def _read(study: ReportStudy, kind: str, count: int) -> ReferenceSolutions:
     kept = []
     for row in range(count):
         path = _to_answers_path(study, kind, row)
-        with (
-            read_as(path, "a solution of the reference", REMEDY),
-            path.open("rb") as raw,
-        ):
+        with read_as(path, "a solution of the reference", REMEDY), path.open("rb") as raw:
             names = "displacement", "good", "seconds"
             arrays = Archive(raw, REMEDY).read_arrays(names)
             kept.append([arrays[name] for name in names])

@@ -24,11 +24,7 @@ from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentati
 from .places import Folded, SamplePlaces, SpacingSettings, compute_fields, find_folds, list_places
 from .readme import write_readme
 
-MESH_COLOURS = {
-    "brain": (0.86, 0.72, 0.66, 0.35),
-    "cortex": (0.86, 0.60, 0.54, 1.0),
-    "tumour": (0.20, 0.94, 0.42, 1.0),
-}
+MESH_COLOURS = {"brain": (0.86, 0.72, 0.66, 0.35), "cortex": (0.86, 0.60, 0.54, 1.0), "tumour": (0.20, 0.94, 0.42, 1.0)}
 """Colours (RGBA, 0 to 1) of the surfaces."""
 MIN_MOTION = 1e-4  # Displacement above which a vertex moves [m].
 MAX_GRID_ERROR = 0.1  # Grid error at the tumour, relative to the largest motion, above which a warning is given.

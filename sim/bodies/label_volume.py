@@ -68,10 +68,7 @@ def build_volume_subject(
 
 
 def build_masked_subject(
-    masks: HeadMasks,
-    t1: str | Path | None = None,
-    settings: Labelling = Labelling(),
-    regions: Sequence[str] = (),
+    masks: HeadMasks, t1: str | Path | None = None, settings: Labelling = Labelling(), regions: Sequence[str] = ()
 ) -> Subject:
     """Return the subject whose brain and tumour are voxel masks.
 
@@ -177,12 +174,7 @@ def _extract_brain(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: l
 
 
 def _extract_tumour(
-    name: str,
-    solid: np.ndarray,
-    tumour: np.ndarray,
-    voxel: float,
-    notes: list[str],
-    settings: Labelling,
+    name: str, solid: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str], settings: Labelling
 ) -> np.ndarray:
     """Return the tumour's components in the solid, without specks."""
     inside = tumour & solid

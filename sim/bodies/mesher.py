@@ -175,10 +175,7 @@ def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
     """Return the solid on a lattice with coarsest cell `edge` [m], split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
     fine, growth = settings.fine * edge, settings.growth
-    wanted = (
-        (KDTree(solids.interface), min(fine, radius / settings.cells_per_radius)),
-        (KDTree(solids.opening), fine),
-    )
+    wanted = ((KDTree(solids.interface), min(fine, radius / settings.cells_per_radius)), (KDTree(solids.opening), fine))
     levels = min(int(np.rint(np.log2(edge / wanted[0][1]))), settings.deepest)
 
     def size(points: np.ndarray) -> np.ndarray:

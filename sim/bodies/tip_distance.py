@@ -60,12 +60,7 @@ class TipGauge:
         return np.unique(self.anatomy.tumour_surface, return_inverse=True)
 
     def compute_distances(
-        self,
-        loads: Loads,
-        displacement: np.ndarray,
-        nodes: np.ndarray,
-        tool: BuiltIn | None = None,
-        lift: float = 0.0,
+        self, loads: Loads, displacement: np.ndarray, nodes: np.ndarray, tool: BuiltIn | None = None, lift: float = 0.0
     ) -> np.ndarray:
         """Return distances (B,) [m] from tip to tumour.
 

@@ -70,8 +70,6 @@ def _iterate_hits(shape: tuple[int, int, int], corners: np.ndarray) -> Iterator[
         line = np.repeat(np.arange(len(tet)), count)
         k = from_k[line].astype(np.int64) + np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
         yield _Hits(
-            (i[line] * shape[1] + j[line]) * shape[2] + k,
-            tet[line],
-            weights[line, 1:] + slope[line, 1:] * k[:, None],
+            (i[line] * shape[1] + j[line]) * shape[2] + k, tet[line], weights[line, 1:] + slope[line, 1:] * k[:, None]
         )
         begin = end

@@ -65,11 +65,7 @@ TILE = 256
 """
 )
 def _add_tile(
-    I: int,
-    J: int,
-    matrix: wp.array2d(dtype=wp.float16),
-    x: wp.array(dtype=wp.float32),
-    y: wp.array(dtype=wp.float32),
+    I: int, J: int, matrix: wp.array2d(dtype=wp.float16), x: wp.array(dtype=wp.float32), y: wp.array(dtype=wp.float32)
 ): ...
 
 

@@ -342,12 +342,7 @@ class Strategy:
         return answer
 
     def _solve_in_steps(
-        self,
-        cases: Cases,
-        start: wp.array,
-        aimed: Callable[[Cases, np.ndarray], Cases],
-        first: float,
-        most: int,
+        self, cases: Cases, start: wp.array, aimed: Callable[[Cases, np.ndarray], Cases], first: float, most: int
     ) -> SolverResult:
         """Solve for cases at growing fractions from start (3N, b); return the equilibrium at the largest one found.
 

@@ -54,14 +54,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
     @wp.func
     def pull(c: whole):
         """Return the symmetric tensor A [Pa]."""
-        xx, yy, zz, yz, zx, xy = (
-            c[count + 1],
-            c[count + 2],
-            c[count + 3],
-            c[count + 4],
-            c[count + 5],
-            c[count + 6],
-        )
+        xx, yy, zz, yz, zx, xy = (c[count + 1], c[count + 2], c[count + 3], c[count + 4], c[count + 5], c[count + 6])
         return mat(xx, xy, zx, xy, yy, yz, zx, yz, zz)
 
     @wp.func

@@ -61,9 +61,7 @@ MEANINGS = {  # Meanings of all arrays, by their path in the file.
     ),
     "anatomy/craniotomy": Meaning("1", "vertex", "which vertices of the surface are free and may be touched"),
     "loads/time": Meaning(
-        "s",
-        CASE,
-        "time of the result; in relaxing tissue, since the tool began to arrive; 0 without time dependence",
+        "s", CASE, "time of the result; in relaxing tissue, since the tool began to arrive; 0 without time dependence"
     ),
     "loads/Pushed/point": Meaning("m", f"{CASE}; {RAS}", "centre of the tool's round footprint, on the body at rest"),
     "loads/Pushed/force": Meaning("N", f"{CASE}; {RAS}", "total force on the body, of fixed direction"),

@@ -213,10 +213,7 @@ def describe_collection(episodes: Sequence[EpisodeContents], run: RunSettings | 
     lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera view was rendered.\n"]
     tools = [str(tool).partition("(")[0] for tool in format_value(episodes, "tool")]  # sizes are sampled parameters
     lines += [*format_counts("deformation model", format_value(episodes, "answered_by"))]
-    lines += [
-        *format_counts("FEM solver", format_value(episodes, "finite_elements")),
-        *format_counts("tool", tools),
-    ]
+    lines += [*format_counts("FEM solver", format_value(episodes, "finite_elements")), *format_counts("tool", tools)]
     versions = sorted(set(map(str, format_value(episodes, "sulcus_version"))))
     dates = sorted(str(date)[:10] for date in format_value(episodes, "date"))
     if versions:
