@@ -205,9 +205,9 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     add_cost_label(replace(frame, named=False), "fem")
     truth = 1e3 * np.linalg.norm(found.true)
     off = bound_words(found.location.p95, 1)
-    assert said[0] == f"truth: tumour moved {truth:.2f} mm"
+    assert said[0] == f"simulated tumour motion: {truth:.2f} mm"
     assert said[1] == f"estimate: tumour moved {1e3 * found.moved:.2f} +- {off}"
-    assert f"truth: {frame.deformation.source}" in said and f"estimate: {found.source}" in said
+    assert f"simulation: {frame.deformation.source}" in said and f"estimate: {found.source}" in said
     assert said[-1].startswith("lines: ") and not any("tumour moved" in line for line in said[2:])
     foot = f"estimate moved {format_millimetres(found.moved, found.location.p95)}"
     assert f"simulated motion {truth:.1f} mm; estimate" in frame.remark
