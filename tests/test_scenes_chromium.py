@@ -9,6 +9,7 @@ from visitor import free_port, wait_for
 
 from ar.page.elements import HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 from scenes.page.demo import Demo
+from scenes.page.requests import HAND
 from scenes.script.tool_paths import press
 
 LOADED = f"document.querySelector('#{PICTURE} img') && document.querySelector('#{SLICES} img')"
@@ -54,8 +55,8 @@ def test_the_page_fits_and_is_in_register(demo, window, size):
     """Nothing is cut off or complained of, and both errors are in sight; the picture is the server's to a pixel."""
     window.size(*size)
     said = f"document.getElementById('{SAID}')"
-    assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('Tumour position error')")
-    assert_fits(window, size, ("Surrogate error", "Tumour position error"))
+    assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('tumour position error')")
+    assert_fits(window, size, ("surrogate error", "tumour position error"))
     assert_in_register(window, demo.browser.shown[1])
     track = box_of(window, f"{FRAME}?.closest('.mantine-Slider-root')")
     assert track[2] - track[0] > 150.0 and track[2] <= size[0]
@@ -88,6 +89,11 @@ def test_keys_and_names(demo, window):
     assert wait_for(lambda: demo.wish.number == 41 and demo.browser.shown[0] == 41)
     window.press("ArrowLeft", "ArrowLeft")
     assert wait_for(lambda: demo.browser.shown[0] == 40)
+    shown = "getComputedStyle(document.querySelector('#sulcus-said .details')).display"
+    assert window.value(shown) == "none"
+    window.value("document.querySelector('#sulcus-said .more').click()")
+    assert window.wait(f"{shown} == 'block'")
+    window.value("document.querySelector('#sulcus-said .more').click()")
     before = demo.wish.style
     window.press("s", "KeyS")
     assert wait_for(lambda: demo.wish.style != before)
@@ -97,7 +103,7 @@ def test_keys_and_names(demo, window):
     assert window.wait(f"!document.getElementById('{HELP}').open")
     window.value("document.querySelector('[aria-label=\"force [N]\"][role=slider]').focus()")
     window.press("ArrowRight", "ArrowRight")
-    assert wait_for(lambda: demo.wish.tool == "hand") and demo.wish.number == 40
+    assert wait_for(lambda: demo.wish.tool == HAND) and demo.wish.number == 40
     window.press(" ", "Space")
-    assert wait_for(lambda: demo.wish.tool == "hand") and not demo.wish.plays
+    assert wait_for(lambda: demo.wish.tool == HAND) and not demo.wish.plays
     assert window.errors == []

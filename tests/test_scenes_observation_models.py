@@ -96,7 +96,7 @@ def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
 
 def test_the_checks_pass_and_tell_what_an_estimate_is_worth(play, frames, truth):
     figures = measure(play, play.get_camera, frames, truth)
-    assert figures.find_violations(Bounds(overlap=0.5, error=3e-3)) == []
+    assert figures.find_violations(Bounds(overlap=0.5, error=3e-3, visible=0.1)) == []
     # One frame moves, and by nothing that the locator's dents are: 14 % of it are removed.
     assert figures.covered == 1.0 and 0.1 < figures.removed < 1.0 and figures.error_mm > 0.01
 
@@ -106,7 +106,7 @@ def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
 
     def sentences(wrong):
         figures = measure(play, play.get_camera, [others[0], wrong, *others[1:]], truth)
-        return " ".join(figures.find_violations(Bounds(overlap=0.0, error=1.0, covered=1.0)))
+        return " ".join(figures.find_violations(Bounds(overlap=0.0, error=1.0, visible=0.1, covered=1.0)))
 
     plain = replace(play, stage=replace(play.stage, observer=None))
     undrawn = plain.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, 0.1)

@@ -80,6 +80,10 @@ ASIDE, HELP = "sulcus-aside", "sulcus-keys"
 """Ids of the elements that hold the tabs with their content, and the list of keys."""
 TABS = (("3-D view", "sulcus-tab-view"), ("slices", "sulcus-tab-slices"), ("last 20 s", "sulcus-tab-history"))
 """Labels of the tabs, and ids of their buttons."""
+DETAILS = "sulcus-details"
+"""Id of the checkbox that shows the details of a result."""
+OPEN_DETAILS = f'<label class="more" for="{DETAILS}">details</label><div class="details">'
+"""Start of the details of a result: they end with `</div>`, and are shown after a click on the label."""
 CAPTION = (  # Text under the slices.
     "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: 95 % error of its "
     "outline, by the named source (none: not known). White: tool in the slice; ring: tip outside the slice."
@@ -142,7 +146,8 @@ def build_tabs(keys: Sequence[Key] = KEYS) -> str:
     script = escape(" ".join(SCRIPT.replace("KEYS", listed, 1).replace("HELP", HELP).split()))
     opens = f"document.getElementById('{HELP}').showModal()"
     return (
-        f'<div id="{ASIDE}">{tabs}<button type="button" aria-label="list of keys" onclick="{opens}">keys</button>'
+        f'<div id="{ASIDE}">{tabs}<input type="checkbox" id="{DETAILS}" aria-label="details of the result">'
+        f'<button type="button" aria-label="list of keys" onclick="{opens}">keys</button>'
         f'<div class="shown"><div id="{SLICES}"></div><p>{CAPTION}</p></div>'
         f'<div class="shown"><div id="{HISTORY}"></div></div>'
         f'<dialog id="{HELP}" aria-label="keys"><table>{rows}</table>'

@@ -8,7 +8,7 @@ rules and shows image and controls in one docked panel.
 from __future__ import annotations
 
 from .client_page import NO_WEBGL_CLASS
-from .elements import ASIDE, HELP, HISTORY, PICTURE, SAID, SLICES, TABS
+from .elements import ASIDE, DETAILS, HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 
 PAGE, STATUS = "sulcus", "sulcus-status"
 """Ids of the elements that hold the words under the image, and the status line over it."""
@@ -41,6 +41,10 @@ RULES = """
 #PAGE .number, #SAID .number { font-size: 1.25rem; font-weight: 600 }
 #SAID table { border-collapse: collapse; font-size: 0.8rem; margin-bottom: 0.3rem }
 #SAID .best { font-weight: 700 }
+#SAID .more { color: #74c0fc; cursor: pointer; text-decoration: underline }
+#SAID .details { display: none }
+:root:has(DETAILS:checked) #SAID .details { display: block }
+:root:has(DETAILS:focus-visible) #SAID .more { outline: 2px solid #fff }
 #SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
 .NOTE { font-size: 0.8rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
 .NOTE ul { margin: 0; padding-left: 1.1rem }
@@ -146,6 +150,7 @@ def build_style(aspect: float) -> str:
         ("#SLICES", f"#{SLICES}"),
         ("#HISTORY", f"#{HISTORY}"),
         ("#HELP", f"#{HELP}"),
+        ("DETAILS", f"#{DETAILS}"),
         ("TABBED", f":is({', '.join(f'#{name}' for _, name in TABS[1:])})"),
         (".NOTE", f".{NOTE}"),
     ):

@@ -8,6 +8,7 @@ from html import escape
 import numpy as np
 
 from ar.overlay import hud
+from ar.page.elements import OPEN_DETAILS
 from sim.anatomy import name_region
 from sim.bodies.lobes import describe_location
 from sim.deformation import Deformation, Outcome
@@ -208,26 +209,29 @@ def report(
     frames: int,
     without: Sequence[str] = (),
 ) -> str:
-    """Build the report of a solution: distance first, then reliability, loads, comparison and table."""
+    """Build the report of a solution: distance, motion and warnings; reliability, loads and times on demand."""
     left = stage.select_stage(frame.loads).left
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
-    if frame.estimate is not None or not is_undeformed(frame.deformation):
-        facts += [format_motion(frame)]
     if frame.distance_error is not None and frame.distance_error < np.inf:
         facts += [f"error of the distance <= {hud.bound_words(frame.distance_error, 1)} (95 %, relative to FEM)"]
     off = None if frame.doubt else frame.tumour_error.bound
     parts = [] if frame.distance is None else [format_tip_distance(frame.distance, off, frame.inside)]
     number, *found = [""] if frame.estimate is None else describe_estimate(frame.estimate)
-    # A narrow window shows the first lines alone: both errors are among them.
-    parts += [number, format_trust(frame.deformation, name), format_tumour_trust(frame.tumour_error), *found]
-    parts.append(f"<p>{escape('; '.join(facts))}</p>")
+    parts.append(number)
+    if frame.estimate is not None or not is_undeformed(frame.deformation):
+        parts.append(f"<p>{format_motion(frame)}</p>")
     if without:
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
+    trust = format_trust(frame.deformation, name)
+    if "warn" in trust:
+        parts, trust = [*parts, trust], ""
+    parts.append(OPEN_DETAILS)
+    parts += [trust, format_tumour_trust(frame.tumour_error), *found, f"<p>{escape('; '.join(facts))}</p>"]
     if left is not None and len(left.loose):
         parts.append(f"<p>{len(left.loose)} loose elements were removed with the resection.</p>")
     spent = {"deform": "deformation", "render": "rendering", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    return "".join([*parts, verdict, format_cost_table(rows), f'<p class="dim">time [ms]: {took}</p>'])
+    return "".join([*parts, verdict, format_cost_table(rows), f'<p class="dim">time [ms]: {took}</p></div>'])
 
 
 def format_motion(frame: Frame) -> str:
