@@ -110,12 +110,13 @@ if (!window.sulcusKeys) {
   const help = () => document.getElementById('HELP');
   document.body.addEventListener('keydown', event => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const typed = event.target.closest('input:not([type=radio]), textarea, select, [role=slider], dialog[open]');
+    const field = 'input:not([type=radio], [type=checkbox]), textarea, select, [role=slider], dialog[open]';
+    const typed = event.target.closest(field);
     if (event.key === '?' && !(typed && typed.matches('input, textarea, dialog'))) { help().showModal(); return; }
     const key = event.key.length > 1 ? event.key : event.key.toLowerCase();
     if (!window.sulcusKeys.includes(key)) return;
     event.stopPropagation();
-    if (typed || (key === ' ' && event.target.closest('button, summary, a'))) return;
+    if (typed || (key === ' ' && event.target.closest('button, summary, a, [type=checkbox]'))) return;
     event.preventDefault();
     document.documentElement.dispatchEvent(new KeyboardEvent('keydown', {key: key, code: event.code}));
   });

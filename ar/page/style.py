@@ -40,6 +40,7 @@ RULES = """
 #SAID .warn { color: #ff922b; font-weight: 600 }
 #PAGE .number, #SAID .number { font-size: 1.25rem; font-weight: 600 }
 #SAID table { border-collapse: collapse; font-size: 0.8rem; margin-bottom: 0.3rem }
+#PAGE small { font-size: 0.8rem; margin-left: 0.8rem }
 #SAID .best { font-weight: 700 }
 #SAID .more { color: #74c0fc; cursor: pointer; text-decoration: underline }
 #SAID .details { display: none }

@@ -23,12 +23,8 @@ from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
 from .comparison import ComparisonRow
 
-IMAGE_EXPLANATION = (  # Explanation of the image.
-    "The tumour is hidden under the cortex: the green outline shows its predicted position while the tissue moves."
-)
 ESTIMATE_EXPLANATION = (  # Explanation of the image where the motion is estimated from the cortex.
-    "The tumour is hidden under the cortex: the green outline shows its position as estimated from the dots on the "
-    "cortex alone. No force and no stiffness is known."
+    "The tumour's position is estimated from the dots on the cortex alone: no force and no stiffness is known."
 )
 RESEARCH_ONLY = "Research only. Not a medical device."  # Restriction of use.
 # Names of finite elements for users.
@@ -54,10 +50,10 @@ def describe_effect(name: str) -> str:
 def format_caption(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
     """Describe the image: visible parts, meaning of the lines, and anatomy."""
     title = " ".join(scene.title.split())
-    seen = IMAGE_EXPLANATION if scene.sight is None else ESTIMATE_EXPLANATION
+    seen = "" if scene.sight is None else f" {ESTIMATE_EXPLANATION}"
     return (
-        f'<p class="number">Simulation: {describe_location(theatre.anatomy)} tumour</p>'
-        f"<p>{escape(title)} {seen} <b>{RESEARCH_ONLY}</b></p>{format_page_legend(scene)}"
+        f'<p class="number">Simulation: {describe_location(theatre.anatomy)} tumour '
+        f"<small>{RESEARCH_ONLY}</small></p><p>{escape(title)}{seen}</p>{format_page_legend(scene)}"
         f'<p class="dim">{escape(describe_scene(theatre, scene, anatomy))}</p>'
     )
 
