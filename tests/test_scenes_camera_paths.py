@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes.script.camera_paths import PATHS, Focus, HandHeld, Microscope, Orbit, sample_wandering
-from scenes.script.viewpoint import USUAL_VIEWPOINT
+from scenes.script.viewpoint import OBLIQUE_VIEWPOINT
 from sim.errors import InputError
 
 
@@ -27,7 +27,7 @@ TIMES = np.linspace(0.0, 4.0, 41)
 
 @pytest.mark.parametrize("name", PATHS)
 def test_camera_path_is_pure_and_keeps_site_in_image(site, name):
-    view = replace(USUAL_VIEWPOINT, path=PATHS[name](3))
+    view = replace(OBLIQUE_VIEWPOINT, path=PATHS[name](3))
     cameras = [view.build_camera(site, float(time)) for time in TIMES]
     again = [view.build_camera(site, float(time)) for time in TIMES[::-1]][::-1]
     for one, other in zip(cameras, again, strict=True):
@@ -38,7 +38,7 @@ def test_camera_path_is_pure_and_keeps_site_in_image(site, name):
 
 
 def test_hand_motion_is_deterministic_per_seed(site):
-    one, same, other = (replace(USUAL_VIEWPOINT, path=HandHeld(seed)).build_camera(site, 1.7) for seed in (5, 5, 6))
+    one, same, other = (replace(OBLIQUE_VIEWPOINT, path=HandHeld(seed)).build_camera(site, 1.7) for seed in (5, 5, 6))
     assert np.array_equal(one.T_camera_world, same.T_camera_world)
     assert np.abs(one.T_camera_world - other.T_camera_world).max() > 1e-5
     assert PATHS["hand-held"](5) == HandHeld(5)
@@ -47,15 +47,15 @@ def test_hand_motion_is_deterministic_per_seed(site):
 def test_a_hand_moves_as_far_as_it_says_and_breathes(site):
     ways = np.array([sample_wandering(seed, time) for seed in range(6) for time in np.arange(0.0, 60.0, 0.05)])
     assert ways.std(axis=0) == pytest.approx(np.ones(6), rel=0.15) and np.abs(ways.mean(axis=0)).max() < 0.1
-    calm = replace(USUAL_VIEWPOINT, path=HandHeld(0, shift=0.0, turn=0.0, breath=2e-3))
+    calm = replace(OBLIQUE_VIEWPOINT, path=HandHeld(0, shift=0.0, turn=0.0, breath=2e-3))
     start, top, back, low = (calm.build_camera(site, time).centre for time in (0.0, 1.0, 2.0, 3.0))
     assert np.linalg.norm(top - start) == pytest.approx(2e-3) and np.allclose(back, start)
     assert np.allclose(low - start, start - top)
 
 
 def test_an_orbit_looks_at_its_target_from_as_far(site):
-    view = replace(USUAL_VIEWPOINT, path=Orbit(np.radians(25.0), 2.0))
-    target, still = USUAL_VIEWPOINT.find_target(site), USUAL_VIEWPOINT.build_camera(site)
+    view = replace(OBLIQUE_VIEWPOINT, path=Orbit(np.radians(25.0), 2.0))
+    target, still = OBLIQUE_VIEWPOINT.find_target(site), OBLIQUE_VIEWPOINT.build_camera(site)
     for time in TIMES:
         camera = view.build_camera(site, float(time))
         assert camera.project(target)[0] == pytest.approx(still.project(target)[0], abs=1e-6)
@@ -66,10 +66,10 @@ def test_an_orbit_looks_at_its_target_from_as_far(site):
 
 
 def test_a_microscope_moves_along_its_axis_zooms_and_focuses(site):
-    view = replace(USUAL_VIEWPOINT, path=Microscope())
+    view = replace(OBLIQUE_VIEWPOINT, path=Microscope())
     start, zoomed, far = (view.build_camera(site, time) for time in (0.0, 1.5, 2.8))
-    target = USUAL_VIEWPOINT.find_target(site)
-    assert np.array_equal(start.K, USUAL_VIEWPOINT.build_camera(site).K) and zoomed.K[0, 0] == pytest.approx(
+    target = OBLIQUE_VIEWPOINT.find_target(site)
+    assert np.array_equal(start.K, OBLIQUE_VIEWPOINT.build_camera(site).K) and zoomed.K[0, 0] == pytest.approx(
         1.6 * start.K[0, 0]
     )
     assert far.to_camera_frame(target)[2] == pytest.approx(1.25 * 0.2)

@@ -71,10 +71,10 @@ def test_scene_checks_pass_on_path_and_fail_on_other_camera(theatre, path):
     frames = list(play.play_frames(every=30))
     truth = solve_reference_frames(theatre, play.scene, [frame.loads for frame in frames])
     figures = measure(play, play.get_camera, frames, truth)
-    assert not figures.find_violations(Bounds()) and figures.pixels < 1e-6
-    assert measure(play, lambda time: play.get_camera(time + 0.3), frames, truth).find_violations(Bounds())
+    assert not figures.find_violations(Bounds(visible=0.0)) and figures.pixels < 1e-6
+    assert measure(play, lambda time: play.get_camera(time + 0.3), frames, truth).find_violations(Bounds(visible=0.0))
     assert measure(play, lambda time: replace(play.get_camera(time), lens=None), frames, truth).find_violations(
-        Bounds()
+        Bounds(visible=0.0)
     )
 
 

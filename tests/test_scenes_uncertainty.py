@@ -294,7 +294,8 @@ class TestSaid:
         assert all(has_text(add_cost_label(frame, "linear"), line, TEXT_SCALE) for line in frame.head)
         narrow = knowing.build_player("linear", scene).draw(3, 0.1, scene.path(0.1))
         assert narrow.shown.shape == (240, 320, 3)
-        assert list(narrow.head) == format_errors(narrow.model_error, narrow.tumour_error, True, brief=True)
+        brief = format_errors(narrow.model_error, narrow.tumour_error, True, brief=True)
+        assert " ".join(narrow.head) == " ".join(brief)
         moved = wrap_line(
             f"moved {format_millimetres(narrow.moved, narrow.tumour_error.moved)}", MAX_BOTTOM_WIDTH * 320
         )

@@ -146,7 +146,9 @@ def measure(
         drawn=max(drawn),
         printed=all(good and has_printed_numbers(player, frame) for good, frame in zip(finite, frames, strict=True)),
         labelled=all(good and has_distance_at_tip(player, frame) for good, frame in zip(finite, frames, strict=True)),
-        visible=min(_measure_visible(player, frame) for frame in frames),
+        visible=min(
+            (_measure_visible(player, frame) for good, frame in zip(finite, frames, strict=True) if good), default=1.0
+        ),
         honest=all(honestly),
         finite=all(finite),
         answered=not doubts,
