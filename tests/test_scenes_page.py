@@ -62,6 +62,8 @@ def test_the_page_reads_what_the_frame_holds(theatre):
         assert f"tip to tumour 12.3&nbsp;±&nbsp;{off}&nbsp;mm<" in said
     surely = report(replace(frame, moved_error=5.31e-3, model_error=None), player.stage, "fem", "", (), 7)
     assert "<p>tumour moved 1.23 mm (tumour position error 5.4 mm)</p>" in surely
+    failed = report(frame, player.stage, "linear", '<p class="warn">no FEM</p>', (), 7)
+    assert failed.index("no FEM") < failed.index("details") < failed.index("frame 3 of 6")
     doubted = replace(frame, tumour_error=known[0], doubt="why", model_error=None)
     assert "(error not known)" in report(doubted, player.stage, "linear", "", (), 7)
     assert "tip to tumour 12.3&nbsp;mm<" in report(doubted, player.stage, "linear", "", (), 7)

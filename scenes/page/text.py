@@ -26,6 +26,7 @@ from .comparison import ComparisonRow
 ESTIMATE_EXPLANATION = (  # Explanation of the image where the motion is estimated from the cortex.
     "The tumour's position is estimated from the dots on the cortex alone: no force and no stiffness is known."
 )
+WARNING = 'class="warn"'  # Mark of a warning in HTML.
 RESEARCH_ONLY = "Research only. Not a medical device."  # Restriction of use.
 # Names of finite elements for users.
 ELEMENTS = {"p1": "linear tetrahedra", "p2": "quadratic tetrahedra", "smoothed": "smoothed linear tetrahedra"}
@@ -218,16 +219,15 @@ def report(
         parts.append(f"<p>{format_motion(frame)}</p>")
     if without:
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
-    trust = format_trust(frame.deformation, name)
-    if "warn" in trust:
-        parts, trust = [*parts, trust], ""
-    parts.append(OPEN_DETAILS)
-    parts += [trust, format_tumour_trust(frame.tumour_error), *found, f"<p>{escape('; '.join(facts))}</p>"]
+    details = [format_trust(frame.deformation, name), format_tumour_trust(frame.tumour_error), *found]
+    details.append(f"<p>{escape('; '.join(facts))}</p>")
     if left is not None and len(left.loose):
-        parts.append(f"<p>{len(left.loose)} loose elements were removed with the resection.</p>")
+        details.append(f"<p>{len(left.loose)} loose elements were removed with the resection.</p>")
     spent = {"deform": "deformation", "render": "rendering", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    return "".join([*parts, verdict, format_cost_table(rows), f'<p class="dim">time [ms]: {took}</p></div>'])
+    details += [verdict, format_cost_table(rows), f'<p class="dim">time [ms]: {took}</p></div>']
+    warnings = [part for part in details if WARNING in part]
+    return "".join([*parts, *warnings, OPEN_DETAILS, *(part for part in details if WARNING not in part)])
 
 
 def format_motion(frame: Frame) -> str:
