@@ -26,7 +26,7 @@ from .player import Frame, Player
 from .stage import DRAPE
 
 STILL_SHARE = 0.25  # Share of its largest motion below which the tumour counts as still.
-WORST_MISS = 0.0, np.inf, np.inf, np.inf, False
+WORST_MISS = 0.0, np.inf, np.inf, np.inf, 1.0, False
 """Metrics of a tumour at an invalid position: overlap, distance [m], two image distances [pixel], occlusion drawn."""
 
 
@@ -137,7 +137,7 @@ def measure(
         _measure_miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else WORST_MISS
         for row, frame in enumerate(frames)
     ]
-    overlap, error, pixels, drawn, honestly = zip(*misses, strict=True)
+    overlap, error, pixels, drawn, visible, honestly = zip(*misses, strict=True)
     return SceneFigures(
         overlap=min(overlap),
         error_mm=1e3 * max(error),
@@ -146,9 +146,7 @@ def measure(
         drawn=max(drawn),
         printed=all(good and has_printed_numbers(player, frame) for good, frame in zip(finite, frames, strict=True)),
         labelled=all(good and has_distance_at_tip(player, frame) for good, frame in zip(finite, frames, strict=True)),
-        visible=min(
-            (_measure_visible(player, frame) for good, frame in zip(finite, frames, strict=True) if good), default=1.0
-        ),
+        visible=min(visible),
         honest=all(honestly),
         finite=all(finite),
         answered=not doubts,
@@ -162,13 +160,6 @@ def measure(
         removed=_compute_removed_share(player, frames, truth) if all(finite) else np.nan,
         doubt="" if not doubts else doubts[0] + (f" ({len(doubts) - 1} more)" if doubts[1:] else ""),
     )
-
-
-def _measure_visible(player: Player, frame: Frame) -> float:
-    """Return the share of the drawn tumour's silhouette in the image that the drape does not cover."""
-    tumour = player.stage.select_stage(frame.loads).build_tumour(player.estimate_positions(frame))
-    mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles) > 0
-    return 1.0 - float(np.mean(frame.picture.segmentation[mask] == DRAPE)) if mask.any() else 0.0
 
 
 def _compute_coverage(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
@@ -240,14 +231,17 @@ def _is_finite(frame: Frame) -> bool:
 def _measure_miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
     """Compute overlap, mean distance [m], largest image distance [pixel] and outline distance of a frame to the truth.
 
-    The last value is true if parts that are not seen through cortex are drawn as occluded.
+    The last values are the share of the drawn silhouette that the drape does not cover, and true if parts that are not
+    seen through cortex are drawn as occluded.
     """
     stage = player.stage.select_stage(frame.loads)
     believed = player.estimate_positions(frame)
     shown = stage.build_tumour(believed)
     true = stage.build_tumour(player.compute_positions(truth, row))
-    drawn = compute_silhouette(frame.camera, shown.vertices, shown.triangles)
-    overlap = compute_iou(drawn, compute_silhouette(camera, true.vertices, true.triangles))
+    inside = compute_silhouette(frame.camera, shown.vertices, shown.triangles)
+    covered = frame.picture.segmentation[inside > 0] == DRAPE
+    visible = 1.0 - float(covered.mean()) if len(covered) else 0.0
+    overlap = compute_iou(inside, compute_silhouette(camera, true.vertices, true.triangles))
     nodes = stage.anatomy.tumour_nodes
     off = (believed - player.compute_positions(truth, row))[nodes]
     ours = frame.camera.project(shown.vertices)[0]
@@ -258,4 +252,5 @@ def _measure_miss(player: Player, camera: Camera, frame: Frame, truth: Deformati
     if frame.estimate is not None:  # both are in the image
         drawn = max(drawn, measure_truth_error(frame, render_silhouette(camera, true)))
     # Not a number: behind the camera.
-    return overlap, mean, np.inf if np.isnan(pixels) else float(pixels), drawn, is_hidden_part_marked(frame, mask)
+    pixels = np.inf if np.isnan(pixels) else float(pixels)
+    return overlap, mean, pixels, drawn, visible, is_hidden_part_marked(frame, mask)
