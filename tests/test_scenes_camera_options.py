@@ -1,16 +1,25 @@
 """Options of a scene's camera: a calibration, a path, an eye."""
 
+from argparse import ArgumentParser
+
 from theatres import REAL, put
 
 from ar.screen import read_png
 from scenes.cli import main
-from scenes.options.camera_options import PATHS as NAMES
+from scenes.options import camera_options
 from scenes.script.camera_paths import PATHS
+from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import write_calibration
 
 
 def test_names_on_the_command_line_are_those_of_paths():
-    assert tuple(PATHS) == NAMES
+    assert tuple(PATHS) == camera_options.PATHS
+
+
+def test_a_tracked_camera_takes_its_distance():
+    camera_options.add_camera(parser := ArgumentParser())
+    args = parser.parse_args(["--distance", "250"])
+    assert camera_options.add_targets(args, find_scene("press")).viewpoint.distance == 0.25
 
 
 def test_a_calibrated_camera_renders_checks_and_collects(theatre, tmp_path, capsys):
@@ -29,6 +38,8 @@ def test_a_calibrated_camera_renders_checks_and_collects(theatre, tmp_path, caps
         (["--camera", str(path), "--size", "240x240"], "another shape"),
         (["--camera", str(out)], "is no file"),
         (["--path", "hand-held", "--path-seed", "-1"], "not below 0"),
+        (["--tilt", "80"], "from -75 to 75 degrees"),
+        (["--distance", "20"], "give 50 to 1000 mm"),
     ):
         assert main(["render", "press", "--out", str(tmp_path / "none"), *words]) == 2
         assert reason in capsys.readouterr().err

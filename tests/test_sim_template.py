@@ -111,8 +111,7 @@ def test_the_craniotomy_is_wider_than_the_tumour(subject):
     assert (
         choose_craniotomy(subject, MeshPlan()) == 0.05 and choose_craniotomy(subject, MeshPlan(craniotomy=0.03)) == 0.03
     )
-    larger = [build_template_subject(Tumour(radius=radius)) for radius in (0.02, 0.03)]
-    sizes = [choose_craniotomy(each, MeshPlan()) for each in larger]
+    sizes = [choose_craniotomy(build_template_subject(Tumour(radius=each)), MeshPlan()) for each in (0.02, 0.03)]
     assert sizes == pytest.approx([0.06, 0.08], abs=1e-3)
 
 

@@ -41,7 +41,12 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
         help="angle of the line of sight to the axis of the craniotomy (default: the most oblique view of the tumour "
         "through the craniotomy)",
     )
-    group.add_argument("--distance", type=float, metavar="MM", help="distance of the camera (default: 300)")
+    group.add_argument(
+        "--distance",
+        type=float,
+        metavar="MM",
+        help="distance of the camera (default: 300; tracked: all targets in sight)",
+    )
     group.add_argument("--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})")
     group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
@@ -106,4 +111,4 @@ def add_targets(args: argparse.Namespace, scene: Scene) -> Scene:
     if args.path == "microscope":
         raise InputError("--path microscope zooms, and a tracked camera has one calibration: choose another path.")
     scene = apply_camera_options(args, replace(scene, viewpoint=VIEW))
-    return replace(scene, viewpoint=from_where_it_sees_all(scene.viewpoint))
+    return scene if args.distance is not None else replace(scene, viewpoint=from_where_it_sees_all(scene.viewpoint))
