@@ -52,7 +52,7 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "show_signature": False,
     "write_computation_times": False,
-    # Of docs/examples, by `make thumbnails`.
+    # Images in docs/examples, made by `make thumbnails`.
     "thumbnail_size": (320, 224),
     "remove_config_comments": True,
 }

@@ -40,7 +40,7 @@ class Framing:
     visible: float
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def find_framing(
     site: CraniotomyFrame, distance: float, aspect: float, direction: tuple[float, float] | None = None
 ) -> Framing:
