@@ -18,7 +18,7 @@ class TestControls:
     def test_the_sliders_end_where_the_bone_stops_the_tool(self, theatre):
         scene, site = short(), theatre.site
         assert scene.tool is not None
-        found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), print, print)
+        found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), print, print, print)
         places = [control for control in found if isinstance(control, Slider) and control.label.startswith("place")]
         room = site.clearance - scene.tool.radius
         assert len(places) == 2 and all(0.5 <= control.high <= max(0.5, 1e3 * room) for control in places)
@@ -27,20 +27,25 @@ class TestControls:
 
     def test_no_code_name_is_shown(self, theatre):
         for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
-            found = build_controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
+            found = build_controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), print, print, print)
             switches = [inner for control in found if isinstance(control, Fold) for inner in control.controls]
             assert switches and all(inner.words and inner.words != inner.label for inner in switches)
 
     def test_the_overlay_comes_before_the_tool_s_sliders(self, theatre):
         labels = [
             control.label
-            for control in build_controls(short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print)
+            for control in build_controls(
+                short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print, print
+            )
         ]
-        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-5] == "slices"
+        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-7:-5] == [
+            "slices",
+            "registration",
+        ]
 
     def test_every_overlay_style_is_offered(self, theatre):
         wish = Requests("fem", Touch())
-        found = build_controls(short(), theatre.site, ("fem",), wish, print, print)
+        found = build_controls(short(), theatre.site, ("fem",), wish, print, print, print)
         overlay = next(control for control in found if isinstance(control, Dropdown) and control.label == "overlay")
         seen = []
         for option in overlay.options:
@@ -51,7 +56,8 @@ class TestControls:
     def test_camera_and_slice_choices_are_offered(self, theatre):
         wish = Requests("fem", Touch())
         found = {
-            control.label: control for control in build_controls(short(), theatre.site, ("fem",), wish, print, print)
+            control.label: control
+            for control in build_controls(short(), theatre.site, ("fem",), wish, print, print, print)
         }
         camera, slices = found["camera"], found["slices"]
         assert isinstance(camera, Dropdown) and isinstance(slices, Dropdown)
@@ -65,9 +71,13 @@ class TestControls:
         assert isinstance(tilt, Slider) and isinstance(distance, Slider) and distance.start == 300.0
         tilt.changed(20.0)
         distance.changed(200.0)
-        assert wish.look == ("window", "orbit", TIP, pytest.approx(-np.radians(20.0)), pytest.approx(0.2))
+        assert wish.look == ("window", "orbit", TIP, pytest.approx(-np.radians(20.0)), pytest.approx(0.2), None)
+        registration = cast(Dropdown, found["registration"])
+        assert registration.options == ("perfect registration", "clinical registration, 1.6 mm per axis")
+        registration.changed(registration.options[1])
+        assert registration.start == registration.options[0] and wish.look.registration == "clinical"
         assert "slices" not in {
-            each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, print, print)
+            each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, print, print, print)
         }
 
     def test_which_scenes_go_on_by_themselves(self, theatre):

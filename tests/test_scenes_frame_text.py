@@ -9,6 +9,7 @@ from scenes.play.frame_text import format_errors, format_tumour_error
 from scenes.script.uncertainty import TumourError, Uncertainty
 
 LISTS = {"times": (0.0, 1.0), "worst": (2e-3, 4e-3), "middle": (1e-3, 1e-3), "moved": (1e-3, 1e-3)}
+LISTS |= {"registered": (2e-3, 4e-3), "motion": (0.0, 1e-3)}
 PARTS = {"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
 
 
@@ -35,6 +36,6 @@ def test_a_guess_is_called_so_and_blames_no_part():
     for error in (alone, seen):
         named = replace(error, registration=1.56e-3)
         for words in (format_errors(None, named, False)[-1], format_tumour_trust(named)):
-            assert "registration 1.6 mm" in words
+            assert "clinical registration, 1.6 mm per axis" in words
     assert format_tumour_error(alone, brief=True) == "tumour <= 4.2 mm, rough estimate"
     assert format_tumour_error(seen, brief=True) == "tumour <= 1.0 mm"

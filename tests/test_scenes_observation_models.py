@@ -231,6 +231,7 @@ def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
     assert frame.tumour_error == TumourError(None, "", frame.estimate.worst)
     times = tuple(float(time) for time in play.scene.times[[0, -1]])
     flat = {"times": times, "worst": (3e-3, 3e-3), "middle": (2e-3, 2e-3), "moved": (1e-3, 1e-3)}
+    flat |= {"registered": (3e-3, 3e-3), "motion": (1e-3, 1e-3)}
     known = Uncertainty("it", "", 9, 0, **flat, parts={"E": (1e-3, 1e-3)})
     knowing = replace(play, uncertainty=known)
     both = knowing.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, 0.1).tumour_error

@@ -37,7 +37,7 @@ def test_the_page_reads_what_the_frame_holds(theatre):
         "model_error": 11e-6,
         "seconds": seconds,
     }
-    frame = replace(player.draw(3, 0.1, Touch(force=0.25)), **known)
+    frame = replace(player.draw(3, 0.1, Touch(force=0.25)), tumour_error=TumourError(None), moved_error=None, **known)
     said = report(frame, player.stage, "linear", "", (), 7)
     for line in (
         ">tip to tumour 12.3&nbsp;mm<",

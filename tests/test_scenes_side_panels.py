@@ -13,7 +13,7 @@ from scenes.script.uncertainty import TumourError
 
 def test_the_chart_and_the_slices_are_of_the_frame_that_is_shown(theatre):
     player = theatre.build_player("linear", short())
-    frame = player.draw(3, 0.1, Touch(force=0.25))
+    frame = replace(player.draw(3, 0.1, Touch(force=0.25)), tumour_error=TumourError(None))
     read = sample_of(replace(frame, distance=12e-3, distance_error=np.inf), player.scene, 5.0)
     assert read.values == pytest.approx((12.0, 0.25)) and read.errors == (None, 0.0) and read.time == 5.0
     assert sample_of(replace(frame, distance_error=2e-3), player.scene, 0.0).errors[0] == pytest.approx(2.0)

@@ -31,6 +31,7 @@ from scenes.script.uncertainty import (
     NOT_KNOWN,
     TumourError,
     Uncertainty,
+    fit_motion_error,
     mark_of,
     read_uncertainties,
     to_uncertainty_path,
@@ -68,6 +69,7 @@ def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
     mark = mark_of(scene, theatre.site, theatre.choose_element(scene))
     flat = (1e-3, 1e-3)
     lists = {"times": (0.0, scene.duration), "worst": worst, "middle": flat, "moved": flat}
+    lists |= {"registered": (1e-3, 3.5e-3), "motion": (0.0, 2.5e-3)}
     return Uncertainty(
         scene.name, mark, 8, 0, **(lists | values), parts={"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
     )
@@ -211,12 +213,37 @@ class TestStored:
         for time, most, largest in ((0.0, 2e-3, "registration"), (0.15, 3.5e-3, "E")):
             error = found.evaluate(time)
             assert error == TumourError(pytest.approx(most), largest, moved=error.moved)
-            # How far it has moved has nothing of what puts it elsewhere in the scan, too.
-            own = [found.read(size, time) for name, size in found.parts.items() if name != "registration"]
-            assert error.moved == pytest.approx(min(1.96 * np.linalg.norm(own), most))
-        assert found.evaluate(0.0, 1.5e-3).moved >= 1.5e-3
+        assert error.moved == pytest.approx(2.5e-3 * time / 0.2)
+        assert found.evaluate(0.0, 1.5e-3).moved == pytest.approx(1.5e-3)
         assert found.evaluate(0.0, 1.5e-3).prior == pytest.approx(2.5e-3)
         assert found.evaluate(0.0, 9e-3).largest == "surrogate"
+
+    def test_perfect_registration_has_no_part_in_the_error(self, theatre):
+        found = stated(short(), theatre)
+        perfect, clinical = (found.evaluate(0.0, 0.0, registration) for registration in ("perfect", "clinical"))
+        assert (perfect.prior, clinical.prior) == (pytest.approx(1e-3), pytest.approx(2e-3))
+        assert perfect.largest != "registration" and clinical.largest == "registration"
+        assert perfect.registration_words == "perfect registration"
+        assert clinical.registration_words == "clinical registration, 1.6 mm per axis"
+
+    def test_a_file_without_the_new_lists_gets_upper_estimates(self, theatre, tmp_path):
+        path, scene = tmp_path / "box.uncertainty.json", short()
+        write_uncertainties(path, [stated(scene, theatre)])
+        stored = json.loads(path.read_text())
+        for name in ("registered", "motion"):
+            del stored["scenes"][scene.name][name]
+        path.write_text(json.dumps(stored))
+        found = read_uncertainties(path)[scene.name]
+        assert found.registered == found.motion == (0.0, pytest.approx(4e-3))  # 1.96 x 3 mm exceeds the whole error
+
+    def test_other_loads_have_an_error_in_proportion_to_the_motion(self, theatre):
+        found = fit_motion_error(stated(short(), theatre, moved=(0.0, 2e-3)))
+        assert found.mean == pytest.approx(1.25) and found.surface == pytest.approx((3.5**2 - 1.0) ** 0.5 / 2.0)
+        rest, moved = (found.evaluate(motion, 0.0, "perfect") for motion in (0.0, 2e-3))
+        assert (rest.prior, rest.moved) == (pytest.approx(1e-3), 0.0)
+        assert (moved.prior, moved.moved) == (pytest.approx(3.5e-3), pytest.approx(2.5e-3)) and moved.guess
+        assert found.evaluate(0.0, 0.0, "clinical").prior == pytest.approx(2e-3)
+        assert fit_motion_error(stated(short(), theatre, moved=(0.0, 0.0))) is None
 
     def test_the_template_ships_with_that_of_its_scenes(self):
         from scenes.play.deformers import open_theatre
@@ -284,7 +311,7 @@ class TestSaid:
             "scenes.play.player.composite", lambda *given, **more: drawn_with.append(given) or composite(*given, **more)
         )
         frame = player.draw(3, 0.1, scene.path(0.1))
-        assert frame.tumour_error.prior == pytest.approx(np.hypot(3e-3, frame.model_error))
+        assert frame.tumour_error.prior == pytest.approx(np.hypot(2.25e-3, frame.model_error))
         assert frame.model_error == frame.deformation.bound[0, 0]
         marks = drawn_with[0][5]
         assert marks.margin == marks.gauge.error == frame.tumour_error.prior
@@ -302,11 +329,13 @@ class TestSaid:
         for line in (*narrow.head, *moved, "frame 3"):
             assert has_text(narrow.shown, line, TEXT_SCALE)
 
-    def test_in_a_hand_and_of_a_doubtful_answer_it_is_not_known(self, theatre):
+    def test_in_a_hand_it_follows_the_motion_and_in_doubt_it_is_not_known(self, theatre):
         scene = short()
         player = replace(theatre, uncertainties={scene.name: stated(scene, theatre)}).build_player("linear", scene)
         held, doubtful = (player.draw(3, 0.1, Touch(force=force)) for force in (0.2, 0.6))
-        assert held.tumour_error == doubtful.tumour_error == NOT_KNOWN
+        expected = fit_motion_error(player.uncertainty).evaluate(held.moved, held.model_error, "perfect")
+        assert held.tumour_error == expected and expected.guess and expected.prior > 1e-3
+        assert doubtful.tumour_error == NOT_KNOWN
         assert held.model_error is not None and doubtful.model_error is None and doubtful.doubt
 
 
@@ -332,7 +361,8 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     assert main(["check", *words, "--deformer", "fem", "--every", "3", "--json"]) == 0
     (checked,) = json.loads(capsys.readouterr().out)["scenes"]
     assert checked["model_error_mm"] is None
-    assert checked["tumour_error_mm"] == pytest.approx(1e3 * max(stored.evaluate(0.1 * one).prior for one in range(3)))
+    errors = [stored.evaluate(0.1 * one, registration="perfect").prior for one in range(3)]
+    assert checked["tumour_error_mm"] == pytest.approx(1e3 * max(errors))
     assert main(["check", *words, "--deformer", "linear", "--every", "3"]) == 0
     said = capsys.readouterr().out
     assert "surrogate error <= " in said and "tumour position error <= " in said

@@ -286,11 +286,14 @@ def estimate_uncertainty(
     rows = []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
         motion = np.stack([answer[moment] for _, answer in sound])
-        worst, middle = compute_worst_distances(compute_error(motion, field, meshes), normals, *shifts)
-        bounds = [float(np.quantile(one, LEVEL)) for one in (worst, middle)]
+        off, (shift, wide) = compute_error(motion, field, meshes), shifts
+        worst, middle = compute_worst_distances(off, normals, shift, wide)
+        registered, _ = compute_worst_distances(off, normals, 0.0 * shift, wide)
+        errors = worst, middle, registered, np.linalg.norm(off.mean(axis=1), axis=1)
+        bounds = [float(np.quantile(one, LEVEL)) for one in errors]
         moved = float(np.linalg.norm(field, axis=1).mean())
         rows.append((*bounds, moved, split_contributions(motion, field, kept, scene)))
-    worst, middle, moved, by_name = zip(*rows, strict=True)
+    worst, middle, registered, motion_error, moved, by_name = zip(*rows, strict=True)
     return Uncertainty(
         scene=scene.name,
         mark=mark_of(scene, theatre.site, theatre.choose_element(scene)),
@@ -299,7 +302,9 @@ def estimate_uncertainty(
         times=still.times,
         worst=worst,
         middle=middle,
+        registered=registered,
         moved=moved,
+        motion=motion_error,
         parts={name: tuple(row[name] for row in by_name) for name in by_name[0]},
         folded=folded,
         numbers=sum(column.shape[1] for column in collect_contributor_values(kept, scene).values()),

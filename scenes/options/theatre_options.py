@@ -70,6 +70,12 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         metavar="MS",
         help="use the most accurate deformation model that needs at most this per frame [ms]",
     )
+    parser.add_argument(
+        "--registration",
+        choices=("perfect", "clinical"),
+        help="registration of the scan to the patient; clinical: standard deviation of 1.6 mm per axis (default: the "
+        "scene's, perfect in built-in scenes)",
+    )
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     add_device(parser, "FEM")
@@ -94,7 +100,7 @@ def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> PatientSe
 
 
 def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientSetup) -> Scene:
-    """Return a scene by name, with the tissue and element of `add_theatre`'s arguments if they are given.
+    """Return a scene by name, with the registration, tissue and element of `add_theatre`'s arguments if given.
 
     Raises
     ------
@@ -103,7 +109,10 @@ def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientS
     """
     from ..script.scene import find_scene
 
-    scene = apply_tissue_options(args, find_scene(name), theatre)
+    scene = find_scene(name)
+    if getattr(args, "registration", None) is not None:
+        scene = replace(scene, registration=args.registration)
+    scene = apply_tissue_options(args, scene, theatre)
     return scene if args.trajectory is None else _follow_trajectory(args, scene, theatre.site)
 
 

@@ -15,6 +15,7 @@ from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, R
 
 from ..script.camera_paths import PATHS
 from ..script.craniotomy_frame import CraniotomyFrame
+from ..script.registration import REGISTRATIONS, Registration, describe_registration
 from ..script.scene import SCENES, Scene
 from ..script.tool_paths import IDLE_HEIGHT, Touch
 from .requests import HAND, SCRIPT, Requests
@@ -28,6 +29,8 @@ STATIC_CAMERA = "stays"
 """Label of a static camera."""
 PLAN = "solver details (advanced)"
 """Label of the note on the solvers."""
+EFFECT_COSTS = "cost of the effects"
+"""Label of the note on the effects' costs."""
 OWN_FILM = "your own video or camera"
 """Label of the note on own videos."""
 # Text of the note on own videos.
@@ -47,10 +50,12 @@ def build_controls(
     wish: Requests,
     give: Callable[[str], None],
     take: Callable[..., None],
+    measure: Callable[[], None],
 ) -> list[Slider | Dropdown | Toggle | Fold | Note]:
     """Build all controls of a scene that these deformers support.
 
-    `give` receives who gets the tool, `take` numbers of its touch, as `Requests.take_over` does.
+    `give` receives who gets the tool, `take` numbers of its touch, as `Requests.take_over` does; `measure` starts the
+    measurement of the effects' costs.
     """
     cameras = "scene default", STATIC_CAMERA, *PATHS
 
@@ -61,6 +66,8 @@ def build_controls(
         Toggle(effect, True, partial(wish.switch, effect), describe_effect(effect), "switch this effect on or off")
         for effect in list_switchable_effects(scene, site)
     )
+    hint = "solves the scene with and without each effect"
+    costs = Toggle("measure costs", False, lambda on: measure() if on else None, "measure what each costs", hint)
     models = {describe_deformer(name): name for name in names}
     slices = build_slice_control(wish.through, lambda name: wish.set(through=name))
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
@@ -77,8 +84,10 @@ def build_controls(
         add_overlay_controls(wish.style, lambda style: wish.set(style=style)),
         Dropdown("camera", cameras, wish.path or cameras[0], film, hint="motion of the camera"),
         *([] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]),
+        build_registration_control(scene, wish),
         Fold("camera position", build_camera_sliders(scene, site, wish)),
-        *([Fold("physics effects (on/off)", switches)] if switches else []),
+        Fold("physics effects (on/off)", (*switches, costs)),
+        Note(EFFECT_COSTS),
         Note(PLAN),
         Note(OWN_FILM, OWN_VIDEO_NOTE),
     ]
@@ -95,6 +104,14 @@ def add_overlay_controls(now: Style, choose: Callable[[Style], None]) -> Dropdow
         hint="style of the overlay",
         key=STYLE_KEY,
     )
+
+
+def build_registration_control(scene: Scene, wish: Requests) -> Dropdown:
+    """Build the choice of the registration of the scan to the patient."""
+    names: dict[str, Registration] = {describe_registration(size): name for name, size in REGISTRATIONS.items()}
+    now = describe_registration(REGISTRATIONS[wish.registration or scene.registration])
+    hint = "error of the scan's registration to the patient; it is part of the error of the tumour's position"
+    return Dropdown("registration", tuple(names), now, lambda words: wish.set(registration=names[words]), hint=hint)
 
 
 def build_slice_control(now: str, choose: Callable[[str], None]) -> Dropdown:

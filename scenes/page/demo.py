@@ -33,7 +33,8 @@ from .comparison import (
     describe_change,
     format_comparison,
 )
-from .controls import PLAN, build_controls, is_animated, to_slider_values
+from .controls import EFFECT_COSTS, PLAN, build_controls, is_animated, to_slider_values
+from .effect_costs import EffectCosts
 from .fem_worker import FemResult, FemWorker
 from .requests import HAND, SCRIPT, Look, Requests, describe_holder
 from .scene_solvers import SceneSolvers
@@ -152,6 +153,7 @@ class Demo:
     def close(self) -> None:
         """Stop the page and the finite elements."""
         self.busy.close()
+        self.costs.close()
         self.browser.close()
         for solver in (*self.cast.solvers.values(), *self.dismissed):
             solver.close()
@@ -170,28 +172,31 @@ class Demo:
         """Have a deformer play a scene."""
         self.cast, self.tally = SceneSolvers(self.theatre, scene, deformer, self.turn), AccuracyTimeTable()
         self.history = History(list_lines(scene))
+        self.costs = EffectCosts(self.theatre, scene, self.turn, lambda words: self.browser.write(EFFECT_COSTS, words))
         # The frame that is shown.
         self.reached: int | None = None
         self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=is_animated(scene, self.theatre.site))
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
-        old = self.cast, self.tally, self.wish, self.history
+        old = self.cast, self.tally, self.wish, self.history, self.costs
         self.busy.begin_work(f"preparing the scene {name}")
         try:
             scene = self.first if name == self.first.name else self.find(name)
             deformer = self.theatre.select_default(scene)
             self._cast(scene, deformer)
-            self.wish.set(style=old[2].style, path=old[2].path, through=old[2].through)
+            kept = old[2].look
+            self.wish.set(style=kept.style, path=kept.path, through=kept.through, registration=kept.registration)
             parts = self._build_contents(deformer)
         except InputError as error:
-            self.cast, self.tally, self.wish, self.history = old
+            self.cast, self.tally, self.wish, self.history, self.costs = old
             self.wish.set(scene=self.stage.scene.name)
             self.browser.put("scene", self.stage.scene.name)
             self.browser.report(f'<p class="warn">{escape(str(error))}</p>')
             return
         finally:
             self.busy.end_work()
+        old[4].close()
         self.browser.fill(*parts)
         self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].stop_soon()
 
@@ -312,6 +317,7 @@ class Demo:
                 now.judged = compare_with_fem(truth, whole, name == "fem", shown)
                 if now.judged.mean is not None:
                     self.tally.record_error(name, compute_loads_digest(truth.loads), now.judged.mean)
+                self.cast.compare_models(truth, self.tally, skip=name)
             now.truth, now.by = truth, (name, off)
         if now.stale is not (not fresh):
             now.stale = not fresh
@@ -329,8 +335,7 @@ class Demo:
         else:
             own = FEM_SHOWN if now.frame.estimate is None else FEM_REFERENCE
             verdict = format_comparison(now.judged if truth is not None else None, not fresh, WAITING_TEXT, own)
-        plan = self.cast.get_worker(off).plan or self.referee.plan
-        if plan != now.plan:
+        if (plan := self.cast.get_worker(off).plan or self.referee.plan) != now.plan:
             now.plan = plan
             self.browser.write(PLAN, plan_words(plan))
         scene = self.stage.scene
@@ -347,14 +352,12 @@ class Demo:
 
     def _build_contents(self, deformer: str) -> tuple:
         """Build the contents of the page: bodies, playback, controls, title, text."""
-        scene, site = self.stage.scene, self.stage.site
-        wish, names = self.wish, self.theatre.list_deformers(scene)
-        playback = Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number))
-        given = build_controls(scene, site, names, wish, self._give, self._take)
+        scene, names = self.stage.scene, self.theatre.list_deformers(self.stage.scene)
+        actions = self._give, self._take, self.costs.start
         return (
             build_page_bodies(self.stage),
-            playback,
-            given,
+            Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number)),
+            build_controls(scene, self.stage.site, names, self.wish, *actions),
             f"sulcus: {scene.name}",
             format_caption(self.theatre, scene, self.anatomy),
         )

@@ -9,19 +9,21 @@ from typing import NamedTuple
 
 from ar.overlay.styles import Style
 
+from ..script.registration import Registration
 from ..script.tool_paths import Touch
 
 SCRIPT, HAND = "automatic", "manual"  # Control of the tool: scripted, manual.
 
 
 class Look(NamedTuple):
-    """Display style of a solution: of the overlay, the camera's path, position of the slices, and camera position."""
+    """Display of a solution: overlay style, path and position of the camera, position of the slices, registration."""
 
     style: Style
     path: str = ""
     through: str = ""
     tilt: float | None = None
     distance: float | None = None
+    registration: Registration | None = None
 
 
 @dataclass
@@ -29,7 +31,7 @@ class Requests:
     """Requests of the users, written by the page's threads and read by the loop, under its lock.
 
     `path` is the name of the camera's motion; "": the scene's own. `tilt` [rad] and `distance` [m] move the camera;
-    None: as the scene has it. `through` is the position of the slices. `clocked` is true if
+    None: as the scene has it, as for `registration`. `through` is the position of the slices. `clocked` is true if
     the scene evolves without tool input: otherwise manual control pauses the script.
     """
 
@@ -46,6 +48,7 @@ class Requests:
     through: str = ""
     tilt: float | None = None
     distance: float | None = None
+    registration: Registration | None = None
     clocked: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -78,7 +81,7 @@ class Requests:
     def look(self) -> Look:
         """Display style of a solution."""
         with self.lock:
-            return Look(self.style, self.path, self.through, self.tilt, self.distance)
+            return Look(self.style, self.path, self.through, self.tilt, self.distance, self.registration)
 
     def read_current(self) -> tuple[int, str, Touch | None, frozenset[str]]:
         """Frame number, deformer, hand-set touch (None: the script's) and effects that are off."""

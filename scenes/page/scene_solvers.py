@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 
 from sim.deformation import Deformation, Deformer
+from surrogate.data.dataset import compute_loads_digest
 
 from ..play.deformers import GUARDED, PatientSetup
 from ..play.effect_ablation import remove_effect
@@ -16,6 +17,7 @@ from ..play.replay import ReplaySession
 from ..play.stage import Stage
 from ..script.camera_paths import PATHS
 from ..script.scene import Scene
+from .comparison import AccuracyTimeTable, compare_with_fem
 from .fem_worker import FemResult, FemWorker, Question
 from .requests import Look
 
@@ -76,25 +78,26 @@ class SceneSolvers:
                 deformer = solved.deformer
             else:
                 deformer = self._build_trained(name, stage.scene)
-            uncertainty = self.theatre.estimate_uncertainty(stage.scene)
-            self.players[name, off] = Player(stage, deformer, uncertainty=uncertainty)
+            self.players[name, off] = self.theatre.build_player_of(stage, deformer)
         return self.players[name, off]
 
     def get_player_with_camera(self, name: str, off: frozenset[str], look: Look) -> Player:
-        """Return the same, with the camera of a display style."""
-        player, key = self.get_player(name, off), (off, look.path, look.tilt, look.distance)
-        if key[1:] == ("", None, None):
+        """Return the same, with the camera and the registration of a display style."""
+        player, key = self.get_player(name, off), (off, look.path, look.tilt, look.distance, look.registration)
+        if key[1:] == ("", None, None, None):
             return player
         if key not in self.filmed:
-            view = player.scene.viewpoint
+            scene = player.scene
+            view = scene.viewpoint
             if look.path:
                 view = replace(view, path=PATHS[look.path](0) if look.path in PATHS else None)
             if look.tilt is not None:
                 view = replace(view, tilt=look.tilt)
             if look.distance is not None:
                 view = replace(view, distance=look.distance)
+            scene = replace(scene, viewpoint=view, registration=look.registration or scene.registration)
             # Only the newest is kept: a slider passes through many.
-            self.filmed = {key: replace(player.stage, scene=replace(player.scene, viewpoint=view))}
+            self.filmed = {key: replace(player.stage, scene=scene)}
         return replace(player, stage=self.filmed[key])
 
     def _build_trained(self, name: str, scene: Scene) -> Deformer:
@@ -117,6 +120,17 @@ class SceneSolvers:
         loads = player.build_loads(*question)
         answer = self.last[name] = player.compute_deformation(loads, self.last.get(name))
         return FemResult(question[0], loads, answer, clock.perf_counter() - begun, question)
+
+    def compare_models(self, truth: FemResult, tally: AccuracyTimeTable, skip: str) -> None:
+        """Record time and error of FEM and of every trained model but `skip`, for the load of an FEM solution."""
+        load, scene = compute_loads_digest(truth.loads), self.get_stage().scene
+        for name in self.theatre.select_models(scene):
+            player = self.get_player(name)
+            if name != skip and not player.follows:
+                shown = player.compute_deformation(truth.loads)
+                error = compare_with_fem(truth, player, False, shown).mean
+                tally.record_time(name, load, shown.cost.total)
+                tally.record_error(name, load, error or 0.0)
 
     def solve(
         self, off: frozenset[str], question: Question, seen: FemResult | None, patience: float

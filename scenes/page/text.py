@@ -39,6 +39,10 @@ EFFECTS = {
     "Pulsation": "heartbeat and breath",
     "SkullContact": "contact with the skull",
     "Inertia": "inertia",
+    "Elasticity": "elastic tissue",
+    "Held": "fixed base of the brain",
+    "Bonded": "bond to the skull",
+    "Slide": "sliding along the skull",
 }
 """Names of a scene's effects for users."""
 
@@ -188,9 +192,10 @@ def format_tumour_trust(error: TumourError) -> str:
         )
     within = hud.bound_words(error.bound, 1)
     said = f"Tumour position error (95 %): at most {within} at any point of its surface"
-    guess = ": rough estimate (few samples or load outside the tissue model)" if error.guess else ""
+    guess = ": rough estimate (few samples, load outside the tissue model, or by the size of the motion)"
+    guess = guess if error.guess else ""
     if error.registration_words:
-        said += f" ({error.registration_words} along each axis, as a standard deviation)"
+        said += f" ({error.registration_words})"
     if error.observed is None:
         return f"<p>{said}{guess or f'; the largest part is {escape(error.largest)}'}.</p>"
     without = "" if error.prior is None else f"; without cortex observation {hud.bound_words(error.prior, 1)}{guess}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +33,16 @@ from surrogate.model.store import load
 
 from ..script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
 from ..script.observation_models import PointObservation, StereoObservation
-from ..script.scene import Scene, check_scene_exists
+from ..script.scene import SCENES, Scene, check_scene_exists, find_scene
 from ..script.shipped_files import get_template_path
-from ..script.uncertainty import Uncertainty, mark_of, read_uncertainties, to_uncertainty_path
+from ..script.uncertainty import (
+    MotionError,
+    Uncertainty,
+    fit_motion_error,
+    mark_of,
+    read_uncertainties,
+    to_uncertainty_path,
+)
 from .observer import Observer
 from .player import Player
 from .stage import Stage
@@ -191,6 +198,10 @@ class PatientSetup:
         """Return the element of a scene, or the recommended one for the mesh."""
         return scene.element or recommend_element(self.anatomy.mesh)
 
+    def select_scene(self) -> str:
+        """Select the scene to open: the first built-in scene that a trained model supports, or the first."""
+        return next((name for name in SCENES if self.select_models(find_scene(name))), SCENES[0])
+
     def build_deformer(self, name: str, scene: Scene) -> Deformer:
         """Build a deformer by name; FEM has the scene's accuracy.
 
@@ -232,14 +243,29 @@ class PatientSetup:
         InputError
             See `deformer`; an anatomy without open cortex.
         """
-        return Player(
-            self.build_stage(scene), self.build_deformer(name, scene), uncertainty=self.estimate_uncertainty(scene)
-        )
+        return self.build_player_of(self.build_stage(scene), self.build_deformer(name, scene))
+
+    def build_player_of(self, stage: Stage, deformer: Deformer) -> Player:
+        """Return a player of a stage with its errors on this anatomy."""
+        scene = stage.scene
+        errors = {"uncertainty": self.estimate_uncertainty(scene), "motion_error": self.estimate_motion_error(scene)}
+        return Player(stage, deformer, **errors)
 
     def estimate_uncertainty(self, scene: Scene) -> Uncertainty | None:
         """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""
         found = self.uncertainties.get(scene.name)
         return found if found and found.mark == mark_of(scene, self.site, self.choose_element(scene)) else None
+
+    def estimate_motion_error(self, scene: Scene) -> MotionError | None:
+        """Return the error in proportion to the motion, from this anatomy's ensemble of the scene or the template's.
+
+        None without an ensemble of a scene of that name with the same kinds of effects.
+        """
+        found = self.uncertainties.get(scene.name) or read_template_uncertainties().get(scene.name)
+        if found is None or scene.name not in SCENES:
+            return None
+        kinds = [[type(effect) for effect in one.effects] for one in (scene, find_scene(scene.name))]
+        return fit_motion_error(found) if kinds[0] == kinds[1] else None
 
     # Former names, for one release.
     stage, knowing, names, best = build_stage, select_models, list_deformers, select_best
@@ -259,14 +285,20 @@ class AtRest:
         return rest if at is None else rest.restrict(at)
 
 
+@lru_cache(1)
+def read_template_uncertainties() -> Mapping[str, Uncertainty]:
+    """Return the uncertainties that ship with the template, by scene."""
+    return read_uncertainties(to_uncertainty_path(get_template_path()))
+
+
 def plan_of(deformer: Deformer) -> tuple[str, ...]:
     """List the solvers that a deformer tries for a load, as sentences; empty for a model or a resected body."""
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
-def to_model_path(anatomy: Path) -> Path:
-    """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu."""
-    return anatomy.with_suffix(".model.npz")
+def to_model_path(anatomy: Path, kind: str = "model") -> Path:
+    """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu; kind "spatula": of a spatula."""
+    return anatomy.with_suffix(f".{kind}.npz")
 
 
 def open_theatre(
@@ -296,8 +328,10 @@ def open_theatre(
     path = get_template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)
     scan = to_intensity_path(path)
-    learnt = to_model_path(path) if model is None else Path(model)
-    models = load(learnt, body) if model is not None or learnt.is_file() else {}
+    models = load(Path(model), body) if model is not None else {}
+    if model is None:
+        for file in (to_model_path(path), to_model_path(path, "spatula")):
+            models = (load(file, body) if file.is_file() else {}) | models
     intensity = read_intensity(scan) if scan.is_file() else None
     uncertainties = read_uncertainties(to_uncertainty_path(path))
     return PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties)

@@ -24,14 +24,16 @@ from sim.geometry.closest_point import find_closest_points
 from sim.geometry.first_contact import find_resting_tip
 from sim.geometry.surface import is_enclosing
 from sim.loads import Loads, stack
+from surrogate.locating.calibration import RADIUS_SQUARED
 from surrogate.model.guarded import find_first_model
 from surrogate.model.learned import Learned
 
 from ..script.craniotomy_frame import CraniotomyFrame
+from ..script.registration import REGISTRATIONS
 from ..script.scene import Scene
 from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, compute_lift
-from ..script.uncertainty import NOT_KNOWN, TumourError, Uncertainty
+from ..script.uncertainty import NOT_KNOWN, MotionError, TumourError, Uncertainty
 from .cortex_layers import COTTON, GLOVE
 from .frame_text import annotate, describe_outcome, format_acting, format_errors
 from .observer import TumourEstimate
@@ -162,6 +164,7 @@ class Player:
     deformer: Deformer
     style: Style = "window"
     uncertainty: Uncertainty | None = None
+    motion_error: MotionError | None = None
     composed: bool = True
 
     @property
@@ -236,11 +239,11 @@ class Player:
         doubt = doubt or (REJECTED_WARNING if estimate is not None and estimate.location is None else "")
         gauge = None if held is None else self._measure_tip_gauge(held, loads, deformation, tumour)
         promised = None if doubt else self._get_model_error(deformation)
-        error = NOT_KNOWN if doubt else self._compute_tumour_error(touch, loads, promised or 0.0, estimate)
+        motion = float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean())
+        error = NOT_KNOWN if doubt else self._compute_tumour_error(touch, loads, motion, promised or 0.0, estimate)
         shown = None if gauge is None else replace(gauge, error=error.bound)
         traces = () if estimate is None else list_traces(estimate, stage.build_reference(positions))
         moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
-        motion = float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean())
         if estimate is None and error.moved is not None and not is_undeformed(deformation):
             moved = motion, error.moved
         band = 0.0 if estimate is not None else error.bound or 0.0
@@ -292,24 +295,30 @@ class Player:
         return bound if np.isfinite(bound) else None
 
     def _compute_tumour_error(
-        self, touch: Touch, loads: Loads, promised: float, estimate: TumourEstimate | None
+        self, touch: Touch, loads: Loads, motion: float, promised: float, estimate: TumourEstimate | None
     ) -> TumourError:
-        """Return the error of the tumour position: known on the script's tool path; an estimate replaces its bound."""
+        """Return the error of the tumour position: an ensemble's on the script's tool path, else by the motion [m].
+
+        An estimate from observations replaces its bound.
+        """
         time = float(loads.times[0])
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
-        error = self.uncertainty.evaluate(time, promised) if self.uncertainty is not None and scripted else NOT_KNOWN
-        return (
-            error
-            if estimate is None
-            else replace(error, observed=estimate.worst, registration=estimate.observation.rigid)
-        )
+        error, registration = NOT_KNOWN, self.scene.registration
+        if self.uncertainty is not None and scripted:
+            error = self.uncertainty.evaluate(time, promised, registration)
+        elif self.motion_error is not None:
+            error = self.motion_error.evaluate(motion, promised, registration)
+        if estimate is None:
+            return error
+        deviation = REGISTRATIONS[registration]
+        worst = None if estimate.worst is None else float(np.hypot(estimate.worst, RADIUS_SQUARED**0.5 * deviation))
+        return replace(error, observed=worst, registration=deviation)
 
     def play_frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
         """Yield the frames of the scene, or each `every`-th.
 
         A model whose solutions are independent computes `together` frames in one batch. It takes a quarter of the time,
-        and
-        the first frame waits for the last solution.
+        and the first frame waits for the last solution.
         """
         numbers = range(0, len(self.scene.times), every)
         if together == 1 or self.remembers or not isinstance(self.deformer, Learned):

@@ -11,6 +11,8 @@ from scipy.special import ndtri
 
 from sim.errors import InputError
 
+from .registration import CLINICAL_DEVIATION
+
 if TYPE_CHECKING:
     from surrogate.fitting.tissue import FittedTissue
 
@@ -96,7 +98,7 @@ SINKING_MESH_PRIOR = ParameterPrior(
     "docs/notes/uncertainty_experiments.md",
 )  # fmt: skip
 REGISTRATION_PRIOR = ParameterPrior(
-    REGISTRATION, "normal", (1.56e-3, 1.56e-3), "shift of the whole scan, along each axis [m]",
+    REGISTRATION, "normal", (CLINICAL_DEVIATION, CLINICAL_DEVIATION), "shift of the whole scan, along each axis [m]",
     "2.49 mm in the mean by point pairs in 11 patients: Mongen, Willems 2019, Acta Neurochir. 161",
 )  # fmt: skip
 SEGMENTATION_PRIOR = ParameterPrior(

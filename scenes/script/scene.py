@@ -36,6 +36,7 @@ from .craniotomy_frame import CraniotomyFrame
 from .debulking import Debulking
 from .head_pose import Lie, get_supine_pose
 from .observation_models import PointObservation, StereoObservation
+from .registration import Registration
 from .tool import Instrument, Probe
 from .tool_paths import IDLE_HEIGHT, Path, Touch, keep_idle
 from .viewpoint import PLAIN_APPEARANCE, USUAL_VIEWPOINT, Appearance, Viewpoint
@@ -97,6 +98,8 @@ class Scene:
     sight
         Observation model of the open cortex, if the tumour position is estimated from observations; the deformer's
         solution is then the ground truth.
+    registration
+        Registration of the scan to the patient: "perfect", as simulated images have it, or "clinical".
     element
         Element, one of `sim.elements.ELEMENTS`; None: the recommended one for the mesh.
 
@@ -118,6 +121,7 @@ class Scene:
     sight: PointObservation | StereoObservation | None = None
     viewpoint: Viewpoint = USUAL_VIEWPOINT
     look: Appearance = PLAIN_APPEARANCE
+    registration: Registration = "perfect"
     element: str | None = None
     accuracy: Accuracy = LIVE
     bounds: Bounds = Bounds()
@@ -255,10 +259,10 @@ def _build_resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
 
 
 SCENES = (
-    "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag", "lost_force",
-    "microscope",
+    "spatula", "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag",
+    "lost_force", "microscope",
 )  # fmt: skip
-"""The built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
+"""The built-in scenes, each a module of `scenes.builtin` that exports SCENE; `sulcus demo` opens the first."""
 
 
 def find_scene(name: str) -> Scene:

@@ -15,7 +15,8 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
 
 from .craniotomy_frame import CraniotomyFrame
-from .priors import PRIORS, REGISTRATION, REGISTRATION_PRIOR, SEGMENTATION
+from .priors import PRIORS, REGISTRATION, SEGMENTATION
+from .registration import REGISTRATIONS, Registration, describe_registration
 from .scene import Scene
 
 FORMAT = "sulcus uncertainty 1"  # Name and version of the file format.
@@ -23,8 +24,9 @@ LEVEL = 0.95
 """Probability level of every printed bound."""
 SUFFIX = ".uncertainty.json"  # Ending of the file, next to the anatomy.
 SURROGATE = "surrogate"  # Name of a contributor.
-REST_CONTRIBUTORS = (REGISTRATION, SEGMENTATION)
-"""Contributors that displace a tumour in the scan, and by the same amount after it has moved."""
+LISTS = ("times", "worst", "middle", "moved")  # Fields that are lists over the times, in every file.
+MIN_MOTION = 0.1e-3  # Smallest motion of a scene that an error is in proportion to [m].
+MIN_MOTION_RATIO = 0.2  # Smallest motion of a time that counts, as a share of the scene's largest.
 BOUND_DEVIATIONS = 1.96  # Bound at 95 % of a Gaussian [standard deviations].
 
 
@@ -41,9 +43,9 @@ class TumourError:
     observed
         Bound with observations of the brain [m]; None without observations.
     moved
-        The part of `prior` from errors of its motion since the scan: without registration and segmentation.
+        95 % bound on the error of its mean displacement since the scan [m], without observation.
     guess
-        True if `prior` is a rough estimate, as in `Uncertainty.guess`.
+        True if `prior` is a rough estimate, as in `Uncertainty.guess` and by `MotionError`.
     registration
         Standard deviation along each axis [m] of the registration that the bound includes; None: not available.
     """
@@ -60,7 +62,7 @@ class TumourError:
         """The registration's standard deviation along each axis, or nothing: bounds of scenes differ by it."""
         if self.registration is None or self.bound is None:
             return ""
-        return f"registration {1e3 * self.registration:.1f} mm"
+        return describe_registration(self.registration)
 
     @property
     def bound(self) -> float | None:
@@ -84,9 +86,12 @@ class Uncertainty:
     times
         [s].
     worst, middle
-        95th percentile of the errors [m]: maximum over the tumour's surface, and of its centroid.
-    moved
-        Mean motion of the tumour's surface [m].
+        95th percentile of the errors [m] with a clinical registration: largest on the tumour's surface, and centroid.
+    registered
+        `worst` with a perfect registration [m].
+    moved, motion
+        Mean motion of the tumour's surface [m], and 95th percentile of the error of its mean displacement [m], without
+        registration and segmentation.
     parts
         Root mean square over draws of the maximum surface error [m], by contributor.
     frames
@@ -110,7 +115,9 @@ class Uncertainty:
     times: tuple[float, ...]
     worst: tuple[float, ...]
     middle: tuple[float, ...]
+    registered: tuple[float, ...]
     moved: tuple[float, ...]
+    motion: tuple[float, ...]
     parts: Mapping[str, tuple[float, ...]]
     frames: int = 0
     folded: int = 0
@@ -129,21 +136,56 @@ class Uncertainty:
         """True if the bound is only a rough estimate: few draws, or a load beyond the range of the tissue law."""
         return self.few or self.folded > 0
 
-    def evaluate(self, time: float, surrogate: float = 0.0) -> TumourError:
+    def evaluate(self, time: float, surrogate: float = 0.0, registration: Registration = "clinical") -> TumourError:
         """Return the error at a time [s], where a trained model adds its own bound [m]."""
+        deviation = REGISTRATIONS[registration]
         parts = {name: self.read(values, time) for name, values in self.parts.items()}
         parts[SURROGATE] = surrogate / BOUND_DEVIATIONS
-        worst = float(np.hypot(self.read(self.worst, time), surrogate))
-        moved = BOUND_DEVIATIONS * float(
-            np.linalg.norm([size for name, size in parts.items() if name not in REST_CONTRIBUTORS])
-        )
+        if not deviation:
+            del parts[REGISTRATION]
+        worst = float(np.hypot(self.read(self.worst if deviation else self.registered, time), surrogate))
+        moved = float(np.hypot(self.read(self.motion, time), surrogate))
         largest = max(parts, key=lambda name: parts[name])
-        registration = REGISTRATION_PRIOR.range[1]
-        return TumourError(worst, largest, moved=min(moved, worst), guess=self.guess, registration=registration)
+        return TumourError(worst, largest, moved=moved, guess=self.guess, registration=deviation)
 
     def read(self, values: tuple[float, ...], time: float) -> float:
         """One of the lists at a time [s], between its entries in proportion."""
         return float(np.interp(time, self.times, values))
+
+
+@dataclass(frozen=True)
+class MotionError:
+    """Error in proportion to the motion, for loads without an ensemble: a rough estimate from one of similar loads.
+
+    Parameters
+    ----------
+    rest
+        95 % bound on the error of the undeformed tumour [m], by registration.
+    surface, mean
+        Largest ratio, over the times of the ensemble, of the bound on the surface error from deformation, and of that
+        on the mean displacement, to the mean motion.
+    """
+
+    rest: Mapping[Registration, float]
+    surface: float
+    mean: float
+
+    def evaluate(self, motion: float, surrogate: float, registration: Registration) -> TumourError:
+        """Return the error at a mean motion [m], where a trained model adds its own bound [m]."""
+        worst = float(np.linalg.norm([self.rest[registration], self.surface * motion, surrogate]))
+        moved = float(np.hypot(self.mean * motion, surrogate))
+        return TumourError(worst, moved=moved, guess=True, registration=REGISTRATIONS[registration])
+
+
+def fit_motion_error(found: Uncertainty) -> MotionError | None:
+    """Fit the error of a scene's motion in proportion to it; None if the tumour hardly moves in the scene."""
+    moved, worst, mean = (np.array(values) for values in (found.moved, found.registered, found.motion))
+    enough = moved > MIN_MOTION_RATIO * max(moved.max(), MIN_MOTION)
+    if not enough.any() or moved.max() < MIN_MOTION:
+        return None
+    rest: dict[Registration, float] = {"perfect": found.registered[0], "clinical": found.worst[0]}
+    surface = np.sqrt(np.maximum(worst**2 - worst[0] ** 2, 0.0))[enough] / moved[enough]
+    return MotionError(rest, float(surface.max()), float((mean[enough] / moved[enough]).max()))
 
 
 def mark_of(scene: Scene, site: CraniotomyFrame, element: str) -> str:
@@ -185,9 +227,15 @@ def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
 
 
 def _read(row: dict) -> Uncertainty:
-    """One scene's; every list is as long as the times, and of finite numbers."""
-    lists = {name: tuple(map(float, row[name])) for name in ("times", "worst", "middle", "moved")}
+    """One scene's; every list is as long as the times, and of finite numbers.
+
+    Files without `registered` and `motion` get an upper estimate from the parts.
+    """
+    lists = {name: tuple(map(float, row[name])) for name in LISTS}
     parts = {str(name): tuple(map(float, values)) for name, values in row["parts"].items()}
+    for name, excluded in (("registered", {REGISTRATION}), ("motion", {REGISTRATION, SEGMENTATION})):
+        sizes = BOUND_DEVIATIONS * np.linalg.norm([parts[one] for one in parts if one not in excluded], axis=0)
+        lists[name] = tuple(map(float, row.get(name, np.minimum(sizes, lists["worst"]))))
     for name, values in (lists | parts).items():
         if len(values) != len(lists["times"]) or not np.isfinite(values).all():
             raise InputError(f"{name} are not {len(lists['times'])} finite numbers.")
@@ -197,8 +245,8 @@ def _read(row: dict) -> Uncertainty:
         raise InputError("covered and deviation are not shares from 0 to 1.")
     return Uncertainty(
         scene=str(row["scene"]), mark=str(row["mark"]), draws=int(row["draws"]), failed=int(row["failed"]),
-        times=lists["times"], worst=lists["worst"], middle=lists["middle"], moved=lists["moved"], parts=parts,
-        frames=frames, folded=folded, numbers=numbers, patients=patients, covered=covered, deviation=deviation,
+        **lists, parts=parts, frames=frames, folded=folded, numbers=numbers, patients=patients, covered=covered,
+        deviation=deviation,
     )  # fmt: skip
 
 
