@@ -6,7 +6,7 @@ import argparse
 from dataclasses import replace
 
 import pytest
-from test_sim_necrosis import hollowed
+from test_sim_anatomy import hollowed
 from theatres import short, small
 
 from scenes.analysis.uncertainty import apply_sample, get_tissue

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_sim_necrosis import hollowed, necrotic_labels
+from test_sim_anatomy import hollowed, necrotic_labels
 
 from scenes.cli import main
 from scenes.report.finite_elements import change_law as tissue_of_law
