@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 PAGES := tests/test_ar_browser.py tests/test_scenes_demo.py tests/test_scenes_overlay_page.py tests/test_scenes_fem_worker.py tests/test_scenes_view.py
 
 # The most telling tests: a minute on two cores.
-QUICK := house sim_reference sim_material sim_physics sim_plan sim_warm sim_loads sim_term sim_given sim_meshfile scenes_solve \
+QUICK := house sim_neo_hookean sim_material sim_elasticity sim_plan sim_deformation sim_loads sim_term sim_arguments sim_meshfile scenes_solve \
 	sim_readme surrogate_conformal surrogate_store ar_camera ar_rasteriser ar_outlines scenes_tissue_options scenes_outputs
 
 .PHONY: demo quick test test-of test-gpu docs thumbnails lint template locator bench bench-check clean

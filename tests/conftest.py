@@ -20,7 +20,7 @@ from surrogate.regressors.baselines import Ann
 pytest_plugins = ["empty_comparisons", "expected_skips"]
 # Files that take longest on two cores, with a few long tests each: begun last, they would leave a core idle at the end.
 LONGEST = (
-    "engine_kills", "commands", "check", "locating", "effects", "play", "docs", "wheel", "examples", "series", "sight",
+    "engine_kills", "cli", "check", "locating", "effects", "play", "docs", "wheel", "examples", "series", "sight",
 )  # fmt: skip
 
 

@@ -1,7 +1,5 @@
 """A box of which tissue is taken in two steps, for tests of what is left."""
 
-from __future__ import annotations
-
 import numpy as np
 from boxes import base_held, box
 
@@ -15,7 +13,6 @@ TIGHT = Accuracy(tolerance=1e-11)
 SOFT = Material("neo-hookean", 3000.0, 0.4)
 MESH = box((3, 3, 3), 0.06, distortion=0.15)
 BODY = base_held(MESH)
-MIDDLE = MESH.nodes[MESH.tets].mean(axis=1)
 DOWN = np.array([0.0, 0.3, -1.0])
 
 

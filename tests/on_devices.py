@@ -1,7 +1,5 @@
 """What processes of several devices do in tests: they import it by its name."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

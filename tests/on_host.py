@@ -1,7 +1,5 @@
 """The iteration's arrays are the device's; tests look at NumPy's."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A box with an opening on top, held below and sliding round it: what is far from the opening is nearly linear."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """The laws in plain NumPy float64, written from the formulas in F: what the kernels are measured against."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations

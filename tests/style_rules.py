@@ -1,7 +1,5 @@
 """Rules of form for docstrings, comments, help strings, headings and names."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import io

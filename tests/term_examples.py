@@ -1,7 +1,5 @@
 """Every term, with load cases and states in which the conformance suite meets it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property

@@ -14,10 +14,8 @@ from ar.overlay.gauge import NUMBER_SCALE, Gauge
 from ar.overlay.hud import FONT, LINE_SPACING, TEXT_SCALE, WHITE, draw_text_panel, wrap_line
 from ar.overlay.legend import SHEET_VALUE
 from ar.overlay.marks import Cover, Marks, Words
-from ar.overlay.measured import Measure
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, find_text, has_text, measure_outline_gap
 from ar.overlay.styles import STYLES, Opening
-from ar.overlay.window import BORDER_COLOUR, Roles
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, render
 
@@ -184,23 +182,6 @@ def test_words_at_the_head_are_broken_beside_a_tool():
     assert max(cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines) < 330
     tool[:, 40:] = True
     assert format_head_lines(texts, tool) == texts  # there is no room beside it
-
-
-def test_a_ring_s_number_keeps_off_the_line_from_the_tip():
-    at = tumour((0.0, 0.0, -0.014))
-    roles = Roles((TOOL,), None, None)
-    plain, crossed = (np.zeros((480, 640, 4), np.uint8) for _ in range(2))
-    box = np.s_[0:480, 0:640]
-    measure = Measure("rings", seen(), CAMERA, at, roles)
-    measure.draw(plain, np.zeros_like(plain), box)
-    line = np.zeros_like(plain)
-    number = (plain[..., :3] == np.array(BORDER_COLOUR, np.uint8)).all(axis=2) & (plain[..., 3] > 0)
-    boxes = cv2.erode(number.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # more than a line's rim
-    assert boxes.any()
-    line[boxes, 3] = 255
-    measure.draw(crossed, line, box)
-    again = (crossed[..., :3] == np.array(BORDER_COLOUR, np.uint8)).all(axis=2) & (crossed[..., 3] > 0)
-    assert not (cv2.erode(again.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)[boxes].any()
 
 
 def test_ring_caption_keeps_clear_of_tip_number():

@@ -1,7 +1,5 @@
 """`python -m benchmarks all`: figures in processes of their own, records, tables of pages, and what got slower."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The list of figures: every command parses, its numbers are what its bench gives, no bench of a page is missing."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import fields
 from pathlib import Path

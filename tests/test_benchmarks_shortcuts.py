@@ -1,7 +1,5 @@
 """`python -m benchmarks shortcuts`: both solvers answer the same loads, and only what a solver has is measured."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

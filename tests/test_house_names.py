@@ -14,9 +14,7 @@ import ar
 import scenes
 import sim
 import surrogate
-from sim.runtime import versions
 from sim.runtime.optional_packages import install_hint
-from sim.runtime.versions import DISTRIBUTION, get_version
 
 PROJECT = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
@@ -41,12 +39,6 @@ def instructions():
             yield path.relative_to(HOUSE).as_posix(), rest
 
 
-def test_distribution_has_one_name():
-    assert PROJECT["name"] == DISTRIBUTION and DISTRIBUTION != "sulcus"
-    own = [one for extra in EXTRAS.values() for one in extra if re.match(r"sulcus\b", one)]
-    assert own == [f"{DISTRIBUTION}[camera,data,docs,gym,onnx,report,slicer]"]
-
-
 def test_instructions_install_the_checkout_and_no_other_name():
     found = list(instructions())
     assert len(found) > 10
@@ -61,17 +53,6 @@ def test_instructions_install_the_checkout_and_no_other_name():
 @pytest.mark.parametrize("extra", ["camera", "data", "gym", "heads", "onnx", "peers", "report", "slicer"])
 def test_install_hint_names_an_extra_that_exists(extra):
     assert extra in EXTRAS and install_hint(extra).endswith(f"pip install -e '.[{extra}]'.")
-
-
-def test_version_of_uninstalled_checkout_is_the_projects(monkeypatch):
-    def gone(name):
-        raise versions.PackageNotFoundError(name)
-
-    assert get_version("sulcus") == PROJECT["version"]
-    monkeypatch.setattr(versions, "version", gone)
-    assert get_version.__wrapped__("sulcus") == PROJECT["version"]
-    with pytest.raises(versions.PackageNotFoundError):
-        get_version.__wrapped__("numpy")
 
 
 FOREIGN = {

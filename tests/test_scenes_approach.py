@@ -1,7 +1,5 @@
 """A scene's tool goes in where a planned trajectory enters, and along it; what does not fit the opening is refused."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The debulking of a tumour: its corridor, and what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from test_scenes_resection import SURGERY

@@ -1,7 +1,5 @@
 """What each effect costs and changes, and the list of scenes with its sheet."""
 
-from __future__ import annotations
-
 import json
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace

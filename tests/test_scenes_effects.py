@@ -1,7 +1,5 @@
 """What acts in a scene follows from its effects, and a learnt model answers none that it was not trained on."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

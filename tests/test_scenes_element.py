@@ -1,7 +1,5 @@
 """--element from the outside: quadratic meshes as input, the same body by different files, refusals."""
 
-from __future__ import annotations
-
 import json
 from itertools import combinations
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Under loads that stay, with mass, no built-in scene gains energy, be its effects what they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

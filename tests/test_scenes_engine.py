@@ -27,8 +27,6 @@ from scenes.episodes.run_folder import (
 )
 from scenes.episodes.workers import connect_workers, start_own_workers
 from sim.errors import InputError
-from sim.runtime.atomic_files import write_atomically
-from sim.runtime.partial_files import remove_left_overs
 
 PLAN = 'title = "tiny"\n'
 
@@ -179,30 +177,6 @@ def test_a_folder_is_one_runs_own(tmp_path):
     (tmp_path / "run.json").write_text("mine")
     with pytest.raises(InputError, match="is not what `sulcus episodes` writes"):
         begin(tmp_path, tiny_run(), PLAN)
-
-
-def test_leftovers_of_dead_processes_only_are_removed(tmp_path):
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
-    remove = tmp_path / "probe.h5"
-    with write_atomically(remove, ".h5") as partial:
-        partial.write_text("mine")
-        own = partial.name
-        machine = own.split("-")[1]
-        names = {
-            own: True,
-            f".sulcus-{machine}-{dead.pid}-episode_000001.h5": False,
-            f".sulcus-00000000-{dead.pid}-episode_000002.h5": True,  # of another machine
-            ".sulcus-notes": True,
-        }
-        for name in names:
-            (tmp_path / name).touch()
-        (tmp_path / f".sulcus-{machine}-{dead.pid}-0003").mkdir()
-        (tmp_path / f".sulcus-{machine}-{dead.pid}-0003" / "body.vtu").touch()
-        begin(tmp_path, tiny_run(), PLAN)
-        assert {name for name, stays in names.items() if stays} == {p.name for p in tmp_path.glob(".*")}
-    remove_left_overs(tmp_path, stale=-1.0)
-    assert [path.name for path in tmp_path.glob(".*")] == [".sulcus-notes"]
 
 
 def test_what_is_missing_is_known_by_name_alone(tmp_path):

@@ -1,7 +1,5 @@
 """The posture of the head, and how its fluid drains."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from theatres import player, sinking

@@ -1,7 +1,5 @@
 """Models judged with the element and the tissue that they were trained on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a scene keeps on the device is what its effects keep, byte by byte: counted, not sampled."""
 
-from __future__ import annotations
-
 import gc
 from types import FunctionType, ModuleType
 

@@ -1,7 +1,5 @@
 """Scenes whose hand moves its tool: what it reads, and that nothing but time and the start decides an answer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import h5py

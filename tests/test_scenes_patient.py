@@ -1,7 +1,5 @@
 """Command that takes a patient from scan to models: in one go, after a stop, and what cannot be."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

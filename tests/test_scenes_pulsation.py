@@ -1,7 +1,5 @@
 """The built-in scene of a ball on a brain that pulsates."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reference solutions of a report and of frames: kept load by load, and read at the points that are compared."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

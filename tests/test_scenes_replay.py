@@ -1,7 +1,5 @@
 """Whatever a visitor does, a frame of the script is that of the straight run; plain statics need no run."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """A tumour that is taken in steps: what is cut, what is drawn of the rest, and what an episode and a page say of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

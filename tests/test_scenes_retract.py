@@ -1,7 +1,5 @@
 """The built-in scene of a blade that is held."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from test_scenes_palpate import small

@@ -13,7 +13,6 @@ from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_t
 from ar.screen import write_film
 from ar.tracking.image_sequences import Named, read_video
 from scenes.cli import main
-from scenes.play.stage import TUMOUR_COLOUR
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import Follower
@@ -23,7 +22,6 @@ from scenes.tracked.run import draw_overlays, read_timed
 from scenes.tracked.tool_motion import ToolMotion
 
 FILM = Path(__file__).parent / "data" / "film"
-INK = compute_ink(TUMOUR_COLOUR)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """Label above an image, and images of a scene side by side: source, time, motion, and doubts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Command that lists scenes: who can play them, pictures and a sheet."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

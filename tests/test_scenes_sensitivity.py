@@ -1,7 +1,5 @@
 """What else moves the tumour: changes whose size is known beforehand, and what does not converge is counted."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Command that solves loads: the element asked for, bodies without tumour, quadratic anatomies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from boxes import quadratic

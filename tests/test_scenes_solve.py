@@ -1,7 +1,5 @@
 """`sulcus solve`: from a mesh file to a mesh file, exit codes, and refusals that write nothing."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

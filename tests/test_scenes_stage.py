@@ -4,17 +4,12 @@ from dataclasses import replace
 from typing import cast
 
 import numpy as np
-import pytest
+from theatres import small, template_theatre
 
-from ar.rendering.real_image import add_vignette
 from scenes.play.player import Player
 from scenes.play.stage import CORTEX, Stage
-from scenes.script.viewpoint import Viewpoint
 from sim.bodies.intensity import Intensity
 from sim.deformation import Deformer, guess
-from sim.errors import InputError
-
-from .theatres import small, template_theatre
 
 
 def seen(values, scene=None):
@@ -55,23 +50,6 @@ def test_a_scan_of_one_value_gives_one_colour_and_no_folds():
     colours = plain.colour[plain.segmentation == CORTEX].astype(float)
     shares = colours[:, 1] / colours[:, 0]
     assert shares.std() < 0.03
-
-
-def test_round_field_darkens_only_beyond_its_edge():
-    grey = template_theatre().intensity.values
-    whole, field = seen(grey), add_vignette(seen(grey), 1.0)
-    row, column = np.mgrid[:240, :320]
-    away = np.hypot(column - 159.5, row - 119.5)
-    assert not field.colour[away > 160.0].any()
-    np.testing.assert_array_equal(field.colour[away < 140.0], whole.colour[away < 140.0])
-    ring = (away > 145.0) & (away < 155.0)
-    assert 0 < field.colour[ring].mean() < whole.colour[ring].mean()
-    np.testing.assert_array_equal(field.depth, whole.depth)
-    np.testing.assert_array_equal(field.segmentation, whole.segmentation)
-    with pytest.raises(InputError, match="round field"):
-        Viewpoint(field=0.0)
-    with pytest.raises(ValueError, match="round field"):
-        add_vignette(seen(grey), float("nan"))
 
 
 def test_a_scene_shows_its_field_and_the_same_bytes_again():

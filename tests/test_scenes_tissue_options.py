@@ -1,7 +1,5 @@
 """The tissue on the command line: laws, named tissues, regions, and options that contradict each other."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import replace

@@ -1,11 +1,19 @@
-"""Warps of images and label maps as SimpleITK carries them."""
+"""Warps by `sulcus warp`: what it is asked for and refuses, and images and label maps as SimpleITK carries them."""
+
+import json
+from dataclasses import replace
 
 import nibabel
+import nrrd
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 from warped import BLOBS, GRIDS, LPS, MAPPED, WIDTH, bump, places
 
+from scenes.cli import main
+from scenes.warp.images import read_picture, warp_values, write_warped
+from sim.bodies.meshfile import write_anatomy, write_mesh
+from sim.fields.warp_fields import warp_fields
 from sim.geometry.locate import locate
 from sim.geometry.tetmesh import compute_signed_volumes
 
@@ -77,3 +85,261 @@ def test_points_go_the_way_that_tissue_goes(box, warp_out):
     now = 1e-3 * LPS * np.array([transform.TransformPoint((1e3 * blob * LPS).tolist()) for blob in BLOBS])
     truth = locate(box.mesh, BLOBS).read((box.mesh.nodes + bump(box.mesh.nodes))[None])[0]
     assert np.abs(now - truth).max() < 0.05e-3
+
+
+def dimple(nodes, depth=4e-3):
+    share = np.clip(1.0 - (np.linalg.norm(nodes[:, :2], axis=1) / 25e-3) ** 2, 0.0, 1.0)
+    return np.outer(share * np.clip(1.0 + nodes[:, 2] / 42e-3, 0.0, 1.0), [0.0, 0.0, -depth])
+
+
+AFFINE = np.diag([2.0, 2.0, 2.0, 1.0])
+AFFINE[:3, 3] = [-40.0, -40.0, -50.0]
+
+
+def save(path, values, affine=AFFINE):
+    nibabel.save(nibabel.Nifti1Image(values, affine), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, box):
+    folder = tmp_path_factory.mktemp("asked")
+    write_anatomy(folder / "box.vtu", box)
+    write_mesh(folder / "located.vtu", box.mesh, {"displacement": dimple(box.mesh.nodes)})
+    save(folder / "t1.nii.gz", np.full((40, 40, 32), 100, np.int16))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fields(box):
+    return warp_fields(box, dimple(box.mesh.nodes), 2e-3)
+
+
+def warp(folder, *words, out="out", anatomy="box.vtu"):
+    return main(["warp", str(folder / anatomy), *map(str, words), "--spacing", "4", "--out", str(folder / out)])
+
+
+def test_a_load_is_solved_and_its_tip_measured(folder, box, capsys):
+    words = "--load=1,2,0,0.1", "--device", "cpu", "--json"
+    assert warp(folder, *words, out="load") == 0
+    report = json.loads(capsys.readouterr().out)
+    said = report["cause"]
+    assert "a load of 0.1 N at 1.0, 2.0, 0.0 mm towards 0.00, 0.00, -1.00 (RAS)" in report["moved_by"]
+    assert (said["kind"], said["place_mm"], said["force_n"]) == ("load", [1.0, 2.0, 0.0], pytest.approx(0.1))
+    assert said["direction"] == [0.0, 0.0, -1.0] and "frame" not in said and "scene" not in report["moved_by"]
+    assert report["anatomy"] == {"file": "box.vtu", "digest": box.digest}
+    assert "finite elements" in report["moved_by"] and report["largest_displacement_mm"] > 0.2
+    assert report["bound_mm"] is None and min(report["least_jacobian"].values()) > 0.0
+    line = json.loads((folder / "load" / "tip_to_tumour.mrk.json").read_text())["markups"][0]
+    ends = np.array([point["position"] for point in line["controlPoints"]])
+    assert line["type"] == "Line" and np.isclose(
+        np.linalg.norm(ends[0] - ends[1]), report["tip_to_tumour_mm"], atol=1e-3
+    )
+    assert np.abs(ends[0, :2] - [-1.0, -2.0]).max() < 1.5  # LPS
+    text = (folder / "load" / "README.txt").read_text()
+    assert all(word in text for word in ("not known", "a load of 0.1 N at", f"box.vtu, digest {box.digest}"))
+    assert report["spaces"]["field_modeling.nrrd"] == "LPS, mm" and report["spaces"]["cause"] == "RAS, mm"
+
+
+def test_a_scene_is_a_sequence_in_time(folder, capsys):
+    words = "--scene", "press", "--frame", "60", "--sequence", "60", "--device", "cpu", "--json"
+    assert warp(folder, *words, out="scene") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["sequence_frames"] == 3
+    assert report["cause"] == {"kind": "scene", "scene": "press", "frame": 60, "time_s": 2.0}
+    values, header = nrrd.read(str(folder / "scene" / "field_sequence.seq.nrrd"))
+    assert header["kinds"] == ["vector", "domain", "domain", "domain", "list"] and values.shape[0::4] == (3, 3)
+    assert header["axis 3 index values"] == "0 2 4" and header["units"][-1] == "s"
+    assert header["displacement field type"] == "modeling" and header["intent_code"] == "1006"
+    largest = np.linalg.norm(values, axis=0).max(axis=(0, 1, 2))
+    assert largest[1] > 5 * largest[0]
+
+
+def test_a_grid_that_is_coarse_for_the_tumour_is_said(folder, box, capsys):
+    moved = np.zeros_like(box.mesh.nodes)
+    moved[box.tumour_nodes[0]] = [0.0, 0.0, 1e-3]  # of one vertex: no grid of 4 mm follows it
+    write_mesh(folder / "narrow.vtu", box.mesh, {"displacement": moved})
+    for name, coarse in (("narrow.vtu", True), ("located.vtu", False)):
+        assert warp(folder, "--located", folder / name, out=f"{name}.warp") == 0
+        assert ("a smaller --spacing" in capsys.readouterr().err) == coarse
+        assert ("the grid is coarse" in (folder / f"{name}.warp" / "README.txt").read_text()) == coarse
+
+
+def test_intensities_keep_scale_and_type(folder, box, fields):
+    image = nibabel.Nifti1Image(np.arange(40 * 40 * 32).reshape(40, 40, 32).astype(np.int16) % 700, AFFINE)
+    image.header.set_slope_inter(0.5, -10.0)
+    nibabel.save(image, folder / "scaled.nii")
+    found = write_warped(folder, read_picture(folder / "scaled.nii", box, False), fields, "cubic")
+    before, after = nibabel.load(folder / "scaled.nii"), nibabel.load(folder / "scaled_deformed.nii.gz")
+    assert after.get_data_dtype() == np.int16 and (after.dataobj.slope, after.dataobj.inter) == (0.5, -10.0)
+    assert np.array_equal(after.affine, before.affine) and after.header["qform_code"] == before.header["qform_code"]
+    same = np.asarray(before.dataobj) == np.asarray(after.dataobj)
+    assert 0.1 < same.mean() < 0.9 and found.moved >= (~same).sum()
+
+
+def test_what_comes_from_outside_or_was_cut_is_zero_and_counted(box, fields):
+    affine = np.diag([1e-3, 1e-3, 1e-3, 1.0])
+    affine[:3, 3] = [-10e-3, -10e-3, -8e-3]  # its top lies below what is pushed into it
+    out, counts = warp_values(np.full((20, 20, 6), 9, np.uint8), affine, fields, 1)
+    assert counts.outside > 200 and (out[counts.blank] == 0).all() and (out[~counts.blank] == 9).all()
+    cut = warp_fields(box, dimple(box.mesh.nodes), 2e-3, box.remove_elements(np.flatnonzero(box.mesh.region == 2)))
+    affine[2, 3] = -40e-3
+    out, counts = warp_values(np.full((20, 20, 36), 9, np.uint8), affine, cut, 0)
+    assert counts.gone > 1000 and (out == 0).sum() == counts.gone + counts.outside
+
+
+def nan_place(path):
+    header = nibabel.Nifti1Header()
+    header.set_data_shape((40, 40, 32))
+    header.set_data_dtype(np.uint8)
+    header["sform_code"] = 1
+    for row in ("srow_x", "srow_y", "srow_z"):
+        header[row] = np.nan
+    header["vox_offset"] = 352
+    path.write_bytes(header.binaryblock + bytes(4) + bytes(40 * 40 * 32))
+
+
+FAR = AFFINE.copy()
+FAR[0, 3] = 400.0
+REFUSED = {
+    "far.nii.gz": (lambda path: save(path, np.ones((40, 40, 32), np.uint8), FAR), "shows none of this brain"),
+    "series.nii.gz": (lambda path: save(path, np.ones((40, 40, 32, 3), np.uint8)), "not one volume"),
+    "slice.nii.gz": (lambda path: save(path, np.ones((40, 40), np.uint8)), "not one volume"),
+    "nowhere.nii": (nan_place, "singular"),
+    "scan.png": (lambda path: path.write_bytes(b"no image"), "unsupported file type; expected .nii"),
+    "none.nii.gz": (lambda path: None, "no such file"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_an_image_that_cannot_be_warped_is_named(name, folder, capsys):
+    make, reason = REFUSED[name]
+    make(folder / name)
+    assert warp(folder, "--located", folder / "located.vtu", "--image", folder / name, out="refused") == 2
+    error = capsys.readouterr().err
+    assert name in error and reason in error and not (folder / "refused").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--scene", "press"], "--frame"),
+        (["--scene", "press", "--frame", "999"], "0 to 120"),
+        (["--scene", "none", "--frame", "1"], "no scene is called"),
+        (["--load", "1,2,0,0.1", "--frame", "3"], "--scene"),
+        (["--load=-1,2,0,-0.1"], "no push"),
+        (["--load", "300,2,0,0.1"], "from the open cortex"),
+        (["--load", "1,2,nan,0.1"], "from the open cortex"),
+        (["--load", "1,2,0,0.1", "--spacing", "0"], "--spacing"),
+        (["--scene", "press", "--frame", "1", "--sequence", "0"], "--sequence"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(words, reason, folder, capsys):
+    assert main(["warp", str(folder / "box.vtu"), *words, "--out", str(folder / "refused")]) == 2
+    error = capsys.readouterr().err
+    assert reason in error and not (folder / "refused").exists()
+
+
+def test_foreign_results_and_unknown_labels_are_rejected(folder, box, capsys):
+    other = box.remove_elements(np.arange(5)).mesh
+    write_mesh(folder / "other.vtu", other, {"displacement": dimple(other.nodes)})
+    for name, reason in (("other.vtu", "another mesh"), ("box.vtu", "no point data `displacement`")):
+        assert warp(folder, "--located", folder / name, out="refused") == 2
+        assert reason in capsys.readouterr().err
+    save(folder / "grey.nii.gz", np.full((40, 40, 32), 0.5, np.float32))
+    assert warp(folder, "--located", folder / "located.vtu", "--labels", folder / "grey.nii.gz", out="refused") == 2
+    assert "no label map" in capsys.readouterr().err
+    twice = ["--image", folder / "t1.nii.gz", "--labels", folder / "t1.nii.gz"]
+    assert warp(folder, "--located", folder / "located.vtu", *twice, out="refused") == 2
+    assert "would both become" in capsys.readouterr().err
+
+
+def test_doubts_about_an_image_are_said(folder, box, capsys):
+    empty, part = np.zeros((40, 40, 32), np.float32), np.ones((12, 40, 32), np.float32)
+    empty[:5], part[0, 0, 0] = 1.0, np.nan
+    save(folder / "empty.nii.gz", empty)
+    image = nibabel.Nifti1Image(part, None)
+    image.header.set_zooms((2.0, 2.0, 2.0))
+    nibabel.save(image, folder / "part.nii.gz")  # neither sform nor qform
+    said = {
+        name: " ".join(read_picture(folder / name, box, False, "RAS").warnings)
+        for name in ("empty.nii.gz", "part.nii.gz")
+    }
+    assert "another space" in said["empty.nii.gz"]
+    assert all(word in said["part.nii.gz"] for word in ("of the brain", "without a number"))
+
+
+def test_a_map_of_a_small_tumour_raises_no_doubt(folder, box):
+    values = np.zeros((40, 40, 32), np.uint8)
+    values[18:23, 18:23, 12:17] = 2
+    save(folder / "small.nii.gz", values)
+    assert read_picture(folder / "small.nii.gz", box, True).warnings == ()
+    asked = " ".join(read_picture(folder / "small.nii.gz", box, False).warnings)
+    assert "another space" in asked and "--labels" in asked
+
+
+def test_intensities_that_are_given_as_labels_are_doubted(folder, box):
+    smooth = 300.0 + 200.0 * np.sin(np.indices((40, 40, 32)).sum(axis=0) / 9.0)
+    for name, values, doubted in (("scan", smooth, True), ("many", 1.0 + smooth // 50.0, False)):
+        save(folder / f"{name}.nii.gz", values.astype(np.int16))
+        said = " ".join(read_picture(folder / f"{name}.nii.gz", box, True).warnings)
+        assert ("as intensities do: give them by --image" in said) == doubted
+
+
+def test_empty_share_is_by_volume_not_vertices(folder, box):
+    index = np.rint((1e3 * box.mesh.nodes - AFFINE[:3, 3]) / 2.0).astype(int)
+    values = np.ones((40, 40, 32), np.float32)
+    values[tuple(index.T)] = 0.0  # one voxel round each vertex
+    save(folder / "pitted.nii.gz", values)
+    assert not any("is 0" in warning for warning in read_picture(folder / "pitted.nii.gz", box, False).warnings)
+
+
+def test_lps_that_is_stated_as_ras_is_doubted(folder, box):
+    moved = replace(box, mesh=replace(box.mesh, nodes=box.mesh.nodes + [0.0, 15e-3, 0.0]))
+    places = np.moveaxis(np.indices((60, 60, 32)), 0, -1) * 2.0 + [-60.0, -60.0, -50.0]
+    low, high = 1e3 * moved.mesh.nodes.min(axis=0), 1e3 * moved.mesh.nodes.max(axis=0)
+    values = np.random.default_rng(0).normal(5.0, 1.0, places.shape[:3])
+    values[((places >= low) & (places <= high)).all(axis=-1)] = 100.3
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    affine[:3, 3] = [-60.0, -60.0, -50.0]
+    for name, signs in (("right", [1.0, 1.0, 1.0, 1.0]), ("wrong", [-1.0, -1.0, 1.0, 1.0])):
+        save(folder / f"{name}.nii.gz", values.astype(np.float32), np.diag(signs) @ affine)
+        warnings = read_picture(folder / f"{name}.nii.gz", moved, False).warnings
+        assert any("LPS marked as RAS" in warning for warning in warnings) == (name == "wrong")
+
+
+def test_a_folder_that_is_not_empty_is_left_alone(folder, capsys):
+    located = "--located", folder / "located.vtu"
+    mine = folder / "mine" / "notes.txt"
+    mine.parent.mkdir()
+    mine.write_text("my own")
+    assert warp(folder, *located, out="mine") == 2
+    assert "mine: exists and is not empty" in capsys.readouterr().err and list(mine.parent.iterdir()) == [mine]
+    mine.unlink()
+    assert warp(folder, *located, out="mine") == 0
+    before = {path.name for path in mine.parent.iterdir()}
+    assert warp(folder, *located, "--image", folder / "t1.nii.gz", out="mine") == 2
+    assert {path.name for path in mine.parent.iterdir()} == before
+    (folder / "file").write_text("my own")
+    assert warp(folder, *located, out="file") == 2
+
+
+def test_other_formats_give_the_same_picture_as_nifti(folder, box, fields, tmp_path):
+    values = np.random.default_rng(2).integers(0, 200, (40, 40, 32)).astype(np.int16)
+    save(tmp_path / "a.nii.gz", values)
+    nibabel.save(nibabel.MGHImage(values, AFFINE), tmp_path / "b.mgz")
+    lps = np.diag([-1.0, -1.0, 1.0, 1.0]) @ AFFINE
+    header = {
+        "space": "left-posterior-superior", "space directions": lps[:3, :3].T, "space origin": lps[:3, 3],
+        "kinds": ["domain"] * 3,
+    }  # fmt: skip
+    nrrd.write(str(tmp_path / "c.nrrd"), values.astype(np.int64), header)
+    found = {}
+    for name in ("a.nii.gz", "b.mgz", "c.nrrd"):
+        warped = write_warped(tmp_path, read_picture(tmp_path / name, box, False), fields, "linear")
+        found[name] = nibabel.load(tmp_path / warped.name)
+        assert warped.name == f"{name[0]}_deformed.nii.gz" and warped.moved > 100
+    for image in found.values():
+        assert image.header["sform_code"] > 0
+        np.testing.assert_allclose(image.affine, AFFINE, atol=1e-5)
+        np.testing.assert_array_equal(image.get_fdata(), found["a.nii.gz"].get_fdata())

@@ -1,17 +1,14 @@
 """Episodes read by others: windows of frames, decoded pictures, workers, and files that are not what they seem."""
 
-import os
 import pickle
 import struct
 
 import h5py
 import numpy as np
 import pytest
-import torch
 from tiny_episodes import HEIGHT, SCALE, WIDTH, Wanted, packed, read_images, write_episode
-from torch.utils.data import DataLoader
 
-from scenes import EpisodeDataset, read_episodes
+from scenes import read_episodes
 from scenes.episodes.reading.contents import OpenFiles
 from sim.errors import InputError
 
@@ -86,22 +83,6 @@ def test_files_are_opened_when_they_are_read_and_not_too_many(folder):
     assert len(other.files) == 0 and other.files.most == 2 and other[3]["frame"] == found[3]["frame"]
     with pytest.raises(InputError, match="at least one"):
         OpenFiles(0)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are forked")
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:multiprocessing.popen_fork")
-@pytest.mark.parametrize("start", ["fork", "spawn"])
-def test_workers_read_what_one_process_reads(folder, start):
-    data = EpisodeDataset(folder, ["colour", "tumour_predicted"], window=2, stride=2)
-    assert isinstance(data[0]["colour"], torch.Tensor) and data.get_window(1, 3)["frame"].tolist() == [3, 4]
-    alone = [data[index] for index in range(len(data))]
-    loader = DataLoader(data, batch_size=1, num_workers=2, multiprocessing_context=start)
-    together = list(loader)
-    assert len(together) == len(alone) == 9
-    for one, batch in zip(alone, together, strict=True):
-        for name in ("colour", "tumour_predicted", "frame"):
-            assert torch.equal(one[name], batch[name][0])
 
 
 def test_keys_that_an_episode_does_not_have_are_named(folder):

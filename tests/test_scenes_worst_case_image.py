@@ -1,7 +1,5 @@
 """Images of a report and of a film: the tool at rest on the cortex, and nothing drawn through a drape."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

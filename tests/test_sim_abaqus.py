@@ -1,7 +1,5 @@
 """Abaqus input files as Abaqus/CAE, CalculiX and meshers write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Algebraic multigrid against dense algebra and under refinement, and which preconditioner is chosen when."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from boxes import base_held, box

@@ -1,7 +1,5 @@
 """Files that are whole or absent: no left-overs of killed runs, and full disks are said."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

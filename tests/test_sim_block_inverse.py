@@ -1,7 +1,5 @@
 """Matrices taken apart in blocks against dense algebra, on the host: torch multiplies there as it does on a card."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

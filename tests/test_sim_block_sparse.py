@@ -1,7 +1,5 @@
 """Products of block matrices against SciPy's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

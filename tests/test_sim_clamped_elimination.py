@@ -1,7 +1,5 @@
 """Elimination of a clamped part against L-BFGS and Newton on the whole body."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from boxes import base_held, box
@@ -13,9 +11,7 @@ from sim.effects import Elasticity, Held, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, push
 from sim.local_solvers.clamped_elimination import ClampedElimination
-from sim.local_solvers.clamped_part import ClampedPart
 from sim.minimisers.lbfgs_kernels import DONE, LIVE
-from sim.minimisers.residual import compute_constant_gradients
 from sim.strategy.plan import SolverStep
 from sim.terms.elasticity import ElasticTerm
 
@@ -65,23 +61,6 @@ def test_what_is_hardly_strained_is_left_to_others() -> None:
     assert fem.deform(pressed(1e-3)).outcome[0].good
 
 
-def test_a_part_is_settled_between_what_holds_its_rim() -> None:
-    fem, _ = fem_and_elimination()
-    problem, device = fem.problem, fem.problem.device
-    problem.begin(Cases(pressed(0.6), np.zeros(1)))
-    u = device.upload(1e-4 * np.random.default_rng(0).normal(size=(problem.rows, 1)))
-    problem.constraint.project(u)
-    chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.08
-    constant, _ = compute_constant_gradients(problem, u)
-    part = ClampedPart(problem, EFFECTS, fem.space, chosen, constant, u)
-    settled = part.settle(u, 1e-9)
-    inside = np.setdiff1d(part.nodes, fem.space.table[~chosen])
-    moved = (settled.numpy() != u.numpy()).reshape(-1, 3).any(axis=1)
-    assert len(inside) and set(np.flatnonzero(moved)) <= set(inside.tolist())
-    free = problem.residual(settled)[0].numpy().reshape(-1, 3)
-    assert np.linalg.norm(free[inside]) <= 1.01e-9 < np.linalg.norm(free)
-
-
 @pytest.mark.parametrize("law", EVERY_LAW)
 def test_the_assembled_curvature_is_the_one_that_multiplies(law: str) -> None:
     fem = Fem(BODY, (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
@@ -107,14 +86,3 @@ def test_a_law_that_forbids_inversion_is_taken_as_far_as_it_goes(law: str, down:
     assert answer.outcome[0].good and expected.outcome[0].good and answer.inverted[0] == 0
     moved = np.abs(expected.displacement).max()
     np.testing.assert_allclose(answer.displacement, expected.displacement, atol=1e-4 * moved)
-
-
-def test_a_part_whose_forces_are_not_finite_stays_as_it_is() -> None:
-    fem = Fem(BODY, (Elasticity(tissue("neo-hookean")), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
-    problem = fem.problem
-    problem.begin(Cases(pressed(0.6), np.zeros(1)))
-    rest = problem.device.allocate(problem.rows, 1)
-    folded = problem.device.upload(-2.0 * fem.space.nodes.reshape(-1, 1) * (fem.space.nodes[:, 2:] > 0.0).repeat(3, 0))
-    chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.04
-    part = ClampedPart(problem, fem.effects, fem.space, chosen, compute_constant_gradients(problem, rest)[0], rest)
-    np.testing.assert_array_equal(part.settle(folded, 1e-9).numpy(), folded.numpy())

@@ -1,7 +1,5 @@
 """Kernels over columns."""
 
-from __future__ import annotations
-
 import numpy as np
 from test_sim_lbfgs_trial_kernels import DEVICE, ROWS, column, double
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from oracle import EVERY_LAW, tissue
-from test_sim_own import BODY, PRESS, TWO, YEOH, answer
+from test_sim_user_script import BODY, PRESS, TWO, YEOH, answer
 
 from sim.accuracy import TRAIN
 from sim.effects import Elasticity, Held, ToolForce, remember

@@ -1,7 +1,5 @@
 """Held, prescribed and sliding nodes, and footprints that a tool moves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from boxes import box, hold

@@ -1,7 +1,5 @@
 """Contact that breaks solvers: tools that jump, turn, squeeze and stab. Each answer is finite, honest and outside."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """What rigid tools are known to do to elastic bodies: Hertz, the flat punch, and what moves with the observer."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """How hard tools press: a plate evenly, by force over area; a blade the most under its lower end."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from boxes import base_held, box

@@ -1,7 +1,5 @@
 """Contact over the product of skulls, tools, stiffness ratios, time steps and elements, on a small block."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Steps of single columns in arrays that stay, against the descent that makes each anew."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

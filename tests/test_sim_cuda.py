@@ -24,7 +24,6 @@ from sim.effects import (
 )
 from sim.elements import ELEMENTS
 from sim.fem import Fem
-from sim.linalg.half_symv import add_product, list_tiles
 from sim.linalg.pcg import BlockJacobi
 from sim.loads import Displaced, Loads, Touching, build_posture, push
 from sim.material import Material
@@ -219,14 +218,3 @@ def test_frames_stay_on_the_card(box):
         largest = np.abs(again.displacement).max()
         np.testing.assert_allclose(again.displacement, answers[number].displacement, atol=1e-3 * largest)
         np.testing.assert_array_equal(again.iterations, answers[number].iterations)
-
-
-def test_half_of_a_symmetric_matrix_is_enough_to_multiply():
-    size = 64 * 13  # no multiple of a tile
-    random = np.random.default_rng(0)
-    matrix, x = random.normal(size=(size, size)).astype(np.float16), random.normal(size=size).astype(np.float32)
-    whole = np.triu(matrix) + np.triu(matrix, 1).T
-    matrix, x = wp.array(whole, dtype=wp.float16, device="cuda"), wp.array(x, device="cuda")
-    y = wp.full(size, 1.0, dtype=wp.float32, device="cuda")
-    add_product(list_tiles(size, "cuda"), matrix, x, y)
-    np.testing.assert_allclose(y.numpy(), 1.0 + whole.astype(float) @ x.numpy(), atol=1e-3)

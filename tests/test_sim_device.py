@@ -1,7 +1,5 @@
 """Kernels on a device, launched from several threads."""
 
-from __future__ import annotations
-
 import threading
 import time
 

@@ -1,7 +1,5 @@
 """Every law on every element: energy and forces by definition, rigid motions, single precision."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

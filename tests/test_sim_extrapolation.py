@@ -1,7 +1,5 @@
 """A frame starts where the last two lead: exact on a straight way, and no farther than the load goes on it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

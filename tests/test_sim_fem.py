@@ -1,7 +1,5 @@
 """One conformance suite that every deformer passes, and what finite elements promise besides."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache

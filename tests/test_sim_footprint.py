@@ -1,7 +1,5 @@
 """A round tool on a triangulated surface: force, moment and moments of the traction do not depend on the mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Weight that changes with posture and fluid: what is cut, what it weighs, and how a column stands under it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

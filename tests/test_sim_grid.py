@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from sim.fields.extension import extend_field
 from sim.fields.folds import compute_jacobians, unfold
-from sim.fields.grid import Grid, build_grid_around
-from sim.fields.grid_interpolation import interpolate_in_tetrahedra
-from sim.fields.inversion import invert_field
 from sim.fields.warp_fields import compute_faint_threshold, remove_faint, warp_fields
-from sim.geometry.locate import locate
 
 
 def bump(nodes, depth=5e-3, width=14e-3):
@@ -30,31 +25,6 @@ def moved(box):
 @pytest.fixture(scope="module")
 def fields(box, moved):
     return warp_fields(box, moved, 1e-3)
-
-
-def test_nodes_in_tetrahedra_have_what_the_vertices_say(box, moved):
-    grid = build_grid_around(box.mesh.nodes, 1.7e-3, 4e-3)
-    field, inside = interpolate_in_tetrahedra(grid, box.mesh.nodes, box.mesh.tets, moved)
-    points = grid.compute_points(np.arange(inside.size))
-    low, high = box.mesh.nodes.min(axis=0), box.mesh.nodes.max(axis=0)
-    assert np.array_equal(inside.ravel(), ((points > low - 1e-9) & (points < high + 1e-9)).all(axis=1))
-    some = np.flatnonzero(inside)[::37]
-    expected = locate(box.mesh, points[some]).read(moved[None])[0]
-    assert np.abs(field.reshape(3, -1)[:, some].T - expected).max() < 1e-8
-    assert not field[:, ~inside].any()
-
-
-def test_every_grid_node_on_a_shared_face_is_inside():
-    """A lattice whose nodes are the grid's: none falls between two tetrahedra."""
-    nodes = 1e-3 * np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4], [4, 4, 4]], float)
-    tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
-    grid = build_grid_around(nodes, 1e-3, 0.0)
-    inside = interpolate_in_tetrahedra(grid, nodes, tets, nodes)[1]
-    points = 1e3 * grid.compute_points(np.arange(inside.size))
-    x, y, z = points.T
-    first = x + y + z <= 4 + 1e-9
-    second = (x + y + z >= 4 - 1e-9) & (x - y + z <= 4 + 1e-9) & (x + y - z <= 4 + 1e-9) & (-x + y + z <= 4 + 1e-9)
-    assert np.array_equal(inside.ravel(), first | second)
 
 
 def errors(box, moved, fields):
@@ -117,19 +87,6 @@ def test_outside_the_two_fields_are_each_others_inverse(box, fields):
     assert np.abs(back + fields.grid.read(fields.forward, back) - around).max() < 0.05e-3
 
 
-def test_a_twist_that_no_fixed_point_inverts_is_inverted():
-    """d = -u(y + d) alone moves away where tissue is turned, or sheared, by that much."""
-    grid = Grid(np.full(3, -20e-3), 1e-3, (41, 41, 41))
-    x, y, _ = np.indices(grid.shape) * 1e-3 - 20e-3
-    turn = 1.3 * np.exp(-(np.hypot(x, y) ** 2) / 7e-3**2)
-    field = np.zeros((3, *grid.shape), np.float32)
-    field[0] = x * np.cos(turn) - y * np.sin(turn) - x
-    field[1] = x * np.sin(turn) + y * np.cos(turn) - y
-    points = 1e-3 * np.random.default_rng(0).uniform(-9.0, 9.0, (300, 3))
-    found = invert_field(grid, field, points, np.zeros_like(points))
-    assert np.abs(found + grid.read(field, points + found)).max() < 2e-6
-
-
 def test_a_body_that_is_turned_inside_out_is_unfolded_too():
     """Moves from there alone end in a minimum that still folds."""
     x, y, z = np.indices((14, 14, 14)) - 6.5
@@ -164,16 +121,6 @@ def test_a_fold_at_any_corner_of_a_cell_is_found():
         field = np.zeros((3, 2, 2, 2), np.float32)
         field[(slice(None), *corner)] = 0.7e-3 * (1 - 2 * np.array(corner))  # past the middle of its neighbours
         assert compute_jacobians(field, 1e-3).min() < 0.0 < compute_jacobians(0.3 * field, 1e-3).min()
-
-
-def test_what_is_filled_in_is_no_larger_than_what_is_known():
-    known = np.zeros((24, 24, 24), bool)
-    known[10:14, 10:14, 10:14] = True
-    field = np.where(known, np.float32(2e-3), np.float32(0.0)) * np.ones((3, 1, 1, 1), np.float32)
-    filled = extend_field(field, known, 8.0)
-    assert np.array_equal(filled[:, known], field[:, known]) and filled.max() <= 2e-3 * (1 + 1e-6)
-    line = filled[0, 12, 12, 13:]
-    assert (np.diff(line) <= 0).all() and line[-1] == 0.0 and line[2] > 1e-3
 
 
 def test_tissue_that_was_cut_away_is_known_to_be_gone(box, moved):

@@ -3,8 +3,6 @@
 Whatever is marked converged has its residual computed again from the published formulas, without the package.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field

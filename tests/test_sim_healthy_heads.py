@@ -4,8 +4,6 @@ import importlib
 import json
 import struct
 import sys
-from importlib.util import find_spec
-from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -14,8 +12,6 @@ from balls import EGG, ball
 from scipy.spatial import ConvexHull
 
 from scenes.cli import main
-from sim.bodies.enclosed_voxels import fill_enclosed
-from sim.bodies.fif import read_surface
 from sim.bodies.healthy_heads import INNER_SKULL
 from sim.bodies.intensity import read_intensity, to_intensity_path
 from sim.bodies.meshfile import read_anatomy
@@ -77,13 +73,6 @@ def test_fsaverage_has_its_inner_skull_and_size(skull, tmp_path, capsys):
     assert np.ptp(nodes, axis=0) == pytest.approx(2.0 * RADII * (1300 / BALL_ML) ** (1 / 3), rel=0.02)
     assert summary["opening"]["side"] == "right superior" and summary["t1"] is None
     assert abs(summary["tumour_volume_error_percent"]) < 2.0
-
-
-@pytest.mark.skipif(find_spec("mne") is None, reason="the package mne is not installed: pip install -e '.[heads]'")
-def test_the_skull_that_mne_ships_is_of_a_head():
-    points, triangles = read_surface(Path(find_spec("mne").origin).parent / INNER_SKULL)
-    mask, _ = fill_enclosed(points, triangles, 2e-3)
-    assert mask.sum() * 8e-3 == pytest.approx(2190, abs=10)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Motion in time: periods, decay, order, energy that never grows, and a past that travels with the answers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """L-BFGS on many columns: the algorithm of the book, column by column, and what the host does between its turns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from boxes import base_held, box, top_forces

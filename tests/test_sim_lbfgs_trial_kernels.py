@@ -1,7 +1,5 @@
 """The kernels do for one column, whose rows they share, what they do for many."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import warp as wp

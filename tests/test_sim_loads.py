@@ -1,7 +1,5 @@
 """What the world does: loads that make no sense are refused, and how rows and magnitudes are taken."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

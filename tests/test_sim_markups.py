@@ -6,23 +6,12 @@ from test_scenes_markups import RADIUS, curve, fcsv, markup
 
 from sim.bodies.markups import read_markup
 from sim.errors import InputError
-from surrogate.locating.observed_files import read_observation
 
 
 @pytest.mark.parametrize("system", ["LPS", "RAS", None])
 def test_coordinates_use_stated_system_or_slicers(tmp_path, system):
     found = read_markup(markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0], [1.0, 2.0, 3.0]], "Line", system))
     np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002, 0.003]])
-
-
-def test_markup_and_table_that_begin_with_a_mark_are_read(tmp_path):
-    """Editors of Windows begin UTF-8 with a byte order mark; a table may name its points."""
-    path = markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0]])
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    table = tmp_path / "p.csv"
-    table.write_bytes(b"\xef\xbb\xbflabel,x,y,z\nF-1,10,20,30\n")
-    for points in (read_markup(path).points, read_observation(table).now):
-        np.testing.assert_allclose(points, [[0.01, 0.02, 0.03]])
 
 
 OLD = '1,{},{},30,0,0,0,1,1,1,0,"F, 1",,'

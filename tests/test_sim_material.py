@@ -1,7 +1,5 @@
 """Tissue descriptions: what they mean at small strain, what is refused, and the named ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What memory is free, as Linux says it, and the sentence when a batch does not fit."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Memory that a batch needs, and what does not fit on a card."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Cells of mesh files from elsewhere: one body without overlaps, with the regions that a mesher gave it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Mesh files that refer to other files, declare what they do not hold, or are of a format that is read for ever."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

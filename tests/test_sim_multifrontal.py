@@ -1,7 +1,5 @@
 """The sparse factor against dense algebra: every order, precision and number of right-hand sides."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

@@ -1,7 +1,5 @@
 """Two levels against dense algebra: symmetric, positive definite, and close to the inverse on every mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

@@ -1,7 +1,5 @@
 """Places on the surface that are nearest to a tool's core."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

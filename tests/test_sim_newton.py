@@ -1,7 +1,5 @@
 """The outer iteration on a body with a spring that remembers and a wall: batches, criteria, hard cases."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import chain, repeat

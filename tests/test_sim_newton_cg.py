@@ -1,7 +1,5 @@
 """Newton-CG within its radius: what it promises as a descent."""
 
-from __future__ import annotations
-
 import numpy as np
 from boxes import base_held, box, top_forces
 from oracle import tissue
@@ -21,7 +19,6 @@ from sim.runtime.device import Device
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
 ROWS = MESH.nodes.size
-FREE = ~ANATOMY.held.ravel()
 TOTAL = np.array([[0.0, 0.0, -0.1], [0.2, 0.1, -0.4], [0.0, 0.0, 2.0], [0.01, 0.0, 0.0], [0.6, 0.0, -0.9]])
 LOADS = Loads((Nodal(top_forces(MESH, TOTAL)),))
 

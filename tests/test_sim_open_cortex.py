@@ -37,27 +37,6 @@ def test_closest_points_are_those_of_trimesh(template):
     assert np.allclose(moved.point - shifts[:, 0, 0], found.point, atol=1e-12)
 
 
-def test_of_triangles_without_area_edges_are_closest():
-    flat = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[5.0, 0.0, 0.0]] * 3])
-    found = find_closest_points(np.array([[0.5, 1.0, 0.0], [5.0, 2.0, 0.0]]), flat)
-    assert np.allclose(found.point, [[0.5, 0.0, 0.0], [5.0, 0.0, 0.0]])
-
-
-def test_large_and_small_triangles_near_and_far():
-    """Triangles of very different sizes, from which those that may be the closest are chosen; the others are not."""
-    random = np.random.default_rng(1)
-    size = 10.0 ** random.uniform(-3.0, 0.7, (80, 1, 1))
-    corners = random.normal(size=(80, 1, 3)) + size * random.normal(size=(80, 3, 3))
-    middle = corners.mean(axis=1)
-    far = 1e3 * random.normal(size=(20, 3))
-    points = np.concatenate([corners[:, 0], middle, middle + 1e-9, far, random.normal(size=(60, 3))])
-    found = find_closest_points(points, corners)
-    every = find_closest_points(points, np.tile(corners, (len(points), 1, 1, 1)))
-    assert np.allclose(found.point, every.point, rtol=1e-12, atol=1e-13)
-    assert np.abs(found.point[:80] - corners[:, 0]).max() < 1e-14
-    assert np.allclose(np.einsum("bc,bci->bi", found.weights, corners[found.triangle]), found.point, atol=1e-12)
-
-
 def test_a_place_is_where_it_was_asked_for(template):
     cortex = open_cortex(template)
     assert np.allclose(cortex.place().point, cortex.origin, atol=1e-12)

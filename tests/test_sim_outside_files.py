@@ -1,7 +1,5 @@
 """Files from outside: one sentence of ours whatever is wrong, and bounded memory."""
 
-from __future__ import annotations
-
 import base64
 import lzma
 import os

@@ -1,7 +1,5 @@
 """Which solvers answer a load: the table says what is done, and what is done is what the table says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,18 +1,14 @@
 """The power series of an answer in the size of its load: held to equilibria that Newton finds."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import warp as wp
-from test_sim_multigrid import built
 
 from sim.accuracy import REFERENCE, TRAIN
 from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import Elasticity, Held, NodalForce, Slide, ToolDisplacement, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.linalg.rest_solver import RestStiffnessSolver
 from sim.loads import Displaced, Loads, Nodal, Pushed
 from sim.material import LAWS, Material
 from sim.minimisers.power_series import (
@@ -60,19 +56,6 @@ def test_a_linear_body_has_one_order_only(box):
     first, second, third = series(fem, pushes(1.0), 3, nodes)
     assert np.allclose(first, fem.deform(pushes(1.0)).displacement, atol=1e-7 * np.abs(first).max())
     assert max(np.abs(second).max(), np.abs(third).max()) < 1e-6 * np.abs(first).max()
-
-
-def test_linear_solution_is_same_without_inverse():
-    """What a series is made of: by a factor, and by conjugate gradients where none pays."""
-    problem, preconditioner = built("smoothed", 0.45, (2, 2, 3))
-    free = problem.constraint.build_basis()
-    force = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 3))
-    direct, iterated = (RestStiffnessSolver(problem, preconditioner, 400, largest_factor=most) for most in (10**6, 0))
-    assert direct.exact is not None and iterated.exact is None
-    one, other = (resting.solve(problem.device.upload(force)).numpy() for resting in (direct, iterated))
-    np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(one).max())
-    with pytest.raises(InputError, match="did not reach 1e-09 in 1 iterations"):
-        replace(iterated, inner=1).solve(problem.device.upload(force))
 
 
 def test_no_load_has_a_series_of_nothing(box):

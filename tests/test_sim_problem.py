@@ -1,7 +1,5 @@
 """What a problem is made of: only what is asked for, in as few launches for many loads as for one."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -27,7 +25,7 @@ from sim.runtime.device import Device
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
-COUNT, ROWS = len(MESH.nodes), MESH.nodes.size
+ROWS = MESH.nodes.size
 TIGHT = Accuracy(tolerance=1e-10)
 
 

@@ -1,7 +1,5 @@
 """Tissue that is taken away: what is left answers as if it had always been so; what came loose goes and is reported."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

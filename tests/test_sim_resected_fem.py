@@ -1,7 +1,5 @@
 """What is left of a body after a cut goes on remembering what it went through, as if it had always been alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

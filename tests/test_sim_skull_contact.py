@@ -1,7 +1,5 @@
 """A skull that holds on one side only: what touches it bears, what leaves it is free."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

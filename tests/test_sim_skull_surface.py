@@ -1,7 +1,5 @@
 """Where bone ends over a brain, and what open cortex may do beside and beneath its edge."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

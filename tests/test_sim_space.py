@@ -1,7 +1,5 @@
 """Mid-edge nodes: where they are held and how they slide, by brute force; they never show outside."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 

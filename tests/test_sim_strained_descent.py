@@ -1,7 +1,5 @@
 """Single loads whose descent knows strained tissue: where it ends, how soon, and what the next frame takes over."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

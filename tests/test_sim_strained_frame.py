@@ -1,7 +1,5 @@
 """Frames that stay on the device and know strained tissue: as many steps, the same answers wherever a start stands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The model that knows how stiff strained tissue is: each part against the same by other means."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Normals at nodes, and of bodies seen through a blur."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

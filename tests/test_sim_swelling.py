@@ -1,7 +1,5 @@
 """Tissue that swells: freely without stress, against walls with pressure, in time with heart and breath."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The order of elimination: nested dissection, fronts and fill."""
 
-from __future__ import annotations
-
 from itertools import chain
 
 import numpy as np

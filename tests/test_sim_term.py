@@ -1,7 +1,5 @@
 """One conformance suite that every term passes: derivatives, batches that shrink, bounds on steps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

@@ -1,7 +1,5 @@
 """Meshes and anatomies: what is refused, what is warned of, and identity by digest."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Threads: a limit that belongs to the whole process, and tasks that are all done, with errors raised at the end."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

@@ -1,7 +1,5 @@
 """Time steps of a batch."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim.strategy.time_steps import group_alike

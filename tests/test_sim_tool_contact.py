@@ -1,7 +1,5 @@
 """Tools moved by pose: distances, ways, and what contact with elastic bodies is known to be."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path

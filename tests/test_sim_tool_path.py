@@ -1,7 +1,5 @@
 """The way of a tool: how long it is, and in how few strides it is flown."""
 
-from __future__ import annotations
-
 import numpy as np
 from test_sim_contact_descent import BODY, HEIGHT, RADIUS, at, solver, touching
 

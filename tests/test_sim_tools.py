@@ -1,7 +1,5 @@
 """Tools: their text, their foremost point, and their surface."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from test_surrogate_rigid_contact import ROD_OF_4, SMALL_BLADE

@@ -1,7 +1,5 @@
 """Tissue that relaxes: the curves of a Prony series, what does not relax, rotations, and a past that travels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Volumes of voxels from outside: bounded memory, and a sentence for what is wrong."""
 
-from __future__ import annotations
-
 import gzip
 import struct
 import tracemalloc

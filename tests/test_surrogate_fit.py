@@ -4,14 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from locators import dent, locator_of
+from locators import locator_of
 
 from sim.effects import SKULLS
-from sim.errors import InputError
 from sim.fem import Fem
-from surrogate.fitting import fit
 from surrogate.fitting.fit import ModulusSettings, compute_probability, estimate_young_moduli, weigh_tissues
-from surrogate.fitting.frame_likelihood import find_unsupported
 from surrogate.fitting.observed_frame import ObservedFrame, Tool, find_foot
 from surrogate.fitting.responses import POISSONS, RATIOS, build_drained_loads, build_force_loads, solve_responses
 from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
@@ -105,24 +102,3 @@ def test_solved_tissues_are_read_again(body, parts, drained, monkeypatch):
     monkeypatch.setattr("surrogate.fitting.responses.Fem", None)
     again = solve_responses(body, build_drained_loads(body), "cpu", parts)
     assert all(np.array_equal(again.motion[name], drained.motion[name]) for name in ("bonded", "slide"))
-
-
-def test_points_that_no_other_supports_are_left_out(body, locator, monkeypatch):
-    """They are those that `locate` leaves out, and nothing is fitted to them; more than a third is refused."""
-    clean = build_tool_frame(body, dent(body, np.random.default_rng(1)))
-    clean = replace(clean, observation=replace(clean.observation, sigma=np.full(60, 3e-4)))
-    wild = np.where(np.isin(np.arange(60), (5, 17))[:, None], [0.0, 0.01, -0.012], 0.0)
-    frames = [clean, replace(clean, observation=replace(clean.observation, now=clean.observation.now + wild))]
-    left_out = find_unsupported(locator, frames)
-    assert [each.tolist() for each in left_out] == [[], [5, 17]]
-    fitted_to = []
-    monkeypatch.setattr(fit, "solve_responses", lambda *_: None)
-    monkeypatch.setattr(fit, "fit_from_evidence", lambda locator, frames, *_: fitted_to.extend(frames))
-    fit.fit_tissue(locator, frames)
-    assert fitted_to[0] is clean and np.array_equal(
-        fitted_to[1].observation.rest, np.delete(clean.observation.rest, (5, 17), axis=0)
-    )
-    assert len(fitted_to[1].observation.now) == len(fitted_to[1].observation.sigma) == 58
-    torn = replace(clean.observation, now=clean.observation.now + np.where(np.arange(60)[:, None] % 2, 0.012, 0.0))
-    with pytest.raises(InputError, match=r"frame 2: .* of 60 points"):
-        find_unsupported(locator, [clean, replace(clean, observation=torn)])

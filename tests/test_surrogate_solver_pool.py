@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import warp as wp
-from on_devices import gone, mortal, small_body
+from on_devices import gone, small_body
 
 from scenes.cli import main
 from sim.accuracy import TRAIN
@@ -20,11 +20,9 @@ from sim.bodies.meshfile import write_anatomy
 from sim.effects import NodalForce, build_push_effects
 from sim.errors import InputError
 from sim.material import BRAIN
-from sim.runtime.processes import process_pool
 from surrogate.data.dataset import SEAL_ATTRIBUTE, read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.solver_pool import LazyFem, choose_even_batch, open_solvers
-from surrogate.data.tasks import SolverPool
 from surrogate.data.tool_loads import draw
 
 SAID = {"preset": "palpation", "seed": "0"}
@@ -87,25 +85,6 @@ def test_two_processes_on_one_card_answer_as_one(tmp_path, body):
     assert all(data.good.all() for data in found) and np.abs(one - two).max() <= 2e-3 * np.abs(one).max()
     units = [data.compute_unit_response(every) for data in found]
     assert np.abs(units[0] - units[1]).max() <= 2e-3 * np.abs(units[0]).max()
-
-
-def test_killed_process_loses_no_finished_case(tmp_path, body):
-    """It dies at the sixth of ten batches; one process alone goes on, and the bytes are those of an undisturbed run."""
-    loads, whole, path = draw("palpation", body, COUNT, 0), tmp_path / "whole.h5", tmp_path / "data.h5"
-    undisturbed = mortal("cpu", COUNT, 0, tmp_path)
-    simulate(whole, undisturbed, loads, SAID, 2)
-    done = []
-    sentence = r"the process on cpu was ended \(Killed\).*--device one cpu less. What was solved is kept: the same com"
-    with (
-        process_pool(["cpu", "cpu"], mortal, COUNT, 11, tmp_path / "mark") as children,
-        pytest.raises(InputError, match=sentence),
-    ):
-        simulate(path, SolverPool(body, children), loads, SAID, 2, lambda *now: done.append(now[0]))
-    assert not path.exists() and path.with_name("data.h5.partial").stat().st_size > 0
-    left = 3 * int(body.craniotomy.sum()) + COUNT - max(done)
-    assert 2 <= left <= 10  # what came after the sixth, and it
-    assert simulate(path, undisturbed, loads, SAID, 2).rows == left
-    assert undated(path) == undated(whole)
 
 
 @pytest.mark.parametrize("devices", [("cpu",), ("cpu", "cpu")])

@@ -16,11 +16,9 @@ from scenes.tracked.truth import read_truth
 from sim.errors import InputError
 from sim.geometry.tetmesh import compute_digest
 from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import Basis
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.model.conformal import GROWTH, Bound
-from surrogate.model.learned import ModelPart
 from surrogate.model.store import load, read_learned_tissue, read_reported_errors, save
 from surrogate.model.training_range import Outside
 from surrogate.training.train import train
@@ -42,73 +40,12 @@ def stored(models, tmp_path_factory):
     return path
 
 
-def part_with(part, **changes):
-    return ModelPart(part.encoder, part.regressor, Basis(**{**vars(part.basis), **changes}))
-
-
-def put(array, place, value):
-    changed = array.copy()
-    changed[place] = value
-    return changed
-
-
-def basis(change):
-    return lambda model: replace(
-        model, parts=(part_with(model.parts[0], **change(model.parts[0].basis)), *model.parts[1:])
-    )
-
-
-def envelope(**changes):
-    return lambda model: replace(model, envelope=replace(model.envelope, **changes))
-
-
 def bounds(**changes):
     def change(model):
         arrays = vars(model.bounds)
         return replace(model, bounds=Bound(**arrays | {name: made(arrays[name]) for name, made in changes.items()}))
 
     return change
-
-
-def encoder(name):
-    return lambda model: replace(model, parts=(replace(model.parts[0], encoder=name),))
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (basis(lambda b: {"nodes": put(b.nodes, -1, 10**6)}), "nodes lie outside the mesh"),
-        (basis(lambda b: {"nodes": put(b.nodes, 0, -1)}), "nodes lie outside the mesh"),
-        (basis(lambda b: {"nodes": b.nodes[::-1]}), "not sorted"),
-        (basis(lambda b: {"nodes": put(b.nodes, 1, b.nodes[0])}), "come twice"),
-        (basis(lambda b: {"nodes": b.nodes.astype(float)}), "no vertex numbers"),
-        (basis(lambda b: {"modes": put(b.modes, (0, 0), np.nan)}), "modes are no finite numbers"),
-        (basis(lambda b: {"modes": b.modes[:, 3:]}), "modes are not those of its nodes"),
-        (basis(lambda b: {"modes": b.modes[1:]}), "gives no result for a load"),
-        (lambda model: replace(model, parts=()), "no parts"),
-        (
-            lambda model: replace(model, parts=(replace(model.parts[0], encoder="magic"),)),
-            "no encoder is called 'magic'",
-        ),
-        (encoder("nodal"), "cannot be read as a model"),
-        (lambda model: replace(model, bound=-1.0), "bound is no distance"),
-        (envelope(reach=-1.0), "reach is none"),
-        (envelope(angle=float("nan")), "angle is none"),
-        (envelope(force=(1.0, 0.1)), "range of force is none"),
-        (envelope(footprint=(0.0, 0.1)), "range of footprint is none"),
-        (envelope(points=np.full((3, 3), np.nan)), "training points are none"),
-        (bounds(quantile=lambda q: -q), "bounds are negative"),
-        (bounds(quantile=lambda q: q[::-1] * [[2.0], [1.0]]), "shrink with their probability"),
-        (bounds(quantile=lambda q: np.full_like(q, np.nan)), "no numbers"),
-        (bounds(deviation=lambda d: 0.0 * d), "scale of its bounds"),
-        (bounds(weights=lambda w: w[1:]), "another shape"),
-    ],
-)
-def test_a_model_that_cannot_be_is_refused(models, box, tmp_path, change, sentence):
-    save(tmp_path / "model.npz", {"svr": change(models["svr"])})
-    with pytest.raises(InputError, match=sentence) as caught:
-        load(tmp_path / "model.npz", box)
-    assert str(caught.value).startswith(str(tmp_path / "model.npz")) and "sulcus train" in str(caught.value)
 
 
 def test_what_a_regressor_knows_is_finite(models, box, tmp_path):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 
 from scenes.play.deformers import open_theatre
 from scenes.play.tip_reading import TipDistance, read_tip_distance
@@ -16,14 +15,12 @@ from sim.bodies.open_cortex import open_cortex
 from sim.bodies.tip_distance import build_tip_gauge
 from sim.deformation import Outcome
 from sim.errors import InputError
-from sim.loads import Loads, Pushed, Touching
-from sim.tools import Ball
+from sim.loads import Loads, Pushed
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.indentation import get_only_pushes
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.coverage import measure_distance_coverage
 from surrogate.model.store import load, save
 from surrogate.model.tip_distance import TipModel
@@ -66,48 +63,6 @@ def fresh(pretender, gauge):
     loads = draw("palpation", pretender.anatomy, 300, 7)
     answer = pretender.deform(loads)
     return loads, gauge.compute_distances(loads, answer.displacement, answer.nodes)
-
-
-def surface(positions, triangles):
-    return trimesh.Trimesh(positions, triangles, process=False)
-
-
-def test_distance_is_measured_from_resting_ball(box, pretender, gauge):
-    loads = draw("palpation", box, 6, 3)
-    answer = pretender.deform(loads)
-    pushed, axis = get_only_pushes(loads), open_cortex(box).axis
-    found = gauge.compute_distances(loads, answer.displacement, answer.nodes)
-    lifted = gauge.compute_distances(loads, answer.displacement, answer.nodes, lift=2e-3)
-    for row in range(6):
-        moved = box.mesh.nodes + answer.displacement[row]
-        cortex = surface(box.mesh.nodes, box.open_surface)
-        at, _, triangle = trimesh.proximity.closest_point_naive(cortex, pushed.point[row][None])
-        share = trimesh.triangles.points_to_barycentric(cortex.triangles[triangle], at)[0]
-        middle = share @ moved[box.open_surface[triangle[0]]]
-        # Bisection: as far down as the ball enters nothing.
-        high, low, radius = -0.05, 0.02, pushed.footprint[row]
-        after = surface(moved, box.open_surface)
-        for _ in range(40):
-            half = 0.5 * (high + low)
-            away = trimesh.proximity.closest_point_naive(after, (middle + half * axis)[None])[1][0]
-            high, low = (half, low) if away > radius else (high, half)
-        tip = middle + (high + radius) * axis
-        tumour = surface(moved, box.tumour_surface)
-        to = trimesh.proximity.closest_point_naive(tumour, np.stack([tip, tip - 2e-3 * axis]))[1]
-        assert found[row] == pytest.approx(to[0], abs=1e-8) and lifted[row] == pytest.approx(to[1], abs=1e-8)
-
-
-def test_of_a_pose_the_tip_is_where_the_pose_has_it(box, gauge):
-    loads = draw_poses("palpation", box, 5, 0, Ball(6e-3))
-    still = np.zeros((5, len(gauge.nodes), 3))
-    touching = loads.get(Touching)
-    assert touching is not None
-    pose = touching.pose[:, 0]
-    tip = pose[:, :3, 3] + 6e-3 * pose[:, :3, 2] + 6e-3 * open_cortex(box).axis
-    away = trimesh.proximity.closest_point_naive(surface(box.mesh.nodes, box.tumour_surface), tip)[1]
-    assert gauge.compute_distances(loads, still, gauge.nodes, Ball(6e-3)) == pytest.approx(away, abs=1e-12)
-    with pytest.raises(InputError, match="no tip"):
-        gauge.compute_distances(loads, still, gauge.nodes)
 
 
 def test_what_it_needs_it_asks_for(box, gauge, fresh):

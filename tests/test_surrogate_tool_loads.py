@@ -5,7 +5,6 @@ import pytest
 
 from sim.errors import InputError
 from sim.loads import Pushed
-from surrogate.data.cortex_patch import Patch
 from surrogate.data.tool_loads import (
     MAX_PRESSURE,
     PLANE_MODULUS,
@@ -48,19 +47,6 @@ def test_points_directions_and_forces_are_uniform(box, patch):
     # No draw below 0.25 N is too deep: the octaves below it are equally full.
     assert (force < 0.1).sum() == pytest.approx(((force >= 0.1) & (force < 0.2)).sum(), rel=0.1)
     assert np.mean(cosine) == pytest.approx((1 + np.cos(np.pi / 4)) / 2, abs=0.01)
-
-
-def test_places_are_uniform_within_a_triangle_too():
-    """Of two triangles, of which one is nine times as large; each quarter of the large one gets its share."""
-    points = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    two = Patch(np.arange(5), np.array([[0, 1, 2], [0, 3, 4]]), points)
-    found, _ = two.place(np.random.default_rng(0).random((20_000, 3)))
-    large = found[found[:, 0] > 0.0]
-    assert len(large) == pytest.approx(18_000, rel=0.01)
-    beside = large[:, :2] / 3.0  # of the corners beside the right angle
-    share = np.column_stack([1.0 - beside.sum(axis=1), beside])
-    assert (share > 0.5).mean(axis=0) == pytest.approx([0.25] * 3, abs=0.015)
-    assert two.compute_covered(np.array([[-0.5, -0.5, 0.0]]), 0.71) == pytest.approx(0.1, abs=0.02)
 
 
 def test_a_load_depends_on_its_number_alone(box):

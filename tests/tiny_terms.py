@@ -1,7 +1,5 @@
 """Two tiny terms in NumPy that ask of the solver what later effects will: a memory, and a domain to stay in."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sp
 import warp as wp

@@ -6,8 +6,6 @@ kernels come from that were compiled, and that were launched in a later frame; t
 modules that no scene needs on this machine.
 """
 
-from __future__ import annotations
-
 import gc
 import json
 import os

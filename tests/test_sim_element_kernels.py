@@ -3,8 +3,6 @@
 Roache 2002, "Code verification by the method of manufactured solutions", J. Fluids Eng. 124:4-10.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from boxes import box, hold, quadratic, surface_nodes

@@ -1,7 +1,5 @@
 """A point force in an infinite body (Kelvin) and on a half space (Boussinesq, Cerruti), some elements away from it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

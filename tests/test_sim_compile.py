@@ -1,7 +1,5 @@
 """Only what a scene asks for is imported, compiled, launched and kept: seen by a fresh interpreter for each scene."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

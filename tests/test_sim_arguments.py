@@ -1,7 +1,5 @@
 """What callers get wrong is a sentence that names it: arrays, vertices, starts, and what a solver is made with."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

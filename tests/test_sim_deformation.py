@@ -1,7 +1,5 @@
 """What is warm in an answer only makes the next one faster: dropped everywhere, the answers are the same."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Threads that share a deformer get the answers that one of them alone would get."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Locking: a block in bending, where linear tetrahedra are too stiff, the more so the less it can be compressed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from boxes import base_held, box

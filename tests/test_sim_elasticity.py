@@ -1,7 +1,5 @@
 """Every law on every element against what is known exactly: affine motions, stretch and shear, balance of forces."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Conjugate gradients, their preconditioners and the line search, each against dense algebra."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import warp as wp

@@ -1,7 +1,5 @@
 """Equilibria found by independent solvers (FElupe, torch-fem, scikit-fem, dolfinx, warp.fem) on a 10 cm box."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,0 +1,35 @@
+"""Episodes for a loader with several workers."""
+
+import os
+
+import pytest
+import torch
+from tiny_episodes import Wanted, write_episode
+from torch.utils.data import DataLoader
+
+from scenes import EpisodeDataset
+
+
+@pytest.fixture(scope="module")
+def folder(box, tmp_path_factory):
+    """Episodes of 7, 9 and 4 frames; of the second every third frame was solved."""
+    folder = tmp_path_factory.mktemp("episodes")
+    for number, wanted in enumerate((Wanted(7), Wanted(9, every=3, seed=1), Wanted(4, seed=2))):
+        write_episode(folder / f"episode_{number:06d}.h5", box, wanted)
+    return folder
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are forked")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:multiprocessing.popen_fork")
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_workers_read_what_one_process_reads(folder, start):
+    data = EpisodeDataset(folder, ["colour", "tumour_predicted"], window=2, stride=2)
+    assert isinstance(data[0]["colour"], torch.Tensor) and data.get_window(1, 3)["frame"].tolist() == [3, 4]
+    alone = [data[index] for index in range(len(data))]
+    loader = DataLoader(data, batch_size=1, num_workers=2, multiprocessing_context=start)
+    together = list(loader)
+    assert len(together) == len(alone) == 9
+    for one, batch in zip(alone, together, strict=True):
+        for name in ("colour", "tumour_predicted", "frame"):
+            assert torch.equal(one[name], batch[name][0])

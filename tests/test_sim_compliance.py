@@ -1,0 +1,38 @@
+"""Columns of the compliance: those of the preconditioner, in any order."""
+
+from typing import cast
+
+import numpy as np
+from test_sim_contact_descent import Rough, parts
+
+from sim.linalg.compliance import Columns, Compliance
+from sim.linalg.pcg import Preconditioner
+
+
+def test_columns_are_what_the_preconditioner_does() -> None:
+    fem, descent = parts()
+    soft, rng = descent.compliance, np.random.default_rng(1)
+    nodes = soft.nodes
+    assert np.array_equal(nodes[: len(descent.barrier.touchable)], descent.barrier.touchable)
+    force = np.zeros((len(nodes), 3, 2))
+    some = rng.permutation(len(nodes))[:5]
+    force[some] = rng.normal(size=(5, 3, 2))
+    force = force.reshape(-1, 2)
+    whole = np.zeros((fem.problem.rows, 2))
+    whole[soft.rows] = force
+    expected = soft.apply(whole)
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(soft.spread(force), expected, atol=1e-6 * size)
+    between = soft.build_matrix(np.isin(np.arange(len(nodes)), some))
+    np.testing.assert_allclose(between @ force, expected[soft.rows], atol=1e-6 * size)
+    np.testing.assert_allclose(soft.compute_motion(force), expected[soft.rows], atol=1e-6 * size)
+
+
+def test_columns_are_bit_identical_in_any_order() -> None:
+    fem, descent = parts()
+    nodes, preconditioner = descent.barrier.touchable, cast(Preconditioner, Rough(fem.strategy.preconditioner, 0.0))
+    assert len(nodes) > 3 * Columns().block
+    one, other = (Compliance(fem.problem, preconditioner, nodes) for _ in range(2))
+    every = np.ones(len(nodes), bool)
+    other.build_matrix(np.arange(len(nodes)) == len(nodes) - 1)
+    np.testing.assert_array_equal(one.build_matrix(every), other.build_matrix(every))

@@ -1,0 +1,15 @@
+"""A field beyond where it is known."""
+
+import numpy as np
+
+from sim.fields.extension import extend_field
+
+
+def test_what_is_filled_in_is_no_larger_than_what_is_known():
+    known = np.zeros((24, 24, 24), bool)
+    known[10:14, 10:14, 10:14] = True
+    field = np.where(known, np.float32(2e-3), np.float32(0.0)) * np.ones((3, 1, 1, 1), np.float32)
+    filled = extend_field(field, known, 8.0)
+    assert np.array_equal(filled[:, known], field[:, known]) and filled.max() <= 2e-3 * (1 + 1e-6)
+    line = filled[0, 12, 12, 13:]
+    assert (np.diff(line) <= 0).all() and line[-1] == 0.0 and line[2] > 1e-3

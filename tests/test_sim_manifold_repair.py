@@ -1,0 +1,20 @@
+"""Tetrahedra taken away until the surface is a manifold."""
+
+import numpy as np
+
+from sim.bodies.bcc_lattice import build_graded_lattice
+from sim.bodies.manifold_repair import clean
+from sim.geometry.tetmesh import compute_row_keys, find_single_faces
+
+
+def test_bodies_that_touch_in_an_edge_or_a_node_are_parted():
+    lattice = build_graded_lattice(np.zeros(3), np.ones(3), 0.25, 0, np.zeros_like)
+    middle = lattice.nodes[lattice.tets].mean(axis=1) - 0.5
+    for together in ((middle[:, :2] > 0).all(axis=1) | (middle[:, :2] < 0).all(axis=1), (middle > 0).all(axis=1)):
+        other = together | (middle < 0).all(axis=1)
+        tets = lattice.tets[other]
+        kept = tets[clean(tets)]
+        assert 0.2 * len(tets) < len(kept) < len(tets)
+        edges = find_single_faces(kept)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        assert set(np.unique(compute_row_keys(edges), return_counts=True)[1]) == {2}
+    assert clean(lattice.tets).all()
