@@ -332,7 +332,7 @@ class Fem:
     ) -> Deformation:
         """Build the deformation from a solver result, with reactions, warm-start data `more` and `seconds` by stage."""
         solved = time.perf_counter()
-        self.problem.begin(replace(cases, share=found.gone, anew=found.anew))
+        self.problem.begin(replace(cases, share=found.path_fraction, anew=found.restarted))
         memory = dict(self.problem.end(found.u))
         displaced = cases.loads.get(Displaced) is not None
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
@@ -356,7 +356,7 @@ class Fem:
             time=cases.loads.times,
             reaction=reaction,
             memory=memory,
-            warm={**found.learnt, **more},
+            warm={**found.warm_start, **more},
             cost=Cost({**seconds, "reactions": time.perf_counter() - solved}),
             reached=found.reached,
             inverted=found.inverted,

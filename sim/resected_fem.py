@@ -208,12 +208,12 @@ def build_fem(
 def _restrict_effects(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
     """Return the effects without references to regions that are completely removed."""
     present = set(body.mesh.region.tolist())
-    gone = set(whole.mesh.region.tolist()) - present
+    removed = set(whole.mesh.region.tolist()) - present
 
     def kept(effect: Effect) -> Effect | None:
         if isinstance(effect, Pulsation) and effect.regions is not None:
-            left = tuple(label for label in effect.regions if label not in gone)
+            left = tuple(label for label in effect.regions if label not in removed)
             return replace(effect, regions=left) if left else None
-        return effect.restrict(present | set(effect.regions) - gone) if isinstance(effect, Elasticity) else effect
+        return effect.restrict(present | set(effect.regions) - removed) if isinstance(effect, Elasticity) else effect
 
     return tuple(effect for effect in map(kept, effects) if effect is not None)

@@ -19,7 +19,7 @@ class Direction:
     """Search direction d (3N, b) [m]; decrease (b,) [J] that the linear model predicts along it; linear iterations."""
 
     d: wp.array
-    promised: np.ndarray
+    predicted: np.ndarray
     iterations: int
 
 
@@ -85,8 +85,8 @@ class NewtonCG:
             problem, self._preconditioner, wp.clone(rhs), tolerance, self._most, self._radius
         )
         self._size, self._truncated = found.size, found.truncated
-        promised = compute_dots(device, rhs, found.x)
-        return Direction(close_constraints(device, found.x, gap), promised, found.iterations)
+        predicted = compute_dots(device, rhs, found.x)
+        return Direction(close_constraints(device, found.x, gap), predicted, found.iterations)
 
     def _compute_radius(self, taken: np.ndarray) -> np.ndarray:
         if self._radius is None:

@@ -53,7 +53,7 @@ class Kept(Mapping[str, Any]):
         with self._lock:
             if self.state is not None:
                 self._own |= {name: to_rows_first(self.state.columns[name]) for name in HISTORY_KEYS}
-                self._own |= {} if self.bent is None else self.bent.learnt
+                self._own |= {} if self.bent is None else self.bent.warm_start
                 self.state = None
 
     def __getitem__(self, key: str) -> Any:

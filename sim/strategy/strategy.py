@@ -38,7 +38,8 @@ EMPTY_HISTORY: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS h
 class SolverResult:
     """Solution u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, load fractions, inverted elements.
 
-    Also the L-BFGS history; with moving tools `gone` (B,), the path fraction reached, and `anew` (B,), undeformed.
+    Also warm-start data of the next load; with moving tools `path_fraction` (B,), the path fraction reached, and
+    `restarted` (B,) bool: from the undeformed state.
     """
 
     u: wp.array
@@ -48,9 +49,9 @@ class SolverResult:
     reached: np.ndarray
     inverted: np.ndarray
     linear_iterations: int
-    learnt: Mapping[str, np.ndarray] = field(default_factory=dict)
-    gone: np.ndarray | None = None
-    anew: np.ndarray | None = None
+    warm_start: Mapping[str, np.ndarray] = field(default_factory=dict)
+    path_fraction: np.ndarray | None = None
+    restarted: np.ndarray | None = None
 
     @property
     def good(self) -> np.ndarray:
@@ -144,11 +145,11 @@ class Strategy:
             acts = self._find_loaded_cases(count)
             guess, astray = self._select_guesses([np.where(acts, one, 0.0) for one in guesses])
             started = guess.any(axis=0)
-            learnt = EMPTY_HISTORY if astray.any() else restore_history(cases, problem.rows)
+            history = EMPTY_HISTORY if astray.any() else restore_history(cases, problem.rows)
             if problem.barriers and astray.any():
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
-            answer = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), learnt)
+            answer = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), history)
             lost = np.where(answer.good, self.inversion.find_doubtful(answer.inverted), self._find_unsolved(answer))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
@@ -162,7 +163,7 @@ class Strategy:
             found = self._raise_load(cases.select(lost), answer, lost)
             astray[lost] |= found.reached > answer.reached[lost]
             answer.put(lost, found, device)
-        return replace(answer, gone=answer.reached, anew=astray) if problem.barriers else answer
+        return replace(answer, path_fraction=answer.reached, restarted=astray) if problem.barriers else answer
 
     def _find_loaded_cases(self, count: int) -> np.ndarray:
         """Return the cases (b,) of the begun batch on which a force or imposed motion acts in the undeformed state."""
@@ -200,11 +201,11 @@ class Strategy:
         return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
     def _solve_whole_load(
-        self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = EMPTY_HISTORY
+        self, cases: Cases, start: wp.array | None = None, history: Mapping[str, np.ndarray] | None = EMPTY_HISTORY
     ) -> SolverResult:
         """Solve for the whole load of the begun batch: local solvers, L-BFGS, Newton, each from the last one's end.
 
-        Without a start it begins undeformed; `learnt` is the L-BFGS history of the start, if any. Imposed motions and
+        Without a start it begins undeformed; `history` is the L-BFGS history of the start, if any. Imposed motions and
         steep terms are left to Newton, which moves the free nodes with them.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
@@ -214,11 +215,11 @@ class Strategy:
         if problem.barriers:
             return self._move_tools(cases, start)
         if problem.paced:  # history would not help the next frame
-            learnt = None
+            history = None
         if SolverStep.LBFGS not in self.plan.list_steps(count, imposed):
             return self._run_newton(start, self.accuracy.outer)
         near = self.get_local_solver(count)
-        descents = [(self.lbfgs, learnt)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
+        descents = [(self.lbfgs, history)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
         answer = SolverResult(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
@@ -231,7 +232,7 @@ class Strategy:
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == NOT_FINITE] = Outcome.CONVERGED, Outcome.NOT_FINITE
             answer.put(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
-            gained = found.learnt
+            gained = found.warm_start
             index = index[found.left]
             if len(index) == 0:
                 break
@@ -239,7 +240,7 @@ class Strategy:
             start = gather_columns(device, found.u, found.left)
         else:
             answer.put(index, self._run_newton(start, self.accuracy.outer), device)
-        return replace(answer, learnt=gained)
+        return replace(answer, warm_start=gained)
 
     def _solve_contact(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Solve for cases whose tools have moved by `gaps` times their gap: separate contact solver, then Newton.
@@ -250,7 +251,7 @@ class Strategy:
         problem.begin(cases)
         if touch is None or problem.constraint.imposes or problem.compute_gap(start)[1].any():
             return self._close_gaps(cases, start, outer, gaps)
-        start, count, few = self._mask_idle(start), len(cases.loads), min(self.gaps.alone, outer)
+        start, count, few = self._mask_idle(start), len(cases.loads), min(self.gaps.max_contact_iterations, outer)
         found = touch.descend(start, np.full(count, self.accuracy.tolerance), few)
         outcome = np.full(count, Outcome.BUDGET, object)
         outcome[found.status == DONE] = Outcome.CONVERGED
@@ -259,7 +260,7 @@ class Strategy:
         def batched(rows: np.ndarray) -> Sequence[np.ndarray]:
             return [rows][: len(rows)] if device.on_cuda else list(rows[:, None])
 
-        near = np.flatnonzero(~answer.good & (found.residual <= self.gaps.nearly))
+        near = np.flatnonzero(~answer.good & (found.residual <= self.gaps.newton_residual))
         for some in batched(near):
             problem.begin(cases.select(some))
             answer.put(some, self._run_newton(gather_columns(device, found.u, some), few), device)
@@ -275,8 +276,8 @@ class Strategy:
         In a narrow gap nodes would be pushed out of the tool, and enter it again, one by one; a wide gap guides them.
         """
         iterations, linear = np.zeros(start.shape[1], int), 0
-        widest = int(np.ceil(np.log(max(gaps / self.gaps.wide_enough, 1.0)) / np.log(self.gaps.closing)))
-        for times in self.gaps.closing ** np.arange(widest, 0.0, -1.0):
+        widest = int(np.ceil(np.log(max(gaps / self.gaps.max_gaps, 1.0)) / np.log(self.gaps.closing_factor)))
+        for times in self.gaps.closing_factor ** np.arange(widest, 0.0, -1.0):
             self.problem.begin(cases)
             for term in self.problem.barriers:
                 term.widen(float(times))
@@ -311,7 +312,7 @@ class Strategy:
             return replace(part, loads=part.loads.scale(share), share=share)
 
         start = device.allocate(problem.rows, len(index))
-        found = self._solve_in_steps(cases, start, raised, self.stepping.first, self.accuracy.steps)
+        found = self._solve_in_steps(cases, start, raised, self.stepping.first_step, self.accuracy.steps)
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
         none = np.flatnonzero(found.reached <= failed.reached[index])
@@ -357,7 +358,8 @@ class Strategy:
         none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
         answer = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
         outer = self.accuracy.outer
-        wanted, outer = (outer, outer) if problem.barriers else (self.stepping.aimed, min(self.stepping.most, outer))
+        wanted = outer if problem.barriers else self.stepping.target_iterations
+        outer = outer if problem.barriers else min(self.stepping.max_iterations, outer)
         while left >= 0:
             strides = [term.compute_stride(aimed(cases, shares.reached), u) for term in problem.barriers]
             shorter, going = shares.limit(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
@@ -365,14 +367,15 @@ class Strategy:
             patience = self.stepping.patience * self.accuracy.inner * done
             if len(rows) == 0 or answer.linear_iterations > patience:
                 break
-            aim, gone = shares.propose_shares(rows)
+            aim, travel = shares.propose_shares(rows)
             left -= int(shorter[rows].any())
-            found = self._solve_contact(aimed(cases.select(rows), aim), gather_columns(device, u, rows), outer, gone)
+            part = aimed(cases.select(rows), aim)
+            found = self._solve_contact(part, gather_columns(device, u, rows), outer, travel)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
             shares.take(rows, aim, good)
             growth = wanted / np.maximum(found.iterations, 1)
-            shares.resize(rows, good, growth, self.stepping.cut, self.gaps.wider)
+            shares.resize(rows, good, growth, self.stepping.failure_factor, self.gaps.failure_factor)
             scatter_columns(device, found.u, rows[good], u, np.flatnonzero(good))
             answer.iterations[rows] += found.iterations
             answer.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
