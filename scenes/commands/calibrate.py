@@ -109,7 +109,7 @@ def _calibrate_camera(args: argparse.Namespace) -> int:
         "looked_at": seen.looked_at,
         "seen": len(seen.views),
         "used": found.used,
-        "left_out": found.left_out,
+        "left_out": found.excluded,
         "covered": found.covered,
     }
     write_calibration(out, found.calibration)
@@ -118,8 +118,8 @@ def _calibrate_camera(args: argparse.Namespace) -> int:
         print(to_json_line(report))
         return 0
     print(f"{seen.looked_at} images, the board in {len(seen.views)}, {len(found.used)} views used")
-    if found.left_out:
-        print(f"held out because of a large residual: {', '.join(found.left_out)}")
+    if found.excluded:
+        print(f"held out because of a large residual: {', '.join(found.excluded)}")
     print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered:.0f} % of the image")
     for name, value, deviation in zip(report["parameters"], found.values, found.deviations, strict=True):
         print(f"{name} {value:.6g} +- {deviation:.2g}{' px' if name[0] in 'fc' else ''}")

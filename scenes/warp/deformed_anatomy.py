@@ -150,9 +150,9 @@ class Played:
         scene, time = self.scene, float(self.scene.times[number])
         return scene.build_loads(self.theatre.site, scene.path(time), time)
 
-    def _build_moment(self, number: int, answer: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
+    def _build_moment(self, number: int, result: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
         scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
-        moved = answer.displacement[0]
+        moved = result.displacement[0]
         # Nothing is located here, and no locator is asked for.
         stage = Stage(replace(scene, sight=None), site)
         player = Player(stage, AtRest(site.anatomy))
@@ -165,7 +165,7 @@ class Played:
         said = {} if bound is None else {"bound_words": ENSEMBLE}
         left = stage.select_stage(loads).anatomy
         return DeformedAnatomy(
-            cause.solve_with(answer.source), site.anatomy, left, moved, answer.outcome[0].good, bound, tip=tip, **said
+            cause.solve_with(result.source), site.anatomy, left, moved, result.outcome[0].good, bound, tip=tip, **said
         )
 
 

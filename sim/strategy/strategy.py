@@ -140,7 +140,7 @@ class Strategy:
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
         if not guesses:
-            answer, astray = self._solve_whole_load(cases), np.zeros(count, bool)
+            result, astray = self._solve_whole_load(cases), np.zeros(count, bool)
         else:
             acts = self._find_loaded_cases(count)
             guess, astray = self._select_guesses([np.where(acts, one, 0.0) for one in guesses])
@@ -149,21 +149,21 @@ class Strategy:
             if problem.barriers and astray.any():
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
-            answer = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), history)
-            lost = np.where(answer.good, self.inversion.find_doubtful(answer.inverted), self._find_unsolved(answer))
+            result = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), history)
+            lost = np.where(result.good, self.inversion.find_doubtful(result.inverted), self._find_unsolved(result))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
                 some = replace(cases.select(again), anew=np.ones(len(again), bool))
                 problem.begin(some)
-                answer.put(again, self._solve_whole_load(some), device)
-        answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
-        lost = np.flatnonzero(self._find_unsolved(answer))
+                result.put(again, self._solve_whole_load(some), device)
+        result.outcome[astray & result.good] = Outcome.CONVERGED_ANEW
+        lost = np.flatnonzero(self._find_unsolved(result))
         if len(lost):
-            found = self._raise_load(cases.select(lost), answer, lost)
-            astray[lost] |= found.reached > answer.reached[lost]
-            answer.put(lost, found, device)
-        return replace(answer, path_fraction=answer.reached, restarted=astray) if problem.barriers else answer
+            found = self._raise_load(cases.select(lost), result, lost)
+            astray[lost] |= found.reached > result.reached[lost]
+            result.put(lost, found, device)
+        return replace(result, path_fraction=result.reached, restarted=astray) if problem.barriers else result
 
     def _find_loaded_cases(self, count: int) -> np.ndarray:
         """Return the cases (b,) of the begun batch on which a force or imposed motion acts in the undeformed state."""
@@ -196,9 +196,9 @@ class Strategy:
                 guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
         return guess, self.inversion.find_doubtful(inverted)
 
-    def _find_unsolved(self, answer: SolverResult) -> np.ndarray:
+    def _find_unsolved(self, result: SolverResult) -> np.ndarray:
         """Return the cases (B,) that another solver may solve; at round-off none comes closer to equilibrium."""
-        return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
+        return ~result.good & (result.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
     def _solve_whole_load(
         self, cases: Cases, start: wp.array | None = None, history: Mapping[str, np.ndarray] | None = EMPTY_HISTORY
@@ -221,7 +221,7 @@ class Strategy:
         near = self.get_local_solver(count)
         descents = [(self.lbfgs, history)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
-        answer = SolverResult(
+        result = SolverResult(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
         )
         gained: Mapping[str, np.ndarray] = {}
@@ -231,7 +231,7 @@ class Strategy:
             left -= int(found.steps.max(initial=0))
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == NOT_FINITE] = Outcome.CONVERGED, Outcome.NOT_FINITE
-            answer.put(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
+            result.put(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
             gained = found.warm_start
             index = index[found.left]
             if len(index) == 0:
@@ -239,8 +239,8 @@ class Strategy:
             problem.begin(cases.select(index))
             start = gather_columns(device, found.u, found.left)
         else:
-            answer.put(index, self._run_newton(start, self.accuracy.outer), device)
-        return replace(answer, warm_start=gained)
+            result.put(index, self._run_newton(start, self.accuracy.outer), device)
+        return replace(result, warm_start=gained)
 
     def _solve_contact(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Solve for cases whose tools have moved by `gaps` times their gap: separate contact solver, then Newton.
@@ -255,20 +255,20 @@ class Strategy:
         found = touch.descend(start, np.full(count, self.accuracy.tolerance), few)
         outcome = np.full(count, Outcome.BUDGET, object)
         outcome[found.status == DONE] = Outcome.CONVERGED
-        answer = self._build_result(found.u, outcome, found.steps, found.residual, 0)
+        result = self._build_result(found.u, outcome, found.steps, found.residual, 0)
 
         def batched(rows: np.ndarray) -> Sequence[np.ndarray]:
             return [rows][: len(rows)] if device.on_cuda else list(rows[:, None])
 
-        near = np.flatnonzero(~answer.good & (found.residual <= self.gaps.newton_residual))
+        near = np.flatnonzero(~result.good & (found.residual <= self.gaps.newton_residual))
         for some in batched(near):
             problem.begin(cases.select(some))
-            answer.put(some, self._run_newton(gather_columns(device, found.u, some), few), device)
-        left = np.flatnonzero(~answer.good)
+            result.put(some, self._run_newton(gather_columns(device, found.u, some), few), device)
+        left = np.flatnonzero(~result.good)
         for some in batched(left):
             begun = gather_columns(device, start, some)
-            answer.put(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
-        return answer
+            result.put(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
+        return result
 
     def _close_gaps(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Solve by Newton for cases whose tools have moved by `gaps` times their gap, which is widened, then closed.
@@ -334,13 +334,13 @@ class Strategy:
         if len(acting) == count:
             return self._solve_in_steps(cases, start, moved, 1.0, most)
         none, every = np.zeros(count, int), np.full(count, Outcome.CONVERGED, object)
-        answer = SolverResult(
+        result = SolverResult(
             device.allocate(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0
         )
         if len(acting):
             part = gather_columns(device, start, acting)
-            answer.put(acting, self._solve_in_steps(cases.select(acting), part, moved, 1.0, most), device)
-        return answer
+            result.put(acting, self._solve_in_steps(cases.select(acting), part, moved, 1.0, most), device)
+        return result
 
     def _solve_in_steps(
         self, cases: Cases, start: wp.array, aimed: Callable[[Cases, np.ndarray], Cases], first: float, most: int
@@ -356,16 +356,16 @@ class Strategy:
         shares = Shares.start(first, gaps)
         u, left, done = wp.clone(start), most, 1
         none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
-        answer = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
+        result = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
         outer = self.accuracy.outer
         wanted = outer if problem.barriers else self.stepping.target_iterations
         outer = outer if problem.barriers else min(self.stepping.max_iterations, outer)
         while left >= 0:
             strides = [term.compute_stride(aimed(cases, shares.reached), u) for term in problem.barriers]
             shorter, going = shares.limit(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
-            rows = np.flatnonzero(going & (answer.iterations < self.accuracy.most))
+            rows = np.flatnonzero(going & (result.iterations < self.accuracy.most))
             patience = self.stepping.patience * self.accuracy.inner * done
-            if len(rows) == 0 or answer.linear_iterations > patience:
+            if len(rows) == 0 or result.linear_iterations > patience:
                 break
             aim, travel = shares.propose_shares(rows)
             left -= int(shorter[rows].any())
@@ -377,14 +377,14 @@ class Strategy:
             growth = wanted / np.maximum(found.iterations, 1)
             shares.resize(rows, good, growth, self.stepping.failure_factor, self.gaps.failure_factor)
             scatter_columns(device, found.u, rows[good], u, np.flatnonzero(good))
-            answer.iterations[rows] += found.iterations
-            answer.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
-            answer = replace(answer, linear_iterations=answer.linear_iterations + found.linear_iterations)
-        return self._finish(cases, aimed, answer)
+            result.iterations[rows] += found.iterations
+            result.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
+            result = replace(result, linear_iterations=result.linear_iterations + found.linear_iterations)
+        return self._finish(cases, aimed, result)
 
-    def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], answer: SolverResult) -> SolverResult:
+    def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], result: SolverResult) -> SolverResult:
         """Finish cases after their last step, in place: mark those that tools pierce, and those that fell short."""
-        problem, u, outcome, reached = self.problem, answer.u, answer.outcome, answer.reached
+        problem, u, outcome, reached = self.problem, result.u, result.outcome, result.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if problem.barriers and len(short) < len(reached):
@@ -394,5 +394,5 @@ class Strategy:
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
             problem.begin(cases.select(short))
-            answer.residual[short] = measure_residual(problem, gather_columns(problem.device, u, short))
-        return replace(answer, inverted=self.inversion.count(u))
+            result.residual[short] = measure_residual(problem, gather_columns(problem.device, u, short))
+        return replace(result, inverted=self.inversion.count(u))
