@@ -149,9 +149,9 @@ def _calibrate_tip(args: argparse.Namespace) -> int:
     """Return a tool's tip, from its poses while it pivots."""
     from ar.tracking.tracker_calibration import calibrate_pivot
 
-    from ..tracked.pose_file import read_numbered_poses
+    from ..tracked.pose_file import read_poses
 
-    rows, _, poses = read_numbered_poses(args.pivot)
+    rows, _, poses = read_poses(args.pivot)
     found = _fit_poses(calibrate_pivot, [args.pivot], [poses], rows)
     deviations = 1e3 * np.sqrt(np.diag(found.covariance))
     if args.json:
@@ -209,10 +209,10 @@ def _calibrate_hand_eye(args: argparse.Namespace) -> int:
     """Estimate the transform between two bodies from poses of both."""
     from ar.tracking.tracker_calibration import solve_hand_eye
 
-    from ..tracked.pose_file import read_numbered_poses
+    from ..tracked.pose_file import read_poses
 
     one, other = args.hand_eye
-    (rows, times, first), (_, again, second) = read_numbered_poses(one), read_numbered_poses(other)
+    (rows, times, first), (_, again, second) = read_poses(one), read_poses(other)
     if len(times) != len(again) or np.abs(times - again).max(initial=0.0) > TIME_TOLERANCE:
         raise InputError(f"{one} and {other} have rows at different times: keep those that both have, in one order.")
     found = _fit_poses(solve_hand_eye, [one, other], [first, second], rows)

@@ -187,15 +187,10 @@ def score(
         *spread(1e3 * distance),
         *spread(100.0 * distance / motion),
         *spread(1e3 * distance.max(axis=1))[:3],
-        time_single_load(deformer, loads, nodes),
+        1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED_LOADS))),
         time_model_alone(deformer, loads),
         solves,
     )
-
-
-def time_single_load(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
-    """Measure the median wall time [us] of one load at a time."""
-    return 1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED_LOADS)))
 
 
 def time_model_alone(deformer: Deformer, loads: Loads) -> float | None:
