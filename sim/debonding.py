@@ -25,20 +25,20 @@ class Tearing:
 
     Parameters
     ----------
-    rounds
+    max_solves
         Maximum number of solves.
-    through
+    penetration_tolerance
         Tolerance of penetration into the skull by debonded vertices [m].
-    pull
+    tension_tolerance
         Tolerance of tension on a sliding vertex, as a fraction of the largest compression.
-    around
+    averaging_radius
         Averaging radius of tractions [m]: bonds fail in patches of that size on any mesh.
     """
 
-    rounds: int = 60
-    through: float = 1e-7
-    pull: float = 1e-3
-    around: float = 5e-3
+    max_solves: int = 60
+    penetration_tolerance: float = 1e-7
+    tension_tolerance: float = 1e-3
+    averaging_radius: float = 5e-3
 
 
 TEARING = Tearing()
@@ -128,14 +128,14 @@ def solve_with_debonding(
         fem = Fem(body, (*others, Slide()), accuracy, device, element=element)
         last = fem.deform(loads, start=last)
         force = _compute_reactions(fem, loads, last)
-        share = _compute_traction_ratios(skull, anatomy, fem, bonded, force, tearing.around)
+        share = _compute_traction_ratios(skull, anatomy, fem, bonded, force, tearing.averaging_radius)
         pull = (_sum_at_vertices(fem, force) * anatomy.slide_normal).sum(axis=1)
         holding = bonded & (share <= 1.0)
-        pressed = (bonded & ~holding | sliding) & (pull <= tearing.pull * -pull.min())
-        passing = (last.displacement[0] * anatomy.slide_normal).sum(axis=1) > tearing.through
+        pressed = (bonded & ~holding | sliding) & (pull <= tearing.tension_tolerance * -pull.min())
+        passing = (last.displacement[0] * anatomy.slide_normal).sum(axis=1) > tearing.penetration_tolerance
         pressed |= covered & ~bonded & ~sliding & passing
         rested = bool((holding == bonded).all() and (pressed == sliding).all())
-        if rested or rounds == tearing.rounds or not last.outcome[0].good:
+        if rested or rounds == tearing.max_solves or not last.outcome[0].good:
             break
         bonded, sliding = holding, pressed
     most = share[bonded].max(initial=0.0)

@@ -188,7 +188,8 @@ class Fem:
         for step, rows in batches:
             guess = None if last is None else last[:, rows]
             parts.append(self._solve(self._get_strategy(step), cases.select(rows), guess, at))
-        answer = _join_batches(parts)
+        # Warm-start data of several batches are dropped, as they may differ.
+        answer = parts[0] if len(parts) == 1 else join_deformations([replace(part, warm={}) for part in parts])
         return answer.select(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
     def _get_strategy(self, step: float) -> Strategy | NoMotionStep:
@@ -332,7 +333,7 @@ class Fem:
     ) -> Deformation:
         """Build the deformation from a solver result, with reactions, warm-start data `more` and `seconds` by stage."""
         solved = time.perf_counter()
-        self.problem.begin(replace(cases, share=found.gone, anew=found.anew))
+        self.problem.begin(replace(cases, share=found.path_fraction, anew=found.restarted))
         memory = dict(self.problem.end(found.u))
         displaced = cases.loads.get(Displaced) is not None
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
@@ -356,7 +357,7 @@ class Fem:
             time=cases.loads.times,
             reaction=reaction,
             memory=memory,
-            warm={**found.learnt, **more},
+            warm={**found.warm_start, **more},
             cost=Cost({**seconds, "reactions": time.perf_counter() - solved}),
             reached=found.reached,
             inverted=found.inverted,
@@ -377,11 +378,6 @@ class Fem:
         return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))
 
     reading, series = build_reading, compute_series  # Former names, for one release.
-
-
-def _join_batches(parts: list[Deformation]) -> Deformation:
-    """Concatenate batches to one deformation; their warm-start data are dropped, as they may differ."""
-    return parts[0] if len(parts) == 1 else join_deformations([replace(part, warm={}) for part in parts])
 
 
 def describe_solver(element: str, effects: Iterable[Effect]) -> str:

@@ -88,10 +88,10 @@ class OperatedFem:
         for stage, stays in sorted(set(zip(done.tolist(), same.tolist(), strict=True))) or [(most, False)]:
             rows = np.flatnonzero((done == stage) & (same == stays))
             begun = None if start is None else self._convert_to_stage(start.select(rows), stage, stays)
-            answer = self._solver(stage).deform(loads.drop(Resected).select(rows), begun, at)
+            result = self._solver(stage).deform(loads.drop(Resected).select(rows), begun, at)
             order.append(rows)
             stages.append(stage)
-            parts.append(self._convert_from_stage(answer, stage))
+            parts.append(self._convert_from_stage(result, stage))
         return (
             self._join_stages(parts, stages).select(np.argsort(np.concatenate(order))) if len(parts) > 1 else parts[0]
         )
@@ -111,19 +111,19 @@ class OperatedFem:
             start, displacement=self._mask_orphans(start, stage), memory=memory, warm=start.warm if stays else {}
         )
 
-    def _convert_from_stage(self, answer: Deformation, stage: int) -> Deformation:
+    def _convert_from_stage(self, result: Deformation, stage: int) -> Deformation:
         """Return a solution of a stage as one of the whole body, marked with its number of steps."""
-        memory = {**answer.memory, DONE_KEY: np.full(len(answer), float(stage))}
+        memory = {**result.memory, DONE_KEY: np.full(len(result), float(stage))}
         for name, place in self._index_memories(memory, stage).items():
             own = memory[name]
             memory[name] = np.zeros((len(own), *self._get_shape(name)), own.dtype)
             memory[name][place] = own
-        return replace(answer, displacement=self._mask_orphans(answer, stage), memory=memory)
+        return replace(result, displacement=self._mask_orphans(result, stage), memory=memory)
 
-    def _mask_orphans(self, answer: Deformation, stage: int) -> np.ndarray:
+    def _mask_orphans(self, result: Deformation, stage: int) -> np.ndarray:
         """Return the displacements of a solution, with zero at orphaned vertices."""
-        orphaned = self._bodies[stage].anatomy.orphaned[answer.nodes]
-        return np.where(orphaned[:, None], 0.0, answer.displacement)
+        orphaned = self._bodies[stage].anatomy.orphaned[result.nodes]
+        return np.where(orphaned[:, None], 0.0, result.displacement)
 
     def _join_stages(self, parts: list[Deformation], stages: list[int]) -> Deformation:
         """Join solutions of several stages; memories that a stage lacks are zero."""
@@ -208,12 +208,12 @@ def build_fem(
 def _restrict_effects(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
     """Return the effects without references to regions that are completely removed."""
     present = set(body.mesh.region.tolist())
-    gone = set(whole.mesh.region.tolist()) - present
+    removed = set(whole.mesh.region.tolist()) - present
 
     def kept(effect: Effect) -> Effect | None:
         if isinstance(effect, Pulsation) and effect.regions is not None:
-            left = tuple(label for label in effect.regions if label not in gone)
+            left = tuple(label for label in effect.regions if label not in removed)
             return replace(effect, regions=left) if left else None
-        return effect.restrict(present | set(effect.regions) - gone) if isinstance(effect, Elasticity) else effect
+        return effect.restrict(present | set(effect.regions) - removed) if isinstance(effect, Elasticity) else effect
 
     return tuple(effect for effect in map(kept, effects) if effect is not None)

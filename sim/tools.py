@@ -216,9 +216,8 @@ def find_foremost_points(tool: BuiltIn, pose: np.ndarray, direction: np.ndarray)
 
 def compute_distances(tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return signed distances (n,) [m] of points (n, 3) [m] from a tool at T_world_tool `pose` (4, 4): < 0 inside."""
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    return np.min([_compute_core_distances(core, local - core.centre) for core in list_cores(tool)], axis=0)
-
-
-def _compute_core_distances(core: Core, local: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(local - np.clip(local, -core.half, core.half), axis=1) - core.radius
+    local, distances = (points - pose[:3, 3]) @ pose[:3, :3], []
+    for core in list_cores(tool):
+        own = local - core.centre
+        distances.append(np.linalg.norm(own - np.clip(own, -core.half, core.half), axis=1) - core.radius)
+    return np.min(distances, axis=0)

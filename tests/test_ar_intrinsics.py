@@ -28,7 +28,7 @@ def test_a_camera_is_found_from_pictures():
     found = [find_board(BOARD, str(number), picture(T)) for number, T in enumerate(places)]
     assert all(found) and min(len(view.pixels) for view in found) > 20
     camera = calibrate_intrinsics(found, WIDTH, HEIGHT, "mine")
-    assert camera.rms < 0.12 and not camera.left_out and camera.used == tuple(map(str, range(12)))
+    assert camera.rms < 0.12 and not camera.excluded and camera.used == tuple(map(str, range(12)))
     np.testing.assert_allclose(camera.values[:4], TRUTH[:4], rtol=3e-3)
     assert (np.abs(camera.values - TRUTH) < 5.0 * camera.deviations).all()
     # Between the corners rays go where they should.
@@ -71,7 +71,7 @@ def test_a_view_that_does_not_fit_is_left_out_and_said():
     some = views(poses(14), 0.1)
     bent = replace(some[5], pixels=some[5].pixels + 3.0 * np.sin(some[5].pixels[:, ::-1] / 20.0))
     camera = calibrate_intrinsics([*some[:5], bent, *some[6:]], WIDTH, HEIGHT)
-    assert camera.left_out == ("view 5",) and len(camera.used) == 13
+    assert camera.excluded == ("view 5",) and len(camera.used) == 13
     alone = calibrate_intrinsics([*some[:5], *some[6:]], WIDTH, HEIGHT)
     np.testing.assert_allclose(camera.values, alone.values, rtol=1e-6)
 

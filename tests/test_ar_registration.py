@@ -97,7 +97,7 @@ def test_pair_residual_uses_registration_without_pair():
     for row in range(len(SCAN)):
         others = register_points(np.delete(SCAN, row, axis=0), np.delete(patient, row, axis=0))
         left = np.linalg.norm(others.point(SCAN[row])[0] - patient[row])
-        assert fits.left_out[row] == pytest.approx(left, rel=0.02) and fits.off[row] < left
+        assert fits.held_out[row] == pytest.approx(left, rel=0.02) and fits.off[row] < left
     assert (
         np.isnan(compute_pair_residuals(SCAN[:3], patient[:3]).chance)
         and not compute_pair_residuals(SCAN[:3], patient[:3]).suspect

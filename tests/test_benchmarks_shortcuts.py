@@ -35,7 +35,7 @@ def test_with_and_without_are_timed_in_turn(site: CraniotomyFrame, monkeypatch: 
     asked, solve = [], Fem.deform
 
     def heard(fem: Fem, loads, start=None):
-        asked.append((fem.plan.quick, loads, start))
+        asked.append((fem.plan.uses_lbfgs, loads, start))
         return solve(fem, loads, start)
 
     monkeypatch.setattr(Fem, "deform", heard)

@@ -63,7 +63,7 @@ def test_pressing_skull_allows_more_motion_than_bonded(brain, capsys):
 
 def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkeypatch):
     path, anatomy = brain
-    (row,) = rows([anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Tearing(rounds=1))
+    (row,) = rows([anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Tearing(max_solves=1))
     assert row.failed == 1 and row.bond is None
     monkeypatch.setattr("benchmarks.studies.skull_models.rows", lambda *words: iter([row]))
     assert main(["benchmarks", "skull", path, "--loads", "1", "--device", "cpu", "--json"]) == 1

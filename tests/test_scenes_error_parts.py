@@ -94,7 +94,7 @@ def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
     first = ToolMotion(stage, sinking).compute_motion(pose, np.diag([1e-6, 1e-8, 1e-8]))
     assert first.moved == pytest.approx(0.0, abs=1e-9) and first.tool == pytest.approx(1.96e-3, rel=1e-3)
     ToolMotion(stage, sinking).compute_motion(pose, 1e-6 * np.eye(3), first)
-    assert sinking.starts[0] is None and sinking.starts[2] is first.answer
+    assert sinking.starts[0] is None and sinking.starts[2] is first.solution
 
 
 @pytest.mark.parametrize(("bound", "expected", "doubt"), [(3e-4, 3e-4, ""), (np.inf, 0.0, NO_ERROR_WARNING)])

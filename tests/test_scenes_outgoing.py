@@ -40,7 +40,7 @@ def motion_of(rest, nodes, displacement):
     positions[nodes] += displacement
     nothing = Loads((Touching(np.eye(4)[None, None]),))
     answer = build_prediction(displacement[None], nodes, nothing, [False], 0.0, np.full((2, 1), np.nan), "")
-    return BrainMotion(positions, True, answer=answer)
+    return BrainMotion(positions, True, solution=answer)
 
 
 def test_tumour_points_move_with_it_and_large_input_fails(follower, registration, truth, beside):

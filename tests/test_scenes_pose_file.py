@@ -48,7 +48,7 @@ def test_pose_rows_not_seen_are_dropped_and_counted(tmp_path, column, cells, pos
 
 def test_poses_are_read_in_metres_and_wrong_ones_are_refused(tmp_path):
     path = write_poses(tmp_path / "poses.csv", turned(3), [[0.1, 0.2, 0.3]] * 3)
-    times, found = read_poses(path)
+    _, times, found = read_poses(path)
     np.testing.assert_allclose(times, [0.0, 0.1, 0.2])
     np.testing.assert_allclose(found[:, :3, 3], [[0.1, 0.2, 0.3]] * 3)
     np.testing.assert_allclose(found[:, :3, :3], turned(3).as_matrix(), atol=1e-12)

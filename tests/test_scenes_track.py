@@ -62,7 +62,7 @@ def test_a_folder_gives_a_row_for_each_picture(folder, camera, tools, tmp_path, 
     assert [row["state"] for row in rows] == ["good", "good", "lost", "lost", "good"]
     assert [float(row["time_s"]) for row in rows] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert all(rows[2][name] == "" for name in ("x_mm", "qw", "tip_x_mm", "tip_off_mm", *COVARIANCE, "corners"))
-    times, poses = read_poses(out)
+    _, times, poses = read_poses(out)
     assert times == pytest.approx([0.0, 0.1, 0.4])
     for row, pose, true in zip([rows[0], rows[1], rows[4]], poses, tools, strict=True):
         tip = np.array([float(row[f"tip_{axis}_mm"]) for axis in "xyz"])
@@ -118,7 +118,7 @@ def test_the_camera_s_pose_is_the_inverse_of_what_it_sees(folder, camera, tmp_pa
     words = ["track", str(folder), "--camera", camera]
     assert main([*words, "--out", str(one), "--body", "camera", "--frame", "patient", "--tip", "0", "0", "0"]) == 0
     assert main([*words, "--out", str(other), "--body", "patient"]) == 0
-    (_, found), (_, seen) = read_poses(one), read_poses(other)
+    (*_, found), (*_, seen) = read_poses(one), read_poses(other)
     np.testing.assert_allclose(found @ seen, np.tile(np.eye(4), (5, 1, 1)), atol=1e-6)
     assert all(float(row["tip_off_mm"]) > 0.0 and int(row["corners"]) < 99 for row in read_csv(one))
 

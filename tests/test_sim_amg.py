@@ -15,7 +15,7 @@ from sim.material import Material
 from sim.runtime.device import find_device
 
 # Every mesh is too large for a factor, and ten nodes are enough for the last level.
-LEVELS = Preconditioning(largest_factor=0, largest_smoothed_factor=0, largest_last=10)
+LEVELS = Preconditioning(max_factorised=0, max_smoothed_factorised=0, max_coarsest_nodes=10)
 
 
 @pytest.mark.parametrize("poisson", [0.3, 0.49])
@@ -59,7 +59,7 @@ def test_the_same_mesh_gives_the_same_cycle() -> None:
     ],
 )
 def test_the_choice_goes_by_size_and_element(kind: str, largest: int, name: str) -> None:
-    settings = Preconditioning(largest_factor=largest, largest_last=5)
+    settings = Preconditioning(max_factorised=largest, max_coarsest_nodes=5)
     problem, preconditioner = built(kind, 0.45, (5, 5, 5), settings=settings)
     assert name_of(preconditioner) == name
     assert name_of(BlockJacobi(problem.device)) == "block Jacobi"

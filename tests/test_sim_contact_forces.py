@@ -30,7 +30,7 @@ def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float, rough:
     barrier = descent.barrier.reduce(np.arange(3))
     assert barrier is not None
     here, known = np.zeros((3 * n, 3)), np.zeros((3 * n, 3))
-    model, few = ContactCompliance(soft, device, partial(allocate_scratch, device)), ForceLimits(iterations=20)
+    model, few = ContactCompliance(soft, device, partial(allocate_scratch, device)), ForceLimits(max_iterations=20)
     force, found = solve_contact_forces(
         barrier, model, here, here + 1e-4, known, np.full(3, 1e-6), np.full(3, drag), few
     )

@@ -69,10 +69,10 @@ def counted(monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> list[obj
     ("limits", "least", "radius", "many", "material"),
     [
         (ContactLimits(), 0.02, 6e-3, 3, NEO),
-        (ContactLimits(stale=0.0), 0.02, 6e-3, 3, NEO),
-        (ContactLimits(drag=30.0), 0.02, 6e-3, 2, NEO),
+        (ContactLimits(stale_factor=0.0), 0.02, 6e-3, 3, NEO),
+        (ContactLimits(proximal=30.0), 0.02, 6e-3, 2, NEO),
         (ContactLimits(), 9.0, 6e-3, 2, NEO),
-        (ContactLimits(shortest=2.0), 0.5, 6e-3, 3, NEO),
+        (ContactLimits(reset_length=2.0), 0.5, 6e-3, 3, NEO),
         (ContactLimits(), 0.02, 1.5e-3, 1, NEO),
         (ContactLimits(), 0.02, 6e-3, 3, RELAXING),
     ],
@@ -85,7 +85,7 @@ def test_replayed_steps_are_those_of_the_descent(
     fem = solver(material, radius)
     found = fem.strategy.contact
     assert found is not None
-    strains = StrainLimits(least=least, cut=np.inf)
+    strains = StrainLimits(min_strain=least, max_omitted=np.inf)
     ordinary, replayed = (replace(found, limits=limits, strains=strains, replays=which) for which in (False, True))
     expected = followed(fem, ordinary, many)
     taken = counted(monkeypatch, ContactSteps, "move_to_last_step")

@@ -219,14 +219,14 @@ def test_finer_pieces_find_nearly_the_same_weights() -> None:
     nodes, triangles = sheet(60)
     device, point, radius = find_device("cpu", "float64"), np.zeros((1, 3)), np.array([5e-3])
     coarse, fine = (
-        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(fineness=share))
+        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(max_edge_ratio=share))
         .press(point, radius)
         .to_matrix(len(nodes))
         for share in (0.12, 0.03)
     )
     assert 0.0 < np.abs((coarse - fine).toarray()).max() < 2e-3
     with pytest.raises(InputError, match="too small"):
-        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(most=1)).press(point, radius)
+        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(max_subdivisions=1)).press(point, radius)
 
 
 @pytest.mark.parametrize("mesh", [sheet(300), quadratic_sheet(60)], ids=["linear", "quadratic"])

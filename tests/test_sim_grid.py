@@ -128,5 +128,5 @@ def test_tissue_that_was_cut_away_is_known_to_be_gone(box, moved):
     found = warp_fields(box, moved, 2e-3, box.remove_elements(cut))
     middle = box.mesh.nodes[box.mesh.tets[cut]].mean(axis=(0, 1))
     place = tuple(np.rint(found.grid.index(middle)).astype(int))
-    assert found.gone[place] and not found.folds
-    assert not found.gone[tuple(np.rint(found.grid.index(middle + [0, 0, 14e-3])).astype(int))]
+    assert found.resected[place] and not found.folds
+    assert not found.resected[tuple(np.rint(found.grid.index(middle + [0, 0, 14e-3])).astype(int))]

@@ -181,7 +181,7 @@ def test_what_slicer_wrote_is_read_as_others_read_it(name, layers):
 
     path = slicerio.get_testdata_file(f"{name}.seg.nrrd")
     values, header = reference.read(path)
-    found = read_volume(path, Voxels(coarsest=0.011), layered=True)
+    found = read_volume(path, Voxels(max_edge=0.011), layered=True)
     expected = np.moveaxis(values, 0, -1) if layers > 1 else values
     np.testing.assert_array_equal(found.values, expected)
     np.testing.assert_allclose(1e3 * found.affine[:3, 3], header["space origin"] * [-1, -1, 1])
@@ -194,7 +194,7 @@ def test_what_slicer_wrote_is_read_as_others_read_it(name, layers):
     if layers > 1:
         assert (found.segments[7].name, found.segments[7].layer) == ("overlapping sphere", 1)
         with pytest.raises(InputError, match=r"its segments overlap, in 2 layers.*Export them as a label map"):
-            read_volume(path, Voxels(coarsest=0.011))
+            read_volume(path, Voxels(max_edge=0.011))
 
 
 def test_segments_are_called_by_their_names(tmp_path):

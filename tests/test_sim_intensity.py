@@ -86,7 +86,7 @@ def test_voxels_that_are_no_tissue_leave_the_others_as_they_are():
         found = Intensity(np.where(wrong, value, grey), AFFINE).apply_window(brain())
         np.testing.assert_allclose(found[~wrong], usual[~wrong], atol=0.02)
         assert np.ptp(found[wrong]) == 0.0 and 0.3 < found[wrong][0] < 0.97
-    assert (Intensity(np.full(grey.shape, -7.0), AFFINE).apply_window(brain()) == np.float32(Window().plain)).all()
+    assert (Intensity(np.full(grey.shape, -7.0), AFFINE).apply_window(brain()) == np.float32(Window().flat_grey)).all()
 
 
 def test_a_volume_elsewhere_or_without_numbers_is_refused(tmp_path):

@@ -185,11 +185,11 @@ def test_what_was_learnt_shortens_the_next_descent(device: Device) -> None:
     solver, tolerance = build_rest_solver(problem), np.full(3, 1e-6)
     first = Lbfgs(problem, solver).descend(rest, tolerance, 300, {})
     plain = Lbfgs(read_problem(device, total=1.1 * few), solver).descend(first.u, tolerance, 300)
-    carried = Lbfgs(read_problem(device, total=1.1 * few), solver).descend(first.u, tolerance, 300, first.learnt)
+    carried = Lbfgs(read_problem(device, total=1.1 * few), solver).descend(first.u, tolerance, 300, first.warm_start)
     assert (carried.status == DONE).all()
     assert carried.steps.sum() < plain.steps.sum()
     np.testing.assert_allclose(carried.u.numpy(), plain.u.numpy(), atol=1e-4 * np.abs(plain.u.numpy()).max())
-    assert not descended(read_problem(device)).learnt  # too many columns to have a next frame
+    assert not descended(read_problem(device)).warm_start  # too many columns to have a next frame
 
 
 def test_a_column_ends_at_a_force_too(device: Device) -> None:

@@ -69,4 +69,4 @@ def test_a_batch_that_fits_a_card_fills_its_room() -> None:
     """As many loads as are worth it, and at least one."""
     column = estimate_column_bytes(ROWS, CARD)
     batches = [choose_batch_size(ROWS, CARD, free * column) for free in (0, 2, 9, 100, 200, 10**9)]
-    assert batches == [1, 1, 4, 4, 96, MemoryBudget.widest_on_cuda]
+    assert batches == [1, 1, 4, 4, 96, MemoryBudget.max_cases_on_cuda]

@@ -80,7 +80,7 @@ def test_hdf5_of_a_mesh_holds_its_arrays_itself(tmp_path: Path, name: str, way: 
 
 
 def test_hdf5_is_as_large_as_its_own_file_allows(tmp_path: Path) -> None:
-    path, few = tmp_path / "a.xdmf", MeshBytes(inflation=2, small=2**10)
+    path, few = tmp_path / "a.xdmf", MeshBytes(max_ratio=2, small=2**10)
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
     with h5py.File(path.with_suffix(".h5"), "r+") as file:
         file["more"] = np.random.default_rng(0).random(400_000)  # 3.2 MB, far more than the XML

@@ -82,7 +82,7 @@ def test_smoothing_improves_angles_on_the_surface(body):
 
     nodes = project(nodes, np.arange(len(nodes)))
     moved = improve_mesh(nodes, body.tets, project)
-    np.testing.assert_array_equal(improve_mesh(nodes, body.tets, project, Smoothing(rounds=0)), nodes)
+    np.testing.assert_array_equal(improve_mesh(nodes, body.tets, project, Smoothing(max_iterations=0)), nodes)
     assert compute_smallest_sines(nodes[body.tets]).min() < np.sin(np.radians(5.0))
     assert compute_smallest_sines(moved[body.tets]).min() > np.sin(np.radians(14.0))
     assert np.abs(ball(moved[surface])).max() < 1e-6

@@ -40,7 +40,7 @@ def test_a_rough_cortex_is_meshed(tmp_path, monkeypatch):
     assert mesh.volumes[mesh.region == TUMOUR_LABEL].sum() == pytest.approx(subject.tumour_volume, rel=0.02)
     monkeypatch.setattr(mesher, "prevent_folds", lambda nodes, moved, tets: moved)
     with pytest.raises(InputError, match="too intricate for 2000 nodes"):
-        make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(more=())))
+        make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(factors=())))
 
 
 def test_what_is_fitted_without_folds_is_left_as_it_is(tmp_path, monkeypatch):
@@ -68,11 +68,11 @@ def test_small_pieces_are_another_reason_than_intricate_surfaces(tmp_path):
     with pytest.raises(
         InputError, match=r"12 of the tumour's 13 pieces, 1.\d ml in all, are too small for 2000 nodes: "
     ):
-        make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(more=())))
+        make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(factors=())))
 
 
 def test_labels_as_rough_as_their_voxels_are_to_be_smoothed(tmp_path):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(1.5, 1.2))
-    plan = MeshPlan(nodes=2000, meshing=mesher.Meshing(more=(1.25,)))
+    plan = MeshPlan(nodes=2000, meshing=mesher.Meshing(factors=(1.25,)))
     with pytest.raises(InputError, match="too intricate for 2000 nodes: smooth the labels"):
         make_anatomy(build_volume_subject(path, (1, 2), (3, 4)), plan)

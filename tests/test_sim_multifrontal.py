@@ -12,7 +12,7 @@ from sim.linalg.multifrontal import Factor, Factorisation, find_moved_nodes
 from sim.runtime.device import Precision, find_device
 
 CELLS = (6, 6, 6)
-FEW, STRIP = Factorisation().few, Factorisation().strip
+FEW, STRIP = Factorisation().max_separate_sweeps, Factorisation().strip_size
 EXACT = {"float32": 2e-5, "float64": 1e-12}
 
 

@@ -17,7 +17,7 @@ from sim.material import Material
 from sim.runtime.device import Precision, find_device
 
 # Smoothed strains take two levels here, as on large meshes.
-SMALL = Preconditioning(largest_smoothed_factor=0)
+SMALL = Preconditioning(max_smoothed_factorised=0)
 
 
 def body(kind: str, cells: tuple[int, int, int]) -> Anatomy:

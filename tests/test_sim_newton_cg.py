@@ -54,7 +54,7 @@ def test_directions_lead_downhill_and_promise_their_slope(device: Device) -> Non
     for _, g, found in walk(problem, descent_of(problem), 8):
         slope = (g * found.d.numpy()).sum(axis=0)
         assert (slope < 0.0).all()
-        np.testing.assert_allclose(found.promised, -slope, rtol=1e-9)
+        np.testing.assert_allclose(found.predicted, -slope, rtol=1e-9)
 
 
 def test_memory_leaves_with_its_columns(device: Device) -> None:

@@ -25,7 +25,7 @@ from sim.runtime.file_limits import MeshBytes
 from sim.runtime.outside_files import read_as
 
 BODY = base_held(box((2, 2, 2), 0.02))
-FEW = MeshBytes(largest=2**22)
+FEW = MeshBytes(max_bytes=2**22)
 
 
 def fattened(path: Path, megabytes: int) -> Path:
@@ -110,7 +110,7 @@ class TestMeshes:
             assert tracemalloc.get_traced_memory()[1] < 2**24
         finally:
             tracemalloc.stop()
-        assert MeshBytes().largest > 2**31
+        assert MeshBytes().max_bytes > 2**31
 
     def test_a_file_is_no_larger_than_the_limit(self, tmp_path: Path) -> None:
         for name in ("a.vtu", "a.inp"):

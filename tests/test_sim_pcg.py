@@ -188,7 +188,7 @@ def test_search_lengthens_what_it_cut_too_much(problem: Problem) -> None:
     """Along a direction far too long it comes near the minimum, not to a tenth of a tenth of the way."""
     u, direction = downhill(problem, np.ones(2))
     far = 37.0 / search(problem, u, direction)
-    long = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.promised, 0)
+    long = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.predicted, 0)
     length = search(problem, u, long)
 
     def slope(t: np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ def test_search_lengthens_what_it_cut_too_much(problem: Problem) -> None:
         problem.constraint.project(g)
         return (g.numpy() * long.d.numpy()).sum(axis=0)
 
-    assert (np.abs(slope(length)) <= 0.5 * long.promised).all()
+    assert (np.abs(slope(length)) <= 0.5 * long.predicted).all()
 
 
 def test_a_step_of_nothing_is_none(problem: Problem) -> None:
@@ -204,5 +204,5 @@ def test_a_step_of_nothing_is_none(problem: Problem) -> None:
     u, direction = downhill(problem, np.ones(2))
     length = search(problem, u, direction)
     far = 1e10 * length
-    endless = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.promised, 0)
+    endless = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.predicted, 0)
     assert not search(problem, u, endless).any()

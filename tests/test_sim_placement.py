@@ -47,8 +47,8 @@ def test_an_opening_that_cannot_be_is_a_sentence(cortex, place, reason):
 def test_how_far_off_a_point_may_lie_is_asked_for(cortex):
     asked = np.array([0.0, 0.0, 0.12])
     with pytest.raises(InputError, match="50 mm is the most"):
-        find_opening_at(cortex, 1.3 * asked, Placement(near=0.05))
-    assert find_opening_at(cortex, asked, Placement(near=0.06))[2] > 0.06
+        find_opening_at(cortex, 1.3 * asked, Placement(max_surface_distance=0.05))
+    assert find_opening_at(cortex, asked, Placement(max_surface_distance=0.06))[2] > 0.06
 
 
 def test_over_a_point_outside_nothing_is_opened(cortex):
@@ -57,7 +57,7 @@ def test_over_a_point_outside_nothing_is_opened(cortex):
     with pytest.raises(InputError, match="over the brainstem"):
         find_opening_over(cortex, np.array([0.0, 0.0, -0.069]), 0.0)
     deep = find_reachable_site(cortex, np.array([0.0, 0.0, 0.0]))
-    assert deep[2] >= -0.07 + Placement().base * 0.14 - 1e-3
+    assert deep[2] >= -0.07 + Placement().min_height * 0.14 - 1e-3
 
 
 @pytest.mark.parametrize(
@@ -80,6 +80,6 @@ def test_too_few_nodes_are_refused_with_how_many_would_do():
         asked.append(count)
         return count >= 4000
 
-    message = str(build_too_few_error(3000, INTRICATE, Meshing().more, would_do))
+    message = str(build_too_few_error(3000, INTRICATE, Meshing().factors, would_do))
     assert "too intricate for 3000 nodes: ask for 4800, or smooth" in message and asked == [3800, 4800]
-    assert "for 1000 nodes: smooth the labels" in str(build_too_few_error(1000, INTRICATE, Meshing().more, would_do))
+    assert "for 1000 nodes: smooth the labels" in str(build_too_few_error(1000, INTRICATE, Meshing().factors, would_do))

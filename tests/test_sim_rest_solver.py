@@ -15,7 +15,7 @@ def test_linear_solution_is_same_without_inverse():
     problem, preconditioner = built("smoothed", 0.45, (2, 2, 3))
     free = problem.constraint.build_basis()
     force = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 3))
-    direct, iterated = (RestStiffnessSolver(problem, preconditioner, 400, largest_factor=most) for most in (10**6, 0))
+    direct, iterated = (RestStiffnessSolver(problem, preconditioner, 400, max_factorised=most) for most in (10**6, 0))
     assert direct.exact is not None and iterated.exact is None
     one, other = (resting.solve(problem.device.upload(force)).numpy() for resting in (direct, iterated))
     np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(one).max())

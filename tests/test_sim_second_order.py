@@ -43,14 +43,14 @@ def check(box, tissue, element):
     near = np.ones((4, 4), bool)
     heard = []
     pairs, table = compute_second_order(
-        fem.problem, units.answers, reading.answers, near, lambda done, total: heard.append((done, total))
+        fem.problem, units.solutions, reading.solutions, near, lambda done, total: heard.append((done, total))
     )
     assert len(pairs) == 12 * 13 // 2 and (pairs[:, 0] <= pairs[:, 1]).all() and heard[-1][0] == heard[-1][1]
     flat = force.reshape(6, -1)
     found = (flat[:, pairs[:, 0]] * flat[:, pairs[:, 1]]) @ table
     assert np.linalg.norm(found - wanted) < 2e-4 * np.linalg.norm(wanted)
     near[0, 3] = near[3, 0] = False
-    fewer, part = compute_second_order(fem.problem, units.answers, reading.answers, near)
+    fewer, part = compute_second_order(fem.problem, units.solutions, reading.solutions, near)
     kept = ~((pairs[:, 0] // 3 == 0) & (pairs[:, 1] // 3 == 3))
     np.testing.assert_array_equal(fewer, pairs[kept])
     np.testing.assert_allclose(part, table[kept], rtol=1e-4, atol=1e-5 * np.abs(table).max())

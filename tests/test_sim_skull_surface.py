@@ -71,7 +71,7 @@ def test_a_body_without_an_opening_has_bone_alone() -> None:
     body = half_open(np.zeros(len(TOP), bool))
     bone = build_bone(body, discretise(MESH, "p1"), GAP)
     np.testing.assert_array_equal(bone.nodes, np.flatnonzero(TOP & ~OPEN))
-    np.testing.assert_array_equal(bone.felt, BONE_SETTINGS.felt)
+    np.testing.assert_array_equal(bone.activation, BONE_SETTINGS.activation)
     assert (bone.inside < 0.0).all()
 
 
@@ -99,7 +99,7 @@ def test_open_cortex_slides_under_bone_and_not_into_it(element: str) -> None:
 
     assert depth(dragged(half_open(np.zeros(len(TOP), bool)), element)).max() > 1e-3
     barred = depth(dragged(half_open(), element))
-    assert barred.max() < 0.1 * BONE_SETTINGS.edge_felt * edge
+    assert barred.max() < 0.1 * BONE_SETTINGS.edge_activation * edge
     assert barred.max() > -edge, "nothing came near the edge"
 
 

@@ -34,7 +34,7 @@ from sim.strategy.plan import SolverStep
 
 LAW, HARD = "neo-hookean", np.array([[1.0, 0.5, -5.0]])
 RENEWAL = Renewal()
-EVERY = StrainLimits(least=0.0, nodes=10**4, cut=np.inf, near=10**4)
+EVERY = StrainLimits(min_strain=0.0, max_nodes=10**4, max_omitted=np.inf, max_candidates=10**4)
 
 
 def factor_of(problem: Problem) -> Factor:
@@ -110,16 +110,18 @@ def test_the_next_frame_begins_with_what_served() -> None:
     problem, space, rest = hard()
     descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {})
-    assert there.steps[0] > RENEWAL.served and there.learnt == {}
+    assert there.steps[0] > RENEWAL.max_served and there.warm_start == {}
     first = descent.descend(there.u, np.full(1, 1e-8), 400, {})
     assert (
-        first.status[0] == DONE and first.steps[0] <= RENEWAL.served and set(first.learnt) == set(UPDATE_KEYS.values())
+        first.status[0] == DONE
+        and first.steps[0] <= RENEWAL.max_served
+        and set(first.warm_start) == set(UPDATE_KEYS.values())
     )
-    again = descent.descend(there.u, np.full(1, 1e-8), 400, first.learnt)
+    again = descent.descend(there.u, np.full(1, 1e-8), 400, first.warm_start)
     np.testing.assert_array_equal(again.u.numpy(), first.u.numpy())
-    for name, array in first.learnt.items():
-        assert np.shares_memory(again.learnt[name], array)
-    assert descent.descend(there.u, np.full(1, 1e-8), 400).learnt == {}
+    for name, array in first.warm_start.items():
+        assert np.shares_memory(again.warm_start[name], array)
+    assert descent.descend(there.u, np.full(1, 1e-8), 400).warm_start == {}
 
 
 @pytest.mark.parametrize("name", UPDATE_KEYS.values())
@@ -129,7 +131,7 @@ def test_what_does_not_fit_is_forgotten(name: str, fault: str) -> None:
     descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {}).u
     first = descent.descend(there, np.full(1, 1e-8), 400, {})
-    learnt, array = dict(first.learnt), first.learnt[name]
+    learnt, array = dict(first.warm_start), first.warm_start[name]
     whole = array.dtype.kind == "i"
     learnt[name] = {
         "missing": None,
@@ -148,7 +150,7 @@ def test_a_factor_that_cannot_be_divided_by_is_forgotten() -> None:
     descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {}).u
     first = descent.descend(there, np.full(1, 1e-8), 400, {})
-    learnt = {name: np.zeros_like(array) for name, array in first.learnt.items()}
+    learnt = {name: np.zeros_like(array) for name, array in first.warm_start.items()}
     np.testing.assert_array_equal(descent.descend(there, np.full(1, 1e-8), 400, learnt).u.numpy(), first.u.numpy())
 
 
@@ -209,9 +211,9 @@ def test_live_frames_go_the_short_way_to_the_same_place() -> None:
 
 def test_models_have_the_nodes_nearest_to_the_opening() -> None:
     problem, space, rest = hard()
-    strains, kept = replace(SINGLE_LIMITS, near=200, nodes=30), Renewal(served=400)
+    strains, kept = replace(SINGLE_LIMITS, max_candidates=200, max_nodes=30), Renewal(max_served=400)
     descent = descent_on(problem, space, strains, kept)
-    rows = descent.descend(rest, np.full(1, 1e-6), 400, {}).learnt[UPDATE_KEYS["rows"]][0]
+    rows = descent.descend(rest, np.full(1, 1e-6), 400, {}).warm_start[UPDATE_KEYS["rows"]][0]
     assert len(np.unique(rows)) == len(rows) == 90
     distance = np.linalg.norm(space.nodes[:, None] - space.nodes[OPENING], axis=2).min(axis=1)
     assert distance[rows // 3].max() <= np.sort(distance)[199]

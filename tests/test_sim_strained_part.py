@@ -22,7 +22,7 @@ from sim.tools import Ball
 
 SIDE, HEIGHT, RADIUS = 0.06, 0.03, 6e-3
 BODY = base_held(box((6, 6, 3), SIDE))
-EVERY = StrainLimits(least=0.0, nodes=10**4)
+EVERY = StrainLimits(min_strain=0.0, max_nodes=10**4)
 BOTH = np.arange(2)
 TISSUES = {
     "plain": Material("neo-hookean", 3000.0, 0.45),
@@ -149,7 +149,7 @@ def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
 
 def test_those_are_chosen_that_are_strained_most() -> None:
     """As many as there is room for, and none that is hardly strained."""
-    fem, descent, u, model = find_model(StrainLimits(least=0.08, nodes=20, cut=1.0))
+    fem, descent, u, model = find_model(StrainLimits(min_strain=0.08, max_nodes=20, max_omitted=1.0))
     strain = fem.problem.device.allocate(fem.space.count, 2)
     every, columns = np.ones(fem.space.count, bool), fem.problem.device.upload(BOTH, wp.int32)
     for term in fem.problem.terms:
@@ -167,7 +167,7 @@ def test_those_are_chosen_that_are_strained_most() -> None:
 
 
 def test_columns_of_different_widths_go_together() -> None:
-    _, _, _, narrow = find_model(StrainLimits(least=0.08, nodes=20, cut=1.0))
+    _, _, _, narrow = find_model(StrainLimits(min_strain=0.08, max_nodes=20, max_omitted=1.0))
     _, _, _, wide = find_model(EVERY)
     both = narrow.merge_columns(np.array([1]), wide.select(np.array([0])))
     size = narrow.matrix.shape[1]
@@ -182,7 +182,7 @@ def test_columns_of_different_widths_go_together() -> None:
 def test_model_is_absent_where_valid_only_in_patches() -> None:
     """Where its room leaves out tissue that is strained far more than what counts as strained."""
     fem, descent = solver()
-    u, few = bent(fem.problem, 4e-4), StrainLimits(least=0.08, nodes=5, cut=0.1)
+    u, few = bent(fem.problem, 4e-4), StrainLimits(min_strain=0.08, max_nodes=5, max_omitted=0.1)
     part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable), few)
     assert part.build_model(u, BOTH) is None and part.build_model(u, BOTH[1:]) is not None
 
@@ -190,7 +190,7 @@ def test_model_is_absent_where_valid_only_in_patches() -> None:
 def test_deep_poses_take_fewer_steps_to_the_same_end() -> None:
     """Than as stiff as at rest: a ball goes down step by step, each from where the last one ended."""
     ends, steps = [], []
-    for strains in (STRAIN_LIMITS, StrainLimits(least=np.inf)):
+    for strains in (STRAIN_LIMITS, StrainLimits(min_strain=np.inf)):
         fem, _ = solver("smoothed", "plain", strains, 1e-3)
         answers = [fem.deform(down(1e-3))]
         for depth in np.arange(2, 9) * 1e-3:

@@ -64,7 +64,7 @@ def test_at_17k_nodes_angles_surface_and_volume_are_as_promised():
 
 
 def test_the_mesh_is_searched_for_as_the_plan_says(subject):
-    meshing = Meshing(trials=1, farthest=0.0)
+    meshing = Meshing(max_trials=1, max_deviation=0.0)
     with pytest.raises(InputError, match="3000 nodes are not possible for this anatomy"):
         make_anatomy(subject, MeshPlan(3000, meshing=meshing))
 

@@ -53,5 +53,5 @@ def test_errors_come_out_and_the_threads_stay(bad: int):
 
 def test_one_core_at_least_and_one_for_little() -> None:
     assert choose_threads(10**6) >= 1
-    assert choose_threads(Sharing().least - 1) == 1
-    assert choose_threads(10**6, Sharing(most=1)) == 1
+    assert choose_threads(Sharing().min_size - 1) == 1
+    assert choose_threads(10**6, Sharing(max_threads=1)) == 1

@@ -13,9 +13,9 @@ def test_a_way_is_as_long_as_it_is_clear() -> None:
     tool = Ball(RADIUS)
     begin, end = at(0.0, 0.0, 0.1)[None, None], at(0.1, 0.0, 0.1)[None, None]
     way = ToolPath(begin, end)
-    np.testing.assert_allclose(way.compute_stride((tool,), np.zeros((1, 1))), ContactSampling.stride * RADIUS / 0.1)
+    np.testing.assert_allclose(way.compute_stride((tool,), np.zeros((1, 1))), ContactSampling.max_stride * RADIUS / 0.1)
     np.testing.assert_allclose(
-        way.compute_stride((tool,), np.full((1, 1), 0.04)), (0.04 + ContactSampling.stride * RADIUS) / 0.1
+        way.compute_stride((tool,), np.full((1, 1), 0.04)), (0.04 + ContactSampling.max_stride * RADIUS) / 0.1
     )
     np.testing.assert_allclose(way.compute_stride((tool,), np.full((1, 1), 0.2)), 1.0)
 
@@ -28,4 +28,4 @@ def test_a_tool_flies_in_few_strides() -> None:
     there = fem.deform(touching(poses[0]))
     cases = Cases(touching(poses[1]), np.zeros(1), there.memory, np.zeros((1, len(BODY.mesh.nodes), 3)), np.zeros(1))
     stride = term.compute_stride(cases, fem.problem.device.allocate(fem.problem.rows, 1))
-    assert stride[0] > 0.07 / 0.24 > 10.0 * ContactSampling.stride * RADIUS / 0.24
+    assert stride[0] > 0.07 / 0.24 > 10.0 * ContactSampling.max_stride * RADIUS / 0.24

@@ -73,6 +73,6 @@ def test_a_cloud_is_not_taken_for_oedema(body):
     rest = body.mesh.nodes[nodes]
     for known, believed in ((rest, True), (None, False)):
         found = condition_prior(prior, to_evidence(body, Observation(rest + moved[nodes], known)))
-        rows = np.concatenate([answer.rows for answer in found.answers])
+        rows = np.concatenate([answer.rows for answer in found.results])
         kinds = prior.kind[rows[rows < len(prior.kind)]]
         assert (OEDEMA in kinds) == believed

@@ -87,14 +87,14 @@ class Ground:
 
     Parameters
     ----------
-    mask, shut
+    mask, closed
         (h, w) bool: the silhouette, and the ground that the surface does not shine through.
     words
         Label of the closed ground; empty if it covers too small a share.
     """
 
     mask: np.ndarray
-    shut: np.ndarray
+    closed: np.ndarray
     words: str
 
 
@@ -306,9 +306,9 @@ def draw_broken(
     """Draw the broken parts of an outline, in place: all of an unreliable one, and those under closed ground."""
     if doubtful:
         draw_dashes(sheet, find_outlines(found.mask), ink, BROKEN_STROKES)
-    elif ground is not None and ground.shut.any():
+    elif ground is not None and ground.closed.any():
         draw_dashes(
-            sheet, cut_outlines(find_outlines(ground.mask), ground.shut), ink, HIDDEN_STROKES, HIDDEN_LINE_WIDTH
+            sheet, cut_outlines(find_outlines(ground.mask), ground.closed), ink, HIDDEN_STROKES, HIDDEN_LINE_WIDTH
         )
 
 
@@ -349,7 +349,7 @@ def write_ground(
     """Write the label of closed ground over the surface, in place; front and lines (H, W) uint8 as in `Below`."""
     if not ground.words:
         return
-    there = cv2.moments((ground.mask & ground.shut).view(np.uint8), binaryImage=True)
+    there = cv2.moments((ground.mask & ground.closed).view(np.uint8), binaryImage=True)
     lines = format_ground(ground.words)
     wide = max(cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines)
     column, row = there["m10"] / there["m00"] + box[1].start, there["m01"] / there["m00"] + box[0].start

@@ -23,12 +23,12 @@ HALF_DOT_WIDTH = 0.06  # Half the width of an isolated sample [s].
 
 @dataclass(frozen=True)
 class Line:
-    """Line of a chart: its name, unit and colour; `whose` names the source of its error."""
+    """Line of a chart: its name, unit and colour; `error_source` names the source of its error."""
 
     name: str
     unit: str
     colour: str
-    whose: str = ""
+    error_source: str = ""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
         middle = f'x="{0.5 * (LEFT_MARGIN + CHART_WIDTH):g}" y="{top + 0.5 * room + 4:g}"'
         what = "not known" if samples else "nothing yet"
         drawn.append(f'<text {middle} text-anchor="middle" opacity="0.7">{what}</text>')
-    said = f"{line.name} [{line.unit}]" + (f", {line.whose}" if line.whose else "")
+    said = f"{line.name} [{line.unit}]" + (f", {line.error_source}" if line.error_source else "")
     scale = "".join(
         f'<text x="{LEFT_MARGIN - 5:g}" y="{top + room * (1 - share) + 4:g}" text-anchor="end">{share * high:g}</text>'
         f'<path d="M{LEFT_MARGIN:g} {top + room * (1 - share):g}H{CHART_WIDTH - 6:g}" '

@@ -79,7 +79,7 @@ class Cut:
         Further surfaces, such as the tool: plain lines of their colours.
     tip
         Position of the tool's contact (3,) [m].
-    whose
+    error_source
         Source of the error, in a word.
     """
 
@@ -89,7 +89,7 @@ class Cut:
     doubtful: bool = False
     others: Sequence[Layer] = ()
     tip: np.ndarray | None = None
-    whose: str = "tumour"
+    error_source: str = "tumour"
 
 
 def draw_slices(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
@@ -136,8 +136,8 @@ def view(plane: SliceView, scan: Solid | None, middle: np.ndarray, cut: Cut) -> 
 def describe_band(cut: Cut) -> str:
     """Describe the band in a few words."""
     if cut.doubtful or cut.error is None:
-        return f"{cut.whose}: not known"
-    return f"{cut.whose}: within {bound_words(cut.error, 1)}"
+        return f"{cut.error_source}: not known"
+    return f"{cut.error_source}: within {bound_words(cut.error, 1)}"
 
 
 def resample_view(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarray:

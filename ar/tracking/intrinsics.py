@@ -191,7 +191,7 @@ class Intrinsics:
         Covariance (9, 9) of `PARAMETERS`.
     rms
         Root mean square distance [pixel] between detected and projected corners, over all views used.
-    used, left_out
+    used, excluded
         Names of views: those used, and those whose errors were too large.
     covered
         Share of the image that is inside the corners of a view.
@@ -201,7 +201,7 @@ class Intrinsics:
     covariance: np.ndarray
     rms: float
     used: tuple[str, ...]
-    left_out: tuple[str, ...]
+    excluded: tuple[str, ...]
     covered: float
 
     @property
@@ -232,14 +232,14 @@ def calibrate_intrinsics(
     ValueError
         Too few views, all from one direction, or views that determine no camera.
     """
-    kept, left_out = list(views), []
+    kept, excluded = list(views), []
     while True:
-        _check_views(kept, len(left_out), width, height, settings)
+        _check_views(kept, len(excluded), width, height, settings)
         K, coefficients, poses, errors = _solve_views(kept, width, height)
         bad = errors > settings.outlier_ratio * np.median(errors)
         if not bad.any():
             break
-        left_out += [view.name for view, worse in zip(kept, bad, strict=True) if worse]
+        excluded += [view.name for view, worse in zip(kept, bad, strict=True) if worse]
         kept = [view for view, worse in zip(kept, bad, strict=True) if not worse]
     calibration = Calibration((K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), width, height, Lens(*coefficients.tolist()), name)
     try:
@@ -247,7 +247,7 @@ def calibrate_intrinsics(
     except np.linalg.LinAlgError as error:
         raise ValueError(f"the views determine no camera. {REMEDY}") from error
     used, covered = tuple(view.name for view in kept), measure_covered_share(kept, width, height)
-    found = Intrinsics(calibration, covariance, rms, used, tuple(left_out), covered)
+    found = Intrinsics(calibration, covariance, rms, used, tuple(excluded), covered)
     unsure = found.deviations[:2] / calibration.focal
     if not unsure.max() <= settings.max_focal_deviation:
         raise ValueError(f"the views leave the focal length unknown to {100.0 * unsure.max():.0f} %. {REMEDY}")
@@ -255,11 +255,11 @@ def calibrate_intrinsics(
 
 
 def _check_views(
-    views: Sequence[BoardView], left_out: int, width: int, height: int, settings: IntrinsicsSettings
+    views: Sequence[BoardView], excluded: int, width: int, height: int, settings: IntrinsicsSettings
 ) -> None:
     """Raise ValueError for views that do not determine a camera."""
     if len(views) < settings.min_views:
-        without = f", and {left_out} more fit badly" if left_out else ""
+        without = f", and {excluded} more fit badly" if excluded else ""
         raise ValueError(
             f"{len(views)} sharp views show the board{without}, but {settings.min_views} are needed: take 20 images or "
             "more, in good light and without motion."

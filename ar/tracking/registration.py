@@ -269,7 +269,7 @@ class PairResiduals:
     ----------
     off
         Residual distances (n,) [m] in the registration by all pairs.
-    left_out
+    held_out
         Residual distances (n,) [m] in the registration by the other pairs.
     studentised
         The latter (n,) divided by its standard deviation as predicted from the others' scatter. NaN for three pairs,
@@ -279,14 +279,14 @@ class PairResiduals:
     """
 
     off: np.ndarray
-    left_out: np.ndarray
+    held_out: np.ndarray
     studentised: np.ndarray
     chance: float
 
     @property
     def worst(self) -> int:
         """Number, from 0, of the pair that fits the others worst."""
-        return int(np.argmax(self.left_out if np.isnan(self.studentised).any() else self.studentised))
+        return int(np.argmax(self.held_out if np.isnan(self.studentised).any() else self.studentised))
 
     @property
     def suspect(self) -> bool:
@@ -319,9 +319,9 @@ def compute_pair_residuals(
     hat = J @ np.linalg.solve(J.T @ J, J.T)
     freedom = 3 * count - 9
     free = np.stack([np.eye(3) - hat[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(count)])
-    left_out = np.linalg.solve(free, off[..., None])[..., 0]
-    own = np.einsum("ni,ni->n", off, left_out)
+    held_out = np.linalg.solve(free, off[..., None])[..., 0]
+    own = np.einsum("ni,ni->n", off, held_out)
     others = np.maximum((np.square(off).sum() - own) / freedom, settings.min_rms**2)
     squares = own / (3.0 * others)
     chance = min(1.0, count * float(f.sf(squares.max(), 3, freedom)))
-    return PairResiduals(np.linalg.norm(off, axis=1), np.linalg.norm(left_out, axis=1), np.sqrt(squares), chance)
+    return PairResiduals(np.linalg.norm(off, axis=1), np.linalg.norm(held_out, axis=1), np.sqrt(squares), chance)

@@ -68,14 +68,14 @@ class Moved:
         """The points where they were."""
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * self._points, self._mesh), stamp)
 
-    def build_messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
+    def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """The surface."""
-        body = encode_polydata(1e3 * answer.known.motion.positions, self._mesh)
-        return (pack_message("POLYDATA", "TumourNow", body, answer.stamp),)
+        body = encode_polydata(1e3 * result.known.motion.positions, self._mesh)
+        return (pack_message("POLYDATA", "TumourNow", body, result.stamp),)
 
-    def build_status(self, answer: PoseResult, refused: str) -> bytes:
+    def build_status(self, result: PoseResult, refused: str) -> bytes:
         """What is known."""
-        return pack_message("STATUS", "Sulcus", encode_status(Code.OK, answer.known.words), answer.stamp)
+        return pack_message("STATUS", "Sulcus", encode_status(Code.OK, result.known.words), result.stamp)
 
     def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """No places are followed."""

@@ -120,7 +120,7 @@ def tried(fem: Fem, step: SolverStep | None) -> bool:
     return (
         step is None
         or step in own
-        or (plan.quick and step is SolverStep.LBFGS)
+        or (plan.uses_lbfgs and step is SolverStep.LBFGS)
         or (plan.frames and step is SolverStep.FRAME)
     )
 

@@ -307,7 +307,7 @@ def choose_moment(still: SurfaceMotions, answers: Sequence[tuple[np.ndarray, ...
     """Return the moment of a scene at which its bodies differ the most; `meshes` (b,) as of `compute_error`."""
     sizes = []
     for number, here in enumerate(still.fields):
-        off = compute_error(np.stack([answer[number] for answer in answers]), here, meshes)
+        off = compute_error(np.stack([result[number] for result in answers]), here, meshes)
         sizes.append(float(np.linalg.norm(off, axis=2).max(axis=1).mean()))
     return int(np.argmax(sizes))
 

@@ -72,10 +72,10 @@ def _build_body_variant(chosen: Mapping[str, str | float]) -> BodyVariant:
 
 
 def _compute_mean_motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
-    answer = fem.deform(loads, at=anatomy.tumour_nodes)
-    if not all(outcome.good for outcome in answer.outcome):
+    result = fem.deform(loads, at=anatomy.tumour_nodes)
+    if not all(outcome.good for outcome in result.outcome):
         return float("nan")
-    return 1e3 * float(np.linalg.norm(answer.displacement, axis=2).mean())
+    return 1e3 * float(np.linalg.norm(result.displacement, axis=2).mean())
 
 
 def compute_variance_shares(found: Sequence[Cell], what: str = "force") -> dict[str, float]:

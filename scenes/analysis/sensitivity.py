@@ -198,19 +198,19 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
         yield SensitivityRow(variant, *found)
 
 
-def change(answer: Deformation, default: Deformation, origin: np.ndarray) -> Change:
-    """Compare `answer`, k blocks of the loads of `default`, with `origin` (B, n, 3) [m].
+def change(result: Deformation, default: Deformation, origin: np.ndarray) -> Change:
+    """Compare `result`, k blocks of the loads of `default`, with `origin` (B, n, 3) [m].
 
     A load counts where it and its default converged.
     """
-    ways = len(answer) // len(default)
-    sound, good = (np.array([outcome.good for outcome in one.outcome]) for one in (default, answer))
+    ways = len(result) // len(default)
+    sound, good = (np.array([outcome.good for outcome in one.outcome]) for one in (default, result))
     good = good & np.tile(sound, ways)
     if not good.any():
         return Change(0, len(good), *[np.nan] * 6)
     now, then, origin = (
         1e3 * field[good]
-        for field in (answer.displacement, *(np.tile(one, (ways, 1, 1)) for one in (default.displacement, origin)))
+        for field in (result.displacement, *(np.tile(one, (ways, 1, 1)) for one in (default.displacement, origin)))
     )
     distance = np.linalg.norm(now - origin, axis=2)
     motion, before = (np.linalg.norm(field, axis=2).mean(axis=1) for field in (now, then))
@@ -226,8 +226,8 @@ def change(answer: Deformation, default: Deformation, origin: np.ndarray) -> Cha
     )
 
 
-def match_motion(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
-    """Build tools with the tissue motion that the forces of `loads` have in `answer`.
+def match_motion(anatomy: Anatomy, loads: Loads, result: Deformation) -> Loads:
+    """Build tools with the tissue motion that the forces of `loads` have in `result`.
 
     The mean motion of each footprint is computed from corner vertices: approximate for quadratic elements.
     """
@@ -236,5 +236,5 @@ def match_motion(anatomy: Anatomy, loads: Loads, answer: Deformation) -> Loads:
         raise InputError("known motions are derived from forces: give `Pushed` loads alone.")
     mesh = anatomy.mesh
     weight = compute_footprint_weights(mesh.nodes, mesh.surface, cause.point, cause.footprint).toarray()
-    motion = np.einsum("bv,bvi->bi", weight, answer.displacement)
+    motion = np.einsum("bv,bvi->bi", weight, result.displacement)
     return Loads((Displaced(cause.point, motion, cause.footprint),), loads.time)

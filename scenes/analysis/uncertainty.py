@@ -201,14 +201,14 @@ def solve_nominal(theatre: PatientSetup, scene: Scene) -> SurfaceMotions:
     """
     if not len(theatre.anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to be uncertain of: make one with `sulcus anatomy`.")
-    answer, normals = solve_scene(theatre, scene), []
-    if answer is None:
+    result, normals = solve_scene(theatre, scene), []
+    if result is None:
         raise InputError(f"of the scene {scene.name} itself no equilibrium was found.")
     for time in list_moments(scene):
         loads = scene.build_loads(theatre.site, scene.path(time), time)
         tumour = Stage(scene, theatre.site).select_stage(loads).build_tumour(theatre.anatomy.mesh.nodes)
         normals.append(compute_vertex_normals(tumour.vertices, tumour.triangles))
-    return SurfaceMotions(list_moments(scene), answer.motions, tuple(normals))
+    return SurfaceMotions(list_moments(scene), result.motions, tuple(normals))
 
 
 def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
@@ -227,12 +227,12 @@ def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
         return start
 
     for time in list_moments(scene):
-        answer = gone_to([time], last)
-        if answer is None and time > before:
-            answer = gone_to(np.linspace(before, time, 1 + ENSEMBLE.load_steps)[1:].tolist(), last)
-        if answer is None:
+        result = gone_to([time], last)
+        if result is None and time > before:
+            result = gone_to(np.linspace(before, time, 1 + ENSEMBLE.load_steps)[1:].tolist(), last)
+        if result is None:
             return None
-        last, before, inverted = answer, time, max(inverted, int(answer.inverted[0]))
+        last, before, inverted = result, time, max(inverted, int(result.inverted[0]))
         loads = scene.build_loads(theatre.site, scene.path(time), time)
         found.append(last.restrict(stage.select_stage(loads).tumour_vertices).displacement[0])
     return SolvedMotions(tuple(found), inverted)
@@ -246,7 +246,7 @@ def solve_ensemble(theatre: PatientSetup, scene: Scene, draws: Sequence[PatientS
 
 def find_sound_draws(draws: Sequence[PatientSample], answers: Iterable[Answer]) -> SoundDraws:
     """Return the draws that have an equilibrium at each moment, with their motions."""
-    return [(draw, answer.motions) for draw, answer in zip(draws, answers, strict=True) if answer is not None]
+    return [(draw, result.motions) for draw, result in zip(draws, answers, strict=True) if result is not None]
 
 
 def filter_sound_draws(scene: Scene, draws: Sequence[PatientSample], answers: Iterable[Answer]) -> SoundDraws:
@@ -280,12 +280,12 @@ def estimate_uncertainty(
     """
     answers = tuple(answers)
     sound = filter_sound_draws(scene, draws, answers)
-    folded = sum(answer is not None and answer.inverted > 0 for answer in answers)
+    folded = sum(result is not None and result.inverted > 0 for result in answers)
     kept, shifts = [draw for draw, _ in sound], sample_rigid_errors(ENSEMBLE.shift_count, seed)
     meshes = sample_mesh_errors(scene, kept)
     rows = []
     for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
-        motion = np.stack([answer[moment] for _, answer in sound])
+        motion = np.stack([result[moment] for _, result in sound])
         off, (shift, wide) = compute_error(motion, field, meshes), shifts
         worst, middle = compute_worst_distances(off, normals, shift, wide)
         registered, _ = compute_worst_distances(off, normals, 0.0 * shift, wide)
@@ -393,7 +393,7 @@ def measure_coverage(
     shift, wide = sample_rigid_errors(shape[0] * shape[1], seed)
     each = list(zip(shift.reshape(*shape, 3), wide.reshape(shape), strict=True))
     for moment in range(1, len(still.times)):
-        motion = np.stack([answer[moment] for _, answer in sound])
+        motion = np.stack([result[moment] for _, result in sound])
         off = compute_error(motion, still.fields[moment], meshes)
         pairs, normals = zip(off, each, strict=True), still.normals[moment]
         worst = [compute_worst_distances(one[None], normals, *errors)[0][0] for one, errors in pairs]

@@ -19,9 +19,9 @@ from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.mesher import compute_surface_errors, describe_lost_pieces, find_lost_pieces
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.placement import describe_side
-from sim.bodies.subject import MeshPlan, Subject, SubjectPart, make_anatomy
+from sim.bodies.subject import MeshPlan, Subject, make_anatomy
 from sim.errors import InputError
-from sim.geometry.tetmesh import TetMesh, compute_dihedral_angles
+from sim.geometry.tetmesh import compute_dihedral_angles
 from sim.runtime.timing import time_stage
 
 from ..options.outputs import add_force, check_no_foreign_files, check_output_path
@@ -89,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
     check_output_path(args.out, ".vtu", args.force, read)
     beside = to_intensity_path(args.out)
     check_output_path(beside, ".gz", args.force, read)
-    chosen = {**DEFAULTS, **PRESETS[args.preset], **_get_given_options(args)}
+    given = {name: getattr(args, name) for name in DEFAULTS if getattr(args, name) is not None}
+    chosen = {**DEFAULTS, **PRESETS[args.preset], **given}
     plan = MeshPlan(args.nodes, to_metres(chosen["craniotomy"]), fine_opening=args.fine_opening)
     with time_stage("labels" if args.labels else "head" if args.mask or args.head else "template"):
         subject = place_craniotomy(_build_subject(args, chosen), args)
@@ -130,10 +131,6 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _get_given_options(args: argparse.Namespace) -> dict[str, float | str]:
-    return {name: getattr(args, name) for name in DEFAULTS if getattr(args, name) is not None}
-
-
 def _build_subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
         for name in ("brain", "tumour", "convention", "tumour_in", "axes", *PART_LABELS, *SEPTA, "regions"):
@@ -154,7 +151,10 @@ def _summarise_anatomy(
     volume = mesh.volumes[anatomy.in_tumour].sum()
     error, weight = compute_surface_errors(mesh.nodes, mesh.surface, subject.brain)
     septa = [int((find_held_vertices(mesh, one) & anatomy.held.all(axis=1)).sum()) for one in subject.septa]
-    regions = {name_region(part.label): (_compute_volume(mesh, part), part) for part in subject.parts}
+    regions = {
+        name_region(part.label): (float(mesh.volumes[mesh.mark_elements(part.label)].sum()), part)
+        for part in subject.parts
+    }
     return {
         "nodes": len(mesh.nodes),
         "tets": len(mesh.tets),
@@ -181,11 +181,6 @@ def _summarise_anatomy(
         ],
         "digest": anatomy.digest,
     }
-
-
-def _compute_volume(mesh: TetMesh, part: SubjectPart) -> float:
-    """[m^3] of the tetrahedra of a part."""
-    return float(mesh.volumes[mesh.mark_elements(part.label)].sum())
 
 
 def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:

@@ -109,7 +109,7 @@ def _calibrate_camera(args: argparse.Namespace) -> int:
         "looked_at": seen.looked_at,
         "seen": len(seen.views),
         "used": found.used,
-        "left_out": found.left_out,
+        "left_out": found.excluded,
         "covered": found.covered,
     }
     write_calibration(out, found.calibration)
@@ -118,8 +118,8 @@ def _calibrate_camera(args: argparse.Namespace) -> int:
         print(to_json_line(report))
         return 0
     print(f"{seen.looked_at} images, the board in {len(seen.views)}, {len(found.used)} views used")
-    if found.left_out:
-        print(f"held out because of a large residual: {', '.join(found.left_out)}")
+    if found.excluded:
+        print(f"held out because of a large residual: {', '.join(found.excluded)}")
     print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered:.0f} % of the image")
     for name, value, deviation in zip(report["parameters"], found.values, found.deviations, strict=True):
         print(f"{name} {value:.6g} +- {deviation:.2g}{' px' if name[0] in 'fc' else ''}")
@@ -149,9 +149,9 @@ def _calibrate_tip(args: argparse.Namespace) -> int:
     """Return a tool's tip, from its poses while it pivots."""
     from ar.tracking.tracker_calibration import calibrate_pivot
 
-    from ..tracked.pose_file import read_numbered_poses
+    from ..tracked.pose_file import read_poses
 
-    rows, _, poses = read_numbered_poses(args.pivot)
+    rows, _, poses = read_poses(args.pivot)
     found = _fit_poses(calibrate_pivot, [args.pivot], [poses], rows)
     deviations = 1e3 * np.sqrt(np.diag(found.covariance))
     if args.json:
@@ -209,10 +209,10 @@ def _calibrate_hand_eye(args: argparse.Namespace) -> int:
     """Estimate the transform between two bodies from poses of both."""
     from ar.tracking.tracker_calibration import solve_hand_eye
 
-    from ..tracked.pose_file import read_numbered_poses
+    from ..tracked.pose_file import read_poses
 
     one, other = args.hand_eye
-    (rows, times, first), (_, again, second) = read_numbered_poses(one), read_numbered_poses(other)
+    (rows, times, first), (_, again, second) = read_poses(one), read_poses(other)
     if len(times) != len(again) or np.abs(times - again).max(initial=0.0) > TIME_TOLERANCE:
         raise InputError(f"{one} and {other} have rows at different times: keep those that both have, in one order.")
     found = _fit_poses(solve_hand_eye, [one, other], [first, second], rows)

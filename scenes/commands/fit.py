@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     if TUMOUR_LABEL in parse_region_tissues(args.region, BRAIN, anatomy.mesh):
         raise InputError("--region tumour: its stiffness is what `sulcus fit` finds. Give other regions alone.")
     locator = find_locator(args, anatomy, small=True)
-    left_out = find_unsupported(locator, frames)
+    excluded = find_unsupported(locator, frames)
     with tqdm(file=sys.stderr) as bar:
 
         def progress(stage: str, done: int, total: int) -> None:
@@ -83,13 +83,13 @@ def run(args: argparse.Namespace) -> int:
             bar.set_description(stage)
 
         parts = Path(args.anatomy).with_suffix(".fit.parts")
-        tissue = fit_tissue(locator, frames, args.device, parts, progress, left_out)
+        tissue = fit_tissue(locator, frames, args.device, parts, progress, excluded)
     save_tissue(out, tissue)
     shutil.rmtree(parts, ignore_errors=True)
     if args.json:
-        print(to_json_line({**_summarise_tissue(tissue, out), "outliers": [each.tolist() for each in left_out]}))
+        print(to_json_line({**_summarise_tissue(tissue, out), "outliers": [each.tolist() for each in excluded]}))
     else:
-        said = [f"Frame {n}: {describe_left_out(each)}" for n, each in enumerate(left_out, start=1) if len(each)]
+        said = [f"Frame {n}: {describe_left_out(each)}" for n, each in enumerate(excluded, start=1) if len(each)]
         print("\n".join([*said, *format_fit(tissue, out)]))
     return 0
 

@@ -95,8 +95,9 @@ class Inspection:
         ]
         shown, hidden = pieces[:MAX_LISTED_PIECES], len(pieces) - MAX_LISTED_PIECES
         at = ", ".join(f"{value:.0f}" for value in self.opening)
+        plural = "" if len(pieces) == 1 else "s"
         return [
-            f"brain {self.brain:.0f} ml; tumour {self.tumour:.2f} ml in {_format_count(len(pieces), 'piece')}, "
+            f"brain {self.brain:.0f} ml; tumour {self.tumour:.2f} ml in {len(pieces)} piece{plural}, "
             f"{self.regions['tumour']}",
             *shown,
             *([f"  and {hidden} smaller"] if hidden > 0 else []),
@@ -206,7 +207,3 @@ def _find_warnings(found: Inspection, subject: Subject, limits: InspectionLimits
         covered = share_on(subject.intensity.values.shape, subject.intensity.affine, subject.cortex)
         if covered < limits.min_t1_coverage:
             yield f"the T1 holds {100.0 * covered:.0f} % of the brain's surface: is it of the same space?"
-
-
-def _format_count(count: int, word: str) -> str:
-    return f"{count} {word}{'' if count == 1 else 's'}"

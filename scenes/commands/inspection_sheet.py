@@ -155,18 +155,13 @@ def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.
     if len(rind) and opened.any():
         apart = np.linalg.norm(points[rind, None] - subject.site, axis=2)[:, 0]
         near = rind[apart < np.linalg.norm(subject.cortex[opened] - subject.site, axis=1).max() + HALF_LINE_WIDTH]
-        colour[near[_is_nearest_chosen(subject.cortex, opened, points[near])]] = COLOURS["opening"]
+        colour[near[opened[KDTree(subject.cortex).query(points[near])[1]]]] = COLOURS["opening"]
     return np.rint(colour).astype(np.uint8).reshape(SIDE, SIDE, 3), drawn
 
 
 def _blend_colour(ground: np.ndarray, colour: Colour, share: float) -> np.ndarray:
     """Colours (..., 3) with a share of another one."""
     return (1.0 - share) * ground + share * np.array(colour)
-
-
-def _is_nearest_chosen(cortex: np.ndarray, chosen: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) bool: whether of the cortex the point nearest to each of `points` (n, 3) is a chosen one."""
-    return chosen[KDTree(cortex).query(points)[1]]
 
 
 def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:

@@ -110,7 +110,7 @@ class Parts:
     calibration: Calibration
     follower: Follower
     painter: Painter
-    who: str
+    model: str
 
 
 def run(args: argparse.Namespace) -> int:
@@ -145,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     if table is not None:
         write_rows(table, shown, errors)
-    report = _report(shown, parts.who)
+    report = _report(shown, parts.model)
     if truth is not None:
         report["off"] = summarise_errors([each.known for each in shown], errors)
     return _print_summary(args, report, shown, out, table)
@@ -175,7 +175,7 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
         write_rows(table, shown, [None] * len(shown))
     if not shown:
         return 1
-    return _print_summary(args, _report(shown, parts.who), shown, None, table)
+    return _print_summary(args, _report(shown, parts.model), shown, None, table)
 
 
 def _show_camera(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
@@ -201,9 +201,9 @@ def _show_video(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> l
 def _build_page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str, frames: int = 0) -> OverlayPage:
     from ..tracked.page import OverlayPage
 
-    page = OverlayPage(parts.follower, parts.painter, name, parts.who, HOST, args.port, frames, list_addresses(args))
+    page = OverlayPage(parts.follower, parts.painter, name, parts.model, HOST, args.port, frames, list_addresses(args))
     closing.callback(page.close)
-    print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.who}", flush=True)
+    print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.model}", flush=True)
     print_addresses(page.browser)
     return page
 
@@ -305,7 +305,7 @@ def _report(shown: list[Shown], who: str) -> dict[str, object]:
     return {
         "pictures": count,
         "motion_by": who,
-        "reference_seen_percent": 100.0 * sum(each.known.seen == each.known.time for each in shown) / count,
+        "reference_seen_percent": 100.0 * sum(each.known.reference_time == each.known.time for each in shown) / count,
         "tool_seen_percent": 100.0 * sum(each.known.T_scan_tool is not None for each in shown) / count,
         "states": dict(states.most_common()),
         "latency": summarise_latencies(shown),

@@ -88,7 +88,7 @@ def _summarise_residuals(fits: PairResiduals) -> dict[str, object]:
     """Summarise the residuals of the pairs for JSON."""
     return {
         "residuals_mm": (1e3 * fits.off).tolist(),
-        "left_out_mm": (1e3 * fits.left_out).tolist(),
+        "left_out_mm": (1e3 * fits.held_out).tolist(),
         "studentised": fits.studentised.tolist(),
         "worst_pair": fits.worst + 1,
         "chance": fits.chance,
@@ -102,12 +102,12 @@ def _format_table(fits: PairResiduals) -> list[str]:
         rows = [f"{row + 1:4d} {1e3 * off:7.2f} mm" for row, off in enumerate(fits.off)]
         return ["pair    error", *rows, "three pairs cannot show an outlier: touch a fourth, better six"]
     lines = ["pair    error      held-out error   studentised error"]
-    for row, (off, left, times) in enumerate(zip(fits.off, fits.left_out, fits.studentised, strict=True)):
+    for row, (off, left, times) in enumerate(zip(fits.off, fits.held_out, fits.studentised, strict=True)):
         lines.append(f"{row + 1:4d} {1e3 * off:5.2f} mm {1e3 * left:16.2f} mm {times:17.1f} x")
     worst = fits.worst
     if fits.suspect:
         lines.append(
-            f"pair {worst + 1} may be an outlier: it is {1e3 * fits.left_out[worst]:.1f} mm from the others' fit. "
+            f"pair {worst + 1} may be an outlier: it is {1e3 * fits.held_out[worst]:.1f} mm from the others' fit. "
             f"{100.0 * fits.chance:.2g} % of sets without outliers have this residual. Touch it again, or leave it out"
         )
     return lines

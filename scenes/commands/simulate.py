@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_element_argument(parser)
     add_skull_argument(parser, ("bonded", "slide"))
     parser.add_argument("--tolerance", type=float, default=1e-4, help="tolerance of the relative residual")
-    widest = f"up to {MemoryBudget.widest}, on CUDA {MemoryBudget.widest_on_cuda}"
+    widest = f"up to {MemoryBudget.max_cases}, on CUDA {MemoryBudget.max_cases_on_cuda}"
     parser.add_argument(
         "--batch",
         type=int,

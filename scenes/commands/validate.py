@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     broken = [report for report in reports if report.problems]
     trained = {place: list_model_errors(place) for place in args.episodes if place.is_dir()}
     if args.json:
-        files = [as_json(one) for one in reports]
+        files = [{**asdict(one), "path": str(one.path)} for one in reports]
         weak = {str(place): to_weak_json(models) for place, models in trained.items()}
         print(to_json_line({"episodes": len(reports), "broken": len(broken), "files": files, "weak_bodies": weak}))
     else:
@@ -82,11 +82,6 @@ def list_lost_episodes(folder: Path) -> list[Report]:
 
     words = f"is gone; {TABLE} lists it. Make it again, or write the card again: `sulcus convert FOLDER --to card`."
     return [Report(folder / name, [words]) for name in list_card_files(folder) if not (folder / name).is_file()]
-
-
-def as_json(report: Report) -> dict[str, object]:
-    """Return a report with its path as text."""
-    return {**asdict(report), "path": str(report.path)}
 
 
 def format_reports(reports: list[Report], broken: list[Report]) -> list[str]:

@@ -258,11 +258,11 @@ def collect_tool(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, n
     }
 
 
-def collect_reactions(answer: Deformation) -> dict[str, np.ndarray]:
+def collect_reactions(result: Deformation) -> dict[str, np.ndarray]:
     """Return the force of a pose-controlled tool, if the deformation model provides it."""
-    if not answer.reaction.shape[1]:
+    if not result.reaction.shape[1]:
         return {}
-    return {"reaction_predicted": answer.reaction[0], "reaction_bound": answer.reaction_bound[:, 0]}
+    return {"reaction_predicted": result.reaction[0], "reaction_bound": result.reaction_bound[:, 0]}
 
 
 def to_number(value: float | None) -> float:

@@ -56,24 +56,20 @@ class PosedElements:
     def _solve_poses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
         loads = Loads((Touching(np.stack([each.pose for each in asked])[:, None]),))
         starts = [each.last.memory for each in asked if each.last is not None and each.last.memory is not None]
-        answer = self.fem.deform(loads, _join_starts(starts) if starts else None)
-        force = answer.reaction[:, 0, :3]
+        result = self.fem.deform(loads, join_deformations(starts) if len(starts) > 1 else next(iter(starts), None))
+        force = result.reaction[:, 0, :3]
         size = np.linalg.norm(force, axis=1)
         if self.ball is not None:
             highest = [self.ball.compute_pressure(float(each)) for each in size]
         else:
-            highest = compute_pressure(self.fem, loads, answer).max(axis=1).tolist()
-        rows = [answer]
+            highest = compute_pressure(self.fem, loads, result).max(axis=1).tolist()
+        rows = [result]
         if len(asked) > 1:
-            rows = [replace(answer.select(np.array([row])), warm={}) for row in range(len(asked))]
+            rows = [replace(result.select(np.array([row])), warm={}) for row in range(len(asked))]
         return [
             Touched(row.displacement[0], row.nodes, force[number], highest[number], row.outcome[0].good, memory=row)
             for number, row in enumerate(rows)
         ]
-
-
-def _join_starts(starts: Sequence[Deformation]) -> Deformation:
-    return starts[0] if len(starts) == 1 else join_deformations(starts)
 
 
 LEVEL_SPACING = (

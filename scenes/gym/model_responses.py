@@ -114,11 +114,11 @@ class PressedModel:
             return answers
         point, inward = near.point[rows], inward[rows]
         size, found = self._find_forces(point, inward, depth[rows])
-        answer = self.model.deform(self._build_loads(point, inward, size))
-        stated = np.where(np.isfinite(answer.bound[0]), answer.bound[0], self.model.bound)
+        result = self.model.deform(self._build_loads(point, inward, size))
+        stated = np.where(np.isfinite(result.bound[0]), result.bound[0], self.model.bound)
         for number, row in enumerate(rows.tolist()):
             answers[row] = Touched(
-                answer.displacement[number], answer.nodes, size[number] * inward[number],
+                result.displacement[number], result.nodes, size[number] * inward[number],
                 self.ball.compute_pressure(float(size[number])), bool(found[number]), float(stated[number]),
             )  # fmt: skip
         return answers
@@ -183,17 +183,17 @@ class PosedModel:
     def _predict_pose(self, pose: np.ndarray, last: Touched | None) -> Touched:
         loads = Loads((Touching(pose[None, None]),))
         try:
-            answer = self.model.deform(loads, None if last is None else last.memory)
+            result = self.model.deform(loads, None if last is None else last.memory)
         except InputError:
             nodes = self.model.nodes
             rest = Touched(np.zeros((len(nodes), 3)), nodes, np.zeros(3), 0.0) if last is None else last
             return replace(rest, good=False, error=float("inf"))
-        force = answer.reaction[0, 0, :3]
+        force = result.reaction[0, 0, :3]
         if self.ball is None:
-            highest = float(compute_tool_pressure(self.model, loads, answer).max())
+            highest = float(compute_tool_pressure(self.model, loads, result).max())
         else:
             highest = self.ball.compute_pressure(float(np.linalg.norm(force)))
-        error = float(answer.bound[0, 0])
+        error = float(result.bound[0, 0])
         if not np.isfinite(error):
             error = self.model.bound
-        return Touched(answer.displacement[0], answer.nodes, force, highest, error=error, memory=answer)
+        return Touched(result.displacement[0], result.nodes, force, highest, error=error, memory=result)

@@ -21,18 +21,18 @@ def print_safely(line: str) -> None:
 
 def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
     """Return a function that writes lines, no more than 10 in 5 s; the next line reports how many were suppressed."""
-    begun, count, left_out = -LINE_INTERVAL, 0, 0
+    begun, count, skipped = -LINE_INTERVAL, 0, 0
 
     def note(line: str) -> None:
-        nonlocal begun, count, left_out
+        nonlocal begun, count, skipped
         if clock() - begun >= LINE_INTERVAL:
             begun, count = clock(), 0
         if count == MAX_LINES:
-            left_out += 1
+            skipped += 1
             return
         count += 1
-        write(line + (f" ({left_out} lines left out)" if left_out else ""))
-        left_out = 0
+        write(line + (f" ({skipped} lines left out)" if skipped else ""))
+        skipped = 0
 
     return note
 

@@ -50,7 +50,7 @@ class SentPlaces:
         Positions in the scan (n, 3) [m].
     vertices, weights
         (n, 4): mesh vertices that determine their motion, and interpolation weights.
-    strange
+    unfollowed
         Description of points that cannot be followed, with their distances; empty: none.
     """
 
@@ -58,7 +58,7 @@ class SentPlaces:
     rest: np.ndarray
     vertices: np.ndarray
     weights: np.ndarray
-    strange: str = ""
+    unfollowed: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +88,9 @@ class Outgoing:
         at = self.stage.anatomy.mesh.nodes[vertices]
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
 
-    def build_messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
+    def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """Build all messages of a result, with its stamp: unknown surfaces are sent without points."""
-        known, stamp = answer.known, answer.stamp
+        known, stamp = result.known, result.stamp
         none = encode_polydata(np.empty((0, 3)), EMPTY_MESH)
         out = []
         for name, vertices, mesh in self._surfaces:
@@ -101,7 +101,7 @@ class Outgoing:
         if known.relied:
             rest, now = (each[self.stage.tumour_vertices] for each in (self._rest, known.motion.positions))
             out.append(pack_message("TRANSFORM", "TumourToRas", transform(fit_rigid(1e3 * rest, 1e3 * now)), stamp))
-        out.append(pack_message("STRING", "TipToTumour", encode_string(self._format_distance(answer)), stamp))
+        out.append(pack_message("STRING", "TipToTumour", encode_string(self._format_distance(result)), stamp))
         out.append(pack_message("STRING", "TumourMotion", encode_string(self._format_motion(known)), stamp))
         if places is not None:
             body = self._build_point_message(known, places)
@@ -109,12 +109,12 @@ class Outgoing:
                 out.append(pack_message("POINT", f"Points{word}", body if shown else b"", stamp))
         return tuple(out)
 
-    def build_status(self, answer: PoseResult, refused: str) -> bytes:
+    def build_status(self, result: PoseResult, refused: str) -> bytes:
         """Build the STATUS of a result, with the number of rejected messages by reason."""
-        known = answer.known
+        known = result.known
         code = Code.OK if known.relied else Code.NOT_READY
         words = known.words or f"the tumour is known, {known.state.value}"
-        return pack_message("STATUS", "Sulcus", encode_status(code, f"{words}{refused}"), answer.stamp)
+        return pack_message("STATUS", "Sulcus", encode_status(code, f"{words}{refused}"), result.stamp)
 
     def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
         """Attach points of the scan (n, 3) [m]: to the tumour's volume if inside, else to the nearest surface.
@@ -159,13 +159,13 @@ class Outgoing:
         """Build the POINT message of the positions of those points that the result covers."""
         moved = (known.motion.positions - self._rest)[places.vertices]
         at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
-        nodes = () if known.motion.answer is None else known.motion.answer.nodes
+        nodes = () if known.motion.solution is None else known.motion.solution.nodes
         here = np.flatnonzero((np.isin(places.vertices, nodes) | (places.weights <= 0.0)).all(axis=1))
         return encode_points([places.names[row] for row in here], at[here])
 
-    def _format_distance(self, answer: PoseResult) -> str:
+    def _format_distance(self, result: PoseResult) -> str:
         """Describe the distance from tip to tumour with its error and source, or the reason why it is not available."""
-        known, gauge = answer.known, answer.gauge
+        known, gauge = result.known, result.gauge
         if gauge is None:
             return f"not known: {known.words}"
         inside = "inside the tumour, its edge " if gauge.inside else ""
@@ -199,8 +199,8 @@ def _format_names(names: list[str]) -> str:
 
 def _is_motion_known(known: TrackingResult, vertices: np.ndarray) -> bool:
     """Return True if the motion of these vertices is known."""
-    answer = known.motion.answer
-    return answer is not None and bool(np.isin(vertices, answer.nodes).all())
+    result = known.motion.solution
+    return result is not None and bool(np.isin(vertices, result.nodes).all())
 
 
 def fit_rigid(rest: np.ndarray, now: np.ndarray) -> np.ndarray:

@@ -147,7 +147,7 @@ class PoseResponder:
             to_time(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "",
             NO_TARGETS, motion, None, pose, spread,
         )  # fmt: skip
-        known = replace(known, seen=known.time, felt=moment, **self._describe_doubts(known, before))
+        known = replace(known, reference_time=known.time, tool_time=moment, **self._describe_doubts(known, before))
         if known.state is TumourState.UNKNOWN:
             return PoseResult(stamp, known)
         known = self._add_band(known, registration)
@@ -212,12 +212,12 @@ class PoseResponder:
 
     def _build_unknown(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
         """Nothing is known now, and why."""
-        felt = None if before is None else before.felt
+        tool_time = None if before is None else before.tool_time
         near = before is not None and before.near
-        state = TumourState.NO_TOOL if felt is None else TumourState.STALE
+        state = TumourState.NO_TOOL if tool_time is None else TumourState.STALE
         motion = self.motion.rest if before is None else before.motion
         return PoseResult(
-            to_stamp(moment), TrackingResult(moment, state, why, NO_TARGETS, motion, felt=felt, near=near)
+            to_stamp(moment), TrackingResult(moment, state, why, NO_TARGETS, motion, tool_time=tool_time, near=near)
         )  # fmt: skip
 
 
@@ -228,9 +228,9 @@ def add_bound(known: TrackingResult, band: float, parts: dict[str, float]) -> Tr
     return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band), band=None, parts={})
 
 
-def add_lateness(answer: PoseResult, age: float, stale: float) -> PoseResult:
+def add_lateness(result: PoseResult, age: float, stale: float) -> PoseResult:
     """Return the result for a pose of the given age [s]: stale if older than `stale`."""
-    if age <= stale or not (answer.known.relied or answer.known.state is TumourState.UNSURE):
-        return answer
+    if age <= stale or not (result.known.relied or result.known.state is TumourState.UNSURE):
+        return result
     words = f"stale, the result is {age:.1f} s old: do not rely on it"
-    return replace(answer, known=replace(answer.known, state=TumourState.STALE, words=words, band=None), gauge=None)
+    return replace(result, known=replace(result.known, state=TumourState.STALE, words=words, band=None), gauge=None)

@@ -69,11 +69,11 @@ class MessageWriter(Protocol):
         """Build the scan's message, as `Outgoing.build_scan`."""
         ...
 
-    def build_messages(self, answer: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
+    def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
         """Build the messages, as `Outgoing.build_messages`."""
         ...
 
-    def build_status(self, answer: PoseResult, refused: str) -> bytes:
+    def build_status(self, result: PoseResult, refused: str) -> bytes:
         """Build the STATUS, as `Outgoing.build_status`."""
         ...
 
@@ -220,14 +220,14 @@ class LinkSession:
             self._posed.clear()
             heard, places, self._begun = self._heard, self._places, self._loop.time()
             body = heard.find_relative(heard.names.tool, self._begun)
-            answer, messages = await self._loop.run_in_executor(
+            result, messages = await self._loop.run_in_executor(
                 thread, self._compute_messages, heard, places, self._begun
             )
-            self._solved, self._begun = answer, np.inf
+            self._solved, self._begun = result, np.inf
             self._arrived = np.inf if isinstance(body, str) else body.arrived
             current = self._get_current_result(self._loop.time())
             # A pose may have grown old while its solution was computed.
-            self._show(current, messages if current is answer else self._speaks.build_messages(current, places))
+            self._show(current, messages if current is result else self._speaks.build_messages(current, places))
 
     async def _reporting(self) -> None:
         """Publish, every tick and whatever the solver does, that a pose or its solution is too old, and a STATUS."""
@@ -235,41 +235,41 @@ class LinkSession:
         beat = 0.0
         while True:
             now, kinds = self._loop.time(), frozenset(self.clients.refused)
-            if (answer := self._get_current_result(now)) is not self._shown:
-                self._show(answer, self._speaks.build_messages(answer, self._places))
-            known = answer.known
+            if (result := self._get_current_result(now)) is not self._shown:
+                self._show(result, self._speaks.build_messages(result, self._places))
+            known = result.known
             # A number that grows is no news.
             saying = known.state, re.sub(r"[\d.]+", "", known.words), kinds, tuple(self._others)
             if saying != said or now - beat >= STATUS_INTERVAL:
                 said, beat = saying, now
-                self.clients.publish("status", (self._speaks.build_status(answer, self._format_rejected(known)),))
+                self.clients.publish("status", (self._speaks.build_status(result, self._format_rejected(known)),))
             await asyncio.sleep(CHECK_INTERVAL)
 
     def _get_current_result(self, now: float) -> PoseResult:
         """Return the last solution, or the reason why none holds at a time [s]; the solver is not called."""
         if isinstance(self._heard.find_relative(self._heard.names.tool, now), str):
             return self._answers.compute_result(self._heard, now, clock.time(), self._shown.known)
-        answer, waited = add_lateness(self._solved, now - self._arrived, self._heard.stale), now - self._begun
+        result, waited = add_lateness(self._solved, now - self._arrived, self._heard.stale), now - self._begun
         if (
-            answer is self._solved
-            and answer.known.state in (TumourState.NO_TOOL, TumourState.STALE)
+            result is self._solved
+            and result.known.state in (TumourState.NO_TOOL, TumourState.STALE)
             and waited > STATUS_INTERVAL
         ):
-            return replace(answer, known=replace(answer.known, words=f"no solution yet, computing for {waited:.0f} s"))
-        return answer
+            return replace(result, known=replace(result.known, words=f"no solution yet, computing for {waited:.0f} s"))
+        return result
 
     def _compute_messages(
         self, heard: ReceivedTransforms, places: SentPlaces | None, now: float
     ) -> tuple[PoseResult, tuple[bytes, ...]]:
         """Compute a result and its messages, in the solver's thread."""
-        answer = self._answers.compute_result(heard, now, clock.time(), self._shown.known)
-        return answer, self._speaks.build_messages(answer, places)
+        result = self._answers.compute_result(heard, now, clock.time(), self._shown.known)
+        return result, self._speaks.build_messages(result, places)
 
-    def _show(self, answer: PoseResult, messages: tuple[bytes, ...]) -> None:
-        self._shown = answer
-        if answer.known.state not in self._states:
-            self._states.add(answer.known.state)
-            self._note(f"the tumour is {_describe_state(answer.known)}")
+    def _show(self, result: PoseResult, messages: tuple[bytes, ...]) -> None:
+        self._shown = result
+        if result.known.state not in self._states:
+            self._states.add(result.known.state)
+            self._note(f"the tumour is {_describe_state(result.known)}")
         self.clients.publish("answer", messages)
 
     def _format_rejected(self, known: TrackingResult) -> str:
@@ -318,8 +318,8 @@ class LinkSession:
                 names, places = read_points(content)
                 self._places = self._speaks.attach_points(names, 1e-3 * places)
                 self._posed.set()
-                if self._places.strange:
-                    words = f"{UNTRACKED_POINTS}: {self._places.strange}; the others are followed"
+                if self._places.unfollowed:
+                    words = f"{UNTRACKED_POINTS}: {self._places.unfollowed}; the others are followed"
                     self.clients.reject(number, Code.CONFIGURATION, UNTRACKED_POINTS, words)
 
     def _receive_transform(self, number: int, header: Header, content: bytes) -> None:

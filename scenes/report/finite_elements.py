@@ -67,10 +67,10 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
     fem.deform(loads.select(np.array([0])))  # kernels are compiled or loaded at their first launch
     fields, good, seconds = [], [], []
     for row in range(len(loads)):
-        answer, spent = time_work(fem.deform, loads.select(np.array([row])))
+        result, spent = time_work(fem.deform, loads.select(np.array([row])))
         seconds.append(spent)
-        fields.append(located.read(answer.displacement)[0])
-        good.append(answer.outcome[0].good)
+        fields.append(located.read(result.displacement)[0])
+        good.append(result.outcome[0].good)
     field = np.array(fields)
     row = ReportRow(
         spec.name,

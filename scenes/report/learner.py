@@ -130,6 +130,6 @@ def _compute_errors(
     model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray
 ) -> tuple[ErrorFigures | None, float]:
     """Figures against `truth` (B, k, 3) [m], and the share of the loads that the model calls extrapolated."""
-    answer = model.deform(loads, at=nodes)
-    flagged = [outcome is Outcome.EXTRAPOLATED for outcome in answer.outcome]
-    return compute_figures(answer.displacement, truth, loads), float(np.mean(flagged)) if flagged else 0.0
+    result = model.deform(loads, at=nodes)
+    flagged = [outcome is Outcome.EXTRAPOLATED for outcome in result.outcome]
+    return compute_figures(result.displacement, truth, loads), float(np.mean(flagged)) if flagged else 0.0

@@ -84,10 +84,10 @@ def _solve(
         return
     fem, located = made()
     for rows in np.array_split(missing, -(-len(missing) // min(fem.batch, BATCH_LOADS))):
-        answer = fem.deform(loads.select(rows))
-        for row, field, outcome in zip(rows, located.read(answer.displacement), answer.outcome, strict=True):
+        result = fem.deform(loads.select(rows))
+        for row, field, outcome in zip(rows, located.read(result.displacement), result.outcome, strict=True):
             with write_atomically(_to_answers_path(study, kind, row), ".npz") as partial:
-                np.savez(partial, displacement=field, good=outcome.good, seconds=answer.cost.total / len(rows))
+                np.savez(partial, displacement=field, good=outcome.good, seconds=result.cost.total / len(rows))
         progress(len(rows))
 
 

@@ -83,20 +83,20 @@ def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.
     )
 
 
-def compute_figures(answer: np.ndarray, truth: np.ndarray, loads: Loads) -> ErrorFigures | None:
-    """Figures of `answer` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
+def compute_figures(result: np.ndarray, truth: np.ndarray, loads: Loads) -> ErrorFigures | None:
+    """Figures of `result` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
     (pushed,) = loads.get_all(Pushed)
-    return compute_distance_figures(np.linalg.norm(answer - truth, axis=2), truth, split_forces(pushed)[0])
+    return compute_distance_figures(np.linalg.norm(result - truth, axis=2), truth, split_forces(pushed)[0])
 
 
 def compare_with_reference(
-    study: ReportStudy, answer: np.ndarray, good: np.ndarray, nodes: np.ndarray
+    study: ReportStudy, result: np.ndarray, good: np.ndarray, nodes: np.ndarray
 ) -> ErrorFigures | None:
     """Compute the errors of solutions (n, k, 3) [m] at vertices (k,) of the test loads where both are `good` (n,)."""
     truth = get_reference(study)
     rows = np.flatnonzero(good & truth.good)
     known = np.isin(study.drawn, nodes)
-    return compute_figures(answer[rows], truth.displacement[rows][:, known], study.played.select(rows))
+    return compute_figures(result[rows], truth.displacement[rows][:, known], study.played.select(rows))
 
 
 def summarise_times(seconds: Sequence[float]) -> dict[str, Any]:

@@ -29,19 +29,19 @@ VIEW = replace(OBLIQUE_VIEWPOINT, fov=FIELD, width=400, height=300)
 YELLOW = (255, 215, 50)  # Colour of the reference's outline (RGB).
 
 
-def render_worst(study: ReportStudy, answer: np.ndarray) -> np.ndarray:
+def render_worst(study: ReportStudy, result: np.ndarray) -> np.ndarray:
     """Render the test load with the largest error, (H, W, 3) uint8.
 
-    `answer` (n, k, 3) [m]: displacements of the tumour's vertices by a row.
+    `result` (n, k, 3) [m]: displacements of the tumour's vertices by a row.
     """
     truth, anatomy = get_reference(study), study.anatomy
     tumour = np.isin(study.drawn, anatomy.tumour_nodes)
-    distance = np.linalg.norm(answer - truth.displacement[:, tumour], axis=2).max(axis=1) * truth.good
+    distance = np.linalg.norm(result - truth.displacement[:, tumour], axis=2).max(axis=1) * truth.good
     worst = int(distance.argmax())
     there = anatomy.mesh.nodes.copy()
     there[study.drawn] += truth.displacement[worst]
     predicted = there.copy()
-    predicted[anatomy.tumour_nodes] = anatomy.mesh.nodes[anatomy.tumour_nodes] + answer[worst]
+    predicted[anatomy.tumour_nodes] = anatomy.mesh.nodes[anatomy.tumour_nodes] + result[worst]
     (pushed,) = study.played.get_all(Pushed)
     site = build_craniotomy_frame(anatomy)
     scan = read_intensity(to_intensity_path(get_template_path())) if study.of_template else None

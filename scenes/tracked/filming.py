@@ -203,7 +203,10 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
             (build_patient_reference(), mounts.T_scan_patient),
         ]
         view = partial(_render_image, renderer, [layer.vertices for layer in layers if not layer.still], targets, wrong)
-        camera_at = partial(_get_later_camera, player, time)
+
+        def camera_at(after: float, time: float = time) -> Camera:
+            return player.get_camera(time + after)
+
         tumour = positions[stage.tumour_vertices]
         places = np.stack([tumour.mean(axis=0), site.origin, *(T[:3, 3] for _, T in targets)])
         shown = (
@@ -220,11 +223,6 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
             pose,
             moved,
         )
-
-
-def _get_later_camera(player: Player, time: float, after: float) -> Camera:
-    """Return the camera `after` seconds from an image's time [s]."""
-    return player.get_camera(time + after)
 
 
 def _render_image(

@@ -87,7 +87,7 @@ class TrackingResult:
         95 % bound on the tumour's error across the line of sight [m]; None if unknown.
     parts
         Contributions to the bound, by source [m].
-    seen, felt
+    reference_time, tool_time
         Time of the last detection of the reference, and of the tool relative to it [s]; None: never.
     interval
         Shortest interval between two images up to now [s].
@@ -109,8 +109,8 @@ class TrackingResult:
     tip_covariance: np.ndarray | None = None
     band: float | None = None
     parts: Mapping[str, float] = field(default_factory=dict)
-    seen: float | None = None
-    felt: float | None = None
+    reference_time: float | None = None
+    tool_time: float | None = None
     interval: float = MAX_INTERVAL
     near: bool = False
     pace: float | None = None
@@ -202,7 +202,7 @@ class Follower:
         known = self._compute_motion(tracked, reference, time, before, shutter)
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
         band, parts = self._compute_band(reference, middle, known.motion, shutter)
-        known = replace(known, camera=camera, band=band, parts=parts, seen=time, pace=pace)
+        known = replace(known, camera=camera, band=band, parts=parts, reference_time=time, pace=pace)
         doubt, near = self._describe_implausible(camera, known.T_scan_tool, before)
         known = replace(known, near=near)
         if known.relied and pace is None and self.calibration.readout > 0.0:
@@ -234,15 +234,15 @@ class Follower:
         self, tracked: TrackedTargets, time: float, before: TrackingResult | None
     ) -> TrackingResult:
         """Return the result without a visible reference: the overlay keeps its position for a short time."""
-        seen = None if before is None else before.seen
+        seen = None if before is None else before.reference_time
         motion = self.motion.rest if before is None else before.motion
         held = before is not None and seen is not None and 0.0 <= time - seen < self.settings.hold_time + TIME_ROUNDING
         camera = before.camera if before is not None and held else None
         why = self._describe_age(time) or ("not seen yet" if seen is None else "lost")
         what = "nothing is drawn" if camera is None else "drawn where it was"
         return TrackingResult(
-            time, TumourState.NO_REFERENCE, f"reference {why}: {what}", tracked, motion, camera, seen=seen,
-            felt=None if before is None else before.felt,
+            time, TumourState.NO_REFERENCE, f"reference {why}: {what}", tracked, motion, camera, reference_time=seen,
+            tool_time=None if before is None else before.tool_time,
         )  # fmt: skip
 
     def _compute_pace(self, reference: Pose, time: float, before: TrackingResult | None) -> float | None:
@@ -262,16 +262,17 @@ class Follower:
         self, tracked: TrackedTargets, reference: Pose, time: float, before: TrackingResult | None, shutter: float
     ) -> TrackingResult:
         """Compute the motion under the tool, by its pose relative to the reference; a `shutter` adds an error [m]."""
-        felt, last = (None, None) if before is None else (before.felt, before.motion)
+        tool_time, last = (None, None) if before is None else (before.tool_time, before.motion)
         beside = self._find_tool(tracked, reference, time)
         if self.tool is None or beside is None:
             if self.motion.deformer is None:
-                return TrackingResult(time, TumourState.UNKNOWN, UNKNOWN_WARNING, tracked, self.motion.rest, felt=felt)
-            if felt is None or last is None:
+                state, rest = TumourState.UNKNOWN, self.motion.rest
+                return TrackingResult(time, state, UNKNOWN_WARNING, tracked, rest, tool_time=tool_time)
+            if tool_time is None or last is None:
                 words = f"tool {self._describe_age(time) or 'not seen yet'}: the tumour as in the scan"
                 return TrackingResult(time, TumourState.NO_TOOL, words, tracked, self.motion.rest)
-            words = f"tool {self._describe_age(time) or 'lost'}: the tumour as {time - felt:.1f} s ago"
-            return TrackingResult(time, TumourState.NO_TOOL, words, tracked, last, felt=felt)
+            words = f"tool {self._describe_age(time) or 'lost'}: the tumour as {time - tool_time:.1f} s ago"
+            return TrackingResult(time, TumourState.NO_TOOL, words, tracked, last, tool_time=tool_time)
         into = np.linalg.inv(self.registration.T_patient_scan)
         pose = into @ beside.T_camera_target @ self.tool.T_cube_tool
         spread = compute_tip_covariance(self.registration, self.tool, beside)
@@ -280,7 +281,7 @@ class Follower:
         moved = TumourState.GOOD if motion.moved > 0.0 else TumourState.REST
         state = TumourState.UNSURE if motion.doubt else moved if motion.known else TumourState.UNKNOWN
         words = UNKNOWN_WARNING if state is TumourState.UNKNOWN else motion.doubt
-        return TrackingResult(time, state, words, tracked, motion, None, pose, spread, felt=time)
+        return TrackingResult(time, state, words, tracked, motion, None, pose, spread, tool_time=time)
 
     def _find_tool(self, tracked: TrackedTargets, reference: Pose, time: float) -> Pose | None:
         """Return the tool's cube relative to the reference."""

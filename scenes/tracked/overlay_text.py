@@ -51,7 +51,7 @@ def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
     doubt = f'<p class="warn">{escape(known.words)}</p>'
     parts.append(f"<p><b>{STATE_TEXTS[known.state]}</b></p>" if known.relied else doubt)
     parts += [overlay_error(known), PATIENT_ERROR]
-    placed = known.seen == known.time
+    placed = known.reference_time == known.time
     tool = "seen" if known.T_scan_tool is not None else "not seen" if placed else "not placed without the reference"
     facts = [place, f"reference {'seen' if placed else 'not seen'}", *([f"tool {tool}"] if tooled else [])]
     if known.motion.known and known.relied:

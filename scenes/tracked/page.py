@@ -45,7 +45,7 @@ class OverlayPage:
     ----------
     follower, painter
         Tracker of its images, and overlay renderer.
-    name, who
+    name, model
         Name of the video or the camera, and description of the deformation model.
     host, port
         Address of the server.
@@ -58,7 +58,7 @@ class OverlayPage:
     follower: Follower
     painter: Painter
     name: str = "camera"
-    who: str = "nobody"
+    model: str = "nobody"
     host: str = "127.0.0.1"
     port: int = 8080
     frames: int = 0
@@ -100,7 +100,7 @@ class OverlayPage:
                 build_slice_control(self.through, lambda name: setattr(self, "through", name)),
             ],
             title=f"sulcus: {self.name}",
-            words=describe_overlay(self.name, self.who, self.tooled),
+            words=describe_overlay(self.name, self.model, self.tooled),
             host=self.host,
             port=self.port,
             size=(calibration.width, calibration.height),

@@ -39,8 +39,10 @@ USUAL_DEVIATIONS = 0.25e-3, float(np.radians(0.1))
 """Standard deviations of a tracker that reports none, along and about each axis [m], [rad]."""
 
 
-def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (n,) [s] and poses (n, 4, 4) [m] of a file with the columns time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw.
+def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Read poses from a file with the columns time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw.
+
+    Returns the numbers (n,) of the rows in the file, times (n,) [s] and poses (n, 4, 4) [m].
 
     A pose leads from the body to the tracker: x_tracker = T x_body. Rows without a pose are passed over. So
     are rows in which the tracker did not see the body, with a warning: a status that is not OK, zeros or the identity.
@@ -52,11 +54,6 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         A file that is missing or no such table, times that do not ascend, quaternions that are not of length 1, or
         places farther than 100 m.
     """
-    return read_numbered_poses(path)[1:]
-
-
-def read_numbered_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows (n,) in the file, then times and poses as of `read_poses`."""
     times, poses, _ = _read(path)
     back = np.flatnonzero(np.diff(times) <= 0.0)
     if len(back):

@@ -65,7 +65,7 @@ class Shown:
 
     def drop_mesh(self) -> Shown:
         """Return the same without where the brain is, and without its colours."""
-        motion = replace(self.known.motion, positions=np.empty((0, 3)), answer=None)
+        motion = replace(self.known.motion, positions=np.empty((0, 3)), solution=None)
         return replace(self.drop_image(), known=replace(self.known, motion=motion))
 
 

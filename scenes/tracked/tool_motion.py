@@ -37,7 +37,7 @@ class BrainMotion:
         95 % bounds on a vertex's error by the model, and by the error of the tool's position [m].
     doubt
         Reason why it is unreliable, in words for the image; empty if it is reliable.
-    answer
+    solution
         The solution, from which the next one may start.
     """
 
@@ -47,7 +47,7 @@ class BrainMotion:
     model: float = 0.0
     tool: float = 0.0
     doubt: str = ""
-    answer: Deformation | None = None
+    solution: Deformation | None = None
 
     @property
     def error(self) -> float:
@@ -79,17 +79,17 @@ class ToolMotion:
         deviation = float(np.sqrt(max(np.linalg.eigvalsh(tip_covariance)[-1], 0.0)))
         deeper = T_scan_tool.copy()
         deeper[:3, 3] += BOUND_DEVIATIONS * deviation * self.stage.site.axis
-        start = None if before is None else before.answer
+        start = None if before is None else before.solution
         try:
-            answer, further = self._solve_poses(T_scan_tool, deeper, start)
+            result, further = self._solve_poses(T_scan_tool, deeper, start)
         except InputError:
             return BrainMotion(self.rest.positions, doubt=TOO_DEEP_WARNING)
         vertices, rest = self.stage.tumour_vertices, self.rest.positions
-        moved, beyond = (each.restrict(vertices).displacement[0] for each in (answer, further))
-        positions, doubt = rest.copy(), describe_outcome(answer.outcome[0])
-        positions[answer.nodes] += answer.displacement[0]
-        model = find_first_model(self.deformer, answer)
-        bound = 0.0 if model is None else float(answer.bound[0, 0])
+        moved, beyond = (each.restrict(vertices).displacement[0] for each in (result, further))
+        positions, doubt = rest.copy(), describe_outcome(result.outcome[0])
+        positions[result.nodes] += result.displacement[0]
+        model = find_first_model(self.deformer, result)
+        bound = 0.0 if model is None else float(result.bound[0, 0])
         if model is not None and not np.isfinite(bound):
             bound, doubt = (model.bound, doubt) if np.isfinite(model.bound) else (0.0, doubt or NO_ERROR_WARNING)
         return BrainMotion(
@@ -99,7 +99,7 @@ class ToolMotion:
             bound,
             float(np.linalg.norm(beyond - moved, axis=1).max()),
             doubt,
-            answer,
+            result,
         )
 
     def _solve_poses(

@@ -102,14 +102,10 @@ def read_tool(path: str | Path) -> TrackedTool:
         if (
             covariance.shape != (3, 3)
             or not np.isfinite(covariance).all()
-            or _compute_min_eigenvalue(covariance) < -1e-9
+            or np.linalg.eigvalsh(0.5 * (covariance + covariance.T))[0] < -1e-9
         ):
             raise InputError(f"tip_covariance_mm2 is no covariance (3, 3). {REMEDY}")
         return TrackedTool(parse_tool(str(stored["shape"])), T, 1e-6 * covariance)
-
-
-def _compute_min_eigenvalue(matrix: np.ndarray) -> float:
-    return float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0])
 
 
 def _check_rigid(T: np.ndarray) -> None:

@@ -39,10 +39,6 @@ class Cause:
     words: str
     record: Mapping[str, Any]
 
-    def solve_with(self, solver: str) -> Cause:
-        """Return the same cause, solved by a solver."""
-        return replace(self, words=f"{self.words}, by {solver}")
-
 
 def play_scene_cause(scene: Scene, number: int) -> Cause:
     """Return a moment of a scene, by the number of its frame."""
@@ -68,11 +64,6 @@ def load_cause(loads: Loads) -> Cause:
     right, anterior, superior = (f"{value + 0.0:.2f}" for value in np.round(direction, 2))
     words = f"a load of {newton:g} N at {x}, {y}, {z} mm towards {right}, {anterior}, {superior} (RAS)"
     return Cause(words, record)
-
-
-def read_file_cause(path: Path) -> Cause:
-    """Return a displacement that a file holds."""
-    return Cause(f"displacement of {path.name}", {"kind": "file", "file": path.name})
 
 
 def _round_values(values: np.ndarray) -> list[float]:
@@ -150,9 +141,9 @@ class Played:
         scene, time = self.scene, float(self.scene.times[number])
         return scene.build_loads(self.theatre.site, scene.path(time), time)
 
-    def _build_moment(self, number: int, answer: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
+    def _build_moment(self, number: int, result: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
         scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
-        moved = answer.displacement[0]
+        moved = result.displacement[0]
         # Nothing is located here, and no locator is asked for.
         stage = Stage(replace(scene, sight=None), site)
         player = Player(stage, AtRest(site.anatomy))
@@ -162,11 +153,10 @@ class Played:
         bound = None if known is None else known.evaluate(time).prior
         loads = self._build_loads(number)
         cause = load_cause(loads) if self.load else play_scene_cause(scene, number)
+        cause = replace(cause, words=f"{cause.words}, by {result.source}")
         said = {} if bound is None else {"bound_words": ENSEMBLE}
         left = stage.select_stage(loads).anatomy
-        return DeformedAnatomy(
-            cause.solve_with(answer.source), site.anatomy, left, moved, answer.outcome[0].good, bound, tip=tip, **said
-        )
+        return DeformedAnatomy(cause, site.anatomy, left, moved, result.outcome[0].good, bound, tip=tip, **said)
 
 
 def read_moment(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
@@ -188,7 +178,7 @@ def read_moment(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
     same = file.mesh.nodes.shape == mesh.nodes.shape and np.array_equal(file.mesh.tets, mesh.tets)
     if not same or np.abs(file.mesh.nodes - mesh.nodes).max() > NODE_TOLERANCE:
         raise InputError(f"{path}: is of another mesh than the anatomy. Give the anatomy that it was made with.")
-    cause = read_file_cause(path)
+    cause = Cause(f"displacement of {path.name}", {"kind": "file", "file": path.name})
     if "covariance" not in file.point_data:
         return DeformedAnatomy(cause, anatomy, anatomy, np.asarray(moved, np.float64))
     xx, yy, zz, xy, yz, xz = np.asarray(file.point_data["covariance"])[np.unique(anatomy.tumour_surface)].T

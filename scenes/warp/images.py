@@ -264,8 +264,8 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
         place = index_of(affine, then)
         off = ((place < -0.5) | (place > last + 0.5)).any(axis=1)
         cut = np.zeros(len(rows), bool)
-        if fields.gone.any():
-            held = ndimage.map_coordinates(fields.gone, fields.grid.index(then).T, order=0)
+        if fields.resected.any():
+            held = ndimage.map_coordinates(fields.resected, fields.grid.index(then).T, order=0)
             cut = np.asarray(held, bool) & ~off
         read = ndimage.map_coordinates(
             source, np.clip(place, 0, last).T, order=order, mode="nearest", prefilter=False, output=source.dtype

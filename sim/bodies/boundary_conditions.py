@@ -45,16 +45,16 @@ def add_boundary_conditions(
     lowest = outer[mesh.nodes[outer, 2].argmin()]
     height = np.ptp(mesh.nodes[outer, 2])
     stem = np.zeros(len(mesh.nodes), bool)
-    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= settings.stem * height
+    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= settings.stem_radius * height
     said = f"a craniotomy of {craniotomy * 1e3:g} mm" if outline is None else "the outlined opening"
     if outline is None:
         opened = compute_geodesic_distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy
     else:
         opened = np.isin(np.arange(len(mesh.nodes)), outer) & find_within_outline(mesh.nodes, outline)
     opened &= ~stem
-    if opened.sum() < settings.fewest_open:
+    if opened.sum() < settings.min_open_nodes:
         raise InputError(
-            f"{said} holds {opened.sum()} mesh nodes, and {settings.fewest_open} are "
+            f"{said} holds {opened.sum()} mesh nodes, and {settings.min_open_nodes} are "
             "needed: ask for a larger one, or for more nodes."
         )
     held = reduce(np.logical_or, (find_held_vertices(mesh, septum) & ~opened for septum in septa), stem)

@@ -28,10 +28,10 @@ class Window:
         Percentiles of the brain by volume, robust against a few voxels such as vessels.
     dark, light
         Grey values in 0 .. 1 of these percentiles; values outside are extrapolated linearly and clipped to 0 .. 1.
-    beyond
+    max_excess
         Excess over `high`, in units of high - low, above which a voxel is not tissue: a vessel with contrast
         agent, fat, or a wrong value.
-    plain
+    flat_grey
         Grey value if the brain is uniform.
     """
 
@@ -39,8 +39,8 @@ class Window:
     high: float = 90.0
     dark: float = 0.3
     light: float = 0.97
-    beyond: float = 1.0
-    plain: float = 0.8
+    max_excess: float = 1.0
+    flat_grey: float = 0.8
 
 
 STORED_WINDOW = Window(dark=0.25, light=0.75)
@@ -103,9 +103,9 @@ class Intensity:
         share = (np.cumsum(size[order]) - 0.5 * size[order]) / size.sum()
         low, middle, high = np.interp([0.01 * window.low, 0.5, 0.01 * window.high], share, found[order])
         values = self.values.astype(np.float64)
-        values[~(np.isfinite(values) & (values <= high + window.beyond * (high - low)))] = middle
+        values[~(np.isfinite(values) & (values <= high + window.max_excess * (high - low)))] = middle
         if high - low <= GREY_TOLERANCE * max(abs(low), abs(high)):
-            return np.full(values.shape, window.plain, np.float32)
+            return np.full(values.shape, window.flat_grey, np.float32)
         grey = window.dark + (window.light - window.dark) * (values - low) / (high - low)
         return np.clip(grey, 0.0, 1.0).astype(np.float32)
 

@@ -74,12 +74,12 @@ def find_removable_tetrahedra(tets: np.ndarray, unwanted: np.ndarray) -> np.ndar
     width = int(tets.max()) + 1
     edges = np.sort(faces[outer.ravel()][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     surface_edges = np.unique(edges @ [width, 1])
-    gone = np.zeros(len(tets), bool)
+    removed = np.zeros(len(tets), bool)
     taken = np.zeros(width, bool)
     for tet in np.flatnonzero(unwanted & (outer.sum(axis=1) >= 2)):
         hidden = tets[tet][outer[tet]]  # corners opposite outer faces: if two, the ends of the inner edge
         inner = len(hidden) == 3 or not np.isin(np.sort(hidden) @ [width, 1], surface_edges)
         if len(hidden) < 4 and inner and not taken[tets[tet]].any():
-            gone[tet] = True
+            removed[tet] = True
             taken[tets[tet]] = True
-    return gone
+    return removed

@@ -28,19 +28,19 @@ class Smoothing:
     ----------
     good_angle
         Tetrahedra with a dihedral angle below it or above 180 less it are bad, and their nodes are moved [degrees].
-    rounds
+    max_iterations
         Maximum number of iterations.
-    largest_shift
+    max_shift
         Maximum distance of a node from its surface for a better fit [m]: half a voxel, the resolution of the image.
-    largest_step, smallest_step
+    first_step, min_step
         Fractions of the shortest edge at a node: initial step, and minimum step below which the node is not moved.
     """
 
     good_angle: float = 18.0
-    rounds: int = 60
-    largest_shift: float = 5e-4
-    largest_step: float = 0.3
-    smallest_step: float = 0.02
+    max_iterations: int = 60
+    max_shift: float = 5e-4
+    first_step: float = 0.3
+    min_step: float = 0.02
 
     @property
     def good_sine(self) -> float:
@@ -85,7 +85,7 @@ def fit_nodes(
     for corner in triangles.T:
         np.add.at(weight, corner, area)
         np.add.at(total, corner, -0.75 * area * field(middle))
-    most = settings.largest_shift
+    most = settings.max_shift
     level = np.clip(total[on] / weight[on], -most, most)
     nodes = nodes.copy()
     nodes[on] = project_onto_level(field, nodes[on], level)
@@ -132,9 +132,9 @@ def improve_mesh(
     nodes, good = nodes.copy(), settings.good_sine
     order = np.argsort(tets, axis=None, kind="stable")
     incident, begin = order // 4, np.searchsorted(tets.ravel()[order], np.arange(len(nodes) + 1))
-    step = np.full(len(nodes), settings.largest_step)
+    step = np.full(len(nodes), settings.first_step)
     sines = compute_smallest_sines(nodes[tets])
-    for _ in range(settings.rounds):
+    for _ in range(settings.max_iterations):
         movers = _select_independent_nodes(tets, sines, step, settings)
         if len(movers) == 0:
             break
@@ -162,7 +162,7 @@ def improve_mesh(
         touched = near[better[row]]
         sines[touched] = compute_smallest_sines(nodes[tets[touched]])
         around = np.unique(tets[touched])
-        step[around] = np.maximum(step[around], 3.0 * settings.smallest_step)
+        step[around] = np.maximum(step[around], 3.0 * settings.min_step)
     return nodes
 
 
@@ -171,7 +171,7 @@ def _select_independent_nodes(tets: np.ndarray, sines: np.ndarray, step: np.ndar
     bad = np.flatnonzero(sines < settings.good_sine)
     worst = np.full(len(step), np.inf)
     np.minimum.at(worst, tets[bad].ravel(), np.repeat(sines[bad], 4))
-    worst[step < settings.smallest_step] = np.inf
+    worst[step < settings.min_step] = np.inf
     movers = np.flatnonzero(np.isfinite(worst))
     rank = np.full(len(step), len(step))
     rank[movers[np.argsort(worst[movers], kind="stable")]] = np.arange(len(movers))

@@ -31,11 +31,11 @@ class Meshing:
 
     Parameters
     ----------
-    tolerance, farthest
+    tolerance, max_deviation
         Relative deviations from the requested number of nodes: the search ends within the first, fails beyond the last.
-    trials
+    max_trials
         Maximum number of lattices in the search.
-    fine
+    fine_ratio
         Cell size at the tumour and the craniotomy, as a fraction of the coarsest: the regions of interest.
     cells_per_radius
         Minimum cells per tumour radius, to resolve its shape.
@@ -43,33 +43,33 @@ class Meshing:
         Growth of the cell edge per distance from those regions.
     rounding
         Cells up to this factor above the requested size are not halved, so that sizes are correct on average.
-    deepest
+    max_halvings
         Maximum halvings of the coarsest cell: limits the lattice around a very small tumour.
-    slacks
+    surface_tolerances
         Allowed distances of nodes from their surface for better angles, one per attempt [m].
     largest_error
         Maximum relative error of the tumour volume. Manual outlines of one glioma agree less: Dice 74 to 85 %,
         Menze et al. 2015.
-    shown
+    min_meshed_fraction
         A piece of the tumour is lost if the mesh contains less than this fraction of its volume.
-    more
+    factors
         Factors of the number of nodes, tried only to recommend a sufficient number.
     stuffing, smoothing
         Options of the cuts, and of the subsequent node moves.
     """
 
     tolerance: float = 0.03
-    farthest: float = 0.1
-    trials: int = 8
-    fine: float = 0.5
+    max_deviation: float = 0.1
+    max_trials: int = 8
+    fine_ratio: float = 0.5
     cells_per_radius: float = 2.5
     growth: float = 0.5
     rounding: float = 2.0**0.5
-    deepest: int = 4
-    slacks: tuple[float, ...] = (0.0, 3e-4, 6e-4, 1.2e-3, 2.4e-3)
+    max_halvings: int = 4
+    surface_tolerances: tuple[float, ...] = (0.0, 3e-4, 6e-4, 1.2e-3, 2.4e-3)
     largest_error: float = 0.1
-    shown: float = 0.1
-    more: tuple[float, ...] = (1.25, 1.6, 2.0, 2.5)
+    min_meshed_fraction: float = 0.1
+    factors: tuple[float, ...] = (1.25, 1.6, 2.0, 2.5)
     stuffing: IsosurfaceStuffingOptions = field(default_factory=IsosurfaceStuffingOptions)
     smoothing: Smoothing = field(default_factory=Smoothing)
 
@@ -114,7 +114,7 @@ def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> Tet
     mesh = _build_mesh_or_reason(solids, count, settings)
     if isinstance(mesh, TetMesh):
         return mesh
-    raise build_too_few_error(count, mesh, settings.more, lambda number: _can_build_mesh(solids, number, settings))
+    raise build_too_few_error(count, mesh, settings.factors, lambda number: _can_build_mesh(solids, number, settings))
 
 
 def build_too_few_error(
@@ -137,12 +137,12 @@ def find_lost_pieces(
     surfaces, corners = KDTree(np.concatenate([piece.surface for piece in pieces])), nodes[tets]
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
     shown = np.bincount(owner[surfaces.query(corners.mean(axis=1))[1]], volume, len(pieces))
-    return [bool(one < settings.shown * piece.volume) for one, piece in zip(shown, pieces, strict=True)]
+    return [bool(one < settings.min_meshed_fraction * piece.volume) for one, piece in zip(shown, pieces, strict=True)]
 
 
 def describe_lost_pieces(pieces: Sequence[Piece], lost: Sequence[bool]) -> str:
     """Format the number of lost pieces and their total volume."""
-    volume = sum(piece.volume for piece, gone in zip(pieces, lost, strict=True) if gone)
+    volume = sum(piece.volume for piece, missing in zip(pieces, lost, strict=True) if missing)
     return f"{sum(lost)} of the tumour's {len(pieces)} pieces, {1e6 * volume:.2g} ml in all"
 
 
@@ -157,7 +157,7 @@ def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetM
     """Return the mesh with `count` nodes, or reason and remedy if it fails. Raises as `build_mesh`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
-    for _ in range(settings.trials):
+    for _ in range(settings.max_trials):
         pieces = carve(solids, edge, settings)
         reached = len(pieces.nodes)
         if best is None or abs(reached - count) < abs(len(best.nodes) - count):
@@ -166,7 +166,7 @@ def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetM
             break
         edge *= float(np.clip((reached / count) ** 0.4, 0.5, 2.0))
     assert best is not None
-    if abs(len(best.nodes) - count) > settings.farthest * count:
+    if abs(len(best.nodes) - count) > settings.max_deviation * count:
         raise InputError(f"{count} nodes are not possible for this anatomy (closest: {len(best.nodes)}): request more.")
     return _fit_mesh_or_reason(solids, best, settings)
 
@@ -174,9 +174,9 @@ def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetM
 def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
     """Return the solid on a lattice with coarsest cell `edge` [m], split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
-    fine, growth = settings.fine * edge, settings.growth
+    fine, growth = settings.fine_ratio * edge, settings.growth
     wanted = ((KDTree(solids.interface), min(fine, radius / settings.cells_per_radius)), (KDTree(solids.opening), fine))
-    levels = min(int(np.rint(np.log2(edge / wanted[0][1]))), settings.deepest)
+    levels = min(int(np.rint(np.log2(edge / wanted[0][1]))), settings.max_halvings)
 
     def size(points: np.ndarray) -> np.ndarray:
         return settings.rounding * np.min([least + growth * tree.query(points)[0] for tree, least in wanted], axis=0)
@@ -197,13 +197,13 @@ def _fit_mesh_or_reason(solids: Solids, pieces: Pieces, settings: Meshing) -> Te
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
     lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
-    gone = sum(piece.volume for piece, one in zip(solids.pieces, lost, strict=True) if one)
-    if gone > settings.largest_error * solids.tumour_volume:
+    missing = sum(piece.volume for piece, one in zip(solids.pieces, lost, strict=True) if one)
+    if missing > settings.largest_error * solids.tumour_volume:
         be = "is" if sum(lost) == 1 else "are"
         return f"{describe_lost_pieces(solids.pieces, lost)}, {be} too small", "leave what is small out of the labels"
     for fold in (True, False):
         found = _improve_pieces(
-            solids, _fit_to_surfaces(solids, pieces, solids.tumour_volume - gone, settings, fold), settings
+            solids, _fit_to_surfaces(solids, pieces, solids.tumour_volume - missing, settings, fold), settings
         )
         if compute_smallest_sines(found.nodes[found.tets]).min() >= np.sin(np.radians(SLIVER_DEGREES)):
             mesh = TetMesh(found.nodes, found.tets, np.where(found.inside, TUMOUR_LABEL, BRAIN_LABEL))
@@ -227,7 +227,7 @@ def _fit_to_surfaces(solids: Solids, pieces: Pieces, volume: float, settings: Me
 
 def _improve_pieces(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
     """Remove flat tetrahedra on the surfaces and improve bad angles."""
-    for slack in settings.slacks:
+    for slack in settings.surface_tolerances:
         bad = compute_smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
         pieces = pieces.select(~find_removable_tetrahedra(pieces.tets, bad))
         projection = _build_projection(solids, pieces, slack)

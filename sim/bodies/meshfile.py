@@ -87,7 +87,7 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
     with read_as(path, "a mesh", REMEDY):
         most = limits.limit_bytes(path.stat().st_size)
         counted = path.suffix.lower() == ".vtu" and check_vtu_size(path, most)
-        with warnings.catch_warnings(), nullcontext() if counted else limit_memory(limits.largest):
+        with warnings.catch_warnings(), nullcontext() if counted else limit_memory(limits.max_bytes):
             warnings.simplefilter("ignore")  # meshio warns about arrays that it skips
             check_mesh_references(path, limits)
             raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _read_with_meshio(path)
@@ -149,9 +149,9 @@ def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) ->
         vectors = {name for name, field in data.items() if field.shape[1:] == (3,) and field.dtype.kind in "if"}
         data.update({name: data[name] * SIGNS["LPS"] for name in vectors})
         notes.append("turned x and y of points and vectors from LPS, which its title states, to RAS")
-    points, table, data, gone = merge_nodes(places, table, data)
-    if gone:
-        notes.append(f"merged {gone} nodes with others at the same place: results are numbered without them")
+    points, table, data, merged = merge_nodes(places, table, data)
+    if merged:
+        notes.append(f"merged {merged} nodes with others at the same place: results are numbered without them")
     tets, middles = np.split(table, [4], axis=1)
     mesh = TetMesh(points * metre, tets, region, middles if middles.size else None)
     check_one_body(points, tets)

@@ -178,7 +178,7 @@ def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -
     return _scale_affine(image, metre), (
         *voxels.ignored_axes,
         note,
-    ) if apart > voxels.same_place else voxels.ignored_axes
+    ) if apart > voxels.max_form_difference else voxels.ignored_axes
 
 
 def _build_centred_affine(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:

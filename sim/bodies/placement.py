@@ -22,30 +22,30 @@ class Placement:
 
     Parameters
     ----------
-    stem
+    stem_radius
         Radius of the brainstem around the lowest point, as a fraction of the brain's height: 21 mm in the template, the
         medulla and adjacent tissue.
     hull_depth
         Maximum depth under the convex hull [m]: deeper cortex lies in a fissure, inaccessible through the skull.
-    base
+    min_height
         Minimum height of an opening, as a fraction of the brain's height, unless the tumour is lower.
-    near
+    max_surface_distance
         Maximum distance of a point from the surface [m], for the intended cortex to be unambiguous.
-    outside
+    max_outside_distance
         Maximum distance of a point outside the brain [m]: coordinates read from images are inexact.
-    midline
+    midline_half_width
         Half width of the midline strip, as a fraction of the brain's width.
-    fewest_open
+    min_open_nodes
         Minimum nodes of a craniotomy, to support a tool.
     """
 
-    stem: float = 0.15
+    stem_radius: float = 0.15
     hull_depth: float = 6e-3
-    base: float = 0.3
-    near: float = 20e-3
-    outside: float = 5e-3
-    midline: float = 0.03
-    fewest_open: int = 6
+    min_height: float = 0.3
+    max_surface_distance: float = 20e-3
+    max_outside_distance: float = 5e-3
+    midline_half_width: float = 0.03
+    min_open_nodes: int = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings
     share = (np.asarray(point) - low) / (high - low)
     words = []
     for axis, names in enumerate(AXES):
-        middle = settings.midline if axis == 0 else 1.0 / 6.0
+        middle = settings.midline_half_width if axis == 0 else 1.0 / 6.0
         if abs(share[axis] - 0.5) > middle:
             words.append(names[int(share[axis] > 0.5)])
         elif axis == 0:
@@ -75,7 +75,7 @@ def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings
 
 def find_reachable_site(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """Return the point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that is accessible through the skull."""
-    floor = min(cortex[:, 2].min() + settings.base * np.ptp(cortex[:, 2]), centre[2])
+    floor = min(cortex[:, 2].min() + settings.min_height * np.ptp(cortex[:, 2]), centre[2])
     return _find_nearest_outer(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
 
 
@@ -90,11 +90,11 @@ def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement =
     _check_finite(point, "--opening-at")
     site = _find_nearest_outer(cortex, point, cortex, settings)
     apart = float(np.linalg.norm(site - point))
-    if apart > settings.near:
+    if apart > settings.max_surface_distance:
         raise InputError(
             f"the opening at {_to_mm(point)} mm lies {apart * 1e3:.0f} mm from the nearest cortex that the skull "
-            "covers; "
-            f"{settings.near * 1e3:g} mm is the most. {_format_box(cortex)} Over a deep point, give --opening-over."
+            f"covers; {settings.max_surface_distance * 1e3:g} mm is the most. {_format_box(cortex)} Over a deep point, "
+            "give --opening-over."
         )
     return _check_not_over_stem(cortex, site, settings)
 
@@ -110,7 +110,7 @@ def find_opening_over(
         A point that is not finite, or more than `outside` outside the brain; one over the brainstem.
     """
     _check_finite(point, "--opening-over")
-    if not depth > -settings.outside:
+    if not depth > -settings.max_outside_distance:
         raise InputError(
             f"the point {_to_mm(point)} mm lies {-depth * 1e3:.0f} mm outside the brain: give a point inside. "
             f"{_format_box(cortex)}"
@@ -127,10 +127,11 @@ def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Place
         See `find_opening_at`; an outline that is not at the surface.
     """
     apart = float(KDTree(cortex).query(outline)[0].max())
-    if apart > settings.near:
+    if apart > settings.max_surface_distance:
         raise InputError(
-            f"the opening's outline lies up to {apart * 1e3:.0f} mm from the cortex; {settings.near * 1e3:g} mm is "
-            f"the most. {_format_box(cortex)} See that its coordinates are those of the labels."
+            f"the opening's outline lies up to {apart * 1e3:.0f} mm from the cortex; "
+            f"{settings.max_surface_distance * 1e3:g} mm is the most. {_format_box(cortex)} See that its coordinates "
+            "are those of the labels."
         )
     inside = cortex[find_within_outline(cortex, outline)]
     return find_opening_at(cortex, inside.mean(axis=0) if len(inside) else outline.mean(axis=0), settings)
@@ -171,7 +172,7 @@ def _check_finite(point: np.ndarray, option: str) -> None:
 
 def _check_not_over_stem(cortex: np.ndarray, site: np.ndarray, settings: Placement) -> np.ndarray:
     lowest, height = cortex[cortex[:, 2].argmin()], np.ptp(cortex[:, 2])
-    if np.linalg.norm(site - lowest) <= settings.stem * height:
+    if np.linalg.norm(site - lowest) <= settings.stem_radius * height:
         raise InputError(
             f"the opening at {_to_mm(site)} mm lies over the brainstem, which is held: choose a point farther from the "
             f"brain's lowest one, {_to_mm(lowest)} mm."

@@ -28,7 +28,7 @@ class TipGauge:
     ----------
     anatomy
         Anatomy with exposed cortex.
-    together
+    block_size
         Load cases per block, which limits memory.
 
     Raises
@@ -38,7 +38,7 @@ class TipGauge:
     """
 
     anatomy: Anatomy
-    together: int = 64
+    block_size: int = 64
 
     @cached_property
     def cortex(self) -> OpenCortex:
@@ -92,8 +92,8 @@ class TipGauge:
             )
         tips = self._compute_tips(loads, displacement, row[self._open[0]], tool, lift)
         found, at = np.empty(len(loads)), row[self._tumour[0]]
-        for first in range(0, len(loads), self.together):
-            some = slice(first, first + self.together)
+        for first in range(0, len(loads), self.block_size):
+            some = slice(first, first + self.block_size)
             tumour = self.anatomy.mesh.nodes[self._tumour[0]] + displacement[some][:, at]
             near = find_closest_points(tips[some], tumour[:, self._tumour[1]]).point
             found[some] = np.linalg.norm(near - tips[some], axis=1)
@@ -111,8 +111,8 @@ class TipGauge:
             raise InputError("the loads have no tip: give pushing tools, or poses and their tool.")
         nodes, triangles = self._open
         rest, tips = self.anatomy.mesh.nodes[nodes], np.empty((len(loads), 3))
-        for first in range(0, len(loads), self.together):
-            some = slice(first, first + self.together)
+        for first in range(0, len(loads), self.block_size):
+            some = slice(first, first + self.block_size)
             _, triangle, weights = find_closest_points(pushed.point[some], rest[triangles])
             surface = rest + displacement[some][:, row]
             corners = surface[np.arange(len(surface))[:, None], triangles[triangle]]

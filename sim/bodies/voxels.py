@@ -30,17 +30,17 @@ class Voxels:
 
     Parameters
     ----------
-    finest, coarsest
+    min_edge, max_edge
         Limits of the voxel edges [m]: no brain scanner is finer, and coarser voxels do not resolve the surface.
-    same_place
+    max_form_difference
         Maximum distance between the sform and qform positions of a voxel, to allow for round-off [m].
     axes
         Axis directions of a NIfTI file without orientation, such as RAS or LPS; if empty, such a file is rejected.
     """
 
-    finest: float = 1e-5
-    coarsest: float = 6e-3
-    same_place: float = 1e-3
+    min_edge: float = 1e-5
+    max_edge: float = 6e-3
+    max_form_difference: float = 1e-3
     axes: str = ""
 
     @property
@@ -153,15 +153,15 @@ def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layer
         raise InputError(
             f"{path}: its affine is singular, so its voxels have no position. Export it with its orientation."
         )
-    if spacing.min() < voxels.finest:
+    if spacing.min() < voxels.min_edge:
         raise InputError(
-            f"{path}: its voxels measure {spacing.min() * 1e3:.3g} mm along an axis; {voxels.finest * 1e3:g} mm is the "
-            "least. Set the voxel size, or resample it."
+            f"{path}: its voxels measure {spacing.min() * 1e3:.3g} mm along an axis; "
+            f"{voxels.min_edge * 1e3:g} mm is the least. Set the voxel size, or resample it."
         )
-    if spacing.max() > voxels.coarsest:
+    if spacing.max() > voxels.max_edge:
         voxel = " x ".join(f"{edge * 1e3:.3g}" for edge in spacing)
         raise InputError(
-            f"{path}: its voxels measure {voxel} mm; {voxels.coarsest * 1e3:g} mm is the maximum for a brain."
+            f"{path}: its voxels measure {voxel} mm; {voxels.max_edge * 1e3:g} mm is the maximum for a brain."
         )
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]

@@ -27,17 +27,17 @@ class EdgeSubdivision:
 
     Parameters
     ----------
-    fineness
+    max_edge_ratio
         Maximum edge length of the subdivision, as a fraction of the footprint's radius.
-    fewest
+    min_subdivisions
         Minimum subdivisions per edge, doubled until fine enough.
-    most
+    max_subdivisions
         Maximum subdivisions per edge: needed for a footprint of 0.1 mm on a triangle of 50 m.
     """
 
-    fineness: float = 0.12
-    fewest: int = 8
-    most: int = 2**22
+    max_edge_ratio: float = 0.12
+    min_subdivisions: int = 8
+    max_subdivisions: int = 2**22
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class ContactSurface:
         centre = corners.mean(axis=1)
         reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
         edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0)
-        self._least = edge / (division.fineness * division.most)
+        self._least = edge / (division.max_edge_ratio * division.max_subdivisions)
         self._corners = device.upload(corners, wp.vec3d)
         self._ball = device.upload(np.column_stack([centre, reach]), wp.vec4d)
         self._table = device.upload(table.reshape(triangles.shape), wp.int32)
@@ -158,7 +158,7 @@ class ContactSurface:
         imprint.weight.zero_()
         imprint.sums.zero_()
         inputs = [self._corners, self._ball, self._table, self._position, imprint.tools, imprint.touched]
-        inputs += [self._division.fineness, self._division.fewest, self._division.most]
+        inputs += [self._division.max_edge_ratio, self._division.min_subdivisions, self._division.max_subdivisions]
         self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
 
     def check_tools_touch(self, points: np.ndarray, radii: np.ndarray) -> None:

@@ -73,13 +73,13 @@ def _iterate_bodies(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterat
     taken: set[int] = set()
     for done, step in enumerate(effect.steps, start=1):
         taken.update(step)
-        gone = np.array(sorted(taken))
+        removed = np.array(sorted(taken))
         try:
-            left = anatomy.remove_elements(gone)
-            kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), gone)
+            left = anatomy.remove_elements(removed)
+            kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), removed)
             loose = kept[find_loose_tetrahedra(left, slides)]
             yield RemainingBody(
-                done, anatomy.remove_elements(np.concatenate([gone, loose])) if len(loose) else left, loose
+                done, anatomy.remove_elements(np.concatenate([removed, loose])) if len(loose) else left, loose
             )
         except InputError as error:
             raise InputError(f"step {done} of Resection cannot be done: {error}") from error

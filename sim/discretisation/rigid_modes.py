@@ -10,12 +10,12 @@ from ..errors import InputError
 from ..geometry.tetmesh import FACES, TetMesh, compute_row_keys
 
 
-def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float = 1e-6) -> None:
+def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, tolerance: float = 1e-6) -> None:
     """Reject a body with a part that can translate or rotate freely.
 
     held (V, 3) bool and normal (V, 3) are the constraints. A node without element must be fixed.
     Elements joined by faces form a rigid cluster; clusters that share only a corner or an edge are hinged there. A
-    rigid motion is resisted if it moves the constraints by more than a fraction `felt` of it, on average.
+    rigid motion is resisted if it moves the constraints by more than a fraction `tolerance` of it, on average.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float 
     piece = _label_components(cluster, cluster.max() + 1 + node, cluster.max() + 1 + count)[cluster]
     for number in np.unique(piece):
         mine = piece == number
-        free, at = _count_free_motions(mesh.nodes, held, normal, cluster[mine], node[mine], felt)
+        free, at = _count_free_motions(mesh.nodes, held, normal, cluster[mine], node[mine], tolerance)
         if free == 0:
             continue
         hinged = len(np.unique(cluster[mine])) > 1
@@ -51,7 +51,7 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, felt: float 
         )
 
 
-def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, felt: float = 1e-6) -> np.ndarray:
+def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, tolerance: float = 1e-6) -> np.ndarray:
     """Return tetrahedra (n,) that can move rigidly: without fixed nodes or, if `slides`, sufficient slide normals."""
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
     cluster, nodes = _label_clusters(anatomy.mesh.tets), anatomy.mesh.nodes
@@ -61,7 +61,7 @@ def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, felt: float = 1
         node = np.unique(anatomy.mesh.table[mine])
         if not anatomy.held[node].any():
             one = np.zeros(len(node), np.int64)
-            if _count_free_motions(nodes, anatomy.held, normal, one, node, felt)[0]:
+            if _count_free_motions(nodes, anatomy.held, normal, one, node, tolerance)[0]:
                 loose.append(mine)
     return np.concatenate(loose) if loose else np.zeros(0, np.int64)
 
@@ -81,7 +81,7 @@ def _label_clusters(tets: np.ndarray) -> np.ndarray:
 
 
 def _count_free_motions(
-    nodes: np.ndarray, held: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray, felt: float
+    nodes: np.ndarray, held: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray, tolerance: float
 ) -> tuple[int, int]:
     """Return the number of unresisted rigid motions, and the cluster that moves most in one of them.
 
@@ -108,4 +108,4 @@ def _count_free_motions(
     equations = int(held[node].sum() + (normal[node] != 0.0).any(axis=1).sum() + len(one))
     values, vectors = np.linalg.eigh((resisted.T @ resisted).toarray())
     amount = np.abs(vectors[:, 0]).reshape(-1, 6).max(axis=1)
-    return int((values <= felt**2 * max(equations, 1)).sum()), int(names[np.argmax(amount)])
+    return int((values <= tolerance**2 * max(equations, 1)).sum()), int(names[np.argmax(amount)])

@@ -49,7 +49,7 @@ class WarpFields:
         (3, I, J, K) [m]: undeformed position x moves to x + forward(x). Also called *modelling*.
     backward
         (3, I, J, K) [m]: deformed position y was at y + backward(y). Also called *resampling*.
-    gone
+    resected
         (I, J, K) bool: nodes in resected tissue, in the undeformed configuration.
     least
         Least Jacobian determinants of the two fields, and least relative volume of a tetrahedron.
@@ -61,7 +61,7 @@ class WarpFields:
     grid: Grid
     forward: np.ndarray
     backward: np.ndarray
-    gone: np.ndarray
+    resected: np.ndarray
     least: tuple[float, float, float]
     reach: float
 
@@ -164,9 +164,9 @@ def warp_fields(
     backward, least_backward = invert_on_grid(grid, body, displacement, forward)
     made()
     share = float((compute_signed_volumes(mesh.nodes + displacement, mesh.tets) / mesh.volumes).min())
-    gone = np.zeros(grid.shape, bool)
+    resected = np.zeros(grid.shape, bool)
     if len(mesh.tets) < len(anatomy.mesh.tets):
-        gone = interpolate_in_tetrahedra(grid, anatomy.mesh.nodes, anatomy.mesh.tets, displacement)[1]
-        gone &= ~interpolate_in_tetrahedra(grid, mesh.nodes, mesh.tets, displacement)[1]
+        resected = interpolate_in_tetrahedra(grid, anatomy.mesh.nodes, anatomy.mesh.tets, displacement)[1]
+        resected &= ~interpolate_in_tetrahedra(grid, mesh.nodes, mesh.tets, displacement)[1]
     least = least_forward, least_backward, share
-    return WarpFields(grid, forward, backward, gone, least, compute_reach(displacement))
+    return WarpFields(grid, forward, backward, resected, least, compute_reach(displacement))

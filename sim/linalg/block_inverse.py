@@ -29,22 +29,22 @@ class Exchange:
     ----------
     block
         Unknowns per block; temporary memory is proportional to it.
-    share
+    memory_fraction
         Fraction of the free memory that may be used.
-    longest
+    max_seconds
         Maximum duration [s].
-    trial
+    trial_size
         Size of the matrix product that measures the speed of a device.
     """
 
     block: int = 4096
-    share: float = 0.9
-    longest: float = 40.0
-    trial: int = 4096
+    memory_fraction: float = 0.9
+    max_seconds: float = 40.0
+    trial_size: int = 4096
 
 
 @cache
-def measure_rate_of_work(where: str, trial: int = Exchange.trial) -> float:
+def measure_rate_of_work(where: str, trial: int = Exchange.trial_size) -> float:
     """Measure multiply-adds per second in double precision, by the second of two matrix products of size `trial`."""
     one = torch.ones((trial, trial), dtype=torch.float64, device=where)
     spent = 0.0
@@ -65,9 +65,9 @@ def can_exchange(count: int, where: str, besides: int = 0, settings: Exchange = 
     if not torch.cuda.is_available():
         return False
     free, _ = torch.cuda.mem_get_info(where)
-    if exchange_bytes(count, settings) + besides >= settings.share * free:
+    if exchange_bytes(count, settings) + besides >= settings.memory_fraction * free:
         return False
-    return count**3 / 2 < settings.longest * measure_rate_of_work(where, settings.trial)
+    return count**3 / 2 < settings.max_seconds * measure_rate_of_work(where, settings.trial_size)
 
 
 def to_half_rows(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[torch.Tensor]:

@@ -22,13 +22,13 @@ class Columns:
     ----------
     block
         Nodes whose columns are computed together, always by the same arithmetic: the cache affects time, never values.
-    most_bytes, fewest_blocks
+    max_bytes, min_blocks
         Maximum size of the cached columns [bytes]; minimum number of cached blocks, if these are larger.
     """
 
     block: int = 16
-    most_bytes: int = 2**28
-    fewest_blocks: int = 8
+    max_bytes: int = 2**28
+    min_blocks: int = 8
 
 
 class Compliance:
@@ -59,7 +59,7 @@ class Compliance:
         self.columns = view(replace(device, precision="float64").allocate(len(self.rows), len(self.rows)))
         self.known = np.zeros(len(nodes), bool)
         size = self._width * problem.rows * np.dtype(device.precision).itemsize
-        self._kept = max(columns.fewest_blocks, columns.most_bytes // size)
+        self._kept = max(columns.min_blocks, columns.max_bytes // size)
         self._block = lru_cache(self._kept)(self._compute_columns)
 
     def apply(self, force: Any) -> Any:

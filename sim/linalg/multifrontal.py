@@ -38,19 +38,19 @@ class Factorisation:
 
     Parameters
     ----------
-    few
+    max_separate_sweeps
         Right-hand sides up to which separate sweeps are faster than matrix products.
-    strip
+    strip_size
         Right-hand sides of one sweep, so that they stay in a core's cache.
-    singular
+    pivot_tolerance
         A pivot below this fraction of its diagonal entry counts as zero: the remaining digits are round-off.
     fronts
         Sizes of the fronts.
     """
 
-    few: int = 3
-    strip: int = 128
-    singular: float = 1e-13
+    max_separate_sweeps: int = 3
+    strip_size: int = 128
+    pivot_tolerance: float = 1e-13
     fronts: FrontSizes = FRONT_SIZES
 
 
@@ -95,7 +95,7 @@ class Factor:
         self._precision, self._settings = precision, settings
         with limit_to_one_thread():
             values, self._panels = factorise_panels(
-                sp.csc_array(free[order][:, order]), fronts, precision, settings.singular
+                sp.csc_array(free[order][:, order]), fronts, precision, settings.pivot_tolerance
             )
         self._sweep = Sweep(fronts, values, precision)
 
@@ -127,7 +127,7 @@ class Factor:
             if reached[panel.front.first : panel.front.stop].any():
                 reached[panel.front.border] = True
                 panels.append(panel)
-        out, size = np.empty((len(rows), len(rows)), self._precision), self._settings.strip
+        out, size = np.empty((len(rows), len(rows)), self._precision), self._settings.strip_size
 
         def fill(firsts: range) -> None:
             for first in firsts:
@@ -141,7 +141,7 @@ class Factor:
         return out
 
     def _solve_columns(self, x: np.ndarray) -> np.ndarray:
-        if x.shape[1] <= self._settings.few:
+        if x.shape[1] <= self._settings.max_separate_sweeps:
             return self._sweep.solve(x)
         # BLAS threads wait for one another at every front, very long where other processes use their cores.
         with limit_to_one_thread():

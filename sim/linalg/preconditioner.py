@@ -27,21 +27,21 @@ class Preconditioning:
 
     Parameters
     ----------
-    largest_factor
+    max_factorised
         Unknowns above which multigrid is faster than a factor on the CPU. For 17,000 nodes, multigrid and factor:
         set-up 6.8 and 7.1 s; application 16 and 11 ms for one load case, 51 and 83 ms for eight. CUDA inverts what
         fits.
-    largest_smoothed_factor
+    max_smoothed_factorised
         The same for smoothed strains, which couple neighbours of neighbours: their factor has more entries.
-    largest_last
+    max_coarsest_nodes
         Maximum nodes, of six unknowns each, of the last level of algebraic multigrid, which is factorised.
     smoother
         Smoother of every level.
     """
 
-    largest_factor: int = 50_000
-    largest_smoothed_factor: int = 40_000
-    largest_last: int = 1_000
+    max_factorised: int = 50_000
+    max_smoothed_factorised: int = 40_000
+    max_coarsest_nodes: int = 1_000
     smoother: Chebyshev = CHEBYSHEV
 
 
@@ -74,7 +74,7 @@ def choose_preconditioner(
             lifted = _build_corner_preconditioner(stiffness, space, constraint, device, settings)
             name = f"p-multigrid on {name_of(lifted.coarse)}"
             return TwoLevel(lifted, project_to_free(stiffness, constraint), device, name, settings.smoother)
-        if space.element == "smoothed" and problem.rows > settings.largest_smoothed_factor:
+        if space.element == "smoothed" and problem.rows > settings.max_smoothed_factorised:
             # Averaging reduces the stiffness, so that the coarse solver never overshoots.
             coarse = _build_solver(unsmoothed(step), constraint, space.nodes, device, settings)
             name = f"two levels on {name_of(coarse)}"
@@ -140,13 +140,13 @@ def _build_solver(
     """Build the solver of K (3N, 3N) over free nodes at points (N, 3): direct if fast enough, else multigrid."""
     basis = constraint.build_basis()
     count = len(basis.indptr) - 1
-    if _can_invert(count, device) if device.on_cuda else count <= settings.largest_factor:
+    if _can_invert(count, device) if device.on_cuda else count <= settings.max_factorised:
         return build_direct(stiffness, basis, find_moved_nodes(basis), device)
     from .amg import build_multigrid_cycle, build_rigid_motions
 
     motions = basis @ (basis.T @ build_rigid_motions(points))
     blocks, coarse = project_to_free(stiffness, constraint), partial(build_direct, device=device)
-    return build_multigrid_cycle(blocks, motions, coarse, device, settings.largest_last, settings.smoother)
+    return build_multigrid_cycle(blocks, motions, coarse, device, settings.max_coarsest_nodes, settings.smoother)
 
 
 def _can_invert(count: int, device: Device) -> bool:

@@ -29,7 +29,7 @@ class RestStiffnessSolver:
         Maximum iterations of these.
     tolerance
         Relative residual of the linear solves.
-    largest_factor
+    max_factorised
         Unknowns up to which the solves justify a factor of their own on the CPU. For 17,000 smoothed nodes it takes
         12 s, and a solve 10 ms instead of 295 with two levels.
     """
@@ -38,12 +38,12 @@ class RestStiffnessSolver:
     preconditioner: Preconditioner
     inner: int
     tolerance: float = 1e-9
-    largest_factor: int = 60_000
+    max_factorised: int = 60_000
 
     @cached_property
     def exact(self) -> Preconditioner | None:
         """Inverse of the undeformed stiffness in the problem's precision, if available or worth it for many solves."""
-        pays = not self.problem.device.on_cuda and self.problem.rows <= self.largest_factor
+        pays = not self.problem.device.on_cuda and self.problem.rows <= self.max_factorised
         return build_rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
 
     def solve(self, force: wp.array) -> wp.array:

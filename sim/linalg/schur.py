@@ -25,12 +25,12 @@ class Condensing:
     ----------
     round_off
         Entries up to this fraction of the largest are round-off of a subtraction, and count as zero.
-    strip
+    strip_size
         Columns solved together: bounds the memory.
     """
 
     round_off: float = 1e-9
-    strip: int = 256
+    strip_size: int = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,8 @@ def condense_exterior(
     rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > settings.round_off * abs(whole).max())
     stiffness = beyond[rows][:, rows].toarray()
     far = sp.csc_array(basis[:, ~np.isin(find_moved_nodes(basis), nodes)])
-    follow, taken = _compute_reduction(whole, far, sp.csc_array(whole[part[rows]].T), problem.device, settings.strip)
+    across = sp.csc_array(whole[part[rows]].T)
+    follow, taken = _compute_reduction(whole, far, across, problem.device, settings.strip_size)
     stiffness -= taken
     return Condensation(rows, (stiffness + stiffness.T) / 2, follow)
 

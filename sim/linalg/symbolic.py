@@ -19,17 +19,17 @@ class FrontSizes:
 
     Parameters
     ----------
-    leaf
+    leaf_size
         Whole subtrees with at most this number of unknowns are one front.
-    zeros
+    max_zeros
         Two fronts are joined if that stores at most this number of zeros: another dense product costs as much.
-    most_above
+    max_fronts_above
         Division stops when this number of fronts is above the parts.
     """
 
-    leaf: int = 64
-    zeros: int = 1000
-    most_above: int = 30
+    leaf_size: int = 64
+    max_zeros: int = 1000
+    max_fronts_above: int = 30
 
 
 FRONT_SIZES = FrontSizes()
@@ -65,9 +65,9 @@ def build_fronts(
     links = np.ones(int(across.sum()), np.int8), (first[across], second[across])
     graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
     graph += graph.T  # an entry may be zero by round-off, and not stored, on one side only
-    order = order_by_dissection(graph, settings.leaf)
+    order = order_by_dissection(graph, settings.leaf_size)
     groups = _group_nodes(sp.csr_array(graph[order][:, order]), weight[order], settings)
-    divided = _split_subtrees(groups, weight[order], parts, settings.most_above)
+    divided = _split_subtrees(groups, weight[order], parts, settings.max_fronts_above)
     inner = np.concatenate([np.zeros(0, int), *(groups[number][0] for part in divided for number in part)])
     order, place = order[inner], np.argsort(inner)
     weight = weight[order]
@@ -85,7 +85,7 @@ def build_fronts(
     return np.argsort(np.argsort(order)[member], kind="stable"), fronts
 
 
-def order_by_dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf) -> np.ndarray:
+def order_by_dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf_size) -> np.ndarray:
     """Compute an order (N,) of a symmetric graph's nodes with little fill: nested dissection.
 
     By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by level sets, with more fill, until
@@ -148,7 +148,7 @@ def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) 
         if above != -1:
             below[above] += below[node]
     for node in reversed(range(count)):
-        if parent[node] != -1 and below[parent[node]] <= settings.leaf:
+        if parent[node] != -1 and below[parent[node]] <= settings.leaf_size:
             top[node] = top[parent[node]]
     members: dict[int, list[int]] = {}
     for node in range(count):
@@ -175,7 +175,7 @@ def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) 
         k, m = int(weight[own].sum()), size(border)
         for child in children[last]:
             inner, _, j, n = groups[child]
-            if entries(j + k, m) <= entries(k, m) + entries(j, n) + settings.zeros:
+            if entries(j + k, m) <= entries(k, m) + entries(j, n) + settings.max_zeros:
                 own, k = inner + own, k + j
                 del groups[child]
         groups[last] = own, border, k, m

@@ -42,16 +42,16 @@ class NearPart:
 
     Parameters
     ----------
-    share, largest_opening
+    share, max_opening
         Fraction of the tetrahedra; largest fraction of surface vertices that may be free.
-    iterations, stragglers
+    max_iterations, straggler_fraction
         Maximum L-BFGS iterations in one cycle, which ends earlier if at most this fraction of the load cases is live.
     """
 
     share: float = 0.2
-    largest_opening: float = 0.25
-    iterations: int = 100
-    stragglers: float = 0.05
+    max_opening: float = 0.25
+    max_iterations: int = 100
+    straggler_fraction: float = 0.05
 
 
 NEAR_PART = NearPart()  # Default.
@@ -85,7 +85,7 @@ class BatchElimination:
     near: NearPart = NEAR_PART
 
     def descend(
-        self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
+        self, start: wp.array, tolerance: np.ndarray, most: int, warm_start: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
         """Solve as `Lbfgs.descend`, in at most `most` cycles; returns no L-BFGS history."""
 
@@ -115,7 +115,7 @@ class BatchElimination:
         self.part.put(combine_columns(device, load, -1.0, g, load))
         part.constraint.project_nodes(g)
         found = self.lbfgs.descend(
-            near, np.zeros(count), self.near.iterations, None, force, self.near.stragglers, (g, back)
+            near, np.zeros(count), self.near.max_iterations, None, force, self.near.straggler_fraction, (g, back)
         )
         missed = combine_columns(device, found.u, -1.0, aim, aim)
         followed = wp.empty_like(out)
@@ -128,7 +128,7 @@ class BatchElimination:
 
 def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
     """Return True if the free surface is a small part of the whole surface, and not empty."""
-    return 0 < len(open_vertices(space, constraint)) <= NEAR_PART.largest_opening * len(np.unique(space.mesh.surface))
+    return 0 < len(open_vertices(space, constraint)) <= NEAR_PART.max_opening * len(np.unique(space.mesh.surface))
 
 
 def find_near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray:

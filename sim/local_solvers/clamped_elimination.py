@@ -34,25 +34,25 @@ class ClampedSize:
 
     Parameters
     ----------
-    strained, largest
+    min_strain, max_fraction
         Norm of the displacement gradient of the linear solution above which tetrahedra belong to the part, the most
         strained first, up to this fraction of all; and all tetrahedra that touch these.
-    left, added
+    residual_factor, max_added
         If a cycle leaves more than this fraction of the residual, and at most this number of nodes have most of the
         residual outside the part, these nodes and what touches them are added to it.
-    cuts
+    max_backtracks
         Maximum backtracking steps of one step.
     """
 
-    strained: float = 0.15
-    largest: float = 0.03
-    left: float = 0.8
-    added: int = 60
-    cuts: int = 6
+    min_strain: float = 0.15
+    max_fraction: float = 0.03
+    residual_factor: float = 0.8
+    max_added: int = 60
+    max_backtracks: int = 6
 
 
 # Few cycles, because each is expensive; the line search already rejects steps whose forces explode.
-CLAMPED_CYCLE_LIMITS = CycleLimits(cycles=30, patience=8, rise=1e6, forcing=0.1, enough=0.5)
+CLAMPED_CYCLE_LIMITS = CycleLimits(cycles=30, patience=8, max_rise=1e6, forcing=0.1, tolerance_factor=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class ClampedElimination:
     size: ClampedSize = ClampedSize()
 
     def descend(
-        self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
+        self, start: wp.array, tolerance: np.ndarray, most: int, warm_start: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
         """Solve as `Lbfgs.descend`, for one load case, in at most `most` cycles; returns no L-BFGS history."""
         chosen, part, pairs = (
@@ -105,7 +105,7 @@ class ClampedElimination:
             s, y = _copy_to_host(new.u) - _copy_to_host(now.u), _copy_to_host(new.g) - _copy_to_host(now.g)
             if s @ y > 0.0:
                 pairs = pairs.add_pair(s, y, after - z)
-            if new.free[0] > self.size.left * now.free[0]:
+            if new.free[0] > self.size.residual_factor * now.free[0]:
                 more = self._find_residual_nodes(_copy_to_host(new.g), part.nodes)
                 if len(more):
                     chosen |= self._mark_touching(more)
@@ -122,15 +122,15 @@ class ClampedElimination:
 
         Its residual is not finite if no trial step is accepted.
         """
-        promised, device = -float(_copy_to_host(now.g) @ d), self.problem.device
+        predicted, device = -float(_copy_to_host(now.g) @ d), self.problem.device
         way = device.upload(d[:, None])
         length = float(self.problem.longest_step(now.u, way)[0])
-        for _ in range(self.size.cuts if promised > 0.0 else 0):
+        for _ in range(self.size.max_backtracks if predicted > 0.0 else 0):
             new = judge(part.settle(combine_columns(device, now.u, length, way, wp.empty_like(way)), force))
             slope = float(_copy_to_host(new.g) @ d)
-            if new.finite[0] and not is_step_too_long(slope, promised):
+            if new.finite[0] and not is_step_too_long(slope, predicted):
                 return new
-            length *= backtrack_by_slopes(slope, promised)
+            length *= backtrack_by_slopes(slope, predicted)
         return replace(now, free=np.full(1, np.inf))
 
     def _compute_response(self, g: wp.array) -> np.ndarray:
@@ -145,7 +145,7 @@ class ClampedElimination:
         table = self.space.table
         slope = np.einsum("tai,taj->tij", u.reshape(-1, 3)[table[:, :4]], self._slopes)
         strain = np.sqrt(np.einsum("tij,tij->t", slope, slope))
-        most = min(int(self.size.largest * len(strain)), int((strain > self.size.strained).sum()))
+        most = min(int(self.size.max_fraction * len(strain)), int((strain > self.size.min_strain).sum()))
         return table[np.argsort(-strain)[:most]].ravel()
 
     def _find_residual_nodes(self, g: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -155,7 +155,7 @@ class ClampedElimination:
         """
         square = (g.reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
         square[nodes] = 0.0
-        most = np.argsort(-square)[: self.size.added]
+        most = np.argsort(-square)[: self.size.max_added]
         return most if 2.0 * square[most].sum() > square.sum() else most[:0]
 
     def _mark_touching(self, nodes: np.ndarray) -> np.ndarray:

@@ -27,14 +27,14 @@ class PartLimits:
 
     Parameters
     ----------
-    iterations, stale
+    max_iterations, stale_iterations
         Maximum L-BFGS iterations before Newton; iterations above which the factor is recomputed.
     outer, inner
         Limits of Newton, as in `Accuracy`.
     """
 
-    iterations: int = 400
-    stale: int = 25
+    max_iterations: int = 400
+    stale_iterations: int = 25
     outer: int = 60
     inner: int = 60
 
@@ -86,7 +86,7 @@ class ClampedPart:
         part, device, values, limits = self._part, self._part.device, u.numpy().copy(), self._limits
         part.constraint.begin(values[self._rows], None, None)
         begun = device.upload(values[self._rows])
-        found = self._lbfgs.descend(begun, np.zeros(1), limits.iterations, None, np.array([force]))
+        found = self._lbfgs.descend(begun, np.zeros(1), limits.max_iterations, None, np.array([force]))
         end = found.u
         if found.status[0] == NOT_FINITE:
             return u
@@ -95,7 +95,7 @@ class ClampedPart:
             aim = float(np.clip(force / scale[0], MIN_TOLERANCE[device.precision], 0.5))
             budget = Accuracy(aim, limits.outer, limits.inner, device.precision, 0)
             end = find_equilibrium(part, NewtonCG(self._factor, limits.inner), end, budget).u
-        if found.steps[0] > limits.stale:
+        if found.steps[0] > limits.stale_iterations:
             self._begin_at(end)
         values[self._rows] = end.numpy()
         return device.upload(values)

@@ -48,26 +48,26 @@ class ContactState:
 class Batch:
     """Live load cases, on the last axis of arrays (.., b); each has its own direction, step length and proximal term.
 
-    judge, now
+    evaluator, state
         Function that evaluates residuals, and the present state.
-    pairs, model
+    history, model
         L-BFGS histories, or models of strained tissue that correct the undeformed compliance; `stale` (b,) bool marks
         models to be recomputed.
     force, rest, aimed
         (3n, b) [N] forces of the tools; (3N, b) [m] linear response of the undeformed mesh to the residual with these
         forces; (3n, b) [N] forces after the step, if there is a model.
-    x, length, promised
+    x, length, predicted
         (3N, b) [m] direction, (b,) trial step length, and (b,) [J] predicted decrease.
-    drag, slow, steps
+    proximal, stalled, steps
         (b,) proximal coefficient, steps in a row with little progress, and number of steps.
-    failed, waiting, gone
+    failed, waiting, ended
         (b,) failures in a row to find the tools' forces; (b,) bool: to be tried again; (b,) bool: ended, but still in
         the arrays.
     """
 
-    judge: ResidualEvaluator
-    now: ContactState
-    pairs: BatchHistory
+    evaluator: ResidualEvaluator
+    state: ContactState
+    history: BatchHistory
     model: StrainedModel | None
     stale: np.ndarray
     force: Any
@@ -75,36 +75,36 @@ class Batch:
     aimed: Any
     x: Any
     length: np.ndarray
-    promised: np.ndarray
-    drag: np.ndarray
-    slow: np.ndarray
+    predicted: np.ndarray
+    proximal: np.ndarray
+    stalled: np.ndarray
     steps: np.ndarray
     failed: np.ndarray
     waiting: np.ndarray
-    gone: np.ndarray
+    ended: np.ndarray
 
     def keep(self, stay: np.ndarray) -> None:
         """Keep these load cases (k,)."""
-        self.judge, self.now = self.judge.select(stay), self.now.select(stay)
+        self.evaluator, self.state = self.evaluator.select(stay), self.state.select(stay)
         if self.model is None:
-            self.pairs.keep(stay)
+            self.history.keep(stay)
         else:
             self.model = self.model.select(stay)
         self.force, self.aimed = self.force[:, stay], self.aimed[:, stay]
         self.rest, self.x = self.rest[:, stay], self.x[:, stay]
-        for name in ("stale", "length", "promised", "drag", "slow", "steps", "failed", "waiting", "gone"):
+        for name in ("stale", "length", "predicted", "proximal", "stalled", "steps", "failed", "waiting", "ended"):
             setattr(self, name, getattr(self, name)[stay])
 
     @property
-    def learnt(self) -> np.ndarray:
+    def updated(self) -> np.ndarray:
         """True (b,) where a load case has a model that differs from the undeformed stiffness."""
-        return self.pairs.count > 0 if self.model is None else self.model.bent
+        return self.history.count > 0 if self.model is None else self.model.bent
 
     def forget(self, columns: np.ndarray) -> None:
         """Reset the model of some load cases (k,) to the undeformed stiffness."""
         if not len(columns):
             return
         if self.model is None:
-            self.pairs.forget(columns)
+            self.history.forget(columns)
         else:
             self.model.forget(columns)

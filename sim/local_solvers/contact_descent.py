@@ -70,7 +70,7 @@ class ContactDescent:
         """Compliance at the touchable nodes, followed by those that a model of strained tissue may include."""
         exact = is_exact(self.preconditioner)
         own = self.barrier.touchable
-        nodes = self.barrier.select_nodes(self.strains.near) if exact else own
+        nodes = self.barrier.select_nodes(self.strains.max_candidates) if exact else own
         compliance = Compliance(self.problem, self.preconditioner, nodes)
         if exact and self.problem.device.on_cuda:  # all columns take as long as one
             compliance.ensure_known(np.arange(len(nodes)) < len(own))
@@ -119,20 +119,20 @@ class ContactDescent:
             ready = np.ones(count, bool)
             while True:
                 over = ready & self._find_ended(batch, tolerance[live], most)
-                done = over & (batch.now.relative <= tolerance[live])
+                done = over & (batch.state.relative <= tolerance[live])
                 if (ready & ~over).any():
                     over |= self._compute_directions(batch, ready & ~over, tolerance[live])
                 if over.any():
                     leave = np.flatnonzero(over)
                     there = live[leave]
-                    view(result)[:, there] = batch.now.u[:, leave]
-                    status[there] = np.where(done, DONE, np.where(batch.now.finite, LIVE, NOT_FINITE))[leave]
-                    steps[there], residual[there] = batch.steps[leave], batch.now.relative[leave]
-                    batch.gone |= over
-                    if batch.gone.all():
+                    view(result)[:, there] = batch.state.u[:, leave]
+                    status[there] = np.where(done, DONE, np.where(batch.state.finite, LIVE, NOT_FINITE))[leave]
+                    steps[there], residual[there] = batch.steps[leave], batch.state.relative[leave]
+                    batch.ended |= over
+                    if batch.ended.all():
                         return Descended(result, status, steps, residual, {})
-                    if batch.gone.mean() >= limits.crowd:
-                        stay = np.flatnonzero(~batch.gone)
+                    if batch.ended.mean() >= limits.ended_fraction:
+                        stay = np.flatnonzero(~batch.ended)
                         batch.keep(stay)
                         live = live[stay]
                 ready = self._try_steps(batch)
@@ -143,15 +143,15 @@ class ContactDescent:
         force, none = self._compute_balancing_forces(now), np.zeros(count)
         rest = self._compute_response(now.smooth, force)
         model = None
-        if self._strained is not None and count <= self.strains.columns:
+        if self._strained is not None and count <= self.strains.max_cases:
             model = self._strained.build_model(start, np.arange(count))
         pairs = BatchHistory(self.problem.device, self.problem.rows, count if model is None else 0)
         slow, steps, failed = np.zeros((3, count), int)
-        stale, waiting, gone = np.zeros((3, count), bool)
+        stale, waiting, ended = np.zeros((3, count), bool)
         return Batch(
-            judge=judge, now=now, pairs=pairs, model=model, stale=stale, force=force, rest=rest, aimed=force + 0.0,
-            x=0.0 * rest, length=none, promised=none.copy(), drag=none.copy(),
-            slow=slow, steps=steps, failed=failed, waiting=waiting, gone=gone,
+            evaluator=judge, state=now, history=pairs, model=model, stale=stale, force=force, rest=rest,
+            aimed=force + 0.0, x=0.0 * rest, length=none, predicted=none.copy(), proximal=none.copy(),
+            stalled=slow, steps=steps, failed=failed, waiting=waiting, ended=ended,
         )  # fmt: skip
 
     def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
@@ -159,27 +159,26 @@ class ContactDescent:
 
         Return early if it needs what only the other path has: more workspace for touched nodes, or Newton.
         """
-        known, judge, limits = None, batch.judge, self.limits
+        known, judge, limits = None, batch.evaluator, self.limits
         if batch.model is None or not steps.set_tools(judge.constant):
             return
-        batch.now, batch.force, batch.rest, batch.x = steps.hold(batch.now, batch.force, batch.rest)
+        batch.state, batch.force, batch.rest, batch.x = steps.hold(batch.state, batch.force, batch.rest)
         while not self._find_ended(batch, tolerance, most).any():
             self._rebuild_models(batch, np.ones(1, bool))
             if batch.model is not known:
                 known = batch.model
                 steps.load(known)
-            said = steps.compute_direction(
-                self._compute_force_tolerance(batch, tolerance)[0], batch.drag[0], bool(self._find_nonconvex(batch)[0])
-            )
+            force_tolerance = self._compute_force_tolerance(batch, tolerance)[0]
+            said = steps.compute_direction(force_tolerance, batch.proximal[0], bool(self._find_nonconvex(batch)[0]))
             if said[STATUS] == TOO_MANY_TOUCHED:
                 return
             if self._increase_proximal_term(batch, said[[STATUS]] != SOLVED).any():
                 return
             if batch.waiting.any():
                 # Its model may have been reset.
-                known = None if batch.failed[0] % limits.times == 0 else known
+                known = None if batch.failed[0] % limits.max_failures == 0 else known
                 continue
-            batch.promised[:] = said[PREDICTED_DECREASE]
+            batch.predicted[:] = said[PREDICTED_DECREASE]
             while True:
                 t, ahead, free, scale = read_step_result(said, judge.square)
                 there, misled = self._take_steps(batch, t, ahead, free)
@@ -188,20 +187,20 @@ class ContactDescent:
                 said = steps.shorten_step(batch.length[0])
             if there.any():
                 steps.move_to_last_step()
-                batch.now.free[:], batch.now.scale[:] = free, scale
+                batch.state.free[:], batch.state.scale[:] = free, scale
             else:  # its model has been reset
                 known = None
 
     def _find_ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
         """Return the load cases (b,) that have ended, in equilibrium or not."""
-        lost = (batch.slow >= self.limits.patience) | (batch.steps >= most) | ~batch.now.finite
-        return lost | (batch.now.relative <= tolerance)
+        lost = (batch.stalled >= self.limits.patience) | (batch.steps >= most) | ~batch.state.finite
+        return lost | (batch.state.relative <= tolerance)
 
     def _rebuild_models(self, batch: Batch, wanted: np.ndarray) -> None:
         """Recompute the stale models of the load cases `wanted` (b,) bool."""
         renewed = np.flatnonzero(wanted & batch.stale)
         if batch.model is not None and self._strained is not None and len(renewed):
-            fresh = self._strained.build_model(from_view(self.problem.device, batch.now.u), renewed)
+            fresh = self._strained.build_model(from_view(self.problem.device, batch.state.u), renewed)
             batch.stale &= ~wanted
             if fresh is not None:
                 batch.model = batch.model.merge_columns(renewed, fresh)
@@ -209,7 +208,7 @@ class ContactDescent:
     def _compute_force_tolerance(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
         """Return the relative tolerance (b,) of the tools' forces."""
         limits = self.limits
-        return np.maximum(limits.forcing * np.minimum(batch.now.relative, 1.0), limits.enough * tolerance)
+        return np.maximum(limits.forcing * np.minimum(batch.state.relative, 1.0), limits.tolerance_factor * tolerance)
 
     def _compute_directions(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
         """Compute directions of the load cases `wanted` (b,) bool; return which (b,) have failed finally.
@@ -232,22 +231,22 @@ class ContactDescent:
 
     def _find_nonconvex(self, batch: Batch) -> np.ndarray:
         """Return the load cases (b,) whose model may be non-convex."""
-        return batch.failed >= 2 * self.limits.times
+        return batch.failed >= 2 * self.limits.max_failures
 
     def _increase_proximal_term(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
         """Increase the proximal coefficient where no forces were found (b,) bool; return which (b,) fail finally."""
-        times = self.limits.times
+        times = self.limits.max_failures
         batch.waiting = waiting
         batch.failed = np.where(waiting, batch.failed + 1, 0)
         fresh = waiting & (batch.failed % times == 0)
         batch.forget(np.flatnonzero(fresh))
-        batch.drag = np.where(fresh, 0.0, np.where(waiting, self._raise_drag(batch.drag), batch.drag))
+        batch.proximal = np.where(fresh, 0.0, np.where(waiting, self._raise_drag(batch.proximal), batch.proximal))
         return batch.failed >= 3 * times
 
     def _compute_steps(self, batch: Batch, some: np.ndarray, force: Any) -> None:
         """Compute directions, step lengths and predicted decreases of load cases (k,) under forces (3n, b)."""
-        now, device = batch.now, self.problem.device
-        on = select_columns(device, some, len(batch.drag))
+        now, device = batch.state, self.problem.device
+        on = select_columns(device, some, len(batch.proximal))
         if batch.model is None:
             batch.rest[:, on] += self.compliance.spread((force - batch.force)[:, on])
             batch.force[:, on] = force[:, on]
@@ -255,19 +254,19 @@ class ContactDescent:
         else:
             batch.aimed[:, on] = force[:, on]
             batch.x[:, on] = -batch.rest[:, on] - self.compliance.apply(self._compute_forces(batch, force)[0])[:, on]
-        if batch.pairs.most:
-            learnt = batch.pairs.get_history(some)
-            batch.x[:, on] -= learnt.compute_motion(learnt.compute_weights(self._pull(now.smooth, force)[:, on]))
+        if batch.history.most:
+            history = batch.history.get_history(some)
+            batch.x[:, on] -= history.compute_motion(history.compute_weights(self._pull(now.smooth, force)[:, on]))
         longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.x))
         batch.length[some] = longest[some]
-        batch.promised[some] = -_compute_dots(now.whole[:, on], batch.x[:, on])
+        batch.predicted[some] = -_compute_dots(now.whole[:, on], batch.x[:, on])
 
     def _solve_forces(
         self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
     ) -> tuple[Any, np.ndarray]:
         """Solve for the tools' forces (3n, k) on the model for load cases (k,); return which (k,) are solved."""
-        rows, now = self._rows, batch.now
-        on = select_columns(self.problem.device, some, len(batch.drag))
+        rows, now = self._rows, batch.state
+        on = select_columns(self.problem.device, some, len(batch.proximal))
         barrier, known = self.barrier.reduce(some), batch.force[:, on]
         if barrier is None:
             return known, np.ones(len(some), bool)
@@ -277,13 +276,13 @@ class ContactDescent:
             free = free - self._compute_forces(batch, batch.force)[1]
             soft = replace(soft, own=batch.model.own[on])
         free, here = free[:, on], to_double(now.u[rows][:, on])
-        if batch.pairs.most:
-            learnt = batch.pairs.get_history(some)
-            own = to_double(learnt.sw[:, :, rows])
-            soft = replace(soft, learnt=own, middle=to_double(learnt.middle))
-            weights = learnt.compute_weights(self._pull(now.smooth, batch.force)[:, on])
+        if batch.history.most:
+            history = batch.history.get_history(some)
+            own = to_double(history.sw[:, :, rows])
+            soft = replace(soft, history=own, middle=to_double(history.middle))
+            weights = history.compute_weights(self._pull(now.smooth, batch.force)[:, on])
             free = free - (to_double(weights).mT @ own)[:, 0].T
-        return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.drag[some], most)
+        return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.proximal[some], most)
 
     def _compute_forces(self, batch: Batch, force: Any) -> tuple[Any, Any]:
         """Compute additional forces (3N, b) [N] on the undeformed mesh: changes of contact forces, model corrections.
@@ -300,7 +299,7 @@ class ContactDescent:
         return out, cast_like(batch.rest, compliance.compute_motion(own)[: len(self._rows)])
 
     def _raise_drag(self, drag: np.ndarray) -> np.ndarray:
-        return np.maximum(self.limits.drag, self.limits.growth * drag)
+        return np.maximum(self.limits.proximal, self.limits.growth * drag)
 
     def _try_steps(self, batch: Batch) -> np.ndarray:
         """Evaluate the trial step of each load case that does not wait; return which (b,) need another direction.
@@ -308,12 +307,12 @@ class ContactDescent:
         That is, they accepted the step, because the energy still falls there, or nearly so; or backtracking left almost
         no step: then they stay, and their model is reset.
         """
-        now, going = batch.now, ~(batch.waiting | batch.gone)
+        now, going = batch.state, ~(batch.waiting | batch.ended)
         t = np.where(going, batch.length, 0.0)
         if not going.any():
-            return batch.waiting & ~batch.gone
+            return batch.waiting & ~batch.ended
         new = self._evaluate_state(
-            batch.judge, now.u + to_library(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
+            batch.evaluator, now.u + to_library(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
         )
         ahead = np.where(new.finite, _compute_dots(new.whole, batch.x), np.inf)
         there, misled = self._take_steps(batch, t, ahead, new.free)
@@ -322,34 +321,34 @@ class ContactDescent:
             some = select_columns(self.problem.device, taken, len(t))
             self._update_models(batch, new, taken, some)
             now.put(taken, some, new)
-        return misled | there | (batch.waiting & ~batch.gone)
+        return misled | there | (batch.waiting & ~batch.ended)
 
     def _take_steps(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
         """Accept steps of length t (b,), or shorten them; return which (b,) are accepted, and which reset their model.
 
         The decision uses the slopes `ahead` (b,) and the residuals `free` (b,) there.
         """
-        limits, now, going = self.limits, batch.now, ~(batch.waiting | batch.gone)
-        far = going & is_step_too_long(ahead, batch.promised) & (t > limits.least)
-        batch.length, there = np.where(far, t * backtrack_by_slopes(ahead, batch.promised), t), going & ~far
-        misled = far & (batch.length < limits.shortest)
+        limits, now, going = self.limits, batch.state, ~(batch.waiting | batch.ended)
+        far = going & is_step_too_long(ahead, batch.predicted) & (t > limits.accepted_length)
+        batch.length, there = np.where(far, t * backtrack_by_slopes(ahead, batch.predicted), t), going & ~far
+        misled = far & (batch.length < limits.reset_length)
         if misled.any():  # reading from the GPU only if needed
-            misled &= batch.learnt
-        well = (t > limits.long) & (free <= limits.left * now.free)
-        eased = np.where(batch.drag >= limits.drag, batch.drag / limits.growth, 0.0)
-        worse = (t < limits.long) | (free > now.free)
+            misled &= batch.updated
+        well = (t > limits.min_good_step) & (free <= limits.residual_factor * now.free)
+        eased = np.where(batch.proximal >= limits.proximal, batch.proximal / limits.growth, 0.0)
+        worse = (t < limits.min_good_step) | (free > now.free)
         drag = np.where(
-            there & well, eased, np.where(misled | (there & worse), self._raise_drag(batch.drag), batch.drag)
+            there & well, eased, np.where(misled | (there & worse), self._raise_drag(batch.proximal), batch.proximal)
         )
-        batch.drag, batch.steps = drag, batch.steps + (misled | there)
-        batch.stale |= there & (free > limits.stale * now.free)
-        batch.slow = np.where(there & well, 0, batch.slow + (misled | there))
+        batch.proximal, batch.steps = drag, batch.steps + (misled | there)
+        batch.stale |= there & (free > limits.stale_factor * now.free)
+        batch.stalled = np.where(there & well, 0, batch.stalled + (misled | there))
         batch.forget(np.flatnonzero(misled))
         return there, misled
 
     def _update_models(self, batch: Batch, new: ContactState, taken: np.ndarray, some: Any) -> None:
         """Update the models with the accepted steps of load cases (k,); `some` is this selection for device arrays."""
-        now = batch.now
+        now = batch.state
         if batch.model is not None:
             batch.force[:, some] = batch.aimed[:, some]
             batch.rest[:, some] = self._compute_response(new.smooth[:, some], batch.force[:, some])
@@ -358,10 +357,10 @@ class ContactDescent:
         rest = self._compute_response(new.smooth[:, some], batch.force[:, some])
         way = rest - batch.rest[:, some]
         batch.rest[:, some] = rest
-        felt = np.flatnonzero((_compute_dots(moved, change) > self.limits.felt) & new.finite[taken])
-        if len(felt):
-            on = select_columns(self.problem.device, felt, len(taken))
-            batch.pairs.update_history(taken[felt], moved[:, on], change[:, on], way[:, on])
+        positive = np.flatnonzero((_compute_dots(moved, change) > self.limits.min_curvature) & new.finite[taken])
+        if len(positive):
+            on = select_columns(self.problem.device, positive, len(taken))
+            batch.history.update_history(taken[positive], moved[:, on], change[:, on], way[:, on])
 
     def _compute_balancing_forces(self, now: ContactState) -> Any:
         """Return the forces (3n, b) at touched nodes that balance the smooth terms."""

@@ -36,29 +36,29 @@ class ForceLimits:
 
     Parameters
     ----------
-    iterations, cuts
+    max_iterations, max_backtracks
         Maximum iterations, and backtracking steps of one iteration.
-    few, most
+    first_capacity, max_capacity
         Touched nodes: capacity of the first workspace, and of the largest.
-    late
+    nonconvex_iterations
         Iterations after which a model that is still not convex is given up.
-    rounded
+    diagonal_shift
         Shift of the compliance matrix, relative to its mean diagonal, that makes it positive definite despite rounding.
-    bytes
+    max_bytes
         Memory of the matrices of all load cases solved at once [bytes].
     """
 
-    iterations: int = 60
-    cuts: int = 20
-    few: int = 64
-    most: int = 300
-    late: int = 12
-    rounded: float = 1e-6
-    bytes: int = 2**30
+    max_iterations: int = 60
+    max_backtracks: int = 20
+    first_capacity: int = 64
+    max_capacity: int = 300
+    nonconvex_iterations: int = 12
+    diagonal_shift: float = 1e-6
+    max_bytes: int = 2**30
 
 
 FORCES = ForceLimits()  # Default.
-NONCONVEX = ForceLimits(late=FORCES.iterations)
+NONCONVEX = ForceLimits(nonconvex_iterations=FORCES.max_iterations)
 """Limits for a model that need not be convex."""
 
 
@@ -66,14 +66,14 @@ NONCONVEX = ForceLimits(late=FORCES.iterations)
 class ContactCompliance:
     """Compliance C at n nodes: that of the undeformed mesh, plus the updates of b load cases.
 
-    `learnt` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision are L-BFGS updates, None without history. `own`
+    `history` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision are L-BFGS updates, None without history. `own`
     (b, 3n, 3n) in single precision is the change by strained tissue. `room` is `allocate_scratch`, perhaps cached.
     """
 
     rest: Compliance
     device: Device
     room: Callable[[int, int, int], Scratch]
-    learnt: Any = None
+    history: Any = None
     middle: Any = None
     own: Any = None
 
@@ -90,7 +90,7 @@ class ContactCompliance:
         out.rest, out.known = from_view(self.device, self.rest.columns), self.device.upload(self.rest.known, wp.int32)
         none = wp.zeros((count, 0, 0), dtype=wp.float32, device=self.device.name)
         kinds = (
-            ("learnt", self.device.allocate(count, 0, n)),
+            ("history", self.device.allocate(count, 0, n)),
             ("middle", self.device.allocate(count, 0, 0)),
             ("own", none),
         )
@@ -98,7 +98,7 @@ class ContactCompliance:
             known = getattr(self, name)
             some = None if known is None else known[select_columns(self.device, columns, len(known))]
             setattr(out, name, nothing if some is None else from_view(self.device, some))
-        out.rounded = rounded
+        out.diagonal_shift = rounded
         return out
 
 
@@ -120,9 +120,9 @@ def solve_contact_forces(
     """
     out, status = known + 0.0, np.full(here.shape[1], OPEN)
     soft.ensure_known(known)
-    for room in (limits.few, limits.most):
+    for room in (limits.first_capacity, limits.max_capacity):
         status[status == TOO_MANY_TOUCHED] = OPEN
-        each = max(1, limits.bytes // (4 * 8 * (3 * room) ** 2))
+        each = max(1, limits.max_bytes // (4 * 8 * (3 * room) ** 2))
         while (status == OPEN).any():
             some = np.flatnonzero(status == OPEN)[:each]
             on = select_columns(soft.device, some, len(status))
@@ -161,7 +161,7 @@ def _solve_forces(
     touching = barrier.build_stage(columns)
     kernel, model, ends = (
         build_kernel(device, functions),
-        soft.build_model(columns, limits.rounded),
+        soft.build_model(columns, limits.diagonal_shift),
         allocate_ends(limits, room),
     )
 
@@ -177,7 +177,8 @@ def _solve_forces(
 def allocate_ends(limits: ForceLimits, room: int) -> Ends:
     """Return the limits for the kernel, with capacity for `room` touched nodes."""
     ends = Ends()
-    ends.iterations, ends.cuts, ends.late, ends.room = limits.iterations, limits.cuts, limits.late, room
+    ends.max_iterations, ends.max_backtracks = limits.max_iterations, limits.max_backtracks
+    ends.nonconvex_iterations, ends.capacity = limits.nonconvex_iterations, room
     return ends
 
 
@@ -195,7 +196,7 @@ def allocate_scratch(device: Device, nodes: int, columns: int, room: int) -> Scr
         setattr(out, name, numbers(columns, 3 * nodes).transpose())
     out.place, out.acts = counts(columns, nodes).transpose(), counts(columns, nodes).transpose()
     out.touched, out.acting, out.counts = counts(columns, nodes), counts(columns, nodes), counts(columns, 2)
-    out.learnt = numbers(columns, 2 * PAIRS, size)
+    out.middle_history = numbers(columns, 2 * PAIRS, size)
     for name in ("soft", "stiff", "both", "system"):
         setattr(out, name, numbers(columns, size, size))
     out.x, out.y = numbers(columns, size), numbers(columns, size)

@@ -126,12 +126,12 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     def pull(model: ComplianceModel, s: Scratch, c: int, me: int) -> int:
         """List the nodes on which the change acts, compute the L-BFGS weights of it, and return their number."""
         m = listed(s.change, s.acts, s.acting, s.counts, ACTING, c, me)
-        pairs = model.learnt.shape[1]
+        pairs = model.history.shape[1]
         for p in range(me, pairs, threads):
             own = wp.float64(0.0)
             for a in range(3 * m):
                 j = 3 * s.acting[c, a // 3] + a % 3
-                own += model.learnt[c, p, j] * s.change[j, c]
+                own += model.history[c, p, j] * s.change[j, c]
             s.x[c, p] = own
         wait()
         for p in range(me, pairs, threads):
@@ -158,10 +158,10 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                         if s.place[i // 3, c] >= 0:
                             soft = between(model, c, i, j)
                         sums[q] += soft * share
-            for p in range(model.learnt.shape[1]):
+            for p in range(model.history.shape[1]):
                 share = s.y[c, p]
                 for q in range(wide):
-                    sums[q] += model.learnt[c, p, wp.min(first + q * threads, size - 1)] * share
+                    sums[q] += model.history[c, p, wp.min(first + q * threads, size - 1)] * share
             for q in range(wide):
                 if first + q * threads < size:
                     out[first + q * threads, c] = -sums[q]
@@ -177,29 +177,29 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             for a in range(3 * m):
                 j = 3 * s.acting[c, a // 3] + a % 3
                 own += between(model, c, row, j) * s.change[j, c]
-            for p in range(model.learnt.shape[1]):
-                own += model.learnt[c, p, row] * s.y[c, p]
+            for p in range(model.history.shape[1]):
+                own += model.history[c, p, row] * s.y[c, p]
             s.at[row, c] = own
         wait()
 
     @wp.func
     def soften(model: ComplianceModel, m: int, s: Scratch, c: int, me: int) -> wp.float64:
         """Assemble the compliance between m touched nodes, and return its mean diagonal."""
-        pairs = model.learnt.shape[1]
+        pairs = model.history.shape[1]
         for j in range(me, 3 * m, threads):
             row = 3 * s.touched[c, j // 3] + j % 3
             for p in range(pairs):
                 own = wp.float64(0.0)
                 for q in range(pairs):
-                    own += model.middle[c, p, q] * model.learnt[c, q, row]
-                s.learnt[c, p, j] = own
+                    own += model.middle[c, p, q] * model.history[c, q, row]
+                s.middle_history[c, p, j] = own
         wait()
         for i in range(me // across, 3 * m, down):
             first = 3 * s.touched[c, i // 3] + i % 3
             for j in range(i + me % across, 3 * m, across):
                 own = between(model, c, first, 3 * s.touched[c, j // 3] + j % 3)
                 for p in range(pairs):
-                    own += model.learnt[c, p, first] * s.learnt[c, p, j]
+                    own += model.history[c, p, first] * s.middle_history[c, p, j]
                 s.soft[c, i, j] = own
         wait()
         own = wp.float64(0.0)
@@ -207,7 +207,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             own += s.soft[c, i, i]
         mean = total(own) / wp.float64(3 * m)
         for i in range(me, 3 * m, threads):
-            s.soft[c, i, i] = s.soft[c, i, i] + model.rounded * mean
+            s.soft[c, i, i] = s.soft[c, i, i] + model.diagonal_shift * mean
         wait()
         return mean
 
@@ -305,10 +305,10 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
         feel(s.w, here, stage, near, s, c, me)
         m = listed(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
-        if m > ends.room or not are_known(model, m, s, c):
+        if m > ends.capacity or not are_known(model, m, s, c):
             wait()
             if me == 0:
-                status[c] = wp.where(m > ends.room, TOO_MANY_TOUCHED, UNKNOWN)
+                status[c] = wp.where(m > ends.capacity, TOO_MANY_TOUCHED, UNKNOWN)
             return
         sound = wp.bool(False)  # True if `soft` holds a valid Cholesky factor
         if m > 0:
@@ -334,7 +334,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
         feel(s.w, here, stage, near, s, c, me)
         convex, verdict = wp.bool(True), wp.int32(OPEN)
-        for step in range(ends.iterations + 1):
+        for step in range(ends.max_iterations + 1):
             fresh = not alike(s.slope, s.place, c, me)
             if fresh:
                 m = listed(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
@@ -344,9 +344,9 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             left = dot(s.change, s.change, c, me)
             if left <= tolerance[c] * tolerance[c] * dot(s.slope, s.slope, c, me):
                 verdict = wp.int32(SOLVED)
-            elif m > ends.room:
+            elif m > ends.capacity:
                 verdict = wp.int32(TOO_MANY_TOUCHED)
-            elif step == ends.iterations or not (convex or step <= ends.late):
+            elif step == ends.max_iterations or not (convex or step <= ends.nonconvex_iterations):
                 verdict = wp.int32(NO_EQUILIBRIUM)
             elif fresh and not are_known(model, m, s, c):
                 verdict = wp.int32(UNKNOWN)
@@ -370,9 +370,9 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             own = wp.float64(0.0)
             for r in range(me, size, threads):
                 own += (s.slope[r, c] - s.force[r, c]) * s.way[r, c]
-            promised = -total(own)
+            predicted = -total(own)
             t = longest(s.w, s.way, stage, near, c, me)
-            for cut in range(ends.cuts + 1):
+            for cut in range(ends.max_backtracks + 1):
                 for r in range(me, size, threads):
                     s.at[r, c] = s.w[r, c] + t * s.way[r, c]
                 wait()
@@ -381,11 +381,11 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 for r in range(me, size, threads):
                     own += (s.slope[r, c] - s.force[r, c] - t * s.change[r, c]) * s.way[r, c]
                 ahead = total(own)
-                if ahead <= overshoot * wp.abs(promised) or cut == ends.cuts:
+                if ahead <= overshoot * wp.abs(predicted) or cut == ends.max_backtracks:
                     break
                 share = middle
-                if promised > wp.float64(0.0) and wp.isfinite(ahead):
-                    share = wp.clamp(promised / (promised + ahead), least, most)
+                if predicted > wp.float64(0.0) and wp.isfinite(ahead):
+                    share = wp.clamp(predicted / (predicted + ahead), least, most)
                 t = t * share
             for r in range(me, size, threads):
                 s.force[r, c] = s.force[r, c] + t * s.change[r, c]

@@ -46,7 +46,7 @@ class ContactPreconditioner:
         self._felt = None
         if columns == 1:
             nodes, curvature = self._barrier.get_pressed()
-            if 0 < len(nodes) <= FORCES.most:
+            if 0 < len(nodes) <= FORCES.max_capacity:
                 # BLAS threads wait for one another, very long where other processes use their cores.
                 with limit_to_one_thread():
                     rows = (3 * nodes[:, None] + np.arange(3)).ravel()

@@ -103,7 +103,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
     def report(
         status: wp.array(dtype=wp.int32),
         length: wp.array(dtype=scalar),
-        promised: wp.array(dtype=wp.float64),
+        predicted: wp.array(dtype=wp.float64),
         ahead: wp.array(dtype=wp.float64),
         sums: wp.array2d(dtype=wp.float64),
         own: wp.array2d(dtype=wp.float64),
@@ -113,7 +113,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         """Write the results for the host to one array."""
         out[STATUS] = wp.float64(status[0])
         out[TRIED_LENGTH] = wp.float64(length[0])
-        out[PREDICTED_DECREASE] = -promised[0]
+        out[PREDICTED_DECREASE] = -predicted[0]
         out[TRIAL_SLOPE] = ahead[0]
         loudest = wp.float64(0.0)
         for i in range(own.shape[0]):
@@ -176,10 +176,10 @@ class ContactSteps:
         self._every = device.upload(np.arange(len(compliance.nodes))[None], wp.int32)
         self._model = ComplianceModel()
         self._model.rest, self._model.known = self._compliance[0], device.upload(compliance.known, wp.int32)
-        self._model.learnt, self._model.middle = exact.allocate(1, 0, len(compliance.rows)), exact.allocate(1, 0, 0)
+        self._model.history, self._model.middle = exact.allocate(1, 0, len(compliance.rows)), exact.allocate(1, 0, 0)
         self._model.own = wp.zeros((1, count + 1, count + 1), dtype=wp.float32, device=name)
-        self._model.rounded = FORCES.rounded
-        self._scratch = allocate_scratch(exact, count // 3, 1, FORCES.few)
+        self._model.diagonal_shift = FORCES.diagonal_shift
+        self._scratch = allocate_scratch(exact, count // 3, 1, FORCES.first_capacity)
         self._exact, self._touch = exact, None
         self._status = wp.zeros(1, dtype=wp.int32, device=name)
         self._length = wp.zeros(1, dtype=device.scalar, device=name)
@@ -206,7 +206,7 @@ class ContactSteps:
         returned array is overwritten by the next call.
         """
         self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, drag
-        ends = allocate_ends(NONCONVEX if bent else FORCES, FORCES.few)
+        ends = allocate_ends(NONCONVEX if bent else FORCES, FORCES.first_capacity)
         return self._run("bent" if bent else "aim", lambda: self._compute_direction(ends))
 
     def shorten_step(self, length: float) -> np.ndarray:

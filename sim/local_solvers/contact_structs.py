@@ -10,27 +10,27 @@ OPEN, SOLVED, NO_EQUILIBRIUM, TOO_MANY_TOUCHED, UNKNOWN = (wp.constant(number) f
 class ComplianceModel:
     """Compliance of nodes: that of the undeformed mesh, transposed (3n, 3n), and the updates of b load cases.
 
-    `known` (n,): 1 if a node's column is computed. L-BFGS update: `learnt` (b, p, 3n), `middle` (b, p, p). `own`
-    (b, 3n, 3n) is the change by strained tissue, or (b, 0, 0). `rounded` is the shift of the matrix between touched
-    nodes, relative to its mean diagonal, that makes it positive definite.
+    `known` (n,): 1 if a node's column is computed. L-BFGS update: `history` (b, p, 3n), `middle` (b, p, p). `own`
+    (b, 3n, 3n) is the change by strained tissue, or (b, 0, 0). `diagonal_shift` is the shift of the matrix between
+    touched nodes, relative to its mean diagonal, that makes it positive definite.
     """
 
     rest: wp.array2d(dtype=wp.float64)
     known: wp.array(dtype=wp.int32)
-    learnt: wp.array3d(dtype=wp.float64)
+    history: wp.array3d(dtype=wp.float64)
     middle: wp.array3d(dtype=wp.float64)
     own: wp.array3d(dtype=wp.float32)
-    rounded: wp.float64
+    diagonal_shift: wp.float64
 
 
 @wp.struct
 class Ends:
-    """Limits of the iteration, as `contact_forces.ForceLimits`; `room` is the capacity for touched nodes."""
+    """Limits of the iteration, as `contact_forces.ForceLimits`; `capacity` is the capacity for touched nodes."""
 
-    iterations: wp.int32
-    cuts: wp.int32
-    late: wp.int32
-    room: wp.int32
+    max_iterations: wp.int32
+    max_backtracks: wp.int32
+    nonconvex_iterations: wp.int32
+    capacity: wp.int32
 
 
 @wp.struct
@@ -53,7 +53,7 @@ class Scratch:
     touched: wp.array2d(dtype=wp.int32)
     acting: wp.array2d(dtype=wp.int32)
     counts: wp.array2d(dtype=wp.int32)
-    learnt: wp.array3d(dtype=wp.float64)
+    middle_history: wp.array3d(dtype=wp.float64)
     soft: wp.array3d(dtype=wp.float64)
     stiff: wp.array3d(dtype=wp.float64)
     both: wp.array3d(dtype=wp.float64)

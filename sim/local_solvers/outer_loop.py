@@ -29,17 +29,17 @@ class CycleLimits:
         Maximum number of cycles.
     patience
         Cycles within which the residual must be halved; otherwise another solver takes over.
-    rise
+    max_rise
         Largest residual relative to the start's. Strong loads pass through large residuals; beyond this they diverge.
-    forcing, enough
+    forcing, tolerance_factor
         Residual of the local solution: fraction of the whole residual, or of the tolerance if larger.
     """
 
     cycles: int = 20
     patience: int = 5
-    rise: float = 30.0
+    max_rise: float = 30.0
     forcing: float = 0.03
-    enough: float = 0.3
+    tolerance_factor: float = 0.3
 
 
 DEFAULT_CYCLE_LIMITS = CycleLimits()  # Default.
@@ -62,7 +62,7 @@ def run_cycles(
     first, least, mark, idle = now.free, np.full(count, np.inf), np.full(count, np.inf), np.zeros(count, int)
     last = min(limits.cycles, most)
     for number in range(last + 1):
-        sane = now.finite & ~(now.free > limits.rise * first[live])
+        sane = now.finite & ~(now.free > limits.max_rise * first[live])
         # Diverging forces raise the scale, and so lower the relative residual.
         done = sane & (now.free <= first[live]) & (now.relative <= tolerance[live])
         better = done | (sane & (now.free <= np.fmin(first, least)[live]))
@@ -77,5 +77,6 @@ def run_cycles(
             break
         if len(stay) < len(live):
             judge, now, live = judge.select(stay), now.select(device, stay), live[stay]
-        now = cycle(judge, now, np.fmax(limits.forcing * now.free, limits.enough * tolerance[live] * now.scale))
+        goal = limits.tolerance_factor * tolerance[live] * now.scale
+        now = cycle(judge, now, np.fmax(limits.forcing * now.free, goal))
     return Descended(result, status, steps, residual, {})

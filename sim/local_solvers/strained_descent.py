@@ -28,7 +28,7 @@ from ..runtime.threads import limit_to_one_thread
 from .batch_elimination import open_vertices
 from .strained_part import StrainedPart, StrainLimits
 
-SINGLE_LIMITS = StrainLimits(nodes=320, cut=np.inf)
+SINGLE_LIMITS = StrainLimits(max_nodes=320, max_omitted=np.inf)
 """Limits for a single model, which has all the memory, and may be incomplete: L-BFGS corrects the remainder."""
 
 
@@ -38,14 +38,14 @@ class Renewal:
 
     Parameters
     ----------
-    served
+    max_served
         Maximum steps of a descent whose model is handed on to the next.
-    evaluations
+    max_evaluations
         L-BFGS evaluations without convergence, after which the model is recomputed at the present state.
     """
 
-    served: int = 4
-    evaluations: int = 8
+    max_served: int = 4
+    max_evaluations: int = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class StiffnessUpdate:
         return -lu_solve((self.factor, self.pivots), self.added @ motion[self.rows], check_finite=False)
 
     @property
-    def learnt(self) -> dict[str, np.ndarray]:
+    def warm_start(self) -> dict[str, np.ndarray]:
         """Entries for the `warm` data of a solution."""
         return {name: getattr(self, field)[None] for field, name in UPDATE_KEYS.items()}
 
@@ -122,14 +122,14 @@ class StrainedDescent:
         self._lbfgs = Lbfgs(problem, self._preconditioner)
 
     def descend(
-        self, start: wp.array, tolerance: np.ndarray, most: int, learnt: Mapping[str, np.ndarray] | None = None
+        self, start: wp.array, tolerance: np.ndarray, most: int, warm_start: Mapping[str, np.ndarray] | None = None
     ) -> Descended:
-        """Solve as `Lbfgs.descend`, for one load case; `learnt` is the model. The first call takes 0.5 s to prepare."""
+        """Solve as `Lbfgs.descend`, for one load case; `warm_start` is the model. The first call takes 0.5 s more."""
         self._part.prepare()
         u, left, steps = start, most, 0
-        self._preconditioner.stiffening = self.get_warm_start(learnt) or self._build_stiffness_update(u)
+        self._preconditioner.stiffening = self.get_warm_start(warm_start) or self._build_stiffness_update(u)
         while True:
-            some = min(left, self._renewal.evaluations)
+            some = min(left, self._renewal.max_evaluations)
             found = self._lbfgs.descend(u, tolerance, some)
             left, steps = left - some, steps + int(found.steps[0])
             if not len(found.left) or left <= 0:
@@ -137,8 +137,9 @@ class StrainedDescent:
             u = found.u
             self._preconditioner.stiffening = self._build_stiffness_update(u)
         stiffening, self._preconditioner.stiffening = self._preconditioner.stiffening, None
-        serves = learnt is not None and steps <= self._renewal.served
-        return replace(found, steps=np.array([steps]), learnt=stiffening.learnt if stiffening and serves else {})
+        serves = warm_start is not None and steps <= self._renewal.max_served
+        kept = stiffening.warm_start if stiffening and serves else {}
+        return replace(found, steps=np.array([steps]), warm_start=kept)
 
     def _build_stiffness_update(self, u: wp.array) -> StiffnessUpdate | None:
         """Compute the update at u (3N, 1) [m]; None if no tissue is strained."""
@@ -156,11 +157,11 @@ class StrainedDescent:
                 return None
             return StiffnessUpdate(compliance.rows[place], added, *lu_factor(system, True, check_finite=False))
 
-    def get_warm_start(self, learnt: Mapping[str, np.ndarray] | None) -> StiffnessUpdate | None:
+    def get_warm_start(self, warm_start: Mapping[str, np.ndarray] | None) -> StiffnessUpdate | None:
         """Read the update of an earlier descent of this problem from warm-start data; None if it does not fit."""
-        if learnt is None or any(name not in learnt for name in UPDATE_KEYS.values()):
+        if warm_start is None or any(name not in warm_start for name in UPDATE_KEYS.values()):
             return None
-        rows, added, factor, pivots = (np.asarray(learnt[name]) for name in UPDATE_KEYS.values())
+        rows, added, factor, pivots = (np.asarray(warm_start[name]) for name in UPDATE_KEYS.values())
         size = rows.shape[-1]
         shapes = [array.shape for array in (rows, added, factor, pivots)]
         if shapes != [(1, size), (1, size, size), (1, size, size), (1, size)]:
@@ -179,5 +180,5 @@ def build_strained_part(
 ) -> StrainedPart:
     """Build the finder of strained tissue for a mesh with a small opening: models use the nodes nearest to it."""
     distance, _ = KDTree(space.nodes[open_vertices(space, problem.constraint)]).query(space.nodes)
-    near = np.sort(np.argsort(distance, kind="stable")[: strains.near])
+    near = np.sort(np.argsort(distance, kind="stable")[: strains.max_candidates])
     return StrainedPart(problem, Compliance(problem, preconditioner, near), 0, strains)

@@ -37,7 +37,7 @@ class UpdatedModel:
     matrix: wp.array
 
     @property
-    def learnt(self) -> dict[str, np.ndarray]:
+    def warm_start(self) -> dict[str, np.ndarray]:
         """Entries for the `warm` data of a solution."""
         return {NODES_KEY: self.nodes.numpy(), MATRIX_KEY: self.matrix.numpy()}
 

@@ -38,32 +38,32 @@ class StrainLimits:
 
     Parameters
     ----------
-    least
+    min_strain
         |H|, H the displacement gradient: below it the undeformed stiffness is used.
-    nodes
+    max_nodes
         Maximum number of nodes of a model, those with the largest |H| first.
-    cut
+    max_omitted
         If nodes beyond this number are strained more than this, there is no model: it would be incomplete.
-    near
+    max_candidates
         Maximum number of candidate nodes: the touchable ones, and the nearest to them. Their compliance has three times
         as many rows.
-    columns
+    max_cases
         Largest batch with models; larger ones use L-BFGS pairs. Models would not be faster there: a launch lasts as
         long as its slowest load case, and the better model makes contact forces harder to solve for.
-    bytes
+    max_bytes
         Memory of the matrices inverted at once [bytes].
     """
 
-    least: float = 0.15
-    nodes: int = 160
-    cut: float = 0.3
-    near: int = 800
-    columns: int = 8
-    bytes: int = 2**31
+    min_strain: float = 0.15
+    max_nodes: int = 160
+    max_omitted: float = 0.3
+    max_candidates: int = 800
+    max_cases: int = 8
+    max_bytes: int = 2**31
 
 
 STRAIN_LIMITS = StrainLimits()  # Default.
-CUDA_STRAIN_LIMITS = StrainLimits(least=0.1, nodes=480, cut=0.5, near=1600)
+CUDA_STRAIN_LIMITS = StrainLimits(min_strain=0.1, max_nodes=480, max_omitted=0.5, max_candidates=1600)
 """Limits on a GPU, which inverts a larger model in less time than the saved steps take."""
 
 
@@ -151,7 +151,7 @@ class StrainedPart:
     def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: StrainLimits = STRAIN_LIMITS):
         device, nodes = problem.device, compliance.nodes
         self._problem, self.compliance, self._touchable, self._strains = problem, compliance, touchable, strains
-        self.size = 3 * min(strains.nodes, len(nodes))
+        self.size = 3 * min(strains.max_nodes, len(nodes))
         """Rows of the largest model."""
         self._near = device.upload(nodes, wp.int32)
         near = np.zeros(problem.rows // 3, bool)
@@ -179,8 +179,10 @@ class StrainedPart:
         strain = device.allocate(self._problem.rows // 3, count)
         for term, some in self._elements:
             term.raise_strain(some, u, picked, strain)
-        nodes, limit, numbers = choose_strained(device, view(strain)[view(self._near)], strains.least, strains.nodes)
-        if strains.cut < np.inf and float(limit.max()) > max(strains.cut, strains.least):
+        nodes, limit, numbers = choose_strained(
+            device, view(strain)[view(self._near)], strains.min_strain, strains.max_nodes
+        )
+        if strains.max_omitted < np.inf and float(limit.max()) > max(strains.max_omitted, strains.min_strain):
             return None
         wide = len(nodes) if full else int(numbers.max())
         place = wp.full((len(strain), count), -1, dtype=wp.int32, device=device.name)
@@ -207,7 +209,7 @@ class StrainedPart:
         shape = count, 3 * self._touchable + 1, 3 * self._touchable + 1
         own = view(wp.zeros(shape, dtype=wp.float32, device=device.name))
         matrix, axes = 0.0 * stiffer, to_library(device, np.arange(3))
-        each = max(1, self._strains.bytes // (6 * 8 * max(size, 1) ** 2))
+        each = max(1, self._strains.max_bytes // (6 * 8 * max(size, 1) ** 2))
         for first in range(0, count if size else 0, each):
             some = slice(first, first + each)
             rows = (3 * nodes[some][:, :, None] + axes).reshape(-1, size)

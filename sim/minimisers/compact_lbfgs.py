@@ -116,9 +116,9 @@ class BatchHistory:
         found = compute_middle(self._sy[place], self._yw[place])
         middle[np.arange(len(columns))[:, None, None], both[:, :, None], both[:, None, :]] = found
         own = self._sw[select_columns(self._device, columns, len(self.count))]
-        learnt = LbfgsHistory(own, to_library(self._device, middle.astype(self._device.precision)))
-        self._asked = columns, learnt
-        return learnt
+        history = LbfgsHistory(own, to_library(self._device, middle.astype(self._device.precision)))
+        self._asked = columns, history
+        return history
 
     def update_history(self, columns: np.ndarray, s: Any, y: Any, w: Any) -> None:
         """Add a newer pair s, y, w (3N, k) of some load cases (k,), and drop the oldest pair beyond `PAIRS`."""

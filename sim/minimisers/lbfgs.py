@@ -33,17 +33,17 @@ class Schedule:
 
     Parameters
     ----------
-    between
+    check_interval
         Iterations between two checks.
-    smaller
+    narrowing
         They move if the narrower width is at most this fraction of the present one.
     """
 
-    between: int = 1
-    smaller: float = 0.85
+    check_interval: int = 1
+    narrowing: float = 0.85
 
 
-CUDA_SCHEDULE = Schedule(between=2, smaller=0.75)  # A check stalls the GPU.
+CUDA_SCHEDULE = Schedule(check_interval=2, narrowing=0.75)  # A check stalls the GPU.
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Descended:
     status: np.ndarray
     steps: np.ndarray
     residual: np.ndarray
-    learnt: Mapping[str, np.ndarray]
+    warm_start: Mapping[str, np.ndarray]
 
     @property
     def left(self) -> np.ndarray:
@@ -92,7 +92,7 @@ class Lbfgs:
         start: wp.array,
         tolerance: np.ndarray,
         most: int,
-        learnt: Mapping[str, np.ndarray] | None = None,
+        history: Mapping[str, np.ndarray] | None = None,
         force: np.ndarray | None = None,
         stragglers: float = 0.0,
         ahead: tuple[wp.array, wp.array] | None = None,
@@ -100,8 +100,8 @@ class Lbfgs:
         """Minimise the potential of the batch that the problem has begun, from start (3N, b) [m], in `most` iterations.
 
         The start satisfies the constraints, and no footprint moves. A load case ends at its tolerance (b,), relative as
-        in `Problem.residual`, or where the 2-norm of the residual is at most force (b,) [N]. `learnt` is the history of
-        an earlier descent of the same problem near this state, if any; with None this descent returns no history
+        in `Problem.residual`, or where the 2-norm of the residual is at most force (b,) [N]. `history` is that of an
+        earlier descent of the same problem near this state, if any; with None this descent returns no history
         either. The descent stops when at most the fraction `stragglers` of all load cases is live. `ahead` holds the
         residual at the start and its preconditioned form (3N, b), if they are available. Each returned u is the last
         accepted state of its load case.
@@ -109,7 +109,7 @@ class Lbfgs:
         device, count = self._problem.device, start.shape[1]
         u, place = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
-        carried = learnt is not None and count <= MAX_CARRIED
+        carried = history is not None and count <= MAX_CARRIED
         if count == 0:
             return Descended(u, status, steps, residual, {})
         workspace, tried = self._get_workspace(count), 0
@@ -117,18 +117,18 @@ class Lbfgs:
             start,
             tolerance,
             np.zeros(count) if force is None else force,
-            (learnt or {}) if count <= MAX_CARRIED else {},
+            (history or {}) if count <= MAX_CARRIED else {},
         )
         if ahead is not None:
             workspace.set_direction(*ahead)
         while True:
-            more = min(self._schedule.between, most - tried)
+            more = min(self._schedule.check_interval, most - tried)
             workspace.iterate(more)
             tried += more
             now = workspace.columns["status"].numpy()[: len(place)]
             left = int((now == LIVE).sum())
             last = tried >= most or left <= stragglers * count
-            if last or (count > MAX_CARRIED and self._find_width(left) <= self._schedule.smaller * workspace.width):
+            if last or (count > MAX_CARRIED and self._find_width(left) <= self._schedule.narrowing * workspace.width):
                 leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
                 there = place[leave]
                 scatter_columns(device, workspace.columns["u"], there, u, leave)
@@ -136,8 +136,8 @@ class Lbfgs:
                     workspace.columns[name].numpy()[leave] for name in ("status", "steps", "residual")
                 )
                 if last:
-                    learnt = {name: to_rows_first(workspace.columns[name]) for name in HISTORY_KEYS} if carried else {}
-                    return Descended(u, status, steps, residual, learnt)
+                    history = {name: to_rows_first(workspace.columns[name]) for name in HISTORY_KEYS} if carried else {}
+                    return Descended(u, status, steps, residual, history)
                 stay = np.flatnonzero(now == LIVE)
                 place, before, workspace = place[stay], workspace, self._get_workspace(len(stay))
                 workspace.take(before, stay)

@@ -124,14 +124,14 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         tolerance: wp.array(dtype=wp.float64),
         force: wp.array(dtype=wp.float64),
         sums: wp.array2d(dtype=wp.float64),
-        promised: wp.array(dtype=wp.float64),
+        predicted: wp.array(dtype=wp.float64),
         # outputs
         status: wp.array(dtype=wp.int32),
         accepted: wp.array(dtype=wp.int32),
         steps: wp.array(dtype=wp.int32),
         cut: wp.array(dtype=wp.int32),
         t: wp.array(dtype=wp.float64),
-        gone: wp.array(dtype=wp.float64),
+        step_length: wp.array(dtype=wp.float64),
         residual: wp.array(dtype=wp.float64),
         slot: wp.array(dtype=wp.int32),
         aiming: wp.array(dtype=wp.int32),
@@ -155,11 +155,11 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         small = relative <= force[c]
         if scale > zero:
             relative = relative / wp.sqrt(scale)
-        first = promised[c] == wp.float64(wp.inf)
+        first = predicted[c] == wp.float64(wp.inf)
         done = finite and (small or relative <= tolerance[c])
-        if done or (finite and slope <= wp.float64(overshoot) * promised[c]):
+        if done or (finite and slope <= wp.float64(overshoot) * predicted[c]):
             accepted[c] = 1
-            gone[c] = t[c]
+            step_length[c] = t[c]
             residual[c] = relative
             cut[c] = 0
             if not first:
@@ -169,7 +169,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         else:
             share = wp.float64(kept)
             if finite:
-                share = wp.clamp(promised[c] / (promised[c] + slope), wp.float64(least_kept), wp.float64(most_kept))
+                share = wp.clamp(predicted[c] / (predicted[c] + slope), wp.float64(least_kept), wp.float64(most_kept))
             t[c] = share * t[c]
             cut[c] = cut[c] + 1
             if cut[c] > cuts:
@@ -184,7 +184,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
     @forward_kernel(module="unique")
     def aim(
         aiming: wp.array(dtype=wp.int32),
-        gone: wp.array(dtype=wp.float64),
+        step_length: wp.array(dtype=wp.float64),
         sums: wp.array2d(dtype=wp.float64),
         products: wp.array2d(dtype=wp.float64),
         # outputs
@@ -193,7 +193,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         known: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
         t: wp.array(dtype=wp.float64),
-        promised: wp.array(dtype=wp.float64),
+        predicted: wp.array(dtype=wp.float64),
         sg: wp.array2d(dtype=wp.float64),
         wg: wp.array2d(dtype=wp.float64),
         sy: wp.array3d(dtype=wp.float64),
@@ -211,27 +211,27 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             return
         zero = wp.float64(0.0)
         slope, gz = sums[slope_row, c], products[gz_row, c]
-        rise = slope + promised[c]
+        rise = slope + predicted[c]
         length = wp.float64(1.0)
-        if rise > zero and wp.isfinite(promised[c]):
-            length = wp.clamp(gone[c] * promised[c] / rise, wp.float64(least_kept), wp.float64(1.0))
+        if rise > zero and wp.isfinite(predicted[c]):
+            length = wp.clamp(step_length[c] * predicted[c] / rise, wp.float64(least_kept), wp.float64(1.0))
         n = int(-1)
-        # Also false at the start, where `promised` is infinite.
-        if rise > wp.float64(least_curvature) * promised[c] and products[yw_row, c] > zero:
+        # Also false at the start, where `predicted` is infinite.
+        if rise > wp.float64(least_curvature) * predicted[c] and products[yw_row, c] > zero:
             n = (head[c] + 1) % m
             for i in range(m):
                 change = products[m + i, c] - wg[i, c]
                 sy[i, n, c] = products[i, c] - sg[i, c]
                 yw[i, n, c] = change
                 yw[n, i, c] = change
-            sy[n, n, c] = gone[c] * rise
+            sy[n, n, c] = step_length[c] * rise
             yw[n, n, c] = products[yw_row, c]
             head[c] = n
             known[c] = wp.min(known[c] + 1, m)
             slot[c] = n
         size = known[c]
         for i in range(m):
-            sg[i, c] = wp.where(i == n, gone[c] * slope, products[i, c])
+            sg[i, c] = wp.where(i == n, step_length[c] * slope, products[i, c])
             wg[i, c] = wp.where(i == n, gz - products[gold_row, c], products[m + i, c])
         # Sorted by age, in registers: the recursion is sequential.
         by_s, by_w, along, across = weights(), weights(), weights(), weights()
@@ -275,7 +275,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             i = (head[c] - a + m) % m
             along_s[i, c] = scalar(by_s[a])
             along_w[i, c] = scalar(by_w[a])
-        promised[c] = decrease
+        predicted[c] = decrease
         t[c] = length
         if not (decrease > zero and wp.isfinite(decrease)):
             status[c] = STOPPED
@@ -287,7 +287,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         accepted: wp.array(dtype=wp.int32),
         known: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
-        gone: wp.array(dtype=wp.float64),
+        step_length: wp.array(dtype=wp.float64),
         along_s: wp.array2d(dtype=scalar),
         along_w: wp.array2d(dtype=scalar),
         new_g: wp.array2d(dtype=scalar),
@@ -304,7 +304,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         block, c = wp.tid()
         if accepted[c] == 0:
             return
-        taken, last, n = scalar(gone[c]), u.shape[0] - 1, slot[c]
+        taken, last, n = scalar(step_length[c]), u.shape[0] - 1, slot[c]
         step, direction = few_scalars(), few_scalars()
         for k in range(few):
             r = wp.min(few * block + k, last)

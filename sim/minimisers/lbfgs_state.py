@@ -37,12 +37,12 @@ def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
         "double": (
             wp.float64,
             {
-                **dict.fromkeys(("t", "promised", "residual", "tolerance", "force"), ()),
+                **dict.fromkeys(("t", "predicted", "residual", "tolerance", "force"), ()),
                 **dict.fromkeys(("sg", "wg"), (PAIRS,)),
                 **dict.fromkeys(("sy", "yw"), (PAIRS, PAIRS)),
                 "loud": terms,
             },
-            {"products": (2 * PAIRS + PRODUCTS,), "gone": (), "sums": (SUMS,), "own": terms},
+            {"products": (2 * PAIRS + PRODUCTS,), "step_length": (), "sums": (SUMS,), "own": terms},
         ),
         "whole": (
             wp.int32,
@@ -106,7 +106,7 @@ class Workspace:
         self._trial = ResidualArrays(a["new_g"], a["part"], a["sums"], a["own"])
 
     def begin(
-        self, start: wp.array, tolerance: np.ndarray, force: np.ndarray, learnt: Mapping[str, np.ndarray]
+        self, start: wp.array, tolerance: np.ndarray, force: np.ndarray, history: Mapping[str, np.ndarray]
     ) -> None:
         """Load a batch of at most `width` load cases; the first iteration evaluates its start (3N, b)."""
         a, device, spare = self.columns, self._problem.device, self.width - start.shape[1]
@@ -118,7 +118,7 @@ class Workspace:
             gather_columns(device, start, index, a["u"])
         else:
             wp.copy(a["u"], start)
-        for name, value in (("promised", np.inf), ("residual", np.inf), ("head", PAIRS - 1)):
+        for name, value in (("predicted", np.inf), ("residual", np.inf), ("head", PAIRS - 1)):
             a[name].fill_(value)
         # Load cases that only fill the workspace converge at once.
         a["tolerance"].assign(np.append(tolerance, np.full(spare, np.inf)))
@@ -126,7 +126,7 @@ class Workspace:
         constant, loud = compute_constant_gradients(self._problem, a["u"])
         wp.copy(a["constant"], constant)
         wp.copy(a["loud"], loud)
-        for name, rows_first in learnt.items():
+        for name, rows_first in history.items():
             a[name].assign(np.moveaxis(rows_first, 0, -1).reshape(a[name].shape))
         self.prepare()
 
@@ -137,8 +137,8 @@ class Workspace:
         gather_columns(device, g, index, a["g"])
         gather_columns(device, z, index, a["z"])
         combine_columns(device, a["d"], -1.0, a["z"], a["d"])
-        a["promised"].zero_()
-        add_dots(device, a["g"], a["z"], a["promised"])
+        a["predicted"].zero_()
+        add_dots(device, a["g"], a["z"], a["predicted"])
         a["t"].fill_(1.0)
         self._limit_steps()
 
@@ -194,14 +194,14 @@ class Workspace:
         step = lbfgs_trial_kernels.build_kernels(device, spread).step
         device.launch(step, (spread.count_threads(rows), count), [a["u"], a["t"], a["d"]], [a["v"]])
         found = compute_residual_arrays(problem, a["v"], a["constant"], a["d"], self._trial)
-        inputs = [a["loud"], found.own, a["tolerance"], a["force"], found.sums, a["promised"]]
-        names = ("status", "accepted", "steps", "cut", "t", "gone", "residual", "slot", "aiming")
+        inputs = [a["loud"], found.own, a["tolerance"], a["force"], found.sums, a["predicted"]]
+        names = ("status", "accepted", "steps", "cut", "t", "step_length", "residual", "slot", "aiming")
         device.launch(k.judge, one, inputs, [a[name] for name in names])
         if count == 1 and (not device.on_cuda or wp.is_conditional_graph_supported()):
             wp.capture_if(a["aiming"], self._compute_directions)
         else:
             self._compute_directions()
-        inputs = [a["status"], a["accepted"], a["known"], a["slot"], a["gone"], a["along_s"], a["along_w"]]
+        inputs = [a["status"], a["accepted"], a["known"], a["slot"], a["step_length"], a["along_s"], a["along_w"]]
         outputs = [a["u"], a["d"], a["g"], a["z"], a["s"], a["w"]]
         device.launch(k.move, (-(-rows // get_rows_per_thread(device)), count), [*inputs, found.g, a["new_z"]], outputs)
         self._limit_steps()
@@ -224,8 +224,8 @@ class Workspace:
             device.launch(build_multiply_kernel(device, PAIRS), dim, inputs, outputs)
         else:
             device.launch(k.multiply, (-(-rows // ROWS_PER_THREAD), count), inputs, outputs)
-        inputs = [a["aiming"], a["gone"], self._trial.sums, a["products"]]
-        outputs = [a["status"], a["head"], a["known"], a["slot"], a["t"], a["promised"]]
+        inputs = [a["aiming"], a["step_length"], self._trial.sums, a["products"]]
+        outputs = [a["status"], a["head"], a["known"], a["slot"], a["t"], a["predicted"]]
         outputs += [a["sg"], a["wg"], a["sy"], a["yw"], a["along_s"], a["along_w"]]
         device.launch(k.aim, (count,), inputs, outputs)
 

@@ -23,31 +23,31 @@ class Search:
 
     Parameters
     ----------
-    undershoot, refinements
+    undershoot, max_refinements
         A shortened step whose slope is still steeper than this fraction of the initial one is lengthened again, at most
         this number of times.
-    trials
+    max_trials
         Maximum number of trial lengths.
-    shortest
+    min_length
         Smallest accepted step length; a shorter one counts as failure.
     """
 
     undershoot: float = 0.5
-    refinements: int = 4
-    trials: int = 16
-    shortest: float = 1e-8
+    max_refinements: int = 4
+    max_trials: int = 16
+    min_length: float = 1e-8
 
 
-def is_step_too_long(ahead: Any, promised: Any) -> Any:
+def is_step_too_long(ahead: Any, predicted: Any) -> Any:
     """Return True for steps whose slope `ahead` exceeds `OVERSHOOT` times the predicted decrease, or is not finite."""
-    return ~(np.asarray(ahead) <= OVERSHOOT * np.abs(promised))
+    return ~(np.asarray(ahead) <= OVERSHOOT * np.abs(predicted))
 
 
-def backtrack_by_slopes(ahead: Any, promised: Any) -> Any:
+def backtrack_by_slopes(ahead: Any, predicted: Any) -> Any:
     """Return the backtracking factors of rejected steps: zero of the secant through both slopes, within bounds."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        kept = np.divide(promised, np.add(promised, ahead))
-    known = np.greater(promised, 0.0) & np.isfinite(ahead)
+        kept = np.divide(predicted, np.add(predicted, ahead))
+    known = np.greater(predicted, 0.0) & np.isfinite(ahead)
     return np.clip(np.where(known, kept, DEFAULT_BACKTRACK), MIN_BACKTRACK, MAX_BACKTRACK)
 
 
@@ -59,26 +59,26 @@ def search(problem: Problem, u: wp.array, direction: Direction, settings: Search
     slopes at both gives the next trial.
     """
     t = problem.longest_step(u, direction.d)
-    promised = direction.promised
+    predicted = direction.predicted
     low, high = np.zeros(len(t)), np.full(len(t), np.inf)
-    slope_low, slope_high = -promised, np.full(len(t), np.inf)
+    slope_low, slope_high = -predicted, np.full(len(t), np.inf)
     found, refinements = np.zeros(len(t), bool), np.zeros(len(t), int)
     trial = problem.device.allocate(*u.shape)
-    for _ in range(settings.trials):
+    for _ in range(settings.max_trials):
         g = problem.gradient(combine_columns(problem.device, u, t, direction.d, trial))
         problem.constraint.project(g)
         slope = compute_dots(problem.device, g, direction.d)
-        slope = np.where(np.isfinite(slope), slope, 3.0 * np.abs(promised))
-        far = ~found & (slope > OVERSHOOT * promised)
+        slope = np.where(np.isfinite(slope), slope, 3.0 * np.abs(predicted))
+        far = ~found & (slope > OVERSHOOT * predicted)
         near = ~found & ~far
         low, slope_low = np.where(near, t, low), np.where(near, slope, slope_low)
         high, slope_high = np.where(far, t, high), np.where(far, slope, slope_high)
-        short = near & (slope < -settings.undershoot * promised) & np.isfinite(high)
+        short = near & (slope < -settings.undershoot * predicted) & np.isfinite(high)
         refinements += short | (far & (low > 0.0))
-        found |= (near & ~short) | (refinements >= settings.refinements)
+        found |= (near & ~short) | (refinements >= settings.max_refinements)
         if found.all():
             break
         with np.errstate(invalid="ignore"):
             share = np.clip(slope_low / (slope_low - slope_high), MIN_BACKTRACK, MAX_BACKTRACK)
             t = np.where(found, low, low + share * (high - low))
-    return np.where(low >= settings.shortest, low, 0.0)
+    return np.where(low >= settings.min_length, low, 0.0)

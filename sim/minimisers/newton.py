@@ -30,7 +30,7 @@ class Newton:
         Inexact Newton: upper bound of the relative linear residual.
     patience
         If the residual has not fallen by a tenth in this number of iterations, it is compared with round-off.
-    still
+    max_stalled
         A load case stalls after this number of such iterations in a row with steps below the last digit of u. Fewer may
         come from a trust radius that a short step made small, and that doubles again.
     round_off
@@ -42,7 +42,7 @@ class Newton:
 
     largest_forcing: float = 0.25
     patience: int = 4
-    still: int = 16
+    max_stalled: int = 16
     round_off: float = 4.0
     stress_free: float = 100.0
 
@@ -92,7 +92,7 @@ def find_equilibrium(
         if stuck.any():
             moved = compute_norms(device, combine_columns(device, u, -1.0, before, wp.empty_like(u)))
             still[live] += stuck & (moved <= last_digit * compute_norms(device, u))
-            failed |= still[live] >= settings.still
+            failed |= still[live] >= settings.max_stalled
             drowned = stuck & ~open_gap & (free <= settings.round_off * round_off(problem, u, g))
             outcome[live[failed]] = Outcome.STALLED
             outcome[live[drowned]] = Outcome.ROUND_OFF

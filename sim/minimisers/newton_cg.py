@@ -19,7 +19,7 @@ class Direction:
     """Search direction d (3N, b) [m]; decrease (b,) [J] that the linear model predicts along it; linear iterations."""
 
     d: wp.array
-    promised: np.ndarray
+    predicted: np.ndarray
     iterations: int
 
 
@@ -85,8 +85,10 @@ class NewtonCG:
             problem, self._preconditioner, wp.clone(rhs), tolerance, self._most, self._radius
         )
         self._size, self._truncated = found.size, found.truncated
-        promised = compute_dots(device, rhs, found.x)
-        return Direction(close_constraints(device, found.x, gap), promised, found.iterations)
+        predicted = compute_dots(device, rhs, found.x)
+        if gap is not None:
+            combine_columns(device, found.x, 1.0, gap, found.x)
+        return Direction(found.x, predicted, found.iterations)
 
     def _compute_radius(self, taken: np.ndarray) -> np.ndarray:
         if self._radius is None:
@@ -105,8 +107,3 @@ def compute_right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None)
     problem.add_curvature(gap, pull)
     problem.constraint.project(pull)
     return combine_columns(device, rhs, -1.0, pull, rhs), compute_norms(device, gap) > 0.0
-
-
-def close_constraints(device: Device, x: wp.array, gap: wp.array | None) -> wp.array:
-    """Add the motion that closes the constraints, if any, to x (3N, b), in place."""
-    return x if gap is None else combine_columns(device, x, 1.0, gap, x)

@@ -91,23 +91,23 @@ class SeriesReading:
 
     Parameters
     ----------
-    answers
+    solutions
         (r, 3N): undeformed compliance, which is symmetric, times the weights of each sum.
     device
         Device of the forces.
     """
 
-    answers: np.ndarray
+    solutions: np.ndarray
     device: Device
 
     @property
     def count(self) -> int:
         """Number of functionals r."""
-        return len(self.answers)
+        return len(self.solutions)
 
     @cached_property
     def _times(self) -> Callable[[wp.array, wp.array], None]:
-        return build_product(self.answers, self.device)
+        return build_product(self.solutions, self.device)
 
     def read(self, force: wp.array) -> np.ndarray:
         """Compute the functionals (b, r) of the linear response to forces (3N, b) [N]."""

@@ -32,16 +32,16 @@ class MeshBytes:
 
     Parameters
     ----------
-    largest
+    max_bytes
         Maximum size of all arrays together [bytes]: nodes, cells, and a few fields.
-    inflation
+    max_ratio
         Maximum ratio to the file's size; a mesh does not inflate further, because its coordinates hardly repeat.
     small
         Size that every file may inflate to [bytes].
     """
 
-    largest: int = 4 * 1024**3
-    inflation: int = 100
+    max_bytes: int = 4 * 1024**3
+    max_ratio: int = 100
     small: int = 2**28
 
     def limit_bytes(self, size: int) -> int:
@@ -52,11 +52,11 @@ class MeshBytes:
         InputError
             A file that is larger than the limit itself.
         """
-        if size > self.largest:
+        if size > self.max_bytes:
             raise InputError(
-                f"its size is {size / 1e9:,.3g} GB: at most {self.largest / 1e9:.3g} GB are allowed. Mesh coarser."
+                f"its size is {size / 1e9:,.3g} GB: at most {self.max_bytes / 1e9:.3g} GB are allowed. Mesh coarser."
             )
-        return min(self.largest, max(self.small, self.inflation * size))
+        return min(self.max_bytes, max(self.small, self.max_ratio * size))
 
 
 MESH_BYTES = MeshBytes()

@@ -27,18 +27,18 @@ class MemoryBudget:
     ----------
     share
         Fraction of the free memory: the remainder is for other programs.
-    batches
+    batch_fraction
         Fraction of it for a batch of automatic size: half, to leave memory for results and other programs.
-    widest, widest_on_cuda
+    max_cases, max_cases_on_cuda
         Maximum load cases solved together: more do not use the processor better.
     group
         Linux folder with the memory limit and use of a control group, such as a container.
     """
 
     share: float = 0.9
-    batches: float = 0.5
-    widest: int = 64
-    widest_on_cuda: int = 16384
+    batch_fraction: float = 0.5
+    max_cases: int = 64
+    max_cases_on_cuda: int = 16384
     group: Path = Path("/sys/fs/cgroup")
 
 
@@ -65,8 +65,8 @@ def measure_host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
 
 def choose_batch_size(rows: int, device: Device, free: int, budget: MemoryBudget = MemoryBudget()) -> int:
     """Choose the number of load cases of `rows` = 3N unknowns to solve together within `free` bytes."""
-    widest = budget.widest_on_cuda if device.on_cuda else budget.widest
-    fitting = int(budget.batches * free / max(estimate_column_bytes(rows, device), 1))
+    widest = budget.max_cases_on_cuda if device.on_cuda else budget.max_cases
+    fitting = int(budget.batch_fraction * free / max(estimate_column_bytes(rows, device), 1))
     return int(np.clip(find_widest_workspace(device, fitting), 1, widest))
 
 

@@ -49,22 +49,22 @@ class Sharing:
 
     Parameters
     ----------
-    most
+    max_threads
         Maximum threads; more share the memory bandwidth, and were not measured.
-    least
+    min_size
         Minimum elements or unknowns: with fewer, the hand-over (0.1 ms) takes longer than the loop.
     """
 
-    most: int = 2
-    least: int = 3000
+    max_threads: int = 2
+    min_size: int = 3000
 
 
 def choose_threads(work: int, sharing: Sharing = Sharing()) -> int:
     """Choose the number of threads for a native loop over `work` elements or unknowns."""
-    if work < sharing.least:
+    if work < sharing.min_size:
         return 1
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(sharing.most, here)
+    return min(sharing.max_threads, here)
 
 
 def run_together(tasks: Sequence[Task]) -> None:

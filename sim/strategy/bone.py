@@ -27,10 +27,10 @@ def solve_off_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Seq
         return strategy.solve(cases, guesses)
     u = device.upload(guesses[-1]) if guesses else device.allocate(problem.rows, count)
     none, outcome = np.zeros(count, int), np.full(count, Outcome.ON_BONE, object)
-    answer = SolverResult(u, outcome, none, np.full(count, np.inf), np.zeros(count), strategy.inversion.count(u), 0)
-    anew, clear = np.zeros(count, bool), np.flatnonzero(~on_bone)
+    result = SolverResult(u, outcome, none, np.full(count, np.inf), np.zeros(count), strategy.inversion.count(u), 0)
+    restarted, clear = np.zeros(count, bool), np.flatnonzero(~on_bone)
     if len(clear):
         found = strategy.solve(cases.select(clear), [guess[:, clear] for guess in guesses])
-        answer.put(clear, found, device)
-        anew[clear] = found.anew
-    return replace(answer, gone=answer.reached, anew=anew)
+        result.put(clear, found, device)
+        restarted[clear] = found.restarted
+    return replace(result, path_fraction=result.reached, restarted=restarted)

@@ -93,7 +93,7 @@ def build_kernels(device: Device) -> FrameKernels:
     def renew(
         # outputs
         t: wp.array(dtype=wp.float64),
-        promised: wp.array(dtype=wp.float64),
+        predicted: wp.array(dtype=wp.float64),
         residual: wp.array(dtype=wp.float64),
         loud: wp.array2d(dtype=wp.float64),
         sg: wp.array2d(dtype=wp.float64),
@@ -107,7 +107,7 @@ def build_kernels(device: Device) -> FrameKernels:
     ):
         """Reset the iteration, so that it evaluates the start first; the L-BFGS history stays."""
         t[0] = wp.float64(0.0)
-        promised[0] = wp.float64(wp.inf)
+        predicted[0] = wp.float64(wp.inf)
         residual[0] = wp.float64(wp.inf)
         loud[0, 0] = wp.float64(0.0)
         for i in range(m):
@@ -217,7 +217,7 @@ class CapturedFrame:
         return self._before
 
     def take(
-        self, u: np.ndarray, past: np.ndarray | None, learnt: Mapping[str, np.ndarray], bent: UpdatedModel | None = None
+        self, u: np.ndarray, past: np.ndarray | None, pairs: Mapping[str, np.ndarray], bent: UpdatedModel | None = None
     ) -> None:
         """Load another state: displacements u (3N, 1) [m], the ones before them, and the L-BFGS history, if any."""
         columns = self._workspace.columns
@@ -227,7 +227,7 @@ class CapturedFrame:
         for name in ("s", "w", "known"):
             columns[name].zero_()
         columns["head"].fill_(PAIRS - 1)
-        for name, rows_first in learnt.items():
+        for name, rows_first in pairs.items():
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
 
     def update_model(self, steps: float) -> None:
@@ -270,7 +270,7 @@ class CapturedFrame:
         for kind, array in self._before.moved.items():
             wp.copy(array, self._workspace.state.moved[kind])
         self._skin.put(imprint)
-        names = ("t", "promised", "residual", "loud", "sg", "wg", "steps", "cut", "status")
+        names = ("t", "predicted", "residual", "loud", "sg", "wg", "steps", "cut", "status")
         outputs = [*(a[name] for name in names), self._tried, self._going, self._inverted]
         device.launch(k.renew, (1,), [], outputs)
         vectors = [self._past, *(a[name] for name in ("u", "d", "g", "z"))]

@@ -53,7 +53,7 @@ class Kept(Mapping[str, Any]):
         with self._lock:
             if self.state is not None:
                 self._own |= {name: to_rows_first(self.state.columns[name]) for name in HISTORY_KEYS}
-                self._own |= {} if self.bent is None else self.bent.learnt
+                self._own |= {} if self.bent is None else self.bent.warm_start
                 self.state = None
 
     def __getitem__(self, key: str) -> Any:
@@ -82,7 +82,7 @@ class FrameSequence:
     diagnostics
         Check of the equilibria for excessive strain.
     lock
-        Lock that the caller of `answer` holds.
+        Lock that the caller of `result` holds.
     source
         Name of the solver in the results.
     """
@@ -142,7 +142,7 @@ class FrameSequence:
         displacement.setflags(write=False)  # a later start uses the copy on the device
         inverted, fields = found[INVERTED : INVERTED + 1].astype(int), self._diagnostics.compute_strains(self._frame.u)
         outcome = self._diagnostics.mark_outcomes(np.array([Outcome.CONVERGED]), inverted, fields["strained"])
-        answer = Deformation(
+        result = Deformation(
             displacement=displacement,
             nodes=self._nodes,
             outcome=tuple(outcome),
@@ -158,8 +158,8 @@ class FrameSequence:
             strained=fields["strained"],
             source=self._source,
         )
-        self._last, self._here = ref(answer), ref(warm)
-        return answer
+        self._last, self._here = ref(result), ref(warm)
+        return result
 
     def _take(self, loads: Loads, start: Deformation, last: np.ndarray) -> bool:
         """Load a start onto the device; return False if it is not usable."""

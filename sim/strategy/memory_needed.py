@@ -142,7 +142,7 @@ def _find_invertible(unknowns: tuple[int, ...], device: Device) -> int:
     """Return the largest of these numbers that the GPU can invert, else the size of the last multigrid level."""
     from ..linalg.dense_inverse import can_invert
 
-    last = 6 * Preconditioning().largest_last
+    last = 6 * Preconditioning().max_coarsest_nodes
     return next((count for count in unknowns if can_invert(count, device)), last)
 
 

@@ -66,7 +66,7 @@ class SolverPlan:
         Local solver that is tried first for `PLAN_LIMITS.min_shared_cases` loads or more, and for one; or None.
     contact
         Solver that is tried first for loads with tools moved by pose; None without such tools.
-    quick
+    uses_lbfgs
         True if L-BFGS is tried before Newton-CG.
     frames, strained
         True if a load that follows another is solved by a captured graph on the GPU; True if this graph updates the
@@ -81,7 +81,7 @@ class SolverPlan:
     many: SolverStep | None
     single: SolverStep | None
     contact: SolverStep | None
-    quick: bool
+    uses_lbfgs: bool
     frames: bool
     strained: bool
     evaluations: int
@@ -95,7 +95,7 @@ class SolverPlan:
 
     def list_steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
         """List the solvers for `count` loads together, in order; `imposed` if the loads prescribe motion."""
-        if imposed or not self.quick:
+        if imposed or not self.uses_lbfgs:
             return (SolverStep.NEWTON,)
         first = self.choose_local(count)
         return (*([] if first is None else [first]), SolverStep.LBFGS, SolverStep.NEWTON)
@@ -109,7 +109,7 @@ class SolverPlan:
         if self.contact:
             lines.append(f"Tools are moved by pose. Every load begins with {self.contact.value}.")
             lines.append(f"{SolverStep.NEWTON.value} solves the loads that remain.")
-        elif not self.quick:
+        elif not self.uses_lbfgs:
             lines.append(f"Every load is solved by {SolverStep.NEWTON.value}, in at most {self.outer} iterations.")
         else:
             if self.many:
@@ -169,7 +169,7 @@ def plan_for(
         many=SolverStep.NEAR if small and exact and SolverStep.NEAR not in avoid else None,
         single=single,
         contact=contact,
-        quick=quick and most > 0 and SolverStep.LBFGS not in avoid,
+        uses_lbfgs=quick and most > 0 and SolverStep.LBFGS not in avoid,
         frames=following and most >= MAX_FRAME_EVALUATIONS and SolverStep.FRAME not in avoid,
         strained=strained,
         evaluations=most,

@@ -14,19 +14,19 @@ class LoadStepping:
 
     Parameters
     ----------
-    first, least, cut
+    first_step, min_step, failure_factor
         Fractions of the load: first step, smallest step; factor on a step that failed.
-    aimed, most
+    target_iterations, max_iterations
         Outer iterations per step: target that sets the length of the next step; maximum.
     patience
         Steps end when the batch has spent this number of times `Accuracy.inner` linear iterations per successful step.
     """
 
-    first: float = 1.0 / 4.0
-    least: float = 1.0 / 64.0
-    cut: float = 1.0 / 4.0
-    aimed: int = 8
-    most: int = 15
+    first_step: float = 1.0 / 4.0
+    min_step: float = 1.0 / 64.0
+    failure_factor: float = 1.0 / 4.0
+    target_iterations: int = 8
+    max_iterations: int = 15
     patience: int = 4
 
 
@@ -39,23 +39,23 @@ class GapContinuation:
 
     Parameters
     ----------
-    wide_enough, closing
-        Tools that move more than this number of gaps at once start with a gap widened by a power of `closing`.
+    max_gaps, closing_factor
+        Tools that move more than this number of gaps at once start with a gap widened by a power of `closing_factor`.
     tolerance
         Relative residual until the gap has its own width.
-    wider
+    failure_factor
         Factor on the gap after a step that failed, which is tried again, shorter.
-    alone, nearly
-        Maximum iterations of the contact solver before Newton. If it ends with a residual of at most `nearly`, Newton
-        continues from there with the same maximum.
+    max_contact_iterations, newton_residual
+        Maximum iterations of the contact solver before Newton. If it ends with a residual of at most
+        `newton_residual`, Newton continues from there with the same maximum.
     """
 
-    wide_enough: float = 8.0
-    closing: float = 4.0
+    max_gaps: float = 8.0
+    closing_factor: float = 4.0
     tolerance: float = 0.05
-    wider: float = 16.0
-    alone: int = 60
-    nearly: float = 0.1
+    failure_factor: float = 16.0
+    max_contact_iterations: int = 60
+    newton_residual: float = 0.1
 
 
 GAP_CONTINUATION = GapContinuation()  # Default.
@@ -86,7 +86,7 @@ class Shares:
         """Limit steps to the `longest` (b,); return which (b,) bool were shorter, and which cases continue."""
         shorter = self.step < longest
         np.minimum(self.step, longest, out=self.step)
-        long_enough = self.step >= stepping.least * np.minimum(1.0, 4.0 * longest)
+        long_enough = self.step >= stepping.min_step * np.minimum(1.0, 4.0 * longest)
         return shorter, (self.reached < 1.0) & long_enough
 
     def propose_shares(self, rows: np.ndarray) -> tuple[np.ndarray, float]:

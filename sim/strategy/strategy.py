@@ -38,7 +38,8 @@ EMPTY_HISTORY: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS h
 class SolverResult:
     """Solution u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, load fractions, inverted elements.
 
-    Also the L-BFGS history; with moving tools `gone` (B,), the path fraction reached, and `anew` (B,), undeformed.
+    Also warm-start data of the next load; with moving tools `path_fraction` (B,), the path fraction reached, and
+    `restarted` (B,) bool: from the undeformed state.
     """
 
     u: wp.array
@@ -48,9 +49,9 @@ class SolverResult:
     reached: np.ndarray
     inverted: np.ndarray
     linear_iterations: int
-    learnt: Mapping[str, np.ndarray] = field(default_factory=dict)
-    gone: np.ndarray | None = None
-    anew: np.ndarray | None = None
+    warm_start: Mapping[str, np.ndarray] = field(default_factory=dict)
+    path_fraction: np.ndarray | None = None
+    restarted: np.ndarray | None = None
 
     @property
     def good(self) -> np.ndarray:
@@ -139,30 +140,30 @@ class Strategy:
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
         if not guesses:
-            answer, astray = self._solve_whole_load(cases), np.zeros(count, bool)
+            result, astray = self._solve_whole_load(cases), np.zeros(count, bool)
         else:
             acts = self._find_loaded_cases(count)
             guess, astray = self._select_guesses([np.where(acts, one, 0.0) for one in guesses])
             started = guess.any(axis=0)
-            learnt = EMPTY_HISTORY if astray.any() else restore_history(cases, problem.rows)
+            history = EMPTY_HISTORY if astray.any() else restore_history(cases, problem.rows)
             if problem.barriers and astray.any():
                 cases = replace(cases, anew=astray.copy())
                 problem.begin(cases)
-            answer = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), learnt)
-            lost = np.where(answer.good, self.inversion.find_doubtful(answer.inverted), self._find_unsolved(answer))
+            result = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), history)
+            lost = np.where(result.good, self.inversion.find_doubtful(result.inverted), self._find_unsolved(result))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
                 some = replace(cases.select(again), anew=np.ones(len(again), bool))
                 problem.begin(some)
-                answer.put(again, self._solve_whole_load(some), device)
-        answer.outcome[astray & answer.good] = Outcome.CONVERGED_ANEW
-        lost = np.flatnonzero(self._find_unsolved(answer))
+                result.put(again, self._solve_whole_load(some), device)
+        result.outcome[astray & result.good] = Outcome.CONVERGED_ANEW
+        lost = np.flatnonzero(self._find_unsolved(result))
         if len(lost):
-            found = self._raise_load(cases.select(lost), answer, lost)
-            astray[lost] |= found.reached > answer.reached[lost]
-            answer.put(lost, found, device)
-        return replace(answer, gone=answer.reached, anew=astray) if problem.barriers else answer
+            found = self._raise_load(cases.select(lost), result, lost)
+            astray[lost] |= found.reached > result.reached[lost]
+            result.put(lost, found, device)
+        return replace(result, path_fraction=result.reached, restarted=astray) if problem.barriers else result
 
     def _find_loaded_cases(self, count: int) -> np.ndarray:
         """Return the cases (b,) of the begun batch on which a force or imposed motion acts in the undeformed state."""
@@ -195,16 +196,16 @@ class Strategy:
                 guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
         return guess, self.inversion.find_doubtful(inverted)
 
-    def _find_unsolved(self, answer: SolverResult) -> np.ndarray:
+    def _find_unsolved(self, result: SolverResult) -> np.ndarray:
         """Return the cases (B,) that another solver may solve; at round-off none comes closer to equilibrium."""
-        return ~answer.good & (answer.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
+        return ~result.good & (result.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
     def _solve_whole_load(
-        self, cases: Cases, start: wp.array | None = None, learnt: Mapping[str, np.ndarray] | None = EMPTY_HISTORY
+        self, cases: Cases, start: wp.array | None = None, history: Mapping[str, np.ndarray] | None = EMPTY_HISTORY
     ) -> SolverResult:
         """Solve for the whole load of the begun batch: local solvers, L-BFGS, Newton, each from the last one's end.
 
-        Without a start it begins undeformed; `learnt` is the L-BFGS history of the start, if any. Imposed motions and
+        Without a start it begins undeformed; `history` is the L-BFGS history of the start, if any. Imposed motions and
         steep terms are left to Newton, which moves the free nodes with them.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
@@ -214,13 +215,13 @@ class Strategy:
         if problem.barriers:
             return self._move_tools(cases, start)
         if problem.paced:  # history would not help the next frame
-            learnt = None
+            history = None
         if SolverStep.LBFGS not in self.plan.list_steps(count, imposed):
             return self._run_newton(start, self.accuracy.outer)
         near = self.get_local_solver(count)
-        descents = [(self.lbfgs, learnt)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
+        descents = [(self.lbfgs, history)] if near is None else [(near, cases.warm), (self.lbfgs, None)]
         index, none, never = np.arange(count), np.zeros(count, int), np.full(count, np.inf)
-        answer = SolverResult(
+        result = SolverResult(
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
         )
         gained: Mapping[str, np.ndarray] = {}
@@ -230,16 +231,16 @@ class Strategy:
             left -= int(found.steps.max(initial=0))
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == NOT_FINITE] = Outcome.CONVERGED, Outcome.NOT_FINITE
-            answer.put(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
-            gained = found.learnt
+            result.put(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
+            gained = found.warm_start
             index = index[found.left]
             if len(index) == 0:
                 break
             problem.begin(cases.select(index))
             start = gather_columns(device, found.u, found.left)
         else:
-            answer.put(index, self._run_newton(start, self.accuracy.outer), device)
-        return replace(answer, learnt=gained)
+            result.put(index, self._run_newton(start, self.accuracy.outer), device)
+        return replace(result, warm_start=gained)
 
     def _solve_contact(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Solve for cases whose tools have moved by `gaps` times their gap: separate contact solver, then Newton.
@@ -250,24 +251,24 @@ class Strategy:
         problem.begin(cases)
         if touch is None or problem.constraint.imposes or problem.compute_gap(start)[1].any():
             return self._close_gaps(cases, start, outer, gaps)
-        start, count, few = self._mask_idle(start), len(cases.loads), min(self.gaps.alone, outer)
+        start, count, few = self._mask_idle(start), len(cases.loads), min(self.gaps.max_contact_iterations, outer)
         found = touch.descend(start, np.full(count, self.accuracy.tolerance), few)
         outcome = np.full(count, Outcome.BUDGET, object)
         outcome[found.status == DONE] = Outcome.CONVERGED
-        answer = self._build_result(found.u, outcome, found.steps, found.residual, 0)
+        result = self._build_result(found.u, outcome, found.steps, found.residual, 0)
 
         def batched(rows: np.ndarray) -> Sequence[np.ndarray]:
             return [rows][: len(rows)] if device.on_cuda else list(rows[:, None])
 
-        near = np.flatnonzero(~answer.good & (found.residual <= self.gaps.nearly))
+        near = np.flatnonzero(~result.good & (found.residual <= self.gaps.newton_residual))
         for some in batched(near):
             problem.begin(cases.select(some))
-            answer.put(some, self._run_newton(gather_columns(device, found.u, some), few), device)
-        left = np.flatnonzero(~answer.good)
+            result.put(some, self._run_newton(gather_columns(device, found.u, some), few), device)
+        left = np.flatnonzero(~result.good)
         for some in batched(left):
             begun = gather_columns(device, start, some)
-            answer.put(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
-        return answer
+            result.put(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
+        return result
 
     def _close_gaps(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
         """Solve by Newton for cases whose tools have moved by `gaps` times their gap, which is widened, then closed.
@@ -275,8 +276,8 @@ class Strategy:
         In a narrow gap nodes would be pushed out of the tool, and enter it again, one by one; a wide gap guides them.
         """
         iterations, linear = np.zeros(start.shape[1], int), 0
-        widest = int(np.ceil(np.log(max(gaps / self.gaps.wide_enough, 1.0)) / np.log(self.gaps.closing)))
-        for times in self.gaps.closing ** np.arange(widest, 0.0, -1.0):
+        widest = int(np.ceil(np.log(max(gaps / self.gaps.max_gaps, 1.0)) / np.log(self.gaps.closing_factor)))
+        for times in self.gaps.closing_factor ** np.arange(widest, 0.0, -1.0):
             self.problem.begin(cases)
             for term in self.problem.barriers:
                 term.widen(float(times))
@@ -311,7 +312,7 @@ class Strategy:
             return replace(part, loads=part.loads.scale(share), share=share)
 
         start = device.allocate(problem.rows, len(index))
-        found = self._solve_in_steps(cases, start, raised, self.stepping.first, self.accuracy.steps)
+        found = self._solve_in_steps(cases, start, raised, self.stepping.first_step, self.accuracy.steps)
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
         none = np.flatnonzero(found.reached <= failed.reached[index])
@@ -333,13 +334,13 @@ class Strategy:
         if len(acting) == count:
             return self._solve_in_steps(cases, start, moved, 1.0, most)
         none, every = np.zeros(count, int), np.full(count, Outcome.CONVERGED, object)
-        answer = SolverResult(
+        result = SolverResult(
             device.allocate(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0
         )
         if len(acting):
             part = gather_columns(device, start, acting)
-            answer.put(acting, self._solve_in_steps(cases.select(acting), part, moved, 1.0, most), device)
-        return answer
+            result.put(acting, self._solve_in_steps(cases.select(acting), part, moved, 1.0, most), device)
+        return result
 
     def _solve_in_steps(
         self, cases: Cases, start: wp.array, aimed: Callable[[Cases, np.ndarray], Cases], first: float, most: int
@@ -355,33 +356,35 @@ class Strategy:
         shares = Shares.start(first, gaps)
         u, left, done = wp.clone(start), most, 1
         none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
-        answer = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
+        result = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
         outer = self.accuracy.outer
-        wanted, outer = (outer, outer) if problem.barriers else (self.stepping.aimed, min(self.stepping.most, outer))
+        wanted = outer if problem.barriers else self.stepping.target_iterations
+        outer = outer if problem.barriers else min(self.stepping.max_iterations, outer)
         while left >= 0:
             strides = [term.compute_stride(aimed(cases, shares.reached), u) for term in problem.barriers]
             shorter, going = shares.limit(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
-            rows = np.flatnonzero(going & (answer.iterations < self.accuracy.most))
+            rows = np.flatnonzero(going & (result.iterations < self.accuracy.most))
             patience = self.stepping.patience * self.accuracy.inner * done
-            if len(rows) == 0 or answer.linear_iterations > patience:
+            if len(rows) == 0 or result.linear_iterations > patience:
                 break
-            aim, gone = shares.propose_shares(rows)
+            aim, travel = shares.propose_shares(rows)
             left -= int(shorter[rows].any())
-            found = self._solve_contact(aimed(cases.select(rows), aim), gather_columns(device, u, rows), outer, gone)
+            part = aimed(cases.select(rows), aim)
+            found = self._solve_contact(part, gather_columns(device, u, rows), outer, travel)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
             shares.take(rows, aim, good)
             growth = wanted / np.maximum(found.iterations, 1)
-            shares.resize(rows, good, growth, self.stepping.cut, self.gaps.wider)
+            shares.resize(rows, good, growth, self.stepping.failure_factor, self.gaps.failure_factor)
             scatter_columns(device, found.u, rows[good], u, np.flatnonzero(good))
-            answer.iterations[rows] += found.iterations
-            answer.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
-            answer = replace(answer, linear_iterations=answer.linear_iterations + found.linear_iterations)
-        return self._finish(cases, aimed, answer)
+            result.iterations[rows] += found.iterations
+            result.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
+            result = replace(result, linear_iterations=result.linear_iterations + found.linear_iterations)
+        return self._finish(cases, aimed, result)
 
-    def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], answer: SolverResult) -> SolverResult:
+    def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], result: SolverResult) -> SolverResult:
         """Finish cases after their last step, in place: mark those that tools pierce, and those that fell short."""
-        problem, u, outcome, reached = self.problem, answer.u, answer.outcome, answer.reached
+        problem, u, outcome, reached = self.problem, result.u, result.outcome, result.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if problem.barriers and len(short) < len(reached):
@@ -391,5 +394,5 @@ class Strategy:
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):
             problem.begin(cases.select(short))
-            answer.residual[short] = measure_residual(problem, gather_columns(problem.device, u, short))
-        return replace(answer, inverted=self.inversion.count(u))
+            result.residual[short] = measure_residual(problem, gather_columns(problem.device, u, short))
+        return replace(result, inverted=self.inversion.count(u))

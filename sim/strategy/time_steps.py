@@ -27,7 +27,7 @@ class NoMotionStep:
         u = device.upload(guesses[-1]) if guesses else device.allocate(self.problem.rows, count)
         outcome, none = np.full(count, Outcome.CONVERGED, object), np.zeros(count, int)
         return SolverResult(
-            u, outcome, none, np.zeros(count), np.ones(count), self.inversion.count(u), 0, gone=np.zeros(count)
+            u, outcome, none, np.zeros(count), np.ones(count), self.inversion.count(u), 0, path_fraction=np.zeros(count)
         )
 
 

@@ -68,18 +68,18 @@ def get_row_type(vertices: int, tools: int = 0) -> np.dtype:
     )
 
 
-def to_rows(answer: Deformation, unit: float, tools: int = 0) -> np.ndarray:
+def to_rows(result: Deformation, unit: float, tools: int = 0) -> np.ndarray:
     """Convert results at every vertex to rows (B,), with displacements in units of `unit` [m].
 
     The reactions of `tools` moved by pose are NaN if the result does not have them.
     """
-    rows = np.empty(len(answer), get_row_type(answer.displacement.shape[1], tools))
-    rows["displacement"] = answer.displacement / unit if unit != 1.0 else answer.displacement
-    rows["outcome"] = [outcome.name for outcome in answer.outcome]
-    rows["iterations"] = answer.iterations
-    rows["residual"] = answer.residual
+    rows = np.empty(len(result), get_row_type(result.displacement.shape[1], tools))
+    rows["displacement"] = result.displacement / unit if unit != 1.0 else result.displacement
+    rows["outcome"] = [outcome.name for outcome in result.outcome]
+    rows["iterations"] = result.iterations
+    rows["residual"] = result.residual
     if tools:
-        rows["reaction"] = answer.reaction if answer.reaction.shape[1] == tools else np.nan
+        rows["reaction"] = result.reaction if result.reaction.shape[1] == tools else np.nan
     return rows
 
 

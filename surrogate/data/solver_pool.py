@@ -61,8 +61,8 @@ class LazyFem:
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Solve as `Fem.deform`; poses in relaxing tissue are histories, as in `solve_histories`."""
         if start is None and get_relaxation_series(self.effects) and loads.get(Touching) is not None:
-            answer = solve_histories(self.fem, loads)
-            return answer if at is None else answer.restrict(at)
+            result = solve_histories(self.fem, loads)
+            return result if at is None else result.restrict(at)
         return self.fem.deform(loads, start, at)
 
 

@@ -153,11 +153,11 @@ def leave_sectors_out(pushed: Pushed, patch: Patch) -> Sectors:
     # The first sector is centred on `first`, so that a lattice of directions starting there is not cut at its edge.
     sector = np.rint(angle * SECTOR_COUNT / (2.0 * np.pi)).astype(int) % SECTOR_COUNT
     tilted = force @ axis < np.cos(np.radians(MIN_SECTOR_ANGLE))
-    left_out = tilted & (sector % (SECTOR_COUNT // 2) == 0)
-    if not left_out.any() or left_out.all():
+    held_out = tilted & (sector % (SECTOR_COUNT // 2) == 0)
+    if not held_out.any() or held_out.all():
         raise InputError(
-            f"of {len(force)} loads {int(left_out.sum())} point into the directions to leave out: simulate more, or "
+            f"of {len(force)} loads {int(held_out.sum())} point into the directions to leave out: simulate more, or "
             "loads of more directions."
         )
-    disc = np.where(left_out, sector // (SECTOR_COUNT // 2), -1)
+    disc = np.where(held_out, sector // (SECTOR_COUNT // 2), -1)
     return Sectors(np.stack([first, -first]), np.pi / SECTOR_COUNT, disc, 2.0 / SECTOR_COUNT)

@@ -52,8 +52,8 @@ def solve_batch(deformer: Deformer, task: LoadBatch) -> bytes:
     anatomy = deformer.anatomy
     unit = task.loads is None
     loads = build_unit_loads(anatomy, task.rows) if task.loads is None else task.loads
-    answer = deformer.deform(loads).restrict(np.arange(len(anatomy.mesh.nodes)))
-    return to_rows(answer, UNIT_FORCE if unit else 1.0, 0 if unit else count_posed_tools(loads)).tobytes()
+    result = deformer.deform(loads).restrict(np.arange(len(anatomy.mesh.nodes)))
+    return to_rows(result, UNIT_FORCE if unit else 1.0, 0 if unit else count_posed_tools(loads)).tobytes()
 
 
 def count_posed_tools(loads: Loads) -> int:

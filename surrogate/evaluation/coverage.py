@@ -64,9 +64,9 @@ def compute_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverag
     if model.bounds is None:
         raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
     _check_load_count(loads)
-    answer = model.deform(loads, at=model.anatomy.tumour_nodes)
-    worst = np.linalg.norm(answer.displacement - truth, axis=2).max(axis=1)
-    return _measure_coverage(model, loads, answer, worst, answer.bound)
+    result = model.deform(loads, at=model.anatomy.tumour_nodes)
+    worst = np.linalg.norm(result.displacement - truth, axis=2).max(axis=1)
+    return _measure_coverage(model, loads, result, worst, result.bound)
 
 
 def measure_distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
@@ -80,9 +80,9 @@ def measure_distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -
     if model.tip is None or model.tip.bound is None:
         raise InputError("this model has no calibrated bound of its distance: train it again, with enough loads.")
     _check_load_count(loads)
-    answer = model.deform(loads, at=model.nodes)
-    found = model.predict_distance(loads, answer)
-    return _measure_coverage(model, loads, answer, np.abs(found.value - truth), found.bound)
+    result = model.deform(loads, at=model.nodes)
+    found = model.predict_distance(loads, result)
+    return _measure_coverage(model, loads, result, np.abs(found.value - truth), found.bound)
 
 
 def _check_load_count(loads: Loads) -> None:
@@ -122,7 +122,7 @@ def measure_covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, ext
 
 
 def _measure_coverage(
-    model: Learned, loads: Loads, answer: Deformation, error: np.ndarray, bound: np.ndarray
+    model: Learned, loads: Loads, result: Deformation, error: np.ndarray, bound: np.ndarray
 ) -> Coverage:
     force = split_forces(model.to_input(loads))[0]
-    return measure_covered(force, error, bound, answer.outcome.count(Outcome.EXTRAPOLATED))
+    return measure_covered(force, error, bound, result.outcome.count(Outcome.EXTRAPOLATED))

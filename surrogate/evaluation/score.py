@@ -128,8 +128,8 @@ def score_forces(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None 
 
 def compare_forces(model: Learned, loads: Loads, truth: np.ndarray) -> ForceScore:
     """Score a model's forces relative to FEM forces (B, 3) [N]."""
-    answer = model.deform(loads, at=model.anatomy.tumour_nodes)
-    return score_forces(compute_force_errors(answer.reaction[:, 0, :3], truth), truth, answer.reaction_bound)
+    result = model.deform(loads, at=model.anatomy.tumour_nodes)
+    return score_forces(compute_force_errors(result.reaction[:, 0, :3], truth), truth, result.reaction_bound)
 
 
 @dataclass(frozen=True)
@@ -187,15 +187,10 @@ def score(
         *spread(1e3 * distance),
         *spread(100.0 * distance / motion),
         *spread(1e3 * distance.max(axis=1))[:3],
-        time_single_load(deformer, loads, nodes),
+        1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED_LOADS))),
         time_model_alone(deformer, loads),
         solves,
     )
-
-
-def time_single_load(deformer: Deformer, loads: Loads, nodes: np.ndarray) -> float:
-    """Measure the median wall time [us] of one load at a time."""
-    return 1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED_LOADS)))
 
 
 def time_model_alone(deformer: Deformer, loads: Loads) -> float | None:
@@ -217,12 +212,12 @@ def time_single_loads(deformer: Deformer, loads: Loads, nodes: np.ndarray, count
     return _measure_times(lambda one: deformer.deform(one, at=nodes), single)
 
 
-def _measure_times(answer: Callable[[T], object], single: Iterable[T]) -> list[float]:
+def _measure_times(result: Callable[[T], object], single: Iterable[T]) -> list[float]:
     """Measure wall times [s] of one call after the other, without the warm-up."""
     seconds = []
     for one in single:
         begun = time.perf_counter()
-        answer(one)
+        result(one)
         seconds.append(time.perf_counter() - begun)
     return seconds[WARM_UP_LOADS:]
 

@@ -136,11 +136,11 @@ def _solve_dents(
     loads = build_force_loads(
         anatomy, find_foot(anatomy, tool)[None], np.array([tool.radius]), sizes[:, None] * direction
     )
-    answer = Fem(anatomy, group.build_effects((0.01,)), ACCURACY, device).deform(loads)
-    good = np.array([outcome.good for outcome in answer.outcome])
+    result = Fem(anatomy, group.build_effects((0.01,)), ACCURACY, device).deform(loads)
+    good = np.array([outcome.good for outcome in result.outcome])
     if good.sum() < 3:
         raise InputError(f"a force of {tool.force:g} N cannot be what dents this brain so: check its unit and frame.")
-    motion = Responses(pressed.nodes, {group.skull: answer.displacement[good][None, None][..., pressed.nodes, :]})
+    motion = Responses(pressed.nodes, {group.skull: result.displacement[good][None, None][..., pressed.nodes, :]})
     return sizes[good], predict_seen(motion, group.skull, evidence)[0, 0]
 
 

@@ -129,11 +129,11 @@ def find_unsupported(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple
     return tuple(found)
 
 
-def remove_points(frames: Sequence[ObservedFrame], left_out: Sequence[np.ndarray]) -> list[ObservedFrame]:
+def remove_points(frames: Sequence[ObservedFrame], excluded: Sequence[np.ndarray]) -> list[ObservedFrame]:
     """Remove points of given numbers (k,) from each frame of points with correspondences."""
     return [
         _remove_points(frame, numbers) if len(numbers) else frame
-        for frame, numbers in zip(frames, left_out, strict=True)
+        for frame, numbers in zip(frames, excluded, strict=True)
     ]
 
 

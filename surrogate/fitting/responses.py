@@ -122,7 +122,7 @@ def _get_motions(
     effects = (law, Held(), SKULLS[skull], ToolForce(), Gravity())
 
     def solved() -> dict[str, np.ndarray]:
-        answer = Fem(anatomy, effects, ACCURACY, device).deform(loads)
-        return {"motion": answer.displacement[:, nodes].astype(np.float32)}
+        result = Fem(anatomy, effects, ACCURACY, device).deform(loads)
+        return {"motion": result.displacement[:, nodes].astype(np.float32)}
 
     return keep_arrays(path, "motions of one tissue", ["motion"], solved)["motion"]

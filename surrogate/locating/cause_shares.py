@@ -79,16 +79,16 @@ def _generate_partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
 
 def compute_cause_shares(prior: MotionPrior, posterior: Posterior) -> np.ndarray:
     """Sample shares (n, kinds) of causes in the mean square motion of the open cortex from the posterior."""
-    ends = np.round(SAMPLE_COUNT * np.cumsum([answer.share for answer in posterior.answers])).astype(int)
+    ends = np.round(SAMPLE_COUNT * np.cumsum([result.share for result in posterior.results])).astype(int)
     normal = np.random.default_rng(0).standard_normal((SAMPLE_COUNT, len(prior.kind)))
     squares, begin = np.zeros((SAMPLE_COUNT, len(KINDS))), 0
-    for answer, end in zip(posterior.answers, ends, strict=True):
-        rows = np.flatnonzero(answer.rows < len(prior.kind))
-        kind = prior.kind[answer.rows[rows]]
-        weight = answer.mean[rows] + normal[begin:end, : len(answer.root)] @ answer.root[:, rows]
+    for result, end in zip(posterior.results, ends, strict=True):
+        rows = np.flatnonzero(result.rows < len(prior.kind))
+        kind = prior.kind[result.rows[rows]]
+        weight = result.mean[rows] + normal[begin:end, : len(result.root)] @ result.root[:, rows]
         for number in np.unique(kind):
             own = rows[kind == number]
-            shapes = answer.rows[own]
+            shapes = result.rows[own]
             part = weight[:, kind == number]
             squares[begin:end, number] = ((part @ prior.on_cortex[shapes[:, None], shapes]) * part).sum(axis=1)
         begin = end

@@ -144,9 +144,9 @@ def solve_members(
         last = fem.deform(loads, start=last)
         answers.append(last)
         kind.append(DRAINAGE)
-    motion = np.concatenate([answer.displacement for answer in answers])
-    kind = np.repeat(kind, [len(answer) for answer in answers])
-    good = np.array([outcome.good for answer in answers for outcome in answer.outcome])
+    motion = np.concatenate([result.displacement for result in answers])
+    kind = np.repeat(kind, [len(result) for result in answers])
+    good = np.array([outcome.good for result in answers for outcome in result.outcome])
     good &= compute_surface_motion(anatomy, motion) > MIN_MOTION
     if not good.any():
         raise InputError(f"no motion of group {group.number} ({group.skull}, nu {group.poisson:g}) converged.")

@@ -100,7 +100,7 @@ class Posterior:
     ----------
     evidence
         Evidence without outliers.
-    answers
+    results
         Posteriors of hypotheses; their shares sum to 1.
     unknown
         Mean (r + 6,) of the shapes' weights, and of the rigid error in its prior's standard deviations.
@@ -117,7 +117,7 @@ class Posterior:
     """
 
     evidence: Evidence
-    answers: list[HypothesisResult]
+    results: list[HypothesisResult]
     unknown: np.ndarray
     surprise: float
     outliers: np.ndarray
@@ -143,11 +143,11 @@ class Posterior:
         """Compute covariances (q, 3, 3) [m^2] of motions from shapes (r, q, 3) [m]."""
         flat = np.pad(shape.reshape(len(shape), -1), ((0, 6), (0, 0)))  # a rigid error moves no tissue
         mean, found = self.unknown @ flat, np.zeros((shape.shape[1], 3, 3))
-        for answer in self.answers:
-            part = flat[answer.rows]
-            off = np.concatenate([answer.root @ part, [answer.mean @ part - mean]])
+        for result in self.results:
+            part = flat[result.rows]
+            off = np.concatenate([result.root @ part, [result.mean @ part - mean]])
             off = off.reshape(len(off), -1, 3).transpose(1, 2, 0)
-            found += answer.share * off @ off.transpose(0, 2, 1)
+            found += result.share * off @ off.transpose(0, 2, 1)
         return self.factor * found
 
 
@@ -314,18 +314,18 @@ def condition_prior(
                 "each has its own motion. If they are less sure, raise sigma."
             )
     unknown = np.zeros(len(prior.kind) + 6)
-    for answer in answers:
-        unknown[answer.rows] += answer.share * answer.mean
+    for result in answers:
+        unknown[result.rows] += result.share * result.mean
     outliers = np.setdiff1d(point, some.point)
     return Posterior(some, answers, unknown, float(odd.sum() / len(some)), outliers, seen.slipped, seen.moving)
 
 
-def _compute_distances(rows: WhitenedSystem, answer: HypothesisResult, point: np.ndarray) -> np.ndarray:
+def _compute_distances(rows: WhitenedSystem, result: HypothesisResult, point: np.ndarray) -> np.ndarray:
     """Compute square Mahalanobis distances (n,) of points from their leave-one-out predictions by one hypothesis."""
     data = len(rows.products) - 1
-    precise = rows.apply_precision(np.append(answer.rows, data))
-    known = precise[:, :-1] @ answer.root.T
-    gain = precise[:, -1] - precise[:, :-1] @ answer.mean
+    precise = rows.apply_precision(np.append(result.rows, data))
+    known = precise[:, :-1] @ result.root.T
+    gain = precise[:, -1] - precise[:, :-1] @ result.mean
     number = np.unique(point, return_inverse=True)[1]
     order, count = np.argsort(number, kind="stable"), np.bincount(number)
     found, first = np.empty(len(count)), np.cumsum(count) - count

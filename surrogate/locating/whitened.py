@@ -52,7 +52,7 @@ class Equations:
         here, there = (each[..., len(left) :].reshape(shape).swapaxes(-3, -2) for each in (rows, solved))
         place = self.place - here[..., :-1].swapaxes(-1, -2) @ there
         gain = (rows[..., -1] * solved[..., -1]).sum(axis=-1)
-        evidence = self.evidence + _compute_logarithm(gain, block)
+        evidence = self.evidence + 0.5 * (gain - np.linalg.slogdet(block)[1])
         if last:
             return Equations(left[:0], rows[..., :0, len(left) :], place, evidence)
         table = rows[..., : len(left)].swapaxes(-1, -2) @ -solved
@@ -83,10 +83,6 @@ def add_places(several: Sequence[Equations]) -> np.ndarray:
         found = found + 0.5 * (table[row, -1] * share[-1] - np.log(pivot))
         table[row + 1 :, row + 1 :] -= table[row, row + 1 : -1, None] * share
     return found
-
-
-def _compute_logarithm(gain: np.ndarray, block: np.ndarray) -> np.ndarray:
-    return 0.5 * (gain - np.linalg.slogdet(block)[1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -229,8 +229,8 @@ class ForcePairs:
         return cls(state["pairs"], Rounded(state["share"], state["unit"]))
 
 
-def fill_table(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """Replace the rows of the `left_out` places of a table by interpolation of the others.
+def fill_table(points: np.ndarray, table: np.ndarray, held_out: np.ndarray) -> np.ndarray:
+    """Replace the rows of the `held_out` places of a table by interpolation of the others.
 
     By cubic radial basis functions with a linear polynomial (Duchon 1977, "Splines minimizing rotation-invariant
     semi-norms"), which reproduce fields that are linear in the place.
@@ -241,7 +241,7 @@ def fill_table(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> n
         Positions (P, 3) [m].
     table
         Table (P, ...) in any unit.
-    left_out
+    held_out
         Mask (P,) bool of held-out positions.
 
     Raises
@@ -249,14 +249,14 @@ def fill_table(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> n
     InputError
         Every place is left out.
     """
-    if not left_out.any():
+    if not held_out.any():
         return table
-    if left_out.all():
+    if held_out.all():
         raise InputError(
             "the discs left out hold all places of the cortex at which the finite elements were asked, so that nothing "
             "is known outside: leave out fewer or smaller discs."
         )
-    known = points[~left_out]
+    known = points[~held_out]
     middle, length = known.mean(axis=0), np.ptp(points, axis=0).max()
     _, size, axes = np.linalg.svd(known - middle, full_matrices=False)
     axes = axes[size > FLAT_TOLERANCE * max(size[0], np.finfo(float).tiny)]
@@ -268,7 +268,7 @@ def fill_table(points: np.ndarray, table: np.ndarray, left_out: np.ndarray) -> n
     kernel, tail = at(known)
     corner = np.zeros((tail.shape[1], tail.shape[1]))
     matrix = np.block([[kernel, tail], [tail.T, corner]])
-    weights = np.linalg.solve(matrix, np.hstack(at(points[left_out])).T)[: len(known)].T
+    weights = np.linalg.solve(matrix, np.hstack(at(points[held_out])).T)[: len(known)].T
     out = table.copy()
-    out[left_out] = (weights @ table[~left_out].reshape(len(known), -1)).reshape(-1, *table.shape[1:])
+    out[held_out] = (weights @ table[~held_out].reshape(len(known), -1)).reshape(-1, *table.shape[1:])
     return out

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
@@ -50,8 +50,7 @@ class Gp(Stored):
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Fit to rows X (n, f), Y (n, r)."""
-        for name in ("_factor", "seen_"):
-            vars(self).pop(name, None)
+        vars(self).pop("seen_", None)
         order = np.random.default_rng(self.seed).permutation(len(X))[: self.most]
         self.mean_, self.deviation_ = compute_standardisation(X)
         x = self.scaled_ = ((X - self.mean_) / self.deviation_)[order].astype(np.float32)
@@ -74,7 +73,9 @@ class Gp(Stored):
                 )
             start = fitted.x
         self.length_, self.noise_ = np.exp(start[:-1]), np.exp(start[-1])
-        self.dual_ = cho_solve(self._factor, y)
+        covariance = compute_matern(cdist(self.seen_, self.seen_))
+        covariance.flat[:: len(covariance) + 1] += self.noise_
+        self.dual_ = cho_solve(cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False), y)
         return self
 
     @classmethod
@@ -92,23 +93,9 @@ class Gp(Stored):
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
-        return (compute_matern(self._compute_distance(X)) @ self.dual_ + self.offset_).astype(np.float32)
-
-    def predict_deviation(self, X: np.ndarray) -> np.ndarray:
-        """Predict the posterior standard deviation (B,), noise included, relative to that of the prior."""
-        near = compute_matern(self._compute_distance(X))
-        known = solve_triangular(self._factor[0], near.T, lower=True, check_finite=False)
-        return np.sqrt(np.maximum(1.0 - np.einsum("nb,nb->b", known, known), 0.0) + self.noise_)
-
-    def _compute_distance(self, X: np.ndarray) -> np.ndarray:
-        return np.sqrt(compute_squared_distances((X - self.mean_) / (self.deviation_ * self.length_), self.seen_))
-
-    @cached_property
-    def _factor(self) -> tuple[np.ndarray, bool]:
-        """Cholesky factor of the covariance of the training rows: computed from them on first use, not stored."""
-        covariance = compute_matern(cdist(self.seen_, self.seen_))
-        covariance.flat[:: len(covariance) + 1] += self.noise_
-        return cho_factor(covariance, lower=True, overwrite_a=True, check_finite=False)
+        x = (X - self.mean_) / (self.deviation_ * self.length_)
+        near = compute_matern(np.sqrt(compute_squared_distances(x, self.seen_)))
+        return (near @ self.dual_ + self.offset_).astype(np.float32)
 
 
 def compute_matern(distance: np.ndarray) -> np.ndarray:

@@ -161,7 +161,7 @@ class Expansion:
             for parts, moved, limits in both
         ]
 
-    def build_series(self, bases: list[Basis], left_out: np.ndarray) -> list[Series]:
+    def build_series(self, bases: list[Basis], held_out: np.ndarray) -> list[Series]:
         """Return the series beyond the exact parts, as coefficients of the examples' `bases`, without some places (P,).
 
         Raises
@@ -177,7 +177,7 @@ class Expansion:
         for added, parts, wide, basis in zip(self._beyond, self.exact, self.tabulated.bases, bases, strict=True):
             # Footprints across the edge press on nodes beyond the open cortex. For others the exact parts leave no
             # residual.
-            every = fill_table(self.places, added @ (wide.modes @ basis.modes.T), left_out)
+            every = fill_table(self.places, added @ (wide.modes @ basis.modes.T), held_out)
             for order in ORDER_COLUMNS[: len(parts)]:
                 every[inside, order] = 0.0
             step = self.settings.series_step * (np.abs(every).max(axis=(0, 1, 3)) * unit).max() / unit
@@ -261,7 +261,7 @@ class Expansion:
         reading = fem.build_reading(basis.nodes, basis.modes.reshape(len(basis.modes), -1, 3))
         nodes = self.patch.nodes
         units = fem.build_reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
-        pairs, table = compute_second_order(fem.problem, units.answers, reading.answers, near)
+        pairs, table = compute_second_order(fem.problem, units.solutions, reading.solutions, near)
         turn = reduce(basis.nodes, table, self.settings.second_order_tolerance, len(basis.modes)).modes
         return pairs, table @ turn.T, Basis(basis.nodes, round_to_half(turn @ basis.modes))
 

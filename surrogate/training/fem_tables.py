@@ -67,7 +67,7 @@ def compute_unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.nd
     found = []
     for first in range(0, len(nodes), STRIP_NODES):
         some = nodes[first : first + STRIP_NODES]
-        answers = fem.build_reading(some, np.eye(3 * len(some)).reshape(-1, len(some), 3)).answers
+        answers = fem.build_reading(some, np.eye(3 * len(some)).reshape(-1, len(some), 3)).solutions
         found.append(answers.reshape(len(answers), -1, 3)[:, at].astype(np.float32))
     return np.concatenate(found)
 

@@ -121,13 +121,13 @@ class Tuned:
         if len(X) < self.selection.min_selection_loads or len(self.settings) == 1:
             return 0
         X, Y = X[: self.selection.max_selection_loads], Y[: self.selection.max_selection_loads]
-        left_out = find_inner_discs(X[:, :3], self.selection)
+        held_out = find_inner_discs(X[:, :3], self.selection)
         columns = np.sort(np.argsort(-Y.std(axis=0), kind="stable")[: self.selection.selection_outputs])
         strongest = Y[:, columns]
         errors = []
         for make in self.settings:
-            model = make().fit(X[~left_out], strongest[~left_out])
-            errors.append(float(np.square(model.predict(X[left_out]) - strongest[left_out]).sum()))
+            model = make().fit(X[~held_out], strongest[~held_out])
+            errors.append(float(np.square(model.predict(X[held_out]) - strongest[held_out]).sum()))
         return int(np.argmin(errors))
 
 

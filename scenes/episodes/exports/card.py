@@ -123,15 +123,10 @@ def keep_card(
 
 def _is_outdated(folder: Path, names: set[str]) -> bool:
     """Return True if a folder's card lists other episodes than these; for many, sizes are not compared."""
-    listed = list_card_files(folder) if has_card(folder) else {}
+    listed = list_card_files(folder) if all((folder / name).is_file() for name in NAMES) else {}
     if listed.keys() != names or len(names) > MAX_COMPARED_EPISODES:
         return listed.keys() != names
     return any((folder / name).stat().st_size != size for name, size in listed.items())
-
-
-def has_card(folder: Path) -> bool:
-    """Return True if all files of a card exist."""
-    return all((folder / name).is_file() for name in NAMES)
 
 
 def list_card_files(folder: Path) -> dict[str, int]:

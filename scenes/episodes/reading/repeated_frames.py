@@ -73,8 +73,8 @@ def _solve_again(
     rows = np.unique(np.linspace(0, len(solved) - 1, min(count, len(solved))).astype(int))
     asked = np.arange(rows[-1] + 1) if is_history_dependent(fem) else rows
     loads = [scene.build_loads(theatre.site, scene.path(time), time) for time in map(float, scene.times[solved[asked]])]
-    answer = solve_reference_frames(theatre, scene, loads, fem=fem).restrict(theatre.anatomy.tumour_nodes)
-    return solved[rows], answer.displacement[np.searchsorted(asked, rows)]
+    result = solve_reference_frames(theatre, scene, loads, fem=fem).restrict(theatre.anatomy.tumour_nodes)
+    return solved[rows], result.displacement[np.searchsorted(asked, rows)]
 
 
 def validate_files(

@@ -32,16 +32,16 @@ class SkullBarrier:
 
     Parameters
     ----------
-    half_shut
+    stiffness_ratio
         Contact stiffness in preconditioners, as a fraction of shear modulus / activation distance: between
         open and closed contact.
-    at_first, again
+    first_width, next_width
         Initial barrier width: maximum displacement per step, from the undeformed or from a previous state [m].
     """
 
-    half_shut: float = 0.2
-    at_first: float = 1e-2
-    again: float = 5e-4
+    stiffness_ratio: float = 0.2
+    first_width: float = 1e-2
+    next_width: float = 5e-4
 
 
 @dataclass(frozen=True)
@@ -66,22 +66,22 @@ class Wall:
     nodes: wp.array(dtype=wp.int32)
     normal: wp.array(dtype=wp.vec3d)
     bend: wp.array(dtype=wp.mat33d)
-    way: wp.array(dtype=wp.vec3d)
+    inward: wp.array(dtype=wp.vec3d)
     inside: wp.array(dtype=wp.float64)
-    felt: wp.array(dtype=wp.float64)
+    activation: wp.array(dtype=wp.float64)
     area: wp.array(dtype=wp.float64)
     gap: wp.float64
     edge: wp.float64
-    times: wp.float64
+    widening: wp.float64
     shear: wp.float64
 
 
 @wp.func
 def place(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
     """Return (h + R, r + R) of node s at displacement x; a widened barrier makes the bone recede by as much."""
-    gap = wall.gap + (wall.times - wp.float64(1.0)) * wall.felt[s]
+    gap = wall.gap + (wall.widening - wp.float64(1.0)) * wall.activation[s]
     h = gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.bend[s] * x)
-    return wp.vec2d(h + wall.edge, wall.inside[s] + wp.dot(wall.way[s], x) + wall.edge)
+    return wp.vec2d(h + wall.edge, wall.inside[s] + wp.dot(wall.inward[s], x) + wall.edge)
 
 
 @wp.func
@@ -103,7 +103,7 @@ def distance(wall: Wall, p: wp.vec2d) -> wp.float64:
 @wp.func
 def turned(wall: Wall, s: int, x: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.vec3d:
     """Return the displacement direction that reduces h by `along` and increases r by `across`."""
-    return along * (wall.normal[s] + wall.bend[s] * x) + across * wall.way[s]
+    return along * (wall.normal[s] + wall.bend[s] * x) + across * wall.inward[s]
 
 
 @wp.func
@@ -116,7 +116,7 @@ def slope(wall: Wall, s: int, x: wp.vec3d, p: wp.vec2d) -> wp.vec3d:
 @wp.func
 def stiffness(wall: Wall, s: int) -> wp.float64:
     """Return the stiffness w k = w mu / (activation distance) [N/m^2]."""
-    return wall.area[s] * wall.shear / (wall.times * wall.felt[s])
+    return wall.area[s] * wall.shear / (wall.widening * wall.activation[s])
 
 
 @wp.func
@@ -124,9 +124,9 @@ def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
     """Return the block w k (b'' m (x) m + b' d''); if `definite`, without the edge curvature, which may be negative."""
     p = place(wall, s, x)
     d, m, at = distance(wall, p), slope(wall, s, x, p), share(p)
-    felt = wall.times * wall.felt[s]
-    pressure = barrier_slope(d, felt)
-    K = barrier_curvature(d, felt) * wp.outer(m, m) - pressure * at[0] * wall.bend[s]
+    width = wall.widening * wall.activation[s]
+    pressure = barrier_slope(d, width)
+    K = barrier_curvature(d, width) * wp.outer(m, m) - pressure * at[0] * wall.bend[s]
     if definite == 0 and wp.min(at[0], at[1]) > wp.float64(0.0):
         round = turned(wall, s, x, at[1], at[0])
         K += pressure / wp.dot(at, p) * wp.outer(round, round)
@@ -165,9 +165,9 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Add the energy: E += sum over nodes of w k b(d)."""
         s, c = wp.tid()
-        d, felt = distance(wall, place(wall, s, motion(u, wall.nodes[s], c))), wall.times * wall.felt[s]
-        if d < felt:
-            wp.atomic_add(out, c, stiffness(wall, s) * barrier(d, felt))
+        d, width = distance(wall, place(wall, s, motion(u, wall.nodes[s], c))), wall.widening * wall.activation[s]
+        if d < width:
+            wp.atomic_add(out, c, stiffness(wall, s) * barrier(d, width))
 
     @forward_kernel(module="unique")
     def add_gradient(
@@ -180,7 +180,7 @@ def build_kernels(device: Device) -> SkullKernels:
         s, c = wp.tid()
         x = motion(u, wall.nodes[s], c)
         p = place(wall, s, x)
-        f = -stiffness(wall, s) * barrier_slope(distance(wall, p), wall.times * wall.felt[s])
+        f = -stiffness(wall, s) * barrier_slope(distance(wall, p), wall.widening * wall.activation[s])
         m = slope(wall, s, x, p)
         for k in range(3):
             out[3 * wall.nodes[s] + k, c] += scalar(f * m[k])
@@ -230,7 +230,7 @@ def build_kernels(device: Device) -> SkullKernels:
         x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
         p = place(wall, s, x)
         d = distance(wall, p)
-        if d > wp.float64(PARABOLA_FRACTION) * wall.times * wall.felt[s]:
+        if d > wp.float64(PARABOLA_FRACTION) * wall.widening * wall.activation[s]:
             bends = share(p)[0] * wp.dot(along, wall.bend[s] * along)
             wp.atomic_min(out, c, scalar(fraction(d, wp.dot(slope(wall, s, x, p), along), bends)))
 
@@ -262,15 +262,15 @@ class Skull:
         self._wall = Wall()
         self._wall.nodes = device.upload(bone.nodes, wp.int32)
         self._wall.bend = device.upload(bone.bend, wp.mat33d)
-        for name in ("normal", "way"):
+        for name in ("normal", "inward"):
             setattr(self._wall, name, device.upload(getattr(bone, name), wp.vec3d))
-        for name in ("inside", "felt", "area"):
+        for name in ("inside", "activation", "area"):
             setattr(self._wall, name, device.upload(getattr(bone, name), wp.float64))
         self._wall.gap, self._wall.edge, self._wall.shear = bone.gap, bone.edge, shear
         self.widen(1.0)
         covered = bone.inside < 0.0
-        nodes, normal, times = bone.nodes[covered], bone.normal[covered], (bone.area / bone.felt)[covered]
-        blocks = (settings.half_shut * shear * times)[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        nodes, normal, times = bone.nodes[covered], bone.normal[covered], (bone.area / bone.activation)[covered]
+        blocks = (settings.stiffness_ratio * shear * times)[:, None, None] * normal[:, :, None] * normal[:, None, :]
         row = (3 * nodes[:, None, None] + np.arange(3)[:, None]).repeat(3, axis=2)
         place = row.ravel(), row.swapaxes(1, 2).ravel()
         self._rest = sp.csc_array(sp.coo_array((blocks.ravel(), place), shape=(3 * count, 3 * count)))
@@ -286,7 +286,7 @@ class Skull:
             known |= cases.displacement.any(axis=(1, 2))
         if cases.anew is not None:
             known &= ~cases.anew
-        return np.where(known, self._settings.again, self._settings.at_first) / self._bone.felt.min()
+        return np.where(known, self._settings.next_width, self._settings.first_width) / self._bone.activation.min()
 
     def find_buried(self, u: wp.array) -> np.ndarray:
         """Return False for every load case: the skull never penetrates the body."""
@@ -298,7 +298,7 @@ class Skull:
 
     def widen(self, times: float) -> None:
         """Widen the barrier by a factor and soften it by the same factor; the bone recedes by the added width."""
-        self._wall.times = times
+        self._wall.widening = times
 
     def compute_reaction(self, u: wp.array) -> np.ndarray:
         """Return an empty array (b, 0, 6): there are no tools."""

@@ -32,26 +32,26 @@ class BoneSettings:
 
     Parameters
     ----------
-    felt
+    activation
         Maximum activation distance [m]; smaller if the gap is narrower.
-    edge_felt
+    edge_activation
         Activation distance at the craniotomy's edge, as a fraction of its radius, which depends on the mesh size. At a
         sharp or stiff edge, nodes would snap from above it to below.
     blur
         Standard deviation of the blur that extends the bone normals over the craniotomy [edge radii].
-    neighbours, facing
+    neighbours, min_normal_cosine
         Number of nearest nodes for the bone's curvature at a node, and minimum cosine between their
         normals.
-    far
+    max_edge_distance
         Distance from the edge beyond which its direction is unreliable [standard deviations of the blur].
     """
 
-    felt: float = 1e-4
-    edge_felt: float = 0.25
+    activation: float = 1e-4
+    edge_activation: float = 0.25
     blur: float = 1.5
     neighbours: int = 16
-    facing: float = 0.5
-    far: float = 2.5
+    min_normal_cosine: float = 0.5
+    max_edge_distance: float = 2.5
 
 
 BONE_SETTINGS = BoneSettings()
@@ -68,10 +68,10 @@ class Bone:
         Node numbers (k,).
     normal, bend
         Unit vectors (k, 3) towards the bone; their derivatives (k, 3, 3) [1/m] along it, positive semi-definite.
-    inside, way
+    inside, inward
         Distances (k,) [m] inside the craniotomy, negative under bone; unit vectors (k, 3) into it, zero if too
         far.
-    felt, area
+    activation, area
         Activation distances (k,) [m], and tributary areas (k,) [m^2].
     gap
         Undeformed distance between surface and bone [m].
@@ -83,8 +83,8 @@ class Bone:
     normal: np.ndarray
     bend: np.ndarray
     inside: np.ndarray
-    way: np.ndarray
-    felt: np.ndarray
+    inward: np.ndarray
+    activation: np.ndarray
     area: np.ndarray
     gap: float
     edge: float
@@ -104,7 +104,7 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
     if not slides.any():
         raise InputError("SkullContact finds no node that can touch: all slide normals are zero, or their nodes fixed.")
     inside, way = np.full(space.count, COVERED_DISTANCE), np.zeros_like(normal)
-    felt = np.full(space.count, min(settings.felt, gap))
+    activation = np.full(space.count, min(settings.activation, gap))
     edge, rim = 0.0, find_opening_edge(anatomy)
     if len(rim):
         opened = np.zeros(space.count, bool)
@@ -115,16 +115,16 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
         edge = compute_edge_radius(space.nodes, rim)
         blur, points = settings.blur * edge, space.nodes[opened]
         normal[opened] = compute_blurred_normals(space.nodes, space.surface[:, :3], points, blur)
-        r, way[opened] = measure_inside_opening(anatomy, points, normal[opened], edge, settings.far)
-        inside[opened], felt[opened] = r.clip(0.0), settings.edge_felt * edge
+        r, way[opened] = measure_inside_opening(anatomy, points, normal[opened], edge, settings.max_edge_distance)
+        inside[opened], activation[opened] = r.clip(0.0), settings.edge_activation * edge
     nodes = np.flatnonzero(slides | (way != 0.0).any(axis=1))
     return Bone(
         nodes=nodes,
         normal=normal[nodes],
         bend=bend_of(space.nodes[nodes], normal[nodes], settings),
         inside=inside[nodes],
-        way=way[nodes],
-        felt=felt[nodes],
+        inward=way[nodes],
+        activation=activation[nodes],
         area=_compute_nodal_areas(space)[nodes],
         gap=gap,
         edge=edge,
@@ -149,7 +149,7 @@ def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BON
     across = np.linalg.svd(normal[:, None])[2][:, 1:]  # two tangents of the wall
     step = np.einsum("kja,kia->kij", across, points[near] - points[:, None])
     turn = np.einsum("kja,kia->kij", across, normal[near] - normal[:, None])
-    weight = np.einsum("kia,ka->ki", normal[near], normal) > settings.facing
+    weight = np.einsum("kia,ka->ki", normal[near], normal) > settings.min_normal_cosine
     x, y = np.moveaxis(step * weight[:, :, None], 2, 0)
     none = np.zeros_like(x)
     # Unknowns H_xx, H_xy, H_yy.
@@ -176,7 +176,7 @@ def compute_edge_radius(nodes: np.ndarray, rim: np.ndarray) -> float:
 
 
 def measure_inside_opening(
-    anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float, far: float = BONE_SETTINGS.far
+    anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float, far: float = BONE_SETTINGS.max_edge_distance
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return distances (n,) [m] of surface points (n, 3) [m] inside the craniotomy, and inward directions (n, 3).
 

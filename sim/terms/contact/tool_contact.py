@@ -74,20 +74,20 @@ class ToolContactTerm:
         self.name = name
         cores = [core for tool in tools for core in list_cores(tool)]
         self._owner = np.repeat(np.arange(len(tools)), [len(list_cores(tool)) for tool in tools])
-        self._first, self._sag = np.unique(self._owner, return_index=True)[1], touch.sag * gap
+        self._first, self._sag = np.unique(self._owner, return_index=True)[1], touch.max_sag * gap
         self._nodes, self._corners = nodes, [core.corners for core in cores]
         self._triangles, self._closed = triangles, device.upload(whole, wp.int32)
         self._shapes, self._way, self._device, self._touch = tools, way, device, touch
         self._kernels = build_kernels(device, triangles.shape[1])
-        fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.sag * gap) / MAX_SAMPLE_DISTANCE
-        self._surface, self._rows = _build_surface(nodes, triangles, fine / touch.stretch, device)
+        fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.max_sag * gap) / MAX_SAMPLE_DISTANCE
+        self._surface, self._rows = _build_surface(nodes, triangles, fine / touch.max_stretch, device)
         self._bone, _ = _build_surface(nodes, bone, fine, device)
         self._cores = [
             device.upload(np.array([core.centre for core in cores]), wp.vec3d),
             device.upload(np.array([core.half for core in cores]), wp.vec3d),
             device.upload(np.array([core.radius + self._sag for core in cores]), wp.float64),
         ]
-        self._asked, self._gap, self._shear = gap, (1.0 - touch.sag) * gap, shear
+        self._asked, self._gap, self._shear = gap, (1.0 - touch.max_sag) * gap, shear
         self.widen(1.0)
         self._pose: np.ndarray | None = None
         # a step needs the same poses several times
@@ -217,9 +217,9 @@ class ToolContactTerm:
         if barrier is None:
             return np.zeros(0, int), np.zeros((0, 0))
         w = self._at[0].numpy().reshape(-1, 3)[self.touchable].reshape(-1, 1).astype(np.float64)
-        felt = barrier.slope(w).reshape(-1, 3).any(axis=1)
-        place = np.where(felt, felt.cumsum() - 1, -1)[:, None]
-        return np.flatnonzero(felt), barrier.curvature(w, place, int(felt.sum()), np.ones(1, bool))[0]
+        active = barrier.slope(w).reshape(-1, 3).any(axis=1)
+        place = np.where(active, active.cumsum() - 1, -1)[:, None]
+        return np.flatnonzero(active), barrier.curvature(w, place, int(active.sum()), np.ones(1, bool))[0]
 
     def compute_reaction(self, u: wp.array) -> np.ndarray:
         """Return force [N] and moment about its origin [N m] that each tool exerts at u (3N, b): (b, tools, 6)."""
@@ -295,9 +295,9 @@ def build_tool_contact(
     touchable, reach = np.unique(triangles), _compute_node_reach(space.nodes, triangles)
     points, normals = space.nodes[touchable], compute_vertex_normals(space.nodes, triangles[:, :3])[touchable]
 
-    @lru_cache(touch.kept)
+    @lru_cache(touch.cached_poses)
     def came_from(number: int, pose: bytes) -> np.ndarray:
-        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, normals, reach, touch.march)
+        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, normals, reach, touch.max_march_steps)
 
     def clear(pose: np.ndarray) -> np.ndarray:
         """Return the poses from which tools (B, tools, 4, 4) approach."""

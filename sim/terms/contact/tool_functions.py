@@ -265,12 +265,12 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
     ):
         """Add K_ab += sum over points of a row of w k H N_a N_b, between the nodes with `place` >= 0."""
         n, half, radius = surface.pieces[s], tools.half[k], tools.radius[k]
-        total, felt, pace, most, j = blocks(), wp.bool(False), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
+        total, touched, pace, most, j = blocks(), wp.bool(False), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             N = shape_of(i, j, n)
             touch = distance_to_core(N * at, half, radius)
             if touch.distance < scale.gap:
-                felt = True
+                touched = True
                 H = curvature_at(touch, scale.gap, definite)
                 for a in range(size):
                     for b in range(size):
@@ -279,7 +279,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
                                 q = 3 * (a * (a + 1) // 2 + b) + row
                                 total[q] = total[q] + N[a] * N[b] * H[row]
             j += clear(touch.distance - scale.gap, pace, most)
-        if felt:
+        if touched:
             R, weight = tools.rotation[k, c], weight_of(surface, scale, s)
             for a in range(size):
                 first = 3 * place[surface.table[s, a], c]

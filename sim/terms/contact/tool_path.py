@@ -17,25 +17,25 @@ class ContactSampling:
 
     Parameters
     ----------
-    sag
+    max_sag
         Maximum decrease of a tool's distance between sample points of the surface, as a fraction of the gap. It is
         added to the tool's radius, so that no point of the surface is inside.
-    stretch
+    max_stretch
         Maximum stretch of triangles for which this bound holds.
-    stride
+    max_stride
         Maximum motion of a tool into tissue per step, as a fraction of its radius, so that it cannot pass
         through.
-    march
+    max_march_steps
         Maximum steps of a tool's approach through air, each as long as the clearance.
-    kept
+    cached_poses
         Number of poses whose approach is cached, since a solver requests them repeatedly.
     """
 
-    sag: float = 0.25
-    stretch: float = 1.3
-    stride: float = 0.5
-    march: int = 40
-    kept: int = 4096
+    max_sag: float = 0.25
+    max_stretch: float = 1.3
+    max_stride: float = 0.5
+    max_march_steps: int = 40
+    cached_poses: int = 4096
 
 
 CONTACT_SAMPLING = ContactSampling()
@@ -75,7 +75,7 @@ class ToolPath:
         self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = CONTACT_SAMPLING
     ) -> np.ndarray:
         """Return the path fraction (B,), at most 1, that tools with clearance `clear` (B, tools) [m] may move."""
-        most = clear + touch.stride * np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
+        most = clear + touch.max_stride * np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
 
@@ -85,7 +85,7 @@ def approach(
     points: np.ndarray,
     normals: np.ndarray,
     reach: np.ndarray,
-    march: int = ContactSampling.march,
+    march: int = ContactSampling.max_march_steps,
 ) -> np.ndarray:
     """Return the pose (4, 4), just clear of a surface, from which a tool moves straight to `pose` (4, 4).
 
