@@ -57,7 +57,7 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     assert f"<p>Tumour position error (95 %): {where} 4.7 mm {whole}; the largest part is E.</p>" in prior
     assert f"<p>Tumour position error (95 %): {where} 1.2 mm {whole}; without cortex observation 4.7 mm.</p>" in seen
     guess = report(replace(frame, tumour_error=replace(known[0], guess=True)), player.stage, "linear", "", (), 7)
-    assert f"{where} 4.7 mm {whole}: rough estimate (few samples or" in guess and "largest part" not in guess
+    assert f"{where} 4.7 mm {whole}: rough estimate (few samples," in guess and "largest part" not in guess
     for said, off in ((prior, "4.7"), (seen, "1.2")):
         assert f"tip to tumour 12.3&nbsp;±&nbsp;{off}&nbsp;mm<" in said
     surely = report(replace(frame, moved_error=5.31e-3, model_error=None), player.stage, "fem", "", (), 7)

@@ -329,7 +329,7 @@ class TestSaid:
         for line in (*narrow.head, *moved, "frame 3"):
             assert has_text(narrow.shown, line, TEXT_SCALE)
 
-    def test_in_a_hand_it_follows_the_motion_and_in_doubt_it_is_not_known(self, theatre):
+    def test_by_hand_it_follows_the_motion_in_doubt_it_is_unknown(self, theatre):
         scene = short()
         player = replace(theatre, uncertainties={scene.name: stated(scene, theatre)}).build_player("linear", scene)
         held, doubtful = (player.draw(3, 0.1, Touch(force=force)) for force in (0.2, 0.6))

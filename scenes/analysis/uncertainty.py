@@ -293,18 +293,14 @@ def estimate_uncertainty(
         bounds = [float(np.quantile(one, LEVEL)) for one in errors]
         moved = float(np.linalg.norm(field, axis=1).mean())
         rows.append((*bounds, moved, split_contributions(motion, field, kept, scene)))
-    worst, middle, registered, motion_error, moved, by_name = zip(*rows, strict=True)
+    *lists, by_name = zip(*rows, strict=True)
     return Uncertainty(
         scene=scene.name,
         mark=mark_of(scene, theatre.site, theatre.choose_element(scene)),
         draws=len(draws),
         failed=len(draws) - len(sound),
         times=still.times,
-        worst=worst,
-        middle=middle,
-        registered=registered,
-        moved=moved,
-        motion=motion_error,
+        **dict(zip(("worst", "middle", "registered", "motion", "moved"), lists, strict=True)),
         parts={name: tuple(row[name] for row in by_name) for name in by_name[0]},
         folded=folded,
         numbers=sum(column.shape[1] for column in collect_contributor_values(kept, scene).values()),
