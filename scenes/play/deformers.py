@@ -198,10 +198,6 @@ class PatientSetup:
         """Return the element of a scene, or the recommended one for the mesh."""
         return scene.element or recommend_element(self.anatomy.mesh)
 
-    def select_scene(self) -> str:
-        """Select the scene to open: the first built-in scene that a trained model supports, or the first."""
-        return next((name for name in SCENES if self.select_models(find_scene(name))), SCENES[0])
-
     def build_deformer(self, name: str, scene: Scene) -> Deformer:
         """Build a deformer by name; FEM has the scene's accuracy.
 
@@ -296,9 +292,9 @@ def plan_of(deformer: Deformer) -> tuple[str, ...]:
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
-def to_model_path(anatomy: Path, kind: str = "model") -> Path:
-    """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu; kind "spatula": of a spatula."""
-    return anatomy.with_suffix(f".{kind}.npz")
+def to_model_path(anatomy: Path) -> Path:
+    """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu."""
+    return anatomy.with_suffix(".model.npz")
 
 
 def open_theatre(
@@ -328,10 +324,8 @@ def open_theatre(
     path = get_template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)
     scan = to_intensity_path(path)
-    models = load(Path(model), body) if model is not None else {}
-    if model is None:
-        for file in (to_model_path(path), to_model_path(path, "spatula")):
-            models = (load(file, body) if file.is_file() else {}) | models
+    learnt = to_model_path(path) if model is None else Path(model)
+    models = load(learnt, body) if model is not None or learnt.is_file() else {}
     intensity = read_intensity(scan) if scan.is_file() else None
     uncertainties = read_uncertainties(to_uncertainty_path(path))
     return PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties)

@@ -259,10 +259,10 @@ def _build_resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
 
 
 SCENES = (
-    "spatula", "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag",
-    "lost_force", "microscope",
+    "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag", "lost_force",
+    "microscope",
 )  # fmt: skip
-"""The built-in scenes, each a module of `scenes.builtin` that exports SCENE; `sulcus demo` opens the first."""
+"""The built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
 
 
 def find_scene(name: str) -> Scene:

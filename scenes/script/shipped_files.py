@@ -12,5 +12,5 @@ def get_template_path() -> Path:
 
 
 def get_spatula_model_path() -> Path:
-    """Return a model of a narrow spatula, 12 x 26 mm, on the template, by its pose, in tissue that does not relax."""
-    return get_template_path().with_suffix(".retract.npz")
+    """Return a model of a spatula on the template, by its pose, in tissue that does not relax."""
+    return get_template_path().with_suffix(".spatula.npz")
