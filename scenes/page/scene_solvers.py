@@ -122,7 +122,7 @@ class SceneSolvers:
         return FemResult(question[0], loads, answer, clock.perf_counter() - begun, question)
 
     def compare_models(self, truth: FemResult, tally: AccuracyTimeTable, skip: str) -> None:
-        """Record time and error of FEM and of every trained model but `skip`, for the load of an FEM solution."""
+        """Record time and error of each trained model but `skip`, for the load of an FEM solution."""
         load, scene = compute_loads_digest(truth.loads), self.get_stage().scene
         for name in self.theatre.select_models(scene):
             player = self.get_player(name)

@@ -142,7 +142,7 @@ class Uncertainty:
         parts = {name: self.read(values, time) for name, values in self.parts.items()}
         parts[SURROGATE] = surrogate / BOUND_DEVIATIONS
         if not deviation:
-            del parts[REGISTRATION]
+            parts.pop(REGISTRATION, None)
         worst = float(np.hypot(self.read(self.worst if deviation else self.registered, time), surrogate))
         moved = float(np.hypot(self.read(self.motion, time), surrogate))
         largest = max(parts, key=lambda name: parts[name])
