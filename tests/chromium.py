@@ -162,4 +162,4 @@ def assert_in_register(window: Chromium, colour: np.ndarray) -> None:
     sent = cv2.resize(sent, seen.shape[::-1], interpolation=cv2.INTER_AREA)
     shift, _ = cv2.phaseCorrelate(sent, seen, cv2.createHanningWindow(seen.shape[::-1], cv2.CV_64F))
     assert max(map(abs, shift)) < 1.0
-    assert np.corrcoef(sent.ravel(), seen.ravel())[0, 1] > 0.98
+    assert np.corrcoef(sent.ravel(), seen.ravel())[0, 1] > 0.975  # fine lines and words are smoothed

@@ -109,7 +109,8 @@ class TestWithoutATool:
         demo = Demo(theatre, sinking(), "fem", "127.0.0.1", free_port())
         try:
             assert (
-                set(demo.browser.inputs) == {"scene", "deformer", "overlay", "camera", *CAMERA, "Gravity"}
+                set(demo.browser.inputs)
+                == {"scene", "deformer", "overlay", "camera", "registration", *CAMERA, "Gravity", "measure costs"}
                 and "tool" not in demo.browser.meshes
             )
             assert wait_for(lambda: demo.run(0.3) and "gravity towards" in demo.browser.shown[2])

@@ -60,7 +60,7 @@ class TestEpisode:
             for name, truth in (("colour", frame.picture.colour), ("overlay", frame.shown)):
                 picture = decode_recorded(file, name, frame.number, cv2.IMREAD_COLOR)[..., ::-1]
                 assert picture.shape == truth.shape
-                assert np.abs(picture.astype(int) - truth).mean() < 2.0
+                assert np.abs(picture.astype(int) - truth).mean() < 2.5  # fine lines and words of the overlay lose most
             depth = decode_recorded(file, "depth", frame.number)
             assert depth.dtype == np.uint16
             assert np.abs(depth * DEPTH_SCALE - frame.picture.depth).max() <= 0.51 * DEPTH_SCALE

@@ -227,7 +227,8 @@ def test_numbers_and_errors_come_before_explanations(play, frames):
 
 
 def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
-    frame = frames[1]
+    alone, of_frame = replace(play, motion_error=None), frames[1]
+    frame = alone.draw_frame(of_frame.number, of_frame.touch, of_frame.loads, of_frame.deformation, 0.1)
     assert frame.tumour_error == TumourError(None, "", frame.estimate.worst)
     times = tuple(float(time) for time in play.scene.times[[0, -1]])
     flat = {"times": times, "worst": (3e-3, 3e-3), "middle": (2e-3, 2e-3), "moved": (1e-3, 1e-3)}

@@ -25,7 +25,7 @@ def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     monkeypatch.setattr(
         "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
     )
-    frame = play.draw(51, 1.7, play.scene.path(1.7))
+    frame = replace(play, motion_error=None).draw(51, 1.7, play.scene.path(1.7))
     add_cost_label(frame, "linear")
     assert said[:2] == [f"linear: tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
     assert said[-1] == frame.deformation.source

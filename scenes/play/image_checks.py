@@ -39,7 +39,7 @@ MASK_TOLERANCE = 0.02  # Share of the silhouette's pixels that may deviate.
 BROKEN_SHARES = (0.35, 0.88)  # Range of the share of a broken outline that is drawn.
 MAX_CHANGED_SHARE = 0.5  # Largest share of occluded ground whose colour may change.
 SOFT_LENGTH = 2  # Total length of the soft ends of two strokes [pixel]: their colour is not the outline's.
-MAX_NUMBER_DISTANCE = 0.3  # Largest distance of the number from the tip, as a share of the image width.
+MAX_NUMBER_DISTANCE = 0.35  # Largest distance of the number from the tip, as a share of the image width.
 
 
 def render_silhouette(camera: Camera, layer: Layer) -> np.ndarray:
