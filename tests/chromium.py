@@ -159,7 +159,8 @@ def assert_in_register(window: Chromium, colour: np.ndarray) -> None:
     shown = cv2.imdecode(np.frombuffer(window.shot(), np.uint8), cv2.IMREAD_GRAYSCALE).astype(np.float64)
     seen = shown[round(top) : round(bottom), round(left) : round(right)]
     sent = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY).astype(np.float64)
-    sent = cv2.resize(sent, seen.shape[::-1], interpolation=cv2.INTER_AREA)
+    smaller = seen.size < sent.size
+    sent = cv2.resize(sent, seen.shape[::-1], interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
     shift, _ = cv2.phaseCorrelate(sent, seen, cv2.createHanningWindow(seen.shape[::-1], cv2.CV_64F))
     assert max(map(abs, shift)) < 1.0
-    assert np.corrcoef(sent.ravel(), seen.ravel())[0, 1] > 0.975  # fine lines and words are smoothed
+    assert np.corrcoef(sent.ravel(), seen.ravel())[0, 1] > 0.98

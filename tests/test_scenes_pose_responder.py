@@ -174,7 +174,7 @@ def heard_of(times, stamped=True, sender=0):
 
 
 def off(placed, time):
-    """How far the tumour is from where it is in the picture of a time [m]."""
+    """Distance of the tumour from its position in the image of a time [m]."""
     truth = camera(time)
     truth[:3, 3] *= 1e-3
     return np.linalg.norm(placed.T[:3, :3] @ TUMOUR + placed.T[:3, 3] - truth[:3, :3] @ TUMOUR - truth[:3, 3])

@@ -4,7 +4,7 @@ import os
 
 import pytest
 import torch
-from tiny_episodes import Wanted, write_episode
+from tiny_episodes import write_three_episodes
 from torch.utils.data import DataLoader
 
 from scenes import EpisodeDataset
@@ -12,11 +12,7 @@ from scenes import EpisodeDataset
 
 @pytest.fixture(scope="module")
 def folder(box, tmp_path_factory):
-    """Episodes of 7, 9 and 4 frames; of the second every third frame was solved."""
-    folder = tmp_path_factory.mktemp("episodes")
-    for number, wanted in enumerate((Wanted(7), Wanted(9, every=3, seed=1), Wanted(4, seed=2))):
-        write_episode(folder / f"episode_{number:06d}.h5", box, wanted)
-    return folder
+    return write_three_episodes(tmp_path_factory.mktemp("episodes"), box)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are forked")

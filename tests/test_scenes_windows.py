@@ -6,7 +6,7 @@ import struct
 import h5py
 import numpy as np
 import pytest
-from tiny_episodes import HEIGHT, SCALE, WIDTH, Wanted, packed, read_images, write_episode
+from tiny_episodes import HEIGHT, SCALE, WIDTH, Wanted, packed, read_images, write_episode, write_three_episodes
 
 from scenes import read_episodes
 from scenes.episodes.reading.contents import OpenFiles
@@ -15,11 +15,7 @@ from sim.errors import InputError
 
 @pytest.fixture(scope="module")
 def folder(box, tmp_path_factory):
-    """Episodes of 7, 9 and 4 frames; of the second every third frame was solved."""
-    folder = tmp_path_factory.mktemp("episodes")
-    for number, wanted in enumerate((Wanted(7), Wanted(9, every=3, seed=1), Wanted(4, seed=2))):
-        write_episode(folder / f"episode_{number:06d}.h5", box, wanted)
-    return folder
+    return write_three_episodes(tmp_path_factory.mktemp("episodes"), box)
 
 
 def test_windows_have_the_frames_that_they_say_in_one_order(folder):

@@ -31,7 +31,7 @@ def test_inverted_elements_from_rest_are_counted() -> None:
 
 @pytest.mark.parametrize(("law", "followed"), [("neo-hookean", True), ("stable-neo-hookean", False)])
 def test_inverted_single_tetrahedra_are_tracked(law: str, followed: bool) -> None:
-    """Where the law is infinite before an average turns over: a deep press turns some, from wherever it is solved."""
+    """A deep press inverts some averages, from any start, if the law is infinite only after that."""
     effects = (Elasticity(tissue(law)), *openings.EFFECTS)
     deep = 8.0 * np.array([[0.2, 0.1, -1.0]])
     solver = Fem(openings.body()[0], effects, Accuracy(tolerance=1e-6, limit_strain=False), "cpu", element="smoothed")

@@ -1,4 +1,4 @@
-"""What killed processes left half-written."""
+"""Partial files of killed processes."""
 
 import os
 import subprocess

@@ -11,7 +11,7 @@ from sim.linalg.rest_solver import RestStiffnessSolver
 
 
 def test_linear_solution_is_same_without_inverse():
-    """What a series is made of: by a factor, and by conjugate gradients where none pays."""
+    """The terms of a series: by a factor, and by conjugate gradients where none pays."""
     problem, preconditioner = built("smoothed", 0.45, (2, 2, 3))
     free = problem.constraint.build_basis()
     force = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 3))

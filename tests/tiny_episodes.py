@@ -109,3 +109,10 @@ def write_episode(path: Path, anatomy: Anatomy, wanted: Wanted = Wanted()) -> Pa
         body.parent.mkdir(parents=True)
         write_anatomy(body, anatomy)
     return path
+
+
+def write_three_episodes(folder, box):
+    """Write episodes of 7, 9 and 4 frames, of the second every third frame solved; return the folder."""
+    for number, wanted in enumerate((Wanted(7), Wanted(9, every=3, seed=1), Wanted(4, seed=2))):
+        write_episode(folder / f"episode_{number:06d}.h5", box, wanted)
+    return folder

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
+from ..script.registration import REGISTRATIONS
 from .shared_options import add_anatomy, add_device
 from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, apply_tissue_options
 
@@ -72,7 +73,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--registration",
-        choices=("perfect", "clinical"),
+        choices=tuple(REGISTRATIONS),
         help="registration of the scan to the patient; clinical: standard deviation of 1.6 mm per axis (default: the "
         "scene's, perfect in built-in scenes)",
     )

@@ -47,12 +47,10 @@ def compare_with_fem(truth: FemResult, player: Player, own: bool, shown: Deforma
     `shown` is the deformer's solution of these loads, if it depends on previous ones.
     """
     nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
-    right = truth.deformation.restrict(nodes).displacement[0]
+    motion = float(np.linalg.norm(truth.deformation.restrict(nodes).displacement[0], axis=1).mean())
     error = None
     if not own:
-        answer = player.deformer.deform(truth.loads, at=nodes) if shown is None else shown.restrict(nodes)
-        error = np.linalg.norm(answer.displacement[0] - right, axis=1)
-    motion = float(np.linalg.norm(right, axis=1).mean())
+        error = compute_distances(truth, player, shown or player.deformer.deform(truth.loads, at=nodes))
     off = (None, None) if error is None else (float(error.mean()), float(error.max()))
     pushed = truth.loads.get_all(Pushed)
     lift = compute_lift(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
@@ -61,6 +59,13 @@ def compare_with_fem(truth: FemResult, player: Player, own: bool, shown: Deforma
     return Comparison(
         truth.number, truth.seconds, describe_outcome(truth.deformation.outcome[0]), motion, *off, distance
     )
+
+
+def compute_distances(truth: FemResult, player: Player, shown: Deformation) -> np.ndarray:
+    """Return the distance (n,) [m] of each tumour node in a solution from its position by FEM."""
+    nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
+    both = (one.restrict(nodes).displacement[0] for one in (truth.deformation, shown))
+    return np.linalg.norm(np.subtract(*both), axis=1)
 
 
 def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: str = FEM_SHOWN) -> str:
@@ -84,9 +89,7 @@ def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: s
 
 def describe_change(truth: FemResult, player: Player, shown: Deformation, off: Sequence[str]) -> str:
     """Describe the tumour's distance from its position under all effects, for a solution without some."""
-    nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
-    apart = truth.deformation.restrict(nodes).displacement[0] - shown.restrict(nodes).displacement[0]
-    mean = 1e3 * float(np.linalg.norm(apart, axis=1).mean())
+    mean = 1e3 * float(compute_distances(truth, player, shown).mean())
     return f"<p>without {escape(', '.join(off))} the tumour moves {mean:.2f} mm differently</p>"
 
 

@@ -26,7 +26,7 @@ class EffectCosts:
 
     def start(self) -> None:
         """Start the measurement, unless it was started before."""
-        if not self.thread.is_alive() and self.thread.ident is None:
+        if self.thread.ident is None:
             self.show("<p>The scene is solved with and without each effect...</p>")
             self.thread.start()
 

@@ -17,7 +17,7 @@ from ..play.replay import ReplaySession
 from ..play.stage import Stage
 from ..script.camera_paths import PATHS
 from ..script.scene import Scene
-from .comparison import AccuracyTimeTable, compare_with_fem
+from .comparison import AccuracyTimeTable, compute_distances
 from .fem_worker import FemResult, FemWorker, Question
 from .requests import Look
 
@@ -128,9 +128,8 @@ class SceneSolvers:
             player = self.get_player(name)
             if name != skip and not player.follows:
                 shown = player.compute_deformation(truth.loads)
-                error = compare_with_fem(truth, player, False, shown).mean
                 tally.record_time(name, load, shown.cost.total)
-                tally.record_error(name, load, error or 0.0)
+                tally.record_error(name, load, float(compute_distances(truth, player, shown).mean()))
 
     def solve(
         self, off: frozenset[str], question: Question, seen: FemResult | None, patience: float

@@ -243,9 +243,8 @@ class PatientSetup:
 
     def build_player_of(self, stage: Stage, deformer: Deformer) -> Player:
         """Return a player of a stage with its errors on this anatomy."""
-        scene = stage.scene
-        errors = {"uncertainty": self.estimate_uncertainty(scene), "motion_error": self.estimate_motion_error(scene)}
-        return Player(stage, deformer, **errors)
+        ensemble, motion_error = self.estimate_uncertainty(stage.scene), self.estimate_motion_error(stage.scene)
+        return Player(stage, deformer, uncertainty=ensemble, motion_error=motion_error)
 
     def estimate_uncertainty(self, scene: Scene) -> Uncertainty | None:
         """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""

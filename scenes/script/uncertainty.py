@@ -180,9 +180,9 @@ class MotionError:
 def fit_motion_error(found: Uncertainty) -> MotionError | None:
     """Fit the error of a scene's motion in proportion to it; None if the tumour hardly moves in the scene."""
     moved, worst, mean = (np.array(values) for values in (found.moved, found.registered, found.motion))
-    enough = moved > MIN_MOTION_RATIO * max(moved.max(), MIN_MOTION)
-    if not enough.any() or moved.max() < MIN_MOTION:
+    if moved.max() < MIN_MOTION:
         return None
+    enough = moved > MIN_MOTION_RATIO * moved.max()
     rest: dict[Registration, float] = {"perfect": found.registered[0], "clinical": found.worst[0]}
     surface = np.sqrt(np.maximum(worst**2 - worst[0] ** 2, 0.0))[enough] / moved[enough]
     return MotionError(rest, float(surface.max()), float((mean[enough] / moved[enough]).max()))
