@@ -40,28 +40,23 @@ from .outlines import (
     find_outlines,
     find_pixel_box,
     join_boxes,
+    lay_lines,
     to_key,
 )
 from .styles import STYLES, Opening, Style
 from .text_placement import BORDER_DISTANCE, TEXT_DISTANCE
 from .window import BORDER_COLOUR, CLOSED_GROUND, FRONT, Lines, Roles, draw_overlay
 
-DOUBTFUL_COLOUR = (
-    0.92,
-    0.50,
-    0.05,
-)  # Outline colour (RGB, 0 to 1) of an unreliable overlay; its outline is broken as well.
+DOUBTFUL_COLOUR = (0.92, 0.50, 0.05)  # Outline (RGB, 0 to 1) of an unreliable overlay, which is broken as well.
 # Text colour of an unreliable overlay: pixels of the outline's colour belong to the outline alone.
 WARNING_COLOUR = (1.0, 0.84, 0.5)
 POINT_COLOUR = (255.0, 245.0, 190.0)
 """Colour of observed points."""
-MARGIN_BRIGHTNESS = (
-    0.75  # Brightness of the margin line relative to the outline, as the margin is not the surface itself.
-)
+MARGIN_BRIGHTNESS = 0.75  # Brightness of the margin line relative to the outline, which is the surface itself.
 BROKEN_STROKES = (9, 6)  # Stroke and gap lengths of an unreliable outline [pixel].
 MARGIN_STROKES = (12, 7)  # Stroke and gap lengths of a margin [pixel].
-HIDDEN_STROKES = (9, 6)  # Stroke and gap lengths of an outline under closed ground [pixel].
-HIDDEN_LINE_WIDTH = 2  # Line width of an outline under closed ground [pixel].
+HIDDEN_STROKES = (9, 6)  # Stroke and gap lengths of an outline under closed ground or a tool [pixel].
+HIDDEN_LINE_WIDTH = 2  # Line width of an outline under closed ground or a tool [pixel].
 SILHOUETTE_TEXT_WIDTH = 96  # Width of text lines within the silhouette [pixel].
 MAX_LOWER_ROWS = 2  # Number of text rows by which text at the top may be lower, to leave a line visible.
 # Widths of text at the top as shares of the image width; the first that covers no tool is used.
@@ -148,7 +143,7 @@ def composite(
         "contour": the outline. "window": also the surface, shaded and darker with depth, while the ground around the
         outline is dimmed. "fill": outline and a flat tint. "depth": outline and a tint that is stronger at smaller
         depth, with its scale. "rings": lines of equal distance from the surface on the ground (`distances.py`).
-        "cut": an inset (`cut.py`). "none": only warnings.
+        "cut": an inset (`cut.py`). "none": only warnings. Occluders are crossed by outlines alone.
     cover, marks, words
         Occluders of the surface, and additional marks and text.
 
@@ -207,7 +202,7 @@ def _draw_sketch(
         return Sketch(picture.colour.copy(), taken, faint, thin)
     part, device = camera.crop_to(*around), str(picture.drawn.colour.device)
     found = rasterise_surface(part, hidden.vertices, hidden.triangles, device=device)
-    under, above, ground = allocate_sheet(part), None, None
+    under, above, ground, front = allocate_sheet(part), None, None, None
     if marks.before is not None:
         draw_before(under, camera, around, marks.before, hidden)
     if grown is not None:
@@ -217,7 +212,7 @@ def _draw_sketch(
         faint[around] = bare & (under[..., 3] > 0)
     if opening is not None:
         role = measure.roles.read_roles(picture.segmentation, around)
-        ground = find_ground(picture.segmentation[around], role, found, opening)
+        ground, front = find_ground(picture.segmentation[around], role, found, opening), role == FRONT
     for trace in marks.traces:
         draw_trace(under, part, trace)
     draw_broken(under, found, compute_ink(hidden.colour), ground, doubtful)
@@ -225,12 +220,17 @@ def _draw_sketch(
         above = allocate_sheet(part)
     if gauge is not None and above is not None:
         draw_line(above, part, gauge)
-    bare = under[..., 3] == 0
+    bare, outlines = under[..., 3] == 0, under.copy()
     measure.draw(under, under if above is None else above, around)
     if style == "rings":
         thin[around] = separate_rings(bare & (under[..., 3] > 0))
     lines = Lines(compute_ink(hidden.colour), not doubtful, under, above)
     out, taken[around] = draw_overlay(picture.drawn, around, part, hidden, found, measure.roles, style, lines)
+    if front is not None and front.any():
+        if not doubtful:
+            pieces = cut_outlines(find_outlines(found.mask), front)
+            draw_dashes(outlines, pieces, lines.ink, HIDDEN_STROKES, HIDDEN_LINE_WIDTH)
+        lay_lines(out[around], outlines, front)
     return Sketch(out, taken, faint, thin, around, ground)
 
 

@@ -120,6 +120,12 @@ def draw_dashes(
     cv2.polylines(out, strokes, False, (*ink, OPAQUE), width, cv2.LINE_AA)
 
 
+def lay_lines(colour: np.ndarray, sheet: np.ndarray, mask: np.ndarray) -> None:
+    """Draw a sheet (h, w, 4) of lines over an image (h, w, 3) uint8 where a mask (h, w) is True, in place."""
+    line, left = sheet[mask, :3], 255 - sheet[mask, 3:].astype(int)
+    colour[mask] = (colour[mask] * left // 255 + line).astype(np.uint8)
+
+
 def clip_to_sheet(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:
     """Return the pieces of an outline (n, 1, 2) inside a sheet, away from its edge."""
     inside = (line >= MAX_EDGE_DISTANCE) & (line < (width - MAX_EDGE_DISTANCE, height - MAX_EDGE_DISTANCE))

@@ -25,7 +25,7 @@ def describe_overlay(name: str, who: str, tooled: bool) -> str:
     now, doubt = to_stroke(TUMOUR_COLOUR), to_stroke(DOUBTFUL_COLOUR)
     keys = [
         (f'{now} stroke-width="3"', "tumour now"),
-        (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone"),
+        (f'{now} stroke-width="3" stroke-dasharray="5 3"', "hidden by tool, drape or bone"),
         (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "95 % error band"),
         ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan; lost or stale: where it was"),
         (f'{doubt} stroke-width="3" stroke-dasharray="5 3"', "not to be relied on"),
