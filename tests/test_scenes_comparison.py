@@ -13,8 +13,8 @@ from scenes.page.comparison import (
     compare_with_fem,
     format_comparison,
 )
+from scenes.page.cost_plot import format_cost_plot
 from scenes.page.fem_worker import FemResult
-from scenes.page.text import format_cost_table
 from scenes.play.frame_text import describe_outcome
 from scenes.play.player import Player
 from scenes.play.stage import Stage
@@ -30,7 +30,7 @@ def shown(tally: AccuracyTimeTable, name: str, loads: Iterable[str], millisecond
 
 def test_deformers_are_ranked_on_common_loads():
     tally = AccuracyTimeTable()
-    assert tally.rows == [] and format_cost_table(tally.rows) == ""
+    assert tally.rows == [] and format_cost_plot(tally.rows) == ""
     shown(tally, "quick", "abc", 1.0, 0.2)
     shown(tally, "quick", "z", 90.0, 90.0)  # a load that nobody else had does not count against it
     shown(tally, "slow", "abc", 4.0, 0.03)
@@ -39,8 +39,8 @@ def test_deformers_are_ranked_on_common_loads():
     rows = [(row.name, round(row.milliseconds, 9), round(row.millimetres, 9), row.loads) for row in tally.rows]
     assert rows == [("quick", 1.0, 0.2, 2), ("slow", 4.0, 0.03, 2), ("lost", 5.0, 0.2, 2)]
     assert [row.best for row in tally.rows] == [True, True, False]
-    words = format_cost_table(tally.rows)
-    assert "over the same 2 loads" in words and words.count("best") == 2
+    words = format_cost_plot(tally.rows)
+    assert "over the same 2 loads" in words and words.count("class=best") == 2
 
 
 def test_without_a_common_load_nobody_is_ranked():
@@ -50,7 +50,7 @@ def test_without_a_common_load_nobody_is_ranked():
     assert [row.best for row in tally.rows] == [None]
     shown(tally, "pressing", "c", 1.0, 0.2)
     assert [row.best for row in tally.rows] == [None, None]
-    words = format_cost_table(tally.rows)
+    words = format_cost_plot(tally.rows)
     assert "not comparable" in words and "best" not in words
 
 
@@ -65,10 +65,9 @@ def test_repeated_load_counts_once_and_old_ones_expire():
 
 def test_an_error_too_small_to_print_is_not_reported_as_none():
     rows = [ComparisonRow("a", 1.0, 4e-4, 3, None), ComparisonRow("b", 1.0, 1.234e-3, 3, None)]
-    assert "error under 0.001 mm" in format_cost_table(rows) and "error 0.001 mm</td><td>3 loads" in format_cost_table(
-        rows
-    )
-    assert "0.000" not in format_cost_table(rows)
+    words = format_cost_plot(rows)
+    assert "a: 1.0 ms, error under 0.001 mm" in words and "b: 1.0 ms, error 0.001 mm, 3 loads" in words
+    assert "0.000" not in words
 
 
 class TestVerdict:

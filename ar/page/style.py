@@ -41,7 +41,9 @@ RULES = """
 #PAGE .number, #SAID .number { font-size: 1.25rem; font-weight: 600 }
 #SAID table { border-collapse: collapse; font-size: 0.8rem; margin-bottom: 0.3rem }
 #PAGE small { font-size: 0.8rem; margin-left: 0.8rem }
-#SAID .best { font-weight: 700 }
+#SAID .cost { width: 100%; max-width: 26rem; display: block; font-size: 10.5px; fill: currentColor }
+#SAID .cost path { stroke: currentColor; opacity: 0.2 }
+#SAID .cost .best { font-weight: 700; fill: #4cf28c }
 #SAID .more { color: #74c0fc; cursor: pointer; text-decoration: underline }
 #SAID .details { display: none }
 :root:has(DETAILS:checked) #SAID .details { display: block }

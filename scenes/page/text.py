@@ -22,6 +22,7 @@ from ..script.scene import Scene
 from ..script.tool_paths import Touch
 from ..script.uncertainty import TumourError
 from .comparison import ComparisonRow
+from .cost_plot import format_cost_plot
 
 ESTIMATE_EXPLANATION = (  # Explanation of the image where the motion is estimated from the cortex.
     "The tumour's position is estimated from the dots on the cortex alone: no force and no stiffness is known."
@@ -67,7 +68,7 @@ def format_page_legend(scene: Scene) -> str:
     """Build the legend of the lines, each with a sample."""
     scan = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
     now, true, ellipsoid = (to_stroke(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
-    under = (f'{now} stroke-width="3" stroke-dasharray="5 3"', "tumour under drape or bone")
+    under = (f'{now} stroke-width="3" stroke-dasharray="5 3"', "hidden by tool, drape or bone")
     keys = [
         (f'{now} stroke-width="3"', "predicted tumour"),
         under,
@@ -230,9 +231,10 @@ def report(
         details.append(f"<p>{len(left.loose)} loose elements were removed with the resection.</p>")
     spent = {"deform": "deformation", "render": "rendering", "overlay": "overlay"}
     took = ", ".join(f"{spent.get(stage, stage)} {1e3 * seconds:.1f}" for stage, seconds in frame.seconds.items())
-    details += [verdict, format_cost_table(rows), f'<p class="dim">time [ms]: {took}</p></div>']
+    details += [verdict, f'<p class="dim">time [ms]: {took}</p></div>']
     warnings = [part for part in details if WARNING in part]
-    return "".join([*parts, *warnings, OPEN_DETAILS, *(part for part in details if WARNING not in part)])
+    parts += [*warnings, format_cost_plot(rows)]
+    return "".join([*parts, OPEN_DETAILS, *(part for part in details if WARNING not in part)])
 
 
 def format_motion(frame: Frame) -> str:
@@ -280,34 +282,3 @@ def format_unbroken(length: float, error: float | None = None) -> str:
     """Return a length and its error [m] in millimetres, whose unit no new line parts from them."""
     said = hud.format_millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
     return said.replace(" ", "&nbsp;")
-
-
-def format_cost_table(rows: Sequence[ComparisonRow]) -> str:
-    """Build the table of time and error of the deformers shown; ranked only if all have the same loads."""
-    if not rows:
-        return ""
-    ranked = rows[0].best is not None
-    what = (
-        f"Medians over the same {format_load_count(rows[0].loads)}; bold: no other is both faster and more accurate."
-        if ranked
-        else "Medians up to now."
-    )
-    if len(rows) > 1 and not ranked:
-        what = "Medians over different loads: not comparable."
-    lines = (
-        f"<tr{' class=best' if row.best else ''}><td>{escape(row.name)}</td>"
-        f"<td>{row.milliseconds:.1f} ms</td><td>error {_format_error(row.millimetres)} mm</td>"
-        f"<td>{format_load_count(row.loads)}</td></tr>"
-        for row in rows
-    )
-    return f'<p class="dim">{what}</p><table>{"".join(lines)}</table>'
-
-
-def _format_error(millimetres: float) -> str:
-    """Return the error in millimetres; a small one is not rounded to none."""
-    return f"{millimetres:.3f}" if millimetres >= 1e-3 else "under 0.001"
-
-
-def format_load_count(loads: int) -> str:
-    """Format the number of loads."""
-    return f"{loads} load{'' if loads == 1 else 's'}"

@@ -1,0 +1,77 @@
+"""Plot of error against time of the deformers on the loads that were shown, as an SVG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from .comparison import ComparisonRow
+
+WIDTH, HEIGHT = 340, 150  # Size of the plot [SVG unit].
+LEFT, RIGHT, TOP, BOTTOM = 44, 12, 10, 30  # Margins of its axes [SVG unit].
+MIN_ERROR = 1e-3  # Smallest error of the plot [mm].
+LABEL_HEIGHT = 11  # Distance of two labels, one above the other [SVG unit].
+LABEL_WIDTH = 70  # Labels nearer than this side by side are parted [SVG unit].
+
+
+def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
+    """Plot error [mm] against time [ms], both logarithmic; ranked only if all deformers have the same loads."""
+    if not rows:
+        return ""
+    if rows[0].best is not None:
+        what = f"the same {_format_load_count(rows[0].loads)}; bold: no other is both faster and more accurate"
+    else:
+        what = "the loads up to now" if len(rows) == 1 else "different loads: not comparable"
+    x, ticks = _scale([row.milliseconds for row in rows], LEFT, WIDTH - RIGHT)
+    y, levels = _scale([max(row.millimetres, MIN_ERROR) for row in rows], HEIGHT - BOTTOM, TOP)
+    parts = [_draw_tick(place, HEIGHT - BOTTOM + 12, f"{value:g}", "middle") for value, place in ticks]
+    parts += [_draw_tick(LEFT - 5, place + 4, f"{value:g}", "end") for value, place in levels]
+    grid = [f"M{place:.0f} {TOP}V{HEIGHT - BOTTOM}" for _, place in ticks]
+    grid += [f"M{LEFT} {place:.0f}H{WIDTH - RIGHT}" for _, place in levels]
+    placed: list[tuple[float, float]] = []
+    for row, across, along in zip(rows, x, y, strict=True):
+        low = along + 4.0
+        while any(abs(low - other) < LABEL_HEIGHT and abs(across - at) < LABEL_WIDTH for at, other in placed):
+            low += 2.0
+        placed.append((across, low))
+        right = across > 0.6 * WIDTH
+        label = _draw_tick(across + (-7 if right else 7), low, row.name, "end" if right else "start")
+        parts.append(
+            f"<g{' class=best' if row.best else ''}><title>{escape(describe_row(row))}</title>"
+            f'<circle cx="{across:.0f}" cy="{along:.0f}" r="4"/>{label}</g>'
+        )
+    words = "; ".join(map(describe_row, rows))
+    return (
+        f'<svg class="cost" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(words)}">'
+        f'<path d="{"".join(grid)}"/>{"".join(parts)}{_draw_tick(WIDTH - RIGHT, HEIGHT - 4, "time [ms]", "end")}'
+        f"{_draw_tick(2, HEIGHT - 4, 'error [mm]', 'start')}</svg>"
+        f'<p class="dim">Mean error relative to FEM against time, medians over {what}.</p>'
+    )
+
+
+def describe_row(row: ComparisonRow) -> str:
+    """Describe the time and the error of a deformer."""
+    error = f"{row.millimetres:.3f}" if row.millimetres >= MIN_ERROR else f"under {MIN_ERROR:.3f}"
+    return f"{row.name}: {row.milliseconds:.1f} ms, error {error} mm, {_format_load_count(row.loads)}"
+
+
+def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[float], list[tuple[float, float]]]:
+    """Return the places of values between two ends, and those of the powers of ten round them."""
+    low, high = np.floor(np.log10(min(values))), np.ceil(np.log10(max(values)))
+    span = max(high - low, 1.0)
+
+    def place(value: float) -> float:
+        return float(start + (end - start) * (np.log10(value) - low) / span)
+
+    return [place(value) for value in values], [(ten, place(ten)) for ten in 10.0 ** np.arange(low, low + span + 0.5)]
+
+
+def _draw_tick(x: float, y: float, words: str, anchor: str) -> str:
+    """Return a text of the plot."""
+    return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}">{escape(words)}</text>'
+
+
+def _format_load_count(loads: int) -> str:
+    return f"{loads} load{'' if loads == 1 else 's'}"
