@@ -8,7 +8,7 @@ EXPECTED = (
     # Devices and programs.
     "no CUDA device|there is a card here|there is no Chromium here|needs make|libopenigtlink-dev",
     # Packages of extras, and Pythons of other projects, that variables name.
-    r"not installed|needs SULCUS_\w+|SULCUS_\w+ names no Python",
+    r"not installed|no container engine runs|needs SULCUS_\w+|SULCUS_\w+ names no Python",
     # Systems, and what needs a machine or an account of its own.
     "could not import 'resource'|needs (processes|a device|a file system)|system's table",
     "no such file system|root writes anywhere|^there is$|small strain is not invariant",

@@ -13,7 +13,7 @@ from scenes.cli import main, make_parsers
 from scenes.script.shipped_files import get_template_path
 
 PAGE = (Path(__file__).parents[1] / "docs/tutorial.md").read_text()
-LABELS, OBSERVE = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+(OBSERVE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 LINES = [
     shlex.split(line) for line in re.findall(r"^sulcus .*$", PAGE.replace("$TEMPLATE", str(get_template_path())), re.M)
 ]
@@ -25,14 +25,16 @@ def test_tutorial_command_is_parsed(command):
     assert make_parsers(command[0])[0].parse_args(command).command == command[0]
 
 
-def test_tutorial_label_map_gives_the_output_shown(tmp_path, monkeypatch, capsys):
+def test_tutorial_sample_gives_the_output_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    exec(LABELS, {})
     assert main(INSPECT) == 0 and Path("patient.inspect.png").exists()
     shown = PAGE.partition("--inspect\n```\n\n```text\n")[2].partition("```")[0]
     assert shown.count("\n") >= 6 and shown in capsys.readouterr().out
-    assert main(["anatomy", "--labels", *PATIENT[1:8], "--out", "mesh.vtu"]) == 0
-    assert re.search(r"^\d+ nodes, \d+ tetrahedra", PAGE, re.MULTILINE)[0] in capsys.readouterr().out
+    sources = ["--labels", "sample_labels.nii.gz", "--brain", "1", "--tumour", "2", "--t1", "sample_t1.nii.gz"]
+    assert PATIENT[:4] == ["patient", "--sample", "--nodes", "2000"]
+    assert main(["anatomy", *sources, *PATIENT[2:4], "--out", "mesh.vtu"]) == 0
+    mesh = re.search(r"^\d+ nodes, \d+ tetrahedra.*?(?=^\.\.\.$)", PAGE, re.MULTILINE | re.DOTALL)
+    assert mesh and mesh[0].count("\n") == 3 and mesh[0] in capsys.readouterr().out
 
 
 def test_tutorial_tumour_is_located(tmp_path, monkeypatch, capsys):

@@ -1,6 +1,9 @@
 """Every script in examples/ runs as a user runs it, in a folder of its own, and says what it is for."""
 
 import ast
+import contextlib
+import io
+import json
 import os
 import subprocess
 import sys
@@ -28,6 +31,22 @@ def test_an_example_runs(script, tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_the_notebook_prints_what_it_shows():
+    notebook = json.loads((EXAMPLES / "first_steps.ipynb").read_text())
+    assert notebook["nbformat"] == 4 and notebook["nbformat_minor"] == 5 and len(notebook["cells"]) <= 12
+    assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
+    names = {}
+    for cell in notebook["cells"]:
+        assert cell["metadata"] == {} and cell["source"]
+        if cell["cell_type"] == "code":
+            with contextlib.redirect_stdout(io.StringIO()) as shown:
+                exec("".join(cell["source"]), names)
+            assert [*map(set, cell["outputs"])] == [{"name", "output_type", "text"}] * bool(shown.getvalue())
+            assert "".join(text for output in cell["outputs"] for text in output["text"]) == shown.getvalue()
+    assert names["errors"].max() < 1e3 * names["predicted"].bound[0, 0]
+    assert names["png"].startswith(b"\x89PNG") and names["frame"].shown.std() > 20.0
 
 
 def test_the_list_of_parts_names_examples():

@@ -93,6 +93,36 @@ def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
     assert len(list((tmp_path / "frames").iterdir())) == 3
 
 
+def test_a_sample_patient_is_previewed_and_kept(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["patient", "--sample", "--inspect"]
+    assert main(words) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("sample label map: sample_labels.nii.gz (1 brain, 2 tumour)\nsample T1: sample_t1.nii.gz\n")
+    assert "left anterior superior" in shown and "no warnings" in shown
+    files = ["patient.inspect.png", "sample_labels.nii.gz", "sample_t1.nii.gz"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == files
+    labels, t1 = (tmp_path / name for name in files[1:])
+    before, data = (labels.stat().st_mtime_ns, t1.stat().st_mtime_ns), t1.read_bytes()
+    assert main([*words, "--json"]) == 0 and json.loads(capsys.readouterr().out)["tumour_ml"] > 7.0
+    assert (labels.stat().st_mtime_ns, t1.stat().st_mtime_ns) == before
+    labels.unlink()
+    t1.write_bytes(b"mine")
+    assert main(words) == 2 and "sample_t1.nii.gz: exists. Give --force" in capsys.readouterr().err
+    assert not labels.exists() and t1.read_bytes() == b"mine"
+    assert main([*words, "--force"]) == 0 and labels.exists() and t1.read_bytes() == data
+
+
+def test_a_sample_patient_gives_its_files_to_the_steps(tmp_path, monkeypatch, capsys):
+    steps = []
+    monkeypatch.setattr("scenes.cli.main", lambda step: steps.append(step) or 0)
+    assert main(["patient", "--sample", "--out", str(tmp_path / "new" / "me.vtu"), "--device", "cpu", "--json"]) == 0
+    labels, t1 = (tmp_path / "new" / f"sample_{name}.nii.gz" for name in ("labels", "t1"))
+    assert steps[0][:6] == ["anatomy", f"--labels={labels}", "--brain=1", "--tumour=2", "--t1", str(t1)]
+    assert labels.exists() and t1.exists() and [step[0] for step in steps] == ["anatomy", "simulate", "train"]
+    assert json.loads(capsys.readouterr().out)["anatomy"] == str(tmp_path / "new" / "me.vtu")
+
+
 def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsys):
     def step(words):
         assert words[-1] == "--json"
@@ -120,6 +150,11 @@ def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsy
         (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "contact"], "contact"),
         (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--learners", "ann,"], "--learners"),
         (["labels.nii.gz", "--brain", "1", "--tumour", "2", "--out", "a.vtu", "--nodes", "3"], "3 nodes"),
+        (["--brain", "1", "--tumour", "2"], "no label map: give LABELS.nii.gz, or --sample"),
+        (["labels.nii.gz", "--sample"], "leave out labels.nii.gz, or --sample"),
+        (["--sample", "--t1", "t1.nii.gz"], "leave out t1.nii.gz, or --sample"),
+        (["--sample", "--tumour", "2"], "leave out --tumour, or --sample"),
+        (["--sample", "--out", "a.vtu", "--count", "3"], "--count 3"),
     ],
 )
 def test_a_patient_that_cannot_be_is_a_sentence(tmp_path, monkeypatch, capsys, words, reason):

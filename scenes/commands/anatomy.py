@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sim.anatomy import PART_LABELS, Anatomy, name_region
-from sim.bodies.dural_septa import SEPTA, find_held_vertices
+from sim.bodies.dural_septa import find_held_vertices
 from sim.bodies.head_masks import read_head_masks
 from sim.bodies.intensity import to_intensity_path, write_intensity
 from sim.bodies.label_volume import build_masked_subject
@@ -25,13 +25,7 @@ from sim.geometry.tetmesh import compute_dihedral_angles
 from sim.runtime.timing import time_stage
 
 from ..options.outputs import add_force, check_no_foreign_files, check_output_path
-from ..options.placement_options import (
-    CRANIOTOMY_HELP,
-    add_opening_arguments,
-    describe_opening,
-    place_craniotomy,
-    to_metres,
-)
+from ..options.placement_options import add_opening_arguments, describe_opening, place_craniotomy, to_metres
 from ..options.shared_options import add_json
 from ..options.subject_options import (
     add_drawn_arguments,
@@ -39,6 +33,7 @@ from ..options.subject_options import (
     build_drawn_subject,
     check_no_drawn_options,
     describe_source,
+    list_label_options,
     parse_regions,
     parse_sources,
 )
@@ -65,8 +60,6 @@ MIN_REPORTED_LOSS = 3.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's options."""
     parser.add_argument("--out", required=True, type=Path, metavar="MESH.vtu", help="mesh to write [m, RAS]")
-    parser.add_argument("--nodes", type=int, default=5300, metavar="N", help="number of mesh nodes, 2000 to 250000")
-    parser.add_argument("--craniotomy", type=float, metavar="MM", help=CRANIOTOMY_HELP)
     parser.add_argument(
         "--preset", choices=tuple(PRESETS), default="default", help="values of the options that are not given"
     )
@@ -133,12 +126,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _build_subject(args: argparse.Namespace, chosen: dict) -> Subject:
     if args.labels is None:
-        for name in ("brain", "tumour", "convention", "tumour_in", "axes", *PART_LABELS, *SEPTA, "regions"):
-            if getattr(args, name):
-                option = name.replace("_", "-")
-                raise InputError(
-                    f"--{option} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out."
-                )
+        for option in list_label_options(args):
+            raise InputError(f"{option} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out.")
         return build_drawn_subject(args, chosen)
     check_no_drawn_options(args)
     return build_masked_subject(read_head_masks(parse_sources(args)), args.t1, regions=parse_regions(args))

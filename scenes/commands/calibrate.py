@@ -31,25 +31,17 @@ MIN_MOTION = 1e-3  # Motion along each axis below which positions may be in metr
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "pictures",
-        nargs="?",
-        type=Path,
-        metavar="VIDEO|FOLDER",
+        "pictures", nargs="?", type=Path, metavar="VIDEO|FOLDER",
         help="images of the board that `sulcus markers` prints: a video, or a folder of PNG or JPEG images",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--pivot",
-        type=Path,
-        metavar="POSES.csv",
+        "--pivot", type=Path, metavar="POSES.csv",
         help="estimate a tool's tip from poses around a fixed tip; columns as below",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--hand-eye",
-        type=Path,
-        nargs=2,
-        metavar=("A.csv", "B.csv"),
+        "--hand-eye", type=Path, nargs=2, metavar=("A.csv", "B.csv"),
         help="estimate the transform from body B to body A from simultaneous poses of both; columns as below",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--out", metavar="K.yaml", help="calibration to write; its covariance goes to K.json next to it"
     )

@@ -30,6 +30,7 @@ next: sulcus export brain.model.npz --out brain.onnx""",
   sulcus export brain.model.npz --out brain.onnx
 next: run it by ONNX Runtime; the file itself says what goes in and what comes out""",
     "patient": """examples:
+  sulcus patient --sample
   sulcus patient labels.nii.gz --brain 1,2 --tumour 3 --out patient.vtu --inspect
   sulcus patient labels.nii.gz --brain 1,2 --tumour 3 --t1 t1.nii.gz --out patient.vtu
 next: sulcus demo --anatomy patient.vtu""",

@@ -26,12 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("anatomy", metavar="ANATOMY.vtu", help="anatomy from `sulcus anatomy` or `sulcus patient`")
     parser.add_argument(
-        "observed",
-        metavar="OBSERVED.csv",
+        "observed", metavar="OBSERVED.csv",
         help="observations [mm, RAS], with a header. `x,y,z,dx,dy,dz`: points in the scan, such as vessels, "
         "and their observed displacements; `x,y,z`: point cloud of the deformed open cortex. Optional last column "
         "`sigma`: non-rigid error of each point (default: 0.58)",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--tips", metavar="TIPS.csv", help="contact points of tools on the cortex [mm], columns `x,y,z`"
     )
@@ -44,17 +43,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="registration verified on fixed landmarks: assume no registration shift beyond --rigid",
     )  # fmt: skip
     parser.add_argument(
-        "--out",
-        metavar="RESULT.vtu",
+        "--out", metavar="RESULT.vtu",
         help="file for mean displacement and covariance of every vertex (default: none; the tumour alone is reported, "
         "and a small locator is enough)",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--locator",
-        metavar="FILE.npz",
-        type=Path,
+        "--locator", metavar="FILE.npz", type=Path,
         help="ensemble of the anatomy; computed in minutes if missing (default: next to the anatomy)",
-    )
+    )  # fmt: skip
     add_region_argument(parser, REGIONS)
     add_device(parser, "building a missing locator")
     add_seed(parser, "a locator that is made; without effect where there is one")

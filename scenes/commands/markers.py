@@ -12,12 +12,9 @@ from ..options.outputs import add_force, check_output_path
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
+        "--out", type=Path, required=True, metavar="DIR",
         help="folder for markers.pdf, a PNG of each page, and targets.json with all corners [mm]",
-    )
+    )  # fmt: skip
     add_force(parser)
 
 

@@ -5,15 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from sim.anatomy import PART_LABELS, REGION_NAMES
+from sim.anatomy import BRAIN_LABEL, PART_LABELS, REGION_NAMES, TUMOUR_LABEL
 from sim.bodies.head_masks import read_head_masks
+from sim.bodies.intensity import encode_intensity
 from sim.bodies.label_volume import build_masked_subject
+from sim.bodies.meshfile import read_anatomy
+from sim.bodies.sample_head import build_sample_head
 from sim.bodies.subject import MeshPlan, choose_craniotomy, find_opened_cortex
 from sim.elements import RECOMMENDED
 from sim.errors import InputError
@@ -27,7 +31,6 @@ from surrogate.data.tool_loads import PRESETS
 
 from ..options.outputs import add_force, check_output_path
 from ..options.placement_options import (
-    CRANIOTOMY_HELP,
     add_opening_arguments,
     get_trajectory_option,
     place_craniotomy,
@@ -35,29 +38,30 @@ from ..options.placement_options import (
     to_opening_options,
 )
 from ..options.shared_options import add_devices, add_json
-from ..options.subject_options import add_label_arguments, label_words, parse_regions, parse_sources
+from ..options.subject_options import add_label_arguments, label_words, list_label_options, parse_regions, parse_sources
 from ..options.tissue_options import NON_BRAIN_REGIONS, add_element_argument, add_region_argument, parse_region_tissues
+from ..script.shipped_files import get_template_path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("labels", type=Path, metavar="LABELS.nii.gz", help="label volume")
+    parser.add_argument("labels", nargs="?", type=Path, metavar="LABELS.nii.gz", help="label volume")
+    parser.add_argument(
+        "--sample", action="store_true",
+        help="without LABELS: write sample_labels.nii.gz and sample_t1.nii.gz of a synthetic patient next to --out, "
+        "and continue with them",
+    )  # fmt: skip
     add_label_arguments(parser, "--convention", "--labels")
     parser.add_argument("--t1", type=Path, help="intensities in the same space, for the camera view")
     parser.add_argument(
-        "--out",
-        required=True,
-        type=Path,
-        help="anatomy to write, PATIENT.vtu; data (.h5) and models (.model.npz) are written next to it",
-    )
-    parser.add_argument("--nodes", type=int, default=5300, help="number of mesh nodes, 2000 to 250000")
-    parser.add_argument("--craniotomy", type=float, metavar="MM", help=CRANIOTOMY_HELP)
+        "--out", type=Path, default="patient.vtu", metavar="PATIENT.vtu",
+        help="anatomy to write; data (.h5) and models (.model.npz) are written next to it",
+    )  # fmt: skip
     add_opening_arguments(parser)
     parser.add_argument(
-        "--inspect",
-        action="store_true",
+        "--inspect", action="store_true",
         help="preview in seconds, without making anything: numbers, warnings, and the image PATIENT.inspect.png",
-    )
+    )  # fmt: skip
     parser.add_argument("--count", type=int, default=1000, help="number of loads to simulate")
     parser.add_argument(
         "--tool-preset", choices=PRESETS, default="palpation",
@@ -67,10 +71,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_region_argument(parser)
     add_element_argument(parser)
     parser.add_argument(
-        "--learners",
-        default="linear,series,series-gp",
+        "--learners", default="linear,series,series-gp",
         help="model types, see `sulcus train --help`, separated by commas",
-    )
+    )  # fmt: skip
     add_devices(parser, "; loads are simulated on all, models trained on the first")
     add_force(parser)
     add_json(parser, "a JSON line of each step, then one of the seconds")
@@ -79,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run anatomy, simulate and train; the same command resumes an interrupted run."""
     # Report problems now, not after minutes of reading and meshing.
+    _check_source(args)
     plan = MeshPlan(args.nodes, to_metres(args.craniotomy), fine_opening=args.fine_opening)
     regions = parse_region_tissues(args.region, replace(BRAIN, law=args.material))
     strange = set(regions) - set(REGION_NAMES.values())
@@ -112,10 +116,7 @@ def run(args: argparse.Namespace) -> int:
     force = ["--force"] if args.force else []
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
     steps = [
-        ["anatomy", *label_words(args), *t1,
-         "--nodes", str(args.nodes), *([] if args.craniotomy is None else ["--craniotomy", str(args.craniotomy)]),
-         *to_opening_options(args),
-         "--out", str(args.out)],
+        ["anatomy", *label_words(args), *t1, *to_opening_options(args), "--out", str(args.out)],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--tool-preset", args.tool_preset,
          "--device", args.device, "--material", args.material,
          *([] if args.element is None else ["--element", args.element]),
@@ -123,6 +124,8 @@ def run(args: argparse.Namespace) -> int:
         ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device],
     ]  # fmt: skip
     began = time.perf_counter()
+    if args.sample:
+        _write_sample(args)
     if args.force:
         note.unlink(missing_ok=True)
     changed = [path.stat().st_mtime for path in _list_inputs(args) if path.exists()]
@@ -154,6 +157,31 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _check_source(args: argparse.Namespace) -> None:
+    """Check that there is one source of labels; set the files and labels of --sample."""
+    if not args.sample:
+        if args.labels is None:
+            raise InputError("no label map: give LABELS.nii.gz, or --sample for a synthetic patient.")
+        return
+    for given in (*_list_inputs(args), *list_label_options(args)):
+        raise InputError(f"--sample brings its own labels and T1: leave out {given}, or --sample.")
+    args.labels, args.t1 = (args.out.parent / f"sample_{name}.nii.gz" for name in ("labels", "t1"))
+    args.brain, args.tumour = (BRAIN_LABEL,), (TUMOUR_LABEL,)
+
+
+def _write_sample(args: argparse.Namespace) -> None:
+    """Write label map and T1 of --sample; equal files are kept, so that a run can resume."""
+    volumes, new = build_sample_head(read_anatomy(get_template_path()).mesh), {}
+    for path, data in zip((args.labels, args.t1), map(encode_intensity, volumes), strict=True):
+        if not (path.is_file() and path.stat().st_size == len(data) and path.read_bytes() == data):
+            new[check_output_path(path, ".gz", args.force)] = data
+    for path, data in new.items():
+        with write_atomically(path, ".gz") as partial:
+            partial.write_bytes(data)
+    shown = f"sample label map: {args.labels} (1 brain, 2 tumour)\nsample T1: {args.t1}"
+    print(shown, file=sys.stderr if args.json else sys.stdout, flush=True)
+
+
 def _list_inputs(args: argparse.Namespace) -> list[Path]:
     return [path for path in (args.labels, args.mask, args.tumour_in, args.t1) if path is not None]
 
@@ -168,6 +196,8 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
     began = time.perf_counter()
     picture = args.out.with_suffix(".inspect.png")
     check_output_path(picture, ".png", True, _list_inputs(args))  # a preview, which is drawn until it looks right
+    if args.sample:
+        _write_sample(args)
     masks = read_head_masks(parse_sources(args))
     subject = place_craniotomy(build_masked_subject(masks, args.t1, regions=parse_regions(args)), args)
     found = inspect_subject(masks, subject, regions)

@@ -36,23 +36,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
     parser.add_argument("--tolerance", type=float, default=1e-6, help="tolerance of the relative residual")
     parser.add_argument(
-        "--any-strain",
-        action="store_true",
+        "--any-strain", action="store_true",
         help="accept inverted tetrahedra, and strains beyond those that were measured on brain tissue",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--precision",
-        default="float64",
-        choices=("float32", "float64"),
+        "--precision", default="float64", choices=("float32", "float64"),
         help=f"scalar type of the solver: float32 is faster, with tolerances of at least {MIN_TOLERANCE['float32']:g}",
-    )
+    )  # fmt: skip
     parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file")
     add_device(parser)
     parser.add_argument(
-        "--out",
-        required=True,
+        "--out", required=True,
         help="output .vtu in metres with point data `displacement` [m]; must not be the input mesh",
-    )
+    )  # fmt: skip
     # The constraints of the file, for comparisons with other programs.
     add_skull_argument(parser, ("slide", "bonded", "contact"))
     add_force(parser)

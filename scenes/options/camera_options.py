@@ -23,30 +23,22 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
     """Declare the camera's options: shared by every command that draws a scene; `path` is the usual one."""
     group = parser.add_argument_group("camera options; see docs/camera.md")
     group.add_argument(
-        "--camera",
-        type=Path,
-        metavar="FILE.yaml",
+        "--camera", type=Path, metavar="FILE.yaml",
         help="camera calibration in the format of OpenCV or ROS (default: ideal camera)",
-    )
+    )  # fmt: skip
     group.add_argument(
-        "--size",
-        type=parse_size,
-        metavar="WxH",
+        "--size", type=parse_size, metavar="WxH",
         help="scale the calibration of --camera to images of this size [pixel]",
-    )
+    )  # fmt: skip
     group.add_argument(
-        "--tilt",
-        type=float,
-        metavar="DEG",
+        "--tilt", type=float, metavar="DEG",
         help="angle of the line of sight to the axis of the craniotomy (default: the most oblique view of the tumour "
         "through the craniotomy)",
-    )
+    )  # fmt: skip
     group.add_argument(
-        "--distance",
-        type=float,
-        metavar="MM",
+        "--distance", type=float, metavar="MM",
         help="distance of the camera (default: 300; tracked: all targets in sight)",
-    )
+    )  # fmt: skip
     group.add_argument("--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})")
     group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")

@@ -14,14 +14,16 @@ from sim.bodies.subject import Subject
 from sim.errors import InputError
 
 Point = tuple[float, float, float]
-CRANIOTOMY_HELP = (  # Help text of --craniotomy.
-    "diameter of the opening along the cortex [mm] (default: 20 mm more than the tumour, at least 50)"
-)
 LINE_POINTS = 2000  # Number of points of a trajectory that are compared with the brain.
 
 
 def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare --fine-opening, and --opening-at and --opening-over, of which one may be given."""
+    """Declare --nodes, --craniotomy, --fine-opening, and --opening-at and --opening-over, of which one may be given."""
+    parser.add_argument("--nodes", type=int, default=5300, metavar="N", help="number of mesh nodes, 2000 to 250000")
+    parser.add_argument(
+        "--craniotomy", type=float, metavar="MM",
+        help="diameter of the opening along the cortex [mm] (default: 20 mm more than the tumour, at least 50)",
+    )  # fmt: skip
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
         "--opening-at", type=point_or_file, metavar="X,Y,Z|FILE.mrk.json",
@@ -60,13 +62,13 @@ def parse_opening(text: str) -> int | Point | Path:
 
 def to_opening_options(args: argparse.Namespace) -> list[str]:
     """Return the options as words for another command."""
-    given = {"--opening-at": args.opening_at, "--opening-over": args.opening_over}
+    given = {name: getattr(args, name) for name in ("nodes", "craniotomy", "opening_at", "opening_over")}
     texts = {
-        name: ",".join(map(repr, value)) if isinstance(value, tuple) else str(value)
+        name.replace("_", "-"): ",".join(map(repr, value)) if isinstance(value, tuple) else str(value)
         for name, value in given.items()
         if value is not None
     }
-    return [f"{name}={text}" for name, text in texts.items()] + ["--fine-opening"] * args.fine_opening
+    return [f"--{name}={text}" for name, text in texts.items()] + ["--fine-opening"] * args.fine_opening
 
 
 def get_trajectory_option(args: argparse.Namespace) -> Path | None:

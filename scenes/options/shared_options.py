@@ -33,11 +33,9 @@ def add_device(parser: argparse.ArgumentParser, purpose: str = "") -> None:
 def add_devices(parser: argparse.ArgumentParser, meant: str = "") -> None:
     """Declare `--device` of several devices; `meant` says how they share the work."""
     parser.add_argument(
-        "--device",
-        default="auto",
-        metavar="DEVICES",
+        "--device", default="auto", metavar="DEVICES",
         help=f"compute devices: auto, cpu, cuda, all, or a list such as cuda:0,cuda:1 with one process each{meant}",
-    )
+    )  # fmt: skip
 
 
 def add_seed(

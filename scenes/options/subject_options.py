@@ -28,11 +28,9 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
     )
     said = ". ".join(f"{name}: {one.source}" for name, one in CONVENTIONS.items())
     parser.add_argument(
-        *names,
-        dest="convention",
-        choices=tuple(CONVENTIONS),
+        *names, dest="convention", choices=tuple(CONVENTIONS),
         help=f"label convention, instead of label numbers. {said}",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--mask", type=Path, metavar="BRAIN.nii.gz",
         help="brain mask (non-zero voxels), instead of --brain; may have its own grid",
@@ -95,6 +93,12 @@ def _get_parts(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
     return {name: getattr(args, name) for name in (*PART_LABELS, *SEPTA) if getattr(args, name) is not None}
 
 
+def list_label_options(args: argparse.Namespace) -> list[str]:
+    """Return the given options that belong to a label volume."""
+    names = ("brain", "tumour", "convention", "tumour_in", "axes", *PART_LABELS, *SEPTA, "regions")
+    return [f"--{name.replace('_', '-')}" for name in names if getattr(args, name)]
+
+
 def label_words(args: argparse.Namespace) -> list[str]:
     """Return the options as words for `sulcus anatomy`."""
     given = {
@@ -121,23 +125,18 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare which healthy head is taken and where its tumour is drawn."""
     drawn = parser.add_argument_group("synthetic tumour in a healthy head, without --labels")
     drawn.add_argument(
-        "--head",
-        choices=("template", "fsaverage"),
+        "--head", choices=("template", "fsaverage"),
         help="healthy head: the ICBM template, or fsaverage's inner skull from the package mne (default: template). "
         "For another head give --mask, and --t1 if available",
-    )
+    )  # fmt: skip
     drawn.add_argument(
-        "--brain-volume",
-        type=float,
-        metavar="ML",
+        "--brain-volume", type=float, metavar="ML",
         help="volume to which the brain is scaled [ml] (default: 1470; with --mask, its own)",
-    )
+    )  # fmt: skip
     drawn.add_argument(
-        "--radius",
-        type=float,
-        metavar="MM",
+        "--radius", type=float, metavar="MM",
         help="radius of the tumour [mm]; if lobed, of a ball of equal volume (default: 12)",
-    )
+    )  # fmt: skip
     drawn.add_argument(
         "--cover", type=float, metavar="MM", help="distance from the cortex to the top of the tumour [mm] (default: 10)"
     )
@@ -147,11 +146,9 @@ def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
         "--tumour-at", type=point, metavar="X,Y,Z", help="centre of the tumour [mm, RAS], instead of --site and --cover"
     )
     drawn.add_argument(
-        "--falx-depth",
-        type=float,
-        metavar="MM",
+        "--falx-depth", type=float, metavar="MM",
         help="depth of a synthetic falx in the midline, which does not move [mm, 10 to 60] (default: no falx)",
-    )
+    )  # fmt: skip
     drawn.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the random lobed shape (default: 0)")
 
 

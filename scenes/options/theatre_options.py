@@ -25,22 +25,19 @@ def add_bodies(parser: argparse.ArgumentParser) -> None:
     """Declare which anatomy and models there are."""
     add_anatomy(parser)
     parser.add_argument(
-        "--model",
-        type=Path,
+        "--model", type=Path,
         help="trained models from `sulcus train`, .npz (default: MESH.model.npz next to the anatomy)",
-    )
+    )  # fmt: skip
     add_trajectory(parser)
 
 
 def add_trajectory(parser: argparse.ArgumentParser) -> None:
     """Declare --trajectory."""
     parser.add_argument(
-        "--trajectory",
-        type=Path,
-        metavar="LINE.mrk.json",
+        "--trajectory", type=Path, metavar="LINE.mrk.json",
         help="line from 3D Slicer along which the tool enters the open cortex, or a point, where it enters straight "
         "inwards (default: the centre of the craniotomy)",
-    )
+    )  # fmt: skip
 
 
 def add_theatre(parser: argparse.ArgumentParser) -> None:
@@ -53,30 +50,23 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         "error)",
     )
     parser.add_argument(
-        "--guard",
-        type=float,
-        metavar="MM",
+        "--guard", type=float, metavar="MM",
         help="bound (95 %%) of the tumour's surface error above which guarded uses FEM [mm] (default: 0.2)",
-    )
+    )  # fmt: skip
     budget = parser.add_argument_group("budget, instead of --deformer; errors as reported by the models")
     budget.add_argument(
-        "--within-error",
-        type=float,
-        metavar="MM",
+        "--within-error", type=float, metavar="MM",
         help="use the fastest deformation model whose reported error is at most this [mm]",
-    )
+    )  # fmt: skip
     budget.add_argument(
-        "--within-time",
-        type=float,
-        metavar="MS",
+        "--within-time", type=float, metavar="MS",
         help="use the most accurate deformation model that needs at most this per frame [ms]",
-    )
+    )  # fmt: skip
     parser.add_argument(
-        "--registration",
-        choices=tuple(REGISTRATIONS),
+        "--registration", choices=tuple(REGISTRATIONS),
         help="registration of the scan to the patient; clinical: standard deviation of 1.6 mm per axis (default: the "
         "scene's, perfect in built-in scenes)",
-    )
+    )  # fmt: skip
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     add_element_argument(parser)
     add_device(parser, "FEM")

@@ -42,12 +42,9 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, d
         each = (f"{name} holds for {known.time_scale}. Source: {known.source}" for name, known in MATERIALS.items())
         sets = ". ".join(each)
     parser.add_argument(
-        "--material",
-        default="default",
-        choices=(*MATERIALS, *LAWS, Ogden.law),
-        metavar="TISSUE",
+        "--material", default="default", choices=(*MATERIALS, *LAWS, Ogden.law), metavar="TISSUE",
         help=f"tissue law ({', '.join((*LAWS, Ogden.law))}), or named tissue: {sets}",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--young", type=float, metavar="PA", help=f"Young's modulus [Pa] (default: the material's, or {BRAIN.young:g})"
     )
@@ -55,33 +52,28 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, d
         "--poisson", type=float, metavar="NU", help=f"Poisson's ratio (default: the material's, or {BRAIN.poisson:g})"
     )
     parser.add_argument(
-        "--ogden",
-        metavar="C1,M1;C2,M2",
+        "--ogden", metavar="C1,M1;C2,M2",
         help="terms of --material ogden, psi = sum of C/M^2 (l1^M + l2^M + l3^M - 3) + K/2 (ln J)^2 [Pa], as in FEBio; "
         "C is 2 mu of the form with 2 mu/alpha^2",
-    )
+    )  # fmt: skip
     parser.add_argument("--bulk", type=float, metavar="K", help="bulk modulus of --material ogden [Pa]")
     parser.add_argument(
-        "--prony",
-        metavar="G1,TAU1;G2,TAU2",
+        "--prony", metavar="G1,TAU1;G2,TAU2",
         help="Prony series of the shear modulus: fractions G and relaxation times TAU [s], such as "
         '"0.45,0.5;0.365,50" in the scene retract',
-    )
+    )  # fmt: skip
     add_region_argument(parser, default_regions)
 
 
 def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN) -> None:
     """Declare --region; `default` describes the default."""
     parser.add_argument(
-        "--region",
-        action="append",
-        default=[],
-        metavar="REGION:YOUNG[,POISSON]",
+        "--region", action="append", default=[], metavar="REGION:YOUNG[,POISSON]",
         help=f"Young's modulus [Pa] and, optionally, Poisson's ratio of a region, by number or name "
         f"({', '.join(NON_BRAIN_REGIONS)}), such as oedema:2000 or 3:2000,0.45; for Ogden's law "
         "REGION:C1,M1;C2,M2;K; repeatable "
         f"(default: {default}; necrosis as the tumour)",
-    )
+    )  # fmt: skip
 
 
 def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] = tuple(SKULLS)) -> None:
@@ -98,11 +90,10 @@ def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] =
 def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMENDED) -> None:
     """Declare --element; None means `meant`, or p2 if the mesh has mid-edge nodes."""
     parser.add_argument(
-        "--element",
-        choices=ELEMENTS,
+        "--element", choices=ELEMENTS,
         help=". ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
         + f" (default: {meant}; p2 for meshes with mid-edge nodes)",
-    )
+    )  # fmt: skip
 
 
 def parse_tissue(args: argparse.Namespace) -> Tissue:

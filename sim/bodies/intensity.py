@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -123,14 +124,18 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
     InputError
         A folder that is not writable.
     """
+    with write_atomically(path, ".gz") as partial:
+        partial.write_bytes(encode_intensity(intensity))
+
+
+def encode_intensity(intensity: Intensity) -> bytes:
+    """Return the bytes of a .nii.gz in millimetres (RAS); equal volumes have equal bytes."""
     import nibabel
 
-    affine = np.diag([1e3, 1e3, 1e3, 1.0]) @ intensity.affine
-    image = nibabel.Nifti1Image(intensity.values, affine)
+    image = nibabel.Nifti1Image(intensity.values, np.diag([1e3, 1e3, 1e3, 1.0]) @ intensity.affine)
     image.header.set_xyzt_units("mm")
-    image.header["descrip"] = b"sulcus: intensities beside a mesh"
-    with write_atomically(path, ".gz") as partial:
-        nibabel.save(image, partial)
+    image.header["descrip"] = b"sulcus: RAS, mm"
+    return gzip.compress(image.to_bytes(), mtime=0)
 
 
 def read_intensity(path: str | Path, voxels: Voxels = DEFAULT_VOXELS) -> Intensity:
