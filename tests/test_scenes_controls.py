@@ -18,7 +18,7 @@ class TestControls:
     def test_the_sliders_end_where_the_bone_stops_the_tool(self, theatre):
         scene, site = short(), theatre.site
         assert scene.tool is not None
-        found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), print, print, print)
+        found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), print, print, print, print)
         places = [control for control in found if isinstance(control, Slider) and control.label.startswith("place")]
         room = site.clearance - scene.tool.radius
         assert len(places) == 2 and all(0.5 <= control.high <= max(0.5, 1e3 * room) for control in places)
@@ -27,7 +27,9 @@ class TestControls:
 
     def test_no_code_name_is_shown(self, theatre):
         for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
-            found = build_controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), print, print, print)
+            found = build_controls(
+                small(name), theatre.site, ("fem",), Requests("fem", Touch()), print, print, print, print
+            )
             switches = [inner for control in found if isinstance(control, Fold) for inner in control.controls]
             assert switches and all(inner.words and inner.words != inner.label for inner in switches)
 
@@ -35,17 +37,17 @@ class TestControls:
         labels = [
             control.label
             for control in build_controls(
-                short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print, print
+                short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print, print, print
             )
         ]
-        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-7:-5] == [
+        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-9:-7] == [
             "slices",
             "registration",
         ]
 
     def test_every_overlay_style_is_offered(self, theatre):
         wish = Requests("fem", Touch())
-        found = build_controls(short(), theatre.site, ("fem",), wish, print, print, print)
+        found = build_controls(short(), theatre.site, ("fem",), wish, print, print, print, print)
         overlay = next(control for control in found if isinstance(control, Dropdown) and control.label == "overlay")
         seen = []
         for option in overlay.options:
@@ -57,7 +59,7 @@ class TestControls:
         wish = Requests("fem", Touch())
         found = {
             control.label: control
-            for control in build_controls(short(), theatre.site, ("fem",), wish, print, print, print)
+            for control in build_controls(short(), theatre.site, ("fem",), wish, print, print, print, print)
         }
         camera, slices = found["camera"], found["slices"]
         assert isinstance(camera, Dropdown) and isinstance(slices, Dropdown)
@@ -77,7 +79,7 @@ class TestControls:
         registration.changed(registration.options[1])
         assert registration.start == registration.options[0] and wish.look.registration == "clinical"
         assert "slices" not in {
-            each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, print, print, print)
+            each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, print, print, print, print)
         }
 
     def test_which_scenes_go_on_by_themselves(self, theatre):

@@ -2,16 +2,16 @@ import threading
 
 from theatres import short
 
-from scenes.page.effect_costs import EffectCosts, format_effect_table
+from scenes.page.background_study import BackgroundStudy
+from scenes.page.effect_costs import format_effect_table, measure_costs
 from scenes.play.effect_ablation import ALL, AblationRow
 
 
-def test_each_effect_of_a_scene_is_measured_once(theatre):
+def test_each_effect_of_a_scene_is_measured(theatre):
     shown, scene = [], short()
-    costs = EffectCosts(theatre, scene, threading.Lock(), shown.append)
-    for _ in range(2):
-        costs.start()
-        costs.thread.join(120.0)
+    costs = BackgroundStudy(lambda: measure_costs(theatre, scene), threading.Lock(), shown.append)
+    costs.start()
+    costs.thread.join(120.0)
     assert len(shown) == 2 + len(scene.effects)
     assert "all effects" in shown[-1] and "push of the tool" in shown[-1] and "being measured" not in shown[-1]
     assert "being measured" in shown[-2] and "always on" in shown[-1]

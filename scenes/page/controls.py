@@ -23,14 +23,15 @@ from .side_panels import TIP, TUMOUR_MIDDLE
 from .text import describe_deformer, describe_effect
 
 MAX_FORCE = 0.4  # End of the force slider [N].
-MAX_DEPTH = 8.0  # End of the depth slider [mm].
+MAX_DEPTH = 8.0  # End of the depth slider [mm], where the scene's script does not go deeper.
 MAX_TILT = 40.0  # End of the direction sliders [deg].
 STATIC_CAMERA = "stays"
 """Label of a static camera."""
 PLAN = "solver details (advanced)"
 """Label of the note on the solvers."""
-EFFECT_COSTS = "cost of the effects"
-"""Label of the note on the effects' costs."""
+EFFECT_COSTS, REFINED_ERROR = "cost of the effects", "refined error"
+"""Labels of the notes on the effects' costs, and on the refined error."""
+REFINE_HINT = "solves this load for 16 sampled patients in the background, for minutes"  # Hint of the switch.
 OWN_FILM = "your own video or camera"
 """Label of the note on own videos."""
 # Text of the note on own videos.
@@ -51,11 +52,12 @@ def build_controls(
     give: Callable[[str], None],
     take: Callable[..., None],
     measure: Callable[[], None],
+    refine: Callable[[], None],
 ) -> list[Slider | Dropdown | Toggle | Fold | Note]:
     """Build all controls of a scene that these deformers support.
 
     `give` receives who gets the tool, `take` numbers of its touch, as `Requests.take_over` does; `measure` starts the
-    measurement of the effects' costs.
+    measurement of the effects' costs, `refine` the refinement of the error.
     """
     cameras = "scene default", STATIC_CAMERA, *PATHS
 
@@ -85,6 +87,8 @@ def build_controls(
         Dropdown("camera", cameras, wish.path or cameras[0], film, hint="motion of the camera"),
         *([] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]),
         build_registration_control(scene, wish),
+        Toggle("refine the error", False, lambda on: refine() if on else None, hint=REFINE_HINT),
+        Note(REFINED_ERROR),
         Fold("camera position", build_camera_sliders(scene, site, wish)),
         Fold("physics effects (on/off)", (*switches, costs)),
         Note(EFFECT_COSTS),
@@ -197,9 +201,10 @@ def build_strength_slider(scene: Scene, wish: Requests, take: Callable[..., None
     touch = wish.touch
     if scene.posed:
         low = -1e3 * IDLE_HEIGHT
-        now = min(max(1e3 * touch.depth, low), MAX_DEPTH)
+        high = max(MAX_DEPTH, *(round(1e3 * scene.path(time).depth, 1) for time in scene.times.tolist()))
+        now = min(max(1e3 * touch.depth, low), high)
         hint = "how far the tool is beyond where it just touches; negative: in the air"
-        return Slider("depth [mm]", low, MAX_DEPTH, 0.1, now, lambda value: take(depth=1e-3 * value), hint=hint)
+        return Slider("depth [mm]", low, high, 0.1, now, lambda value: take(depth=1e-3 * value), hint=hint)
     return Slider(
         "force [N]",
         0.0,

@@ -24,6 +24,7 @@ from ..play.stage import Stage
 from ..play.waiting_notice import Busy
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
+from .background_study import build_studies
 from .comparison import (
     FEM_REFERENCE,
     FEM_SHOWN,
@@ -33,8 +34,7 @@ from .comparison import (
     describe_change,
     format_comparison,
 )
-from .controls import EFFECT_COSTS, PLAN, build_controls, is_animated, to_slider_values
-from .effect_costs import EffectCosts
+from .controls import PLAN, build_controls, is_animated, to_slider_values
 from .fem_worker import FemResult, FemWorker
 from .requests import HAND, SCRIPT, Look, Requests, describe_holder
 from .scene_solvers import SceneSolvers
@@ -80,15 +80,9 @@ class Demo:
         size, site = (scene.viewpoint.width, scene.viewpoint.height), theatre.site
         parts = self._build_contents(deformer)
         self.browser = Browser(
-            parts[0],
-            choose_viewpoint(site),
-            *parts[1:],
-            host=host,
-            port=port,
-            size=size,
-            signs=list_orientation_labels(site),
-            origins=origins,
-        )
+            parts[0], choose_viewpoint(site), *parts[1:],
+            host=host, port=port, size=size, signs=list_orientation_labels(site), origins=origins,
+        )  # fmt: skip
         self.busy = Busy(lambda line: self.browser.show_status(escape(line)))
         self.dismissed: list[FemWorker] = []
         self.asked, self.drawn = self.wish.read_current(), 0
@@ -153,7 +147,8 @@ class Demo:
     def close(self) -> None:
         """Stop the page and the finite elements."""
         self.busy.close()
-        self.costs.close()
+        for study in self.studies:
+            study.close()
         self.browser.close()
         for solver in (*self.cast.solvers.values(), *self.dismissed):
             solver.close()
@@ -172,14 +167,16 @@ class Demo:
         """Have a deformer play a scene."""
         self.cast, self.tally = SceneSolvers(self.theatre, scene, deformer, self.turn), AccuracyTimeTable()
         self.history = History(list_lines(scene))
-        self.costs = EffectCosts(self.theatre, scene, self.turn, lambda words: self.browser.write(EFFECT_COSTS, words))
         # The frame that is shown.
         self.reached: int | None = None
         self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=is_animated(scene, self.theatre.site))
+        # The browser opens later.
+        notes = (self.theatre, scene, self.wish, self.turn, lambda *said: self.browser.write(*said))
+        self.studies = build_studies(*notes)
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
-        old = self.cast, self.tally, self.wish, self.history, self.costs
+        old = self.cast, self.tally, self.wish, self.history, self.studies
         self.busy.begin_work(f"preparing the scene {name}")
         try:
             scene = self.first if name == self.first.name else self.find(name)
@@ -189,14 +186,15 @@ class Demo:
             self.wish.set(style=kept.style, path=kept.path, through=kept.through, registration=kept.registration)
             parts = self._build_contents(deformer)
         except InputError as error:
-            self.cast, self.tally, self.wish, self.history, self.costs = old
+            self.cast, self.tally, self.wish, self.history, self.studies = old
             self.wish.set(scene=self.stage.scene.name)
             self.browser.put("scene", self.stage.scene.name)
             self.browser.report(f'<p class="warn">{escape(str(error))}</p>')
             return
         finally:
             self.busy.end_work()
-        old[4].close()
+        for study in old[4]:
+            study.close()
         self.browser.fill(*parts)
         self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + old[0].stop_soon()
 
@@ -353,7 +351,7 @@ class Demo:
     def _build_contents(self, deformer: str) -> tuple:
         """Build the contents of the page: bodies, playback, controls, title, text."""
         scene, names = self.stage.scene, self.theatre.list_deformers(self.stage.scene)
-        actions = self._give, self._take, self.costs.start
+        actions = self._give, self._take, *(study.start for study in self.studies)
         return (
             build_page_bodies(self.stage),
             Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number)),

@@ -1,12 +1,9 @@
-"""Background measurement of what each effect of a scene costs, and of how much it moves the tumour."""
+"""Measurement of what each effect of a scene costs, and of how much it moves the tumour."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
-
-from sim.errors import InputError
 
 from ..play.deformers import PatientSetup
 from ..play.effect_ablation import ALL, AblationRow, measure_effects
@@ -16,35 +13,19 @@ from .text import describe_effect
 SOLVED_FRAMES = 8  # Number of frames of the script that are solved with and without each effect.
 
 
-class EffectCosts:
-    """Measurement of a scene's effects, at most once; `show` receives the table (HTML) whenever a row is added."""
+def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[str]:
+    """Yield the table (HTML) of a scene's effects whenever a row is added.
 
-    def __init__(self, theatre: PatientSetup, scene: Scene, turn: threading.Lock, show: Callable[[str], None]) -> None:
-        """Prepare the measurement; it holds the lock `turn`, so that no other solver is built meanwhile."""
-        self.theatre, self.scene, self.turn, self.show = theatre, scene, turn, show
-        self.closed, self.thread = threading.Event(), threading.Thread(target=self._measure, name="costs", daemon=True)
-
-    def start(self) -> None:
-        """Start the measurement, unless it was started before."""
-        if self.thread.ident is None:
-            self.show("<p>The scene is solved with and without each effect...</p>")
-            self.thread.start()
-
-    def close(self) -> None:
-        """End the measurement after the effect in progress."""
-        self.closed.set()
-
-    def _measure(self) -> None:
-        rows: list[AblationRow] = []
-        try:
-            with self.turn:
-                for row in measure_effects(self.theatre, self.scene, max(1, len(self.scene.times) // SOLVED_FRAMES)):
-                    if self.closed.is_set():
-                        return
-                    rows.append(row)
-                    self.show(format_effect_table(rows, len(self.scene.get_effects_on(self.theatre.anatomy))))
-        except InputError as error:
-            self.show(f'<p class="warn">{escape(str(error))}</p>')
+    Raises
+    ------
+    InputError
+        See `measure_effects`.
+    """
+    yield "<p>The scene is solved with and without each effect...</p>"
+    rows: list[AblationRow] = []
+    for row in measure_effects(theatre, scene, max(1, len(scene.times) // SOLVED_FRAMES)):
+        rows.append(row)
+        yield format_effect_table(rows, len(scene.get_effects_on(theatre.anatomy)))
 
 
 def format_effect_table(rows: Sequence[AblationRow], count: int) -> str:

@@ -1,0 +1,64 @@
+"""Computations behind a page that report their progress: costs of the effects, refined error."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from html import escape
+
+from sim.errors import InputError
+
+from ..play.deformers import PatientSetup
+from ..script.scene import Scene
+from .controls import EFFECT_COSTS, REFINED_ERROR
+from .effect_costs import measure_costs
+from .error_refinement import refine_error
+from .requests import Requests
+
+
+class BackgroundStudy:
+    """Computation in a thread, again at each start; `show` receives each text (HTML) that `work` yields."""
+
+    def __init__(self, work: Callable[[], Iterator[str]], turn: threading.Lock, show: Callable[[str], None]) -> None:
+        """Prepare the study; it holds the lock `turn`, so that no other solver is built meanwhile."""
+        self.work, self.turn, self.show = work, turn, show
+        self.closed, self.thread = threading.Event(), threading.Thread()
+
+    def start(self) -> None:
+        """Start the study, unless it is running."""
+        if not self.thread.is_alive():
+            self.thread = threading.Thread(target=self._run, name="study", daemon=True)
+            self.thread.start()
+
+    def close(self) -> None:
+        """End the study after the step in progress."""
+        self.closed.set()
+
+    def _run(self) -> None:
+        try:
+            with self.turn:
+                for words in self.work():
+                    if self.closed.is_set():
+                        return
+                    self.show(words)
+        except InputError as error:
+            self.show(f'<p class="warn">{escape(str(error))}</p>')
+
+
+def build_studies(
+    theatre: PatientSetup, scene: Scene, wish: Requests, turn: threading.Lock, write: Callable[[str, str], None]
+) -> tuple[BackgroundStudy, ...]:
+    """Build the studies of a scene's effects and of the requested load; `write` fills a note by its label."""
+
+    def refine() -> Iterator[str]:
+        number, _, touch, _ = wish.read_current()
+        time = float(scene.times[number])
+        registered = replace(scene, registration=wish.registration or scene.registration)
+        return refine_error(theatre, registered, touch or scene.path(time), time)
+
+    return (
+        BackgroundStudy(lambda: measure_costs(theatre, scene), turn, partial(write, EFFECT_COSTS)),
+        BackgroundStudy(refine, turn, partial(write, REFINED_ERROR)),
+    )
