@@ -1,63 +1,83 @@
 "use strict";
 // Drawing by WebGL: lit surfaces under a lamp, lines in pixels; the same light as ar/rendering/shade.py.
 
-const SURFACE_VERTEX = `
-  attribute vec3 place, facing; attribute vec2 texel;
-  uniform mat4 view; uniform vec3 shift;
-  varying vec3 at, normal; varying vec2 where;
+const LIGHT = `
+  precision highp float;
+  uniform vec3 eye, lamp, lampAxis, base; uniform vec2 cone, light, shine;
+  // Share of the lamp inside its lit circle, which has a soft edge; toned light, as a display shows it.
+  float arrivingAt(vec3 ray) {
+    float rim = clamp((-dot(ray, lampAxis) - cone.x) * cone.y, 0.0, 1.0);
+    return light.x * rim * rim * (3.0 - 2.0 * rim);
+  }
+  vec3 tone(vec3 x) { return sqrt(clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)); }
+  float ambientOn(float facing) { return light.y * (0.35 + 0.65 * max(0.0, facing)); }
+  float diffuse(float facing) { return max(0.0, (facing + 0.2) / 1.2); }`;
+
+// Share of the lamp that passes the tool, with a soft edge: a ball at `ball`, a shaft and a grip along the line from it.
+const SHADOW = `
+  varying vec3 at;
+  uniform vec3 ball, rod; uniform vec4 radii; // of ball, shaft, grip; distance from the ball to the grip
+  float shareOfLamp() {
+    #ifdef SHADED
+    vec3 ray = normalize(lamp - at), arm = ball - at;
+    float slope = dot(ray, rod), room = max(1.0 - slope * slope, 1e-6), ahead = dot(ray, arm);
+    float along = (slope * ahead - dot(rod, arm)) / room;
+    float radius = mix(radii.y, radii.z, smoothstep(radii.w - radii.z, radii.w, along));
+    float past = abs(dot(cross(ray, rod), arm)) * inversesqrt(room), beside = length(arm - ahead * ray);
+    float shaft = along > 0.0 && ahead + slope * along > 0.0 ? smoothstep(0.8 * radius, 1.2 * radius, past) : 1.0;
+    return min(shaft, smoothstep(0.8 * radii.x, 1.2 * radii.x, beside));
+    #else
+    return 1.0;
+    #endif
+  }`;
+
+const PLAIN_VERTEX = `${LIGHT}
+  attribute vec3 place, facing; uniform mat4 view;
+  varying vec3 at, bright, dim;
+  void main() { // light at the vertices: enough for a dull surface
+    vec3 ray = normalize(lamp - place), sight = normalize(eye - place), n = facing * sign(dot(facing, sight));
+    float ambient = ambientOn(dot(n, sight));
+    at = place; dim = tone(base * ambient);
+    bright = tone(base * (ambient + arrivingAt(ray) * diffuse(dot(n, ray))));
+    gl_Position = view * vec4(place, 1.0);
+  }`;
+
+const PLAIN_FRAGMENT = `${LIGHT}${SHADOW}
+  varying vec3 bright, dim;
+  void main() { gl_FragColor = vec4(mix(dim, bright, shareOfLamp()), 1.0); }`;
+
+const LIT_VERTEX = `${LIGHT}
+  attribute vec3 place, facing; attribute vec2 texel; uniform mat4 view; uniform vec3 shift;
+  varying vec3 at, normal, ray, sight, middle; varying vec2 where; varying float arriving;
   void main() {
     at = place + shift; normal = facing; where = texel;
+    ray = normalize(lamp - at); sight = normalize(eye - at); middle = normalize(ray + sight); arriving = arrivingAt(ray);
     gl_Position = view * vec4(at, 1.0);
   }`;
 
-const LIT_FRAGMENT = `
-  precision highp float;
-  varying vec3 at, normal; varying vec2 where;
-  uniform vec3 eye, lamp, lampAxis, base, dark, right, up; uniform vec2 cone, light, shine; uniform float relief, step;
-  uniform bool textured, shaded; uniform sampler2D scan; uniform vec3 ends[6]; uniform float radii[3];
-  float lit(vec3 ray) { // share of the lamp that passes the tool, with a soft edge
-    float share = 1.0;
-    for (int k = 0; k < 3; k++) {
-      vec3 rod = ends[2 * k + 1] - ends[2 * k], arm = ends[2 * k] - at;
-      float slope = dot(ray, rod), room = max(dot(rod, rod) - slope * slope, 1e-12);
-      vec3 axis = arm + clamp((slope * dot(ray, arm) - dot(rod, arm)) / room, 0.0, 1.0) * rod;
-      float far = dot(axis, ray);
-      float gap = length(axis - max(far, 0.0) * ray);
-      share = min(share, smoothstep(0.8 * radii[k], 1.2 * radii[k], gap));
-    }
-    return share;
-  }
+const LIT_FRAGMENT = `${LIGHT}${SHADOW}
+  varying vec3 normal, ray, sight, middle; varying vec2 where; varying float arriving;
+  uniform vec3 dark, right, up; uniform float relief; uniform bool textured; uniform sampler2D scan;
   void main() {
-    vec3 n = normalize(normal), sight = normalize(eye - at), ray = normalize(lamp - at), colour = base;
-    if (dot(n, sight) < 0.0) n = -n;
-    if (textured) {
-      float value = texture2D(scan, where).r;
-      vec2 slope = vec2(texture2D(scan, where + vec2(step, 0.0)).r - texture2D(scan, where - vec2(step, 0.0)).r,
-                        texture2D(scan, where + vec2(0.0, step)).r - texture2D(scan, where - vec2(0.0, step)).r);
-      colour *= dark + (1.0 - dark) * value;
-      vec3 tilt = relief * (slope.x * right + slope.y * up);
-      n = normalize(n - tilt + dot(tilt, n) * n);
+    vec3 n = normal * sign(dot(normal, sight)), colour = base;
+    if (textured) { // value of the scan, and its slopes along right and up
+      vec3 texel = texture2D(scan, where).rgb;
+      vec3 tilt = relief * ((texel.g - 0.5) * right + (texel.b - 0.5) * up);
+      colour *= dark + (1.0 - dark) * texel.r;
+      n += dot(tilt, n) * n - tilt;
     }
-    float rim = clamp((-dot(ray, lampAxis) - cone.x) * cone.y, 0.0, 1.0);
-    float arriving = light.x * rim * rim * (3.0 - 2.0 * rim);
-    if (shaded && arriving > 0.0) arriving *= lit(ray);
-    float ambient = light.y * (0.35 + 0.65 * max(0.0, dot(n, sight)));
-    vec3 shown = colour * (ambient + arriving * max(0.0, (dot(n, ray) + 0.2) / 1.2));
-    vec3 middle = normalize(ray + sight);
-    float fresnel = 0.04 + 0.96 * pow(1.0 - max(0.0, dot(sight, middle)), 5.0);
-    shown += arriving * shine.x * fresnel * exp(shine.y * (dot(n, middle) - 1.0)) * (shine.y + 8.0) * 0.12;
-    vec3 film = clamp(shown * (2.51 * shown + 0.03) / (shown * (2.43 * shown + 0.59) + 0.14), 0.0, 1.0);
-    gl_FragColor = vec4(sqrt(film), 1.0);
+    n = normalize(n);
+    float came = arriving * shareOfLamp(), grazing = 1.0 - dot(sight, middle);
+    float fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing;
+    float lobe = exp(shine.y * (dot(n, middle) - 1.0)) * (shine.y + 8.0) * 0.12 * fresnel;
+    gl_FragColor = vec4(tone(colour * (ambientOn(dot(n, sight)) + came * diffuse(dot(n, ray))) + came * shine.x * lobe), 1.0);
   }`;
 
 const GLOW_FRAGMENT = `
   precision highp float;
-  varying vec3 at, normal;
-  uniform vec3 eye, base; uniform float opacity;
-  void main() {
-    float towards = abs(dot(normalize(normal), normalize(eye - at)));
-    gl_FragColor = vec4(base * (0.35 + 0.75 * towards), opacity);
-  }`;
+  varying vec3 normal, sight;
+  uniform vec3 base; uniform float opacity;
+  void main() { gl_FragColor = vec4(base * (0.35 + 0.75 * abs(dot(normalize(normal), sight))), opacity); }`;
 
 const LINE_VERTEX = `
   attribute vec4 corner; // x, y, side, length along the line [pixel]
@@ -91,7 +111,7 @@ function buildProgram(gl, vertex, fragment) {
   gl.linkProgram(program);
   const list = (count, info, find) => Object.fromEntries(
     Array.from({ length: gl.getProgramParameter(program, count) }, (_, k) => info.call(gl, program, k).name)
-      .map((name) => [name.replace("[0]", ""), find.call(gl, program, name)]));
+      .map((name) => [name, find.call(gl, program, name)]));
   return {
     program,
     uniforms: list(gl.ACTIVE_UNIFORMS, gl.getActiveUniform, gl.getUniformLocation),
@@ -114,13 +134,27 @@ function normalsOf(points, triangles) {
   return out;
 }
 
+// Place of a point's ray to the lamp relative to a rod: signed distance of their lines, and distance along the rod [m].
+function shadowPlace(point, lamp, start, rod) {
+  const towards = minus(lamp, point), size = sizeOf(towards), ray = towards.map((value) => value / size);
+  const arm = minus(start, point), across = cross(ray, rod), slope = dot(ray, rod);
+  return [dot(across, arm) / sizeOf(across), (slope * dot(ray, arm) - dot(rod, arm)) / (1 - slope * slope)];
+}
+
+// True if no graphics card draws: smooth edges would take too long.
+function isSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl"), info = gl?.getExtension("WEBGL_debug_renderer_info");
+  return !gl || /swiftshader|llvmpipe|software|basic render/i.test(gl.getParameter(info?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER));
+}
+
 function buildPainter(canvas, scene, arrays) {
-  const gl = canvas.getContext("webgl", { alpha: false, antialias: true });
+  const gl = canvas.getContext("webgl", { alpha: false, antialias: !isSoftware() });
   if (!gl) return null;
+  const shaded = "#define SHADED\n";
   const programs = {
-    lit: buildProgram(gl, SURFACE_VERTEX, LIT_FRAGMENT),
-    glow: buildProgram(gl, SURFACE_VERTEX, GLOW_FRAGMENT),
-    line: buildProgram(gl, LINE_VERTEX, LINE_FRAGMENT),
+    plain: buildProgram(gl, PLAIN_VERTEX, PLAIN_FRAGMENT), plainShaded: buildProgram(gl, PLAIN_VERTEX, shaded + PLAIN_FRAGMENT),
+    lit: buildProgram(gl, LIT_VERTEX, LIT_FRAGMENT), litShaded: buildProgram(gl, LIT_VERTEX, shaded + LIT_FRAGMENT),
+    glow: buildProgram(gl, LIT_VERTEX, GLOW_FRAGMENT), line: buildProgram(gl, LINE_VERTEX, LINE_FRAGMENT),
   };
   const lines = gl.createBuffer();
 
@@ -133,12 +167,13 @@ function buildPainter(canvas, scene, arrays) {
 
   function addSurface(points, triangles, texels = new Float32Array((points.length / 3) * 2)) {
     return {
-      triangles, count: triangles.length, place: buffer(points), facing: buffer(normalsOf(points, triangles)),
-      texel: buffer(texels), index: buffer(triangles, gl.ELEMENT_ARRAY_BUFFER),
+      points, triangles, place: buffer(points), facing: buffer(normalsOf(points, triangles)), texel: buffer(texels),
+      index: buffer(triangles, gl.ELEMENT_ARRAY_BUFFER),
     };
   }
 
   function move(surface, points) {
+    surface.points = points;
     for (const [name, data] of [["place", points], ["facing", normalsOf(points, surface.triangles)]]) {
       gl.bindBuffer(gl.ARRAY_BUFFER, surface[name]);
       gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
@@ -152,12 +187,24 @@ function buildPainter(canvas, scene, arrays) {
       if (typeof value === "boolean") gl.uniform1i(at, +value);
       else if (typeof value === "number") gl.uniform1f(at, value);
       else if (name === "view") gl.uniformMatrix4fv(at, false, value);
-      else if (name === "radii") gl.uniform1fv(at, value);
-      else gl[`uniform${name === "ends" ? 3 : value.length}fv`](at, value);
+      else gl[`uniform${value.length}fv`](at, value);
     }
   }
 
-  function drawSurface(name, surface, values) {
+  // Draw a surface: first the triangles that the tool's shadow cannot reach, then the others, which take longer.
+  function drawShaded(name, surface, values) {
+    const { ball, rod, lamp } = values, parts = [[], []], reach = 1.3 * scene.tool.radius;
+    const lines = Array.from({ length: surface.points.length / 3 }, (_, n) => shadowPlace(pointAt(surface.points, n), lamp, ball, rod));
+    for (let t = 0; t < surface.triangles.length; t += 3) {
+      const corners = surface.triangles.subarray(t, t + 3), [a, b, c] = [...corners].map((n) => lines[n]);
+      const along = Math.max(a[1], b[1], c[1]) > -2 * reach;
+      const beside = Math.min(a[0], b[0], c[0]) > reach || Math.max(a[0], b[0], c[0]) < -reach;
+      parts[beside || !along ? 0 : 1].push(...corners);
+    }
+    for (const [k, program] of [name, `${name}Shaded`].entries()) drawSurface(program, surface, values, Uint16Array.from(parts[k]));
+  }
+
+  function drawSurface(name, surface, values, triangles = surface.triangles) {
     const { program, uniforms, attributes } = programs[name];
     gl.useProgram(program);
     set(uniforms, values);
@@ -168,7 +215,8 @@ function buildPainter(canvas, scene, arrays) {
       gl.vertexAttribPointer(attributes[attribute], length, gl.FLOAT, false, 0, 0);
     }
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.index);
-    gl.drawElements(gl.TRIANGLES, surface.count, gl.UNSIGNED_SHORT, 0);
+    if (triangles !== surface.triangles) gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.DYNAMIC_DRAW);
+    gl.drawElements(gl.TRIANGLES, triangles.length, gl.UNSIGNED_SHORT, 0);
   }
 
   // Draw a closed line [[x, y], ...] in pixels, `half` on each side and a dark border; strokes: [stroke, gap] lengths.
@@ -196,7 +244,7 @@ function buildPainter(canvas, scene, arrays) {
   function addTexture(values, side) {
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.LUMINANCE, side, side, 0, gl.LUMINANCE, gl.UNSIGNED_BYTE, values);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, side, side, 0, gl.RGB, gl.UNSIGNED_BYTE, values);
     for (const edge of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, edge, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
   }
@@ -205,10 +253,10 @@ function buildPainter(canvas, scene, arrays) {
   const drape = addSurface(arrays.drape, arrays.drapeTriangles);
   const tool = addSurface(arrays.tool, arrays.toolTriangles);
   const tumour = addSurface(arrays.tumour, arrays.tumourTriangles);
-  if (arrays.scan) addTexture(arrays.scan, Math.sqrt(arrays.scan.length));
+  if (arrays.scan) addTexture(arrays.scan, Math.sqrt(arrays.scan.length / 3));
 
-  // Draw one image. `picture`: view matrix, positions, tip and axis ends of the tool, and the lines with their inks.
-  return function paint({ view, positions, tumourPositions, tip, ends, glow, lines: drawn }) {
+  // Draw one image. `picture`: view matrix, positions, tip and ball of the tool, and the lines with their inks.
+  return function paint({ view, positions, tumourPositions, tip, ball, glow, lines: drawn }) {
     move(cortex, positions);
     move(tumour, tumourPositions);
     gl.viewport(0, 0, canvas.width, canvas.height);
@@ -216,18 +264,18 @@ function buildPainter(canvas, scene, arrays) {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
-    const all = { ...scene.light, view, ends, radii: scene.tool.radii, shift: [0, 0, 0], textured: false, shaded: true };
-    drawSurface("lit", cortex, { ...all, ...scene.looks.cortex, textured: !!arrays.scan });
-    drawSurface("lit", drape, { ...all, ...scene.looks.drape });
+    const all = { ...scene.light, view, ball, rod: scene.tool.rod, radii: scene.tool.radii, shift: [0, 0, 0], textured: false };
+    drawShaded("lit", cortex, { ...all, ...scene.looks.cortex, textured: !!arrays.scan });
+    drawShaded("plain", drape, { ...all, ...scene.looks.drape });
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     gl.enable(gl.CULL_FACE);
-    drawSurface("glow", tumour, { view, eye: scene.light.eye, shift: [0, 0, 0], base: glow, opacity: 0.45 });
+    drawSurface("glow", tumour, { ...all, base: glow, opacity: 0.45 });
     gl.disable(gl.CULL_FACE);
     for (const line of drawn) drawLine(...line);
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
-    drawSurface("lit", tool, { ...all, ...scene.looks.tool, shift: tip, shaded: false });
+    drawSurface("lit", tool, { ...all, ...scene.looks.tool, shift: tip });
   };
 }

@@ -57,7 +57,7 @@ function reduce(input, axes, keep, start, combine) {
 }
 
 function multiply(left, right) {
-  const [inner, width] = right.shape, out = filled([...left.shape.slice(0, -1), width]);
+  const [inner, width = 1] = right.shape, out = filled([...left.shape.slice(0, -1), ...right.shape.slice(1)]);
   for (let row = 0; row * inner < left.data.length; row++) {
     for (let k = 0; k < inner; k++) {
       const factor = left.data[row * inner + k];

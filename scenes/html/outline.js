@@ -1,7 +1,7 @@
 "use strict";
 // Smooth outline of a projected surface: its mask on a small canvas, the contour at half coverage, resampled and smoothed.
 
-const MASK_SIDE = 256; // longer side of the mask [pixel]
+const MASK_SIDE = 160; // longer side of the mask [pixel]
 const OUTLINE_POINTS = 180;
 const SMOOTHING = 6; // number of passes of the filter (1, 2, 1) / 4
 const maskCanvas = document.createElement("canvas");
@@ -37,17 +37,16 @@ function longestContour(rgba) {
     at.set(key, high - low === 1 ? [u + share, v] : [u, v + share]);
     return key;
   };
-  for (let v = 0; v < MASK_SIDE - 1; v++) {
-    for (let u = 0; u < MASK_SIDE - 1; u++) {
-      const place = v * MASK_SIDE + u, ring = [place, place + 1, place + MASK_SIDE + 1, place + MASK_SIDE];
-      const inside = ring.map((one) => alpha(one) > 0);
-      if (inside.every((one) => one === inside[0])) continue;
-      for (let k = 0; k < 4; k++) { // enter where the ring goes inside, leave where it next goes outside
-        if (inside[k] || !inside[(k + 1) % 4]) continue;
-        let end = (k + 1) % 4;
-        while (inside[(end + 1) % 4]) end = (end + 1) % 4;
-        next.set(crossing(ring[k], ring[(k + 1) % 4]), crossing(ring[end], ring[(end + 1) % 4]));
-      }
+  const inside = Uint8Array.from({ length: MASK_SIDE ** 2 }, (_, place) => +(rgba[4 * place + 3] > 127));
+  for (let place = 0; place < MASK_SIDE * (MASK_SIDE - 1) - 1; place++) { // the mask's border is empty
+    const below = place + MASK_SIDE, count = inside[place] + inside[place + 1] + inside[below] + inside[below + 1];
+    if (count === 0 || count === 4) continue;
+    const ring = [place, place + 1, below + 1, below];
+    for (let k = 0; k < 4; k++) { // enter where the ring goes inside, leave where it next goes outside
+      if (inside[ring[k]] || !inside[ring[(k + 1) % 4]]) continue;
+      let end = (k + 1) % 4;
+      while (inside[ring[(end + 1) % 4]]) end = (end + 1) % 4;
+      next.set(crossing(ring[k], ring[(k + 1) % 4]), crossing(ring[end], ring[(end + 1) % 4]));
     }
   }
   let longest = [];

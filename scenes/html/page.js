@@ -1,7 +1,9 @@
 "use strict";
 // The page: decodes the arrays, holds the state (place and force of the tool), solves and draws when it changes.
 
-const FRAME_BUDGET = 30; // time of an image above which fewer pixels are drawn [ms]
+const MAX_INTERVAL = 34; // time between two images above which fewer pixels are drawn [ms]
+const PAUSE = 1000; // time between two images that counts as a pause [ms]
+const REST = 200; // time without a change after which the image is drawn with all pixels [ms]
 const MIN_QUALITY = 0.5; // smallest share of the window's pixels along each axis
 const KEY_STEP = 1e-3, FORCE_STEP = 0.02; // of one key press [m], [N]
 const TYPES = { f4: Float32Array, f8: Float64Array, i4: Int32Array, u2: Uint16Array, u1: Uint8Array };
@@ -96,13 +98,17 @@ function start(scene, arrays, graph) {
     };
   }
 
-  // Mapping from the camera's image to the canvas: the image is as large as fits, in the middle.
-  function fit() {
-    const ratio = (window.devicePixelRatio || 1) * state.quality, { width, height } = scene.camera;
+  function resize(quality) {
+    const ratio = (window.devicePixelRatio || 1) * quality;
     const size = [canvas.clientWidth, canvas.clientHeight].map((length) => Math.max(1, Math.round(length * ratio)));
     if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
-    const scale = Math.min(size[0] / width, size[1] / height);
-    return { ratio, scale, left: 0.5 * (size[0] - scale * width), top: 0.5 * (size[1] - scale * height) };
+  }
+
+  // Mapping from the camera's image to the canvas: the image is as large as fits, in the middle.
+  function fit() {
+    const { width, height } = scene.camera, scale = Math.min(canvas.width / width, canvas.height / height);
+    const ratio = canvas.width / canvas.clientWidth;
+    return { ratio, scale, left: 0.5 * (canvas.width - scale * width), top: 0.5 * (canvas.height - scale * height) };
   }
 
   function toCamera(point) {
@@ -134,13 +140,21 @@ function start(scene, arrays, graph) {
     return outlineOf(flat, arrays.tumourTriangles);
   }
 
+  let still = {}; // outline in the scan, until the view changes
+  function outlineInScan(view) {
+    const key = JSON.stringify(view);
+    if (still.key !== key) still = { key, edge: outline(arrays.tumour, view) };
+    return still.edge;
+  }
+
   // Error of the tumour position in the patient [m], in proportion to the motion; null: not known.
   function positionError({ moved, bound }) {
     const error = scene.positionError;
     return error && bound !== null ? Math.hypot(error.rest, error.surface * moved, bound) : null;
   }
 
-  function draw() {
+  function draw(quality) {
+    resize(quality);
     const view = fit(), { result } = state, now = result.outside ? scene.inks.doubtful : scene.inks.tumour;
     const edge = outline(result.tumour, view), error = positionError(result), lines = [], r = view.ratio;
     const perMetre = view.scale * scene.camera.focal / toCamera(pointAt(result.tumour, 0))[2];
@@ -149,10 +163,10 @@ function start(scene, arrays, graph) {
     }
     if (result.bound !== null && state.force > 0) lines.push([edge, [...now, 0.3], result.bound * perMetre]);
     lines.push([edge, [...now, 1], 1.4 * r, r, result.outside ? [9 * r, 6 * r] : [1, 0]]);
-    lines.push([outline(arrays.tumour, view), [...scene.inks.scan, 1], 0.9 * r, 0.7 * r, [2.5 * r, 5 * r]]);
-    const ends = tool.ends.flatMap((end) => along(result.tip, end, 1));
+    lines.push([outlineInScan(view), [...scene.inks.scan, 1], 0.9 * r, 0.7 * r, [2.5 * r, 5 * r]]);
+    const ball = along(result.tip, frame.axis, -tool.radius);
     paint?.({
-      view: viewMatrix(view), positions: result.cortex, tumourPositions: result.tumour, tip: result.tip, ends, glow: now,
+      view: viewMatrix(view), positions: result.cortex, tumourPositions: result.tumour, tip: result.tip, ball, glow: now,
       lines,
     });
     Object.assign(state, { edge, view, error });
@@ -176,13 +190,18 @@ function start(scene, arrays, graph) {
   let last = 0, slow = 0;
   function loop(time) {
     if (state.dirty) {
-      slow = time - last < 250 && time - last > FRAME_BUDGET + 4 ? slow + 1 : 0;
-      if (slow > 8 && state.quality > MIN_QUALITY) [state.quality, slow] = [Math.max(MIN_QUALITY, 0.8 * state.quality), 0];
+      const late = time - last > MAX_INTERVAL && time - last < PAUSE;
+      slow = late ? slow + 1 : Math.max(0, slow - 1);
+      if (slow > 4 && state.quality > MIN_QUALITY) [state.quality, slow] = [Math.max(MIN_QUALITY, 0.75 * state.quality), 0];
       last = time;
       state.dirty = false;
       compute();
-      draw();
+      draw(state.quality);
       state.images += 1;
+      state.sharp = state.quality === 1;
+    } else if (!state.sharp && time - last > REST) { // all pixels once nothing moves
+      draw(1);
+      state.sharp = true;
     }
     requestAnimationFrame(loop);
   }
@@ -239,7 +258,7 @@ function start(scene, arrays, graph) {
   new ResizeObserver(() => (state.dirty = true)).observe(canvas);
   press(state.force);
   requestAnimationFrame(loop);
-  return { scene, state, solve, moveTo, press, project, fit };
+  return { scene, state, solve, moveTo, press, project, fit, draw };
 }
 
 // For other scripts and tests: a promise of the page's state and functions.

@@ -22,6 +22,7 @@ from ..script.tool_paths import IDLE_HEIGHT, MIN_VISIBLE_FORCE
 
 NO_ROW = 0xFFFF  # Number of a vertex that the model does not predict.
 TEXTURE_SIDE = 192  # Side of the texture of the cortex [pixel].
+MAX_SLOPE = 600.0  # Largest slope of the grey values in the texture [1/m].
 NEAR, FAR = 0.2, 2.0  # Smallest and largest drawn depth, relative to the distance from the camera to the cortex.
 
 
@@ -60,7 +61,7 @@ def _build_texture(stage: Stage, cortex: Layer) -> dict[str, np.ndarray]:
     """Build the scan on the cortex as an image over the tangent plane, and the place of each vertex in it."""
     if cortex.solid is None or cortex.rest is None:
         return {}
-    site, half = stage.site, _measure_texture(stage)
+    site, half = stage.site, stage.site.radius + RIM_DISTANCE
     flat = np.stack([(cortex.rest - site.origin) @ each for each in (site.right, site.up, site.axis)], axis=1)
     across = half * (2.0 * (np.arange(TEXTURE_SIDE) + 0.5) / TEXTURE_SIDE - 1.0)
     x, y = np.meshgrid(across, across)
@@ -70,15 +71,11 @@ def _build_texture(stage: Stage, cortex: Layer) -> dict[str, np.ndarray]:
     T = cortex.solid.T_index_world
     index = np.moveaxis(world @ T[:3, :3].T + T[:3, 3], -1, 0)
     values = map_coordinates(np.asarray(cortex.solid.values), index, order=1, mode="nearest")
+    up, right = (slope / (2.0 * half / TEXTURE_SIDE) / (2.0 * MAX_SLOPE) + 0.5 for slope in np.gradient(values))
     return {
         "texels": (0.5 + 0.5 * flat[:, :2] / half).astype(np.float32),
-        "scan": np.rint(255.0 * values.clip(0.0, 1.0)).astype(np.uint8),
+        "scan": np.rint(255.0 * np.stack([values, right, up], axis=-1).clip(0.0, 1.0)).astype(np.uint8),
     }
-
-
-def _measure_texture(stage: Stage) -> float:
-    """Half the side of the texture [m]."""
-    return stage.site.radius + RIM_DISTANCE
 
 
 def describe_stage(stage: Stage, camera: Camera) -> dict[str, Any]:
@@ -116,18 +113,15 @@ def _describe_layers(stage: Stage) -> Mapping[str, Any]:
     for layer in stage.build_layers(stage.anatomy.mesh.nodes, pose):
         looks[layer.name] = {
             "base": np.square(layer.colour[0]).tolist(), "shine": [layer.gloss, layer.shininess], "relief": 0.0,
-            "dark": [0.0] * 3, "step": 1.0 / TEXTURE_SIDE,
+            "dark": [0.0] * 3,
         }  # fmt: skip
         if layer.solid is not None:
-            step = 2.0 * _measure_texture(stage) / TEXTURE_SIDE
-            looks[layer.name] |= {"dark": layer.solid.dark, "relief": layer.solid.relief / (2.0 * step)}
+            looks[layer.name] |= {"dark": layer.solid.dark, "relief": 2.0 * MAX_SLOPE * layer.solid.relief}
     return looks
 
 
 def _describe_tool(tool: Probe, inward: np.ndarray, aside: np.ndarray) -> dict[str, Any]:
-    """Radius of the ball, and rods (3) with ends relative to the tip, that cast the shadow."""
+    """Radius of the ball, direction of the shaft; radii of ball, shaft and grip, and distance from ball to grip."""
     pose = tool.pose(np.zeros(3), inward, aside)
-    shaft, grip = tool.radius + tool.length * np.array([[0.0, 1.0], [0.55, 1.15]])
-    heights = np.array([[tool.radius, tool.radius], shaft, grip]).ravel()
-    ends = heights[:, None] * pose[:3, 2] + pose[:3, 3]
-    return {"radius": tool.radius, "ends": ends.tolist(), "radii": [tool.radius, tool.shaft, 2.2 * tool.shaft]}
+    radii = [tool.radius, tool.shaft, 2.2 * tool.shaft, 0.55 * tool.length]
+    return {"radius": tool.radius, "rod": pose[:3, 2].tolist(), "radii": radii}
