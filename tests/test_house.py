@@ -42,6 +42,7 @@ ORDER = (
     {"scenes.script"},
     {"scenes.builtin", "scenes.play"},
     {"scenes.page"},
+    {"scenes.html"},
     {"scenes.tracked"},
     {"scenes.gym", "scenes.link"},
     {"scenes.analysis", "scenes.episodes"},

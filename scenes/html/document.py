@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sim.bodies.lobes import describe_location
+from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.versions import get_version
@@ -25,16 +26,18 @@ from surrogate.onnx_export.graph import Sheet
 from ..page.text import RESEARCH_ONLY, describe_scene, format_legend, to_stroke
 from ..play.deformers import PatientSetup
 from ..play.frame_text import OUTCOME_WARNINGS
+from ..play.player import BONE_WARNING
 from ..play.stage import TUMOUR_COLOUR
 from ..script.registration import REGISTRATIONS, describe_registration
 from ..script.scene import Scene
+from ..script.tool import Probe
 from .packing import pack_arrays
 from .scene_arrays import build_arrays, describe_stage
 
 MAX_BYTES = 2_000_000  # Largest size of the file [bytes].
 MAX_MODEL_BYTES = 32_000_000  # Size of a model's arrays above which they do not fit, compressed [bytes].
 FORCE_RANGE = 1.5  # Largest force of the page, relative to that of the training.
-SCRIPTS = ("graph.js", "contact.js", "outline.js", "draw.js", "page.js")
+SCRIPTS = ("graph.js", "contact.js", "model.js", "outline.js", "draw.js", "page.js")
 """Scripts of the page, in the order in which they depend on each other."""
 
 
@@ -49,7 +52,7 @@ class ExportedModel:
 
 
 def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: str | None = None) -> ExportedModel:
-    """Write the page of a scene atomically; return the model in it.
+    """Write the page of a scene atomically, without the motion of the cortex if that is too large; return its model.
 
     Parameters
     ----------
@@ -59,18 +62,23 @@ def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: s
     Raises
     ------
     InputError
-        No model of that name, or none that a page evaluates; a page of more than `MAX_BYTES`; a path that does not end
-        in .html, or a folder that cannot be written.
+        No model of that name, or none that a page evaluates; a scene without a palpation ball; a page of more than
+        `MAX_BYTES`; a path that does not end in .html, or a folder that cannot be written.
     """
+    if not isinstance(scene.tool, Probe):
+        raise InputError(f"{scene.name}: the page pushes with a palpation ball, which this scene has not.")
     found = choose_model(theatre, learner)
     text = build_html(theatre, scene, found)
-    if len(text.encode()) > MAX_BYTES:
+    if found.cortex and len(text) > MAX_BYTES:
+        found = trace(found.name, found.model, cortex=False)
+        text = build_html(theatre, scene, found)
+    if len(text) > MAX_BYTES:
         raise InputError(
-            f"{found.name}: the page would have {len(text.encode()) / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:g} are "
-            "allowed: choose a smaller model by --learner."
+            f"{found.name}: the page would have {len(text) / 1e6:.1f} MB, but at most {MAX_BYTES / 1e6:g} MB are "
+            "allowed: choose another model by --learner."
         )
     with write_atomically(path, ".html") as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(text, encoding="ascii")
     return found
 
 
@@ -87,22 +95,30 @@ def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedM
     found, reasons = [], []
     for name in theatre.models if learner is None else [learner]:
         try:
-            found.append(_trace(name, theatre.models[name]))
+            found.append(trace(name, theatre.models[name], cortex=True))
         except InputError as error:
             reasons.append(str(error))
     if not found:
-        raise InputError(f"no model here can be evaluated by a page: {'; '.join(reasons) or 'there is none'}.")
+        raise InputError(" ".join(reasons) or "there is no model next to this anatomy: make one by `sulcus train`.")
     return min(found, key=lambda one: _count_bytes(one.sheet))
 
 
-def _trace(name: str, model: Learned) -> ExportedModel:
+def trace(name: str, model: Learned, cortex: bool) -> ExportedModel:
+    """Trace a model of the tumour, or of the cortex too.
+
+    Raises
+    ------
+    InputError
+        A model of poses, a model that is far too large, and what `trace_model` rejects.
+    """
     if model.tool is not None:
-        raise InputError(f"{name} is a model of poses, and the page pushes by a force")
-    for cortex in (True, False):
-        sheet = trace_model(name, model, cortex)
-        if _count_bytes(sheet) <= MAX_MODEL_BYTES:
-            return ExportedModel(name, model, sheet, cortex)
-    raise InputError(f"{name} has {_count_bytes(sheet) / 1e6:.0f} MB of numbers, more than a page holds")
+        raise InputError(f"{name} is a model of poses, but the page pushes by a force: export another learner.")
+    sheet = trace_model(name, model, cortex)
+    if _count_bytes(sheet) > MAX_MODEL_BYTES:
+        raise InputError(
+            f"{name} has {_count_bytes(sheet) / 1e6:.0f} MB of numbers, too many for a page: export another learner."
+        )
+    return ExportedModel(name, model, sheet, cortex)
 
 
 def _count_bytes(sheet: Sheet) -> int:
@@ -113,8 +129,7 @@ def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> 
     """Build the text of the page, with all that it needs: model, surfaces, scripts and style."""
     stage, model = theatre.build_stage(scene), exported.model
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
-    arrays = exported.sheet.constants | build_arrays(stage, nodes)
-    table, packed = pack_arrays(arrays)
+    table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
     described = describe_stage(stage, scene.viewpoint.build_camera(stage.site))
     most = round(FORCE_RANGE * model.envelope.force[1], 2)
     described["force"] |= {"most": most}
@@ -137,7 +152,7 @@ def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> 
     }
     return Template(_read("page.html")).substitute(
         fields, style=style, style_digest=_digest(style), script=script, script_digest=_digest(script),
-        scene=_to_script_json(described), arrays=packed,
+        scene=_to_script_json(described), arrays=packed, shaders=_read("shaders.glsl"),
     )  # fmt: skip
 
 
@@ -147,9 +162,10 @@ def _describe_errors(theatre: PatientSetup, scene: Scene) -> dict[str, Any]:
     known = None if error is None else {"rest": error.rest[registration], "surface": error.surface}
     words = {
         "still": "the tool does not push: the tumour is where the scan has it",
-        "outside": next(iter(OUTCOME_WARNINGS.values())),
+        "outside": OUTCOME_WARNINGS[Outcome.EXTRAPOLATED],
+        "blocked": BONE_WARNING,
         "position": "tumour position error",
-        "guess": f", rough estimate; {describe_registration(REGISTRATIONS[registration])}",
+        "guess": f"(95\N{NO-BREAK SPACE}%), rough estimate; {describe_registration(REGISTRATIONS[registration])}",
         "unknown": "tumour position error: not known",
     }
     return {"positionError": known, "words": words}
@@ -181,7 +197,7 @@ def _format_legend() -> str:
 
 
 def _read(name: str) -> str:
-    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+    return files("scenes.html").joinpath(name).read_text(encoding="utf-8")
 
 
 def _digest(text: str) -> str:

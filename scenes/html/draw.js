@@ -1,103 +1,5 @@
 "use strict";
-// Drawing by WebGL: lit surfaces under a lamp, lines in pixels; the same light as ar/rendering/shade.py.
-
-const LIGHT = `
-  precision highp float;
-  uniform vec3 eye, lamp, lampAxis, base; uniform vec2 cone, light, shine;
-  // Share of the lamp inside its lit circle, which has a soft edge; toned light, as a display shows it.
-  float arrivingAt(vec3 ray) {
-    float rim = clamp((-dot(ray, lampAxis) - cone.x) * cone.y, 0.0, 1.0);
-    return light.x * rim * rim * (3.0 - 2.0 * rim);
-  }
-  vec3 tone(vec3 x) { return sqrt(clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)); }
-  float ambientOn(float facing) { return light.y * (0.35 + 0.65 * max(0.0, facing)); }
-  float diffuse(float facing) { return max(0.0, (facing + 0.2) / 1.2); }`;
-
-// Share of the lamp that passes the tool, with a soft edge: a ball at `ball`, a shaft and a grip along the line from it.
-const SHADOW = `
-  varying vec3 at;
-  uniform vec3 ball, rod; uniform vec4 radii; // of ball, shaft, grip; distance from the ball to the grip
-  float shareOfLamp() {
-    #ifdef SHADED
-    vec3 ray = normalize(lamp - at), arm = ball - at;
-    float slope = dot(ray, rod), room = max(1.0 - slope * slope, 1e-6), ahead = dot(ray, arm);
-    float along = (slope * ahead - dot(rod, arm)) / room;
-    float radius = mix(radii.y, radii.z, smoothstep(radii.w - radii.z, radii.w, along));
-    float past = abs(dot(cross(ray, rod), arm)) * inversesqrt(room), beside = length(arm - ahead * ray);
-    float shaft = along > 0.0 && ahead + slope * along > 0.0 ? smoothstep(0.8 * radius, 1.2 * radius, past) : 1.0;
-    return min(shaft, smoothstep(0.8 * radii.x, 1.2 * radii.x, beside));
-    #else
-    return 1.0;
-    #endif
-  }`;
-
-const PLAIN_VERTEX = `${LIGHT}
-  attribute vec3 place, facing; uniform mat4 view;
-  varying vec3 at, bright, dim;
-  void main() { // light at the vertices: enough for a dull surface
-    vec3 ray = normalize(lamp - place), sight = normalize(eye - place), n = facing * sign(dot(facing, sight));
-    float ambient = ambientOn(dot(n, sight));
-    at = place; dim = tone(base * ambient);
-    bright = tone(base * (ambient + arrivingAt(ray) * diffuse(dot(n, ray))));
-    gl_Position = view * vec4(place, 1.0);
-  }`;
-
-const PLAIN_FRAGMENT = `${LIGHT}${SHADOW}
-  varying vec3 bright, dim;
-  void main() { gl_FragColor = vec4(mix(dim, bright, shareOfLamp()), 1.0); }`;
-
-const LIT_VERTEX = `${LIGHT}
-  attribute vec3 place, facing; attribute vec2 texel; uniform mat4 view; uniform vec3 shift;
-  varying vec3 at, normal, ray, sight, middle; varying vec2 where; varying float arriving;
-  void main() {
-    at = place + shift; normal = facing; where = texel;
-    ray = normalize(lamp - at); sight = normalize(eye - at); middle = normalize(ray + sight); arriving = arrivingAt(ray);
-    gl_Position = view * vec4(at, 1.0);
-  }`;
-
-const LIT_FRAGMENT = `${LIGHT}${SHADOW}
-  varying vec3 normal, ray, sight, middle; varying vec2 where; varying float arriving;
-  uniform vec3 dark, right, up; uniform float relief; uniform bool textured; uniform sampler2D scan;
-  void main() {
-    vec3 n = normal * sign(dot(normal, sight)), colour = base;
-    if (textured) { // value of the scan, and its slopes along right and up
-      vec3 texel = texture2D(scan, where).rgb;
-      vec3 tilt = relief * ((texel.g - 0.5) * right + (texel.b - 0.5) * up);
-      colour *= dark + (1.0 - dark) * texel.r;
-      n += dot(tilt, n) * n - tilt;
-    }
-    n = normalize(n);
-    float came = arriving * shareOfLamp(), grazing = 1.0 - dot(sight, middle);
-    float fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing;
-    float lobe = exp(shine.y * (dot(n, middle) - 1.0)) * (shine.y + 8.0) * 0.12 * fresnel;
-    gl_FragColor = vec4(tone(colour * (ambientOn(dot(n, sight)) + came * diffuse(dot(n, ray))) + came * shine.x * lobe), 1.0);
-  }`;
-
-const GLOW_FRAGMENT = `
-  precision highp float;
-  varying vec3 normal, sight;
-  uniform vec3 base; uniform float opacity;
-  void main() { gl_FragColor = vec4(base * (0.35 + 0.75 * abs(dot(normalize(normal), sight))), opacity); }`;
-
-const LINE_VERTEX = `
-  attribute vec4 corner; // x, y, side, length along the line [pixel]
-  uniform vec2 size;
-  varying vec2 along;
-  void main() {
-    along = corner.zw;
-    gl_Position = vec4(2.0 * corner.x / size.x - 1.0, 1.0 - 2.0 * corner.y / size.y, 0.0, 1.0);
-  }`;
-
-const LINE_FRAGMENT = `
-  precision highp float;
-  varying vec2 along;
-  uniform vec4 ink; uniform float width, border; uniform vec2 strokes;
-  void main() {
-    if (strokes.y > 0.0 && mod(along.y, strokes.x + strokes.y) > strokes.x) discard;
-    float far = abs(along.x);
-    float cover = clamp(width + border + 0.5 - far, 0.0, 1.0), core = clamp(width + 0.5 - far, 0.0, 1.0);
-    gl_FragColor = vec4(mix(vec3(0.04, 0.05, 0.05), ink.rgb, border > 0.0 ? core : 1.0), ink.a * cover);
-  }`;
+// Drawing by WebGL: lit surfaces under a lamp, and lines in pixels.
 
 function buildProgram(gl, vertex, fragment) {
   const program = gl.createProgram();
@@ -149,12 +51,15 @@ function isSoftware() {
 
 function buildPainter(canvas, scene, arrays) {
   const gl = canvas.getContext("webgl", { alpha: false, antialias: !isSoftware() });
-  if (!gl) return null;
-  const shaded = "#define SHADED\n";
+  if (!gl) throw new Error("it has no WebGL");
+  const code = Object.fromEntries(byId("shaders").textContent.split("//@ ").map((part) => part.split(/\n([^]*)/)));
+  const build = (name, mark) => buildProgram(
+    gl, code.LIGHT + code[`${name}_VERTEX`], mark + code.LIGHT + code.SHADOW + code[`${name}_FRAGMENT`]);
+  const mark = "#define SHADED\n"; // of programs that look for the tool's shadow
   const programs = {
-    plain: buildProgram(gl, PLAIN_VERTEX, PLAIN_FRAGMENT), plainShaded: buildProgram(gl, PLAIN_VERTEX, shaded + PLAIN_FRAGMENT),
-    lit: buildProgram(gl, LIT_VERTEX, LIT_FRAGMENT), litShaded: buildProgram(gl, LIT_VERTEX, shaded + LIT_FRAGMENT),
-    glow: buildProgram(gl, LIT_VERTEX, GLOW_FRAGMENT), line: buildProgram(gl, LINE_VERTEX, LINE_FRAGMENT),
+    plain: build("PLAIN", ""), plainShaded: build("PLAIN", mark), lit: build("LIT", ""), litShaded: build("LIT", mark),
+    glow: buildProgram(gl, code.LIGHT + code.LIT_VERTEX, code.GLOW_FRAGMENT),
+    line: buildProgram(gl, code.LINE_VERTEX, code.LINE_FRAGMENT),
   };
   const lines = gl.createBuffer();
 
@@ -255,10 +160,11 @@ function buildPainter(canvas, scene, arrays) {
   const tumour = addSurface(arrays.tumour, arrays.tumourTriangles);
   if (arrays.scan) addTexture(arrays.scan, Math.sqrt(arrays.scan.length / 3));
 
-  // Draw one image. `picture`: view matrix, positions, tip and ball of the tool, and the lines with their inks.
-  return function paint({ view, positions, tumourPositions, tip, ball, glow, lines: drawn }) {
-    move(cortex, positions);
-    move(tumour, tumourPositions);
+  // Draw one image: the view matrix, vertices of cortex and tumour, tip and ball of the tool, ink of the tumour, lines.
+  return function paint(image) {
+    const { view, tip, ball } = image;
+    move(cortex, image.cortex);
+    move(tumour, image.tumour);
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clearColor(...scene.background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -271,9 +177,9 @@ function buildPainter(canvas, scene, arrays) {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     gl.enable(gl.CULL_FACE);
-    drawSurface("glow", tumour, { ...all, base: glow, opacity: 0.45 });
+    drawSurface("glow", tumour, { ...all, base: image.ink, opacity: 0.45 });
     gl.disable(gl.CULL_FACE);
-    for (const line of drawn) drawLine(...line);
+    for (const line of image.lines) drawLine(...line);
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
     drawSurface("lit", tool, { ...all, ...scene.looks.tool, shift: tip });

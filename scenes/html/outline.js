@@ -3,7 +3,7 @@
 
 const MASK_SIDE = 160; // longer side of the mask [pixel]
 const OUTLINE_POINTS = 180;
-const SMOOTHING = 6; // number of passes of the filter (1, 2, 1) / 4
+const SMOOTHING = 12; // number of passes of the filter (1, 2, 1) / 4
 const maskCanvas = document.createElement("canvas");
 const maskContext = maskCanvas.getContext("2d", { willReadFrequently: true });
 

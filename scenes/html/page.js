@@ -1,65 +1,34 @@
 "use strict";
-// The page: decodes the arrays, holds the state (place and force of the tool), solves and draws when it changes.
+// The page: holds the state (place and force of the tool), solves and draws when it changes.
 
 const MAX_INTERVAL = 34; // time between two images above which fewer pixels are drawn [ms]
 const PAUSE = 1000; // time between two images that counts as a pause [ms]
 const REST = 200; // time without a change after which the image is drawn with all pixels [ms]
 const MIN_QUALITY = 0.5; // smallest share of the window's pixels along each axis
 const KEY_STEP = 1e-3, FORCE_STEP = 0.02; // of one key press [m], [N]
-const TYPES = { f4: Float32Array, f8: Float64Array, i4: Int32Array, u2: Uint16Array, u1: Uint8Array };
 const byId = (id) => document.getElementById(id);
-
-// Arrays by name: base64 of deflated bytes, in which the first bytes of an array's numbers come first, then the second.
-async function decode(text, table) {
-  const packed = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const bytes = new Uint8Array(await new Response(stream).arrayBuffer()), arrays = {};
-  let start = 0;
-  for (const [name, [type, shape]] of Object.entries(table)) {
-    const count = countOf(shape), width = TYPES[type].BYTES_PER_ELEMENT, plain = new Uint8Array(count * width);
-    for (let k = 0; k < width; k++) {
-      for (let n = 0; n < count; n++) plain[n * width + k] = bytes[start + k * count + n];
-    }
-    arrays[name] = { shape, data: new TYPES[type](plain.buffer) };
-    start += count * width;
-  }
-  return arrays;
-}
 
 async function open() {
   const scene = JSON.parse(byId("scene").textContent);
-  const found = await decode(byId("arrays").textContent, scene.arrays);
-  const arrays = {}, constants = {};
-  for (const [name, { shape, data }] of Object.entries(found)) {
-    if (name.startsWith("constant_")) constants[name] = { shape, data: Float64Array.from(data) };
-    else arrays[name] = data;
-  }
-  return start(scene, arrays, buildGraph(scene.graph, constants));
+  return start(scene, await openModel(scene, byId("arrays").textContent));
 }
 
-function start(scene, arrays, graph) {
+function start(scene, { arrays, surface, solve }) {
   const { frame, tool, words } = scene, canvas = byId("view"), slider = byId("force");
-  const surface = { points: arrays.patch, triangles: arrays.patchTriangles };
   const paint = buildPainter(canvas, scene, arrays);
   const state = { x: 0, y: 0, force: scene.force.start, quality: 1, dirty: true, result: null, images: 0 };
-  if (!paint) byId("result").textContent = "This browser has no WebGL: the image cannot be drawn.";
-
-  // Outputs of the model for one load: point [m], force [N], footprint radius [m].
-  function solve(point, force, footprint) {
-    const weight = () => ({ shape: [1, surface.points.length / 3], data: footprintWeights(surface, point, footprint) });
-    const inputs = {
-      point: { shape: [1, 3], data: Float64Array.from(point) }, force: { shape: [1, 3], data: Float64Array.from(force) },
-      footprint: { shape: [1], data: Float64Array.of(footprint) },
-    };
-    return graph(scene.graph.inputs.includes("weight") ? { ...inputs, weight: weight() } : inputs);
-  }
 
   // Contact point of the tool at a place (x, y) of the tangent plane, which the bone limits.
   const contactAt = (x, y) => nearestOnSurface(surface, along(along(frame.origin, frame.right, x), frame.up, y));
 
-  function moveTo(x, y) {
+  function inReach(x, y) {
     const share = Math.min(1, frame.reach / Math.max(Math.hypot(x, y), 1e-12));
-    Object.assign(state, { x: share * x, y: share * y, dirty: true });
+    return [share * x, share * y];
+  }
+
+  function moveTo(...place) {
+    [state.x, state.y] = inReach(...place);
+    state.dirty = true;
   }
 
   function press(force) {
@@ -78,23 +47,29 @@ function start(scene, arrays, graph) {
     return out;
   }
 
+  // Place of the tool on the deformed cortex as in scenes/play/player.py: lifted off if idle, and stopped by the bone.
+  function placeTool(contact, displacement) {
+    const patch = displace(arrays.patch, arrays.patchRows, displacement), { lift, visible, carried } = scene.force;
+    const moved = contact.vertices.map((n) => minus(pointAt(patch, n), frame.origin));
+    const at = moved.reduce((sum, one, k) => along(sum, one, contact.weights[k]), [0, 0, 0]);
+    const flat = [dot(at, frame.right), dot(at, frame.up)], stopped = inReach(...flat);
+    const beyond = Math.hypot(flat[0] - stopped[0], flat[1] - stopped[1]);
+    const [x, y] = beyond > carried ? [stopped[0] - flat[0], stopped[1] - flat[1]] : [0, 0];
+    const through = along(along(along(frame.origin, at, 1), frame.right, x), frame.up, y);
+    const tip = restingTip({ ...surface, points: patch }, through, frame.axis, tool.radius);
+    return { tip: along(tip, frame.axis, -lift * Math.max(0, 1 - state.force / visible)), beyond };
+  }
+
   function compute() {
     const contact = contactAt(state.x, state.y), force = frame.axis.map((one) => state.force * one);
     const answer = solve(contact.point, force, tool.radius), displacement = answer.displacement.data;
-    const patch = displace(arrays.patch, arrays.patchRows, displacement);
-    const carried = contact.vertices.map((n, k) => pointAt(patch, n).map((value) => contact.weights[k] * value))
-      .reduce((sum, one) => along(sum, one, 1));
-    const lift = scene.force.lift * Math.max(0, 1 - state.force / scene.force.visible);
-    const touched = restingTip({ ...surface, points: patch }, carried, frame.axis, tool.radius);
-    const tumour = displace(arrays.tumour, arrays.tumourRows, displacement);
-    let moved = 0;
-    for (let n = 0; n < arrays.tumourRows.length; n++) {
-      moved += sizeOf(pointAt(displacement, arrays.tumourRows[n])) / arrays.tumourRows.length;
-    }
-    const outside = answer.extrapolated.data[0] > 0, bound = answer.bound.data[0];
+    const { tip, beyond } = placeTool(contact, displacement), rows = [...arrays.tumourRows];
+    const blocked = beyond > scene.force.blocked ? words.blocked : "", ofLoad = answer.bound.data[0];
+    const doubt = answer.extrapolated.data[0] ? words.outside : blocked;
     state.result = {
-      contact, displacement, tumour, moved, outside, bound: outside || !(bound < Infinity) ? null : bound,
-      cortex: displace(arrays.cortex, arrays.cortexRows, displacement), tip: along(touched, frame.axis, -lift),
+      contact, displacement, tip, doubt, bound: doubt ? null : Number.isFinite(ofLoad) ? ofLoad : scene.bound,
+      moved: rows.reduce((sum, row) => sum + sizeOf(pointAt(displacement, row)), 0) / rows.length,
+      tumour: displace(arrays.tumour, rows, displacement), cortex: displace(arrays.cortex, arrays.cortexRows, displacement),
     };
   }
 
@@ -104,31 +79,29 @@ function start(scene, arrays, graph) {
     if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
   }
 
-  // Mapping from the camera's image to the canvas: the image is as large as fits, in the middle.
+  // Mapping to the canvas: the camera's image is as large as fits, in the middle. Focal length and centre in pixels, of
+  // which whole numbers are at the corners; `ratio`: pixels of the canvas per pixel of the window.
   function fit() {
-    const { width, height } = scene.camera, scale = Math.min(canvas.width / width, canvas.height / height);
-    const ratio = canvas.width / canvas.clientWidth;
-    return { ratio, scale, left: 0.5 * (canvas.width - scale * width), top: 0.5 * (canvas.height - scale * height) };
+    const { width, height, focal, centre } = scene.camera, ratio = canvas.width / canvas.clientWidth;
+    const scale = Math.min(canvas.width / width, canvas.height / height);
+    const at = [0.5 * (canvas.width - scale * width), 0.5 * (canvas.height - scale * height)];
+    return { ratio, focal: scale * focal, centre: at.map((start, k) => start + scale * (centre[k] + 0.5)) };
   }
 
-  function toCamera(point) {
-    const T = scene.camera.T;
-    return [0, 1, 2].map((row) => dot(T[row], point) + T[row][3]);
-  }
+  const toCamera = (point) => scene.camera.T.map((row) => dot(row, point) + row[3]);
 
-  // Place on the canvas [pixel] of a point [m]; pixel centres of the image are whole numbers.
-  function project(point, { scale, left, top }) {
-    const [x, y, z] = toCamera(point), { focal, centre } = scene.camera;
-    return [left + scale * (focal * x / z + centre[0] + 0.5), top + scale * (focal * y / z + centre[1] + 0.5)];
+  function project(point, { focal, centre }) {
+    const [x, y, z] = toCamera(point);
+    return [centre[0] + (focal * x) / z, centre[1] + (focal * y) / z];
   }
 
   // The same as a matrix of WebGL, column by column.
-  function viewMatrix({ scale, left, top }) {
-    const { focal, centre, T, near, far } = scene.camera, [w, h] = [canvas.width, canvas.height];
-    const x = T[0].map((value, k) => (2 / w) * scale * focal * value + ((2 / w) * (left + scale * (centre[0] + 0.5)) - 1) * T[2][k]);
-    const y = T[1].map((value, k) => (-2 / h) * scale * focal * value + (1 - (2 / h) * (top + scale * (centre[1] + 0.5))) * T[2][k]);
-    const z = T[2].map((value, k) => ((far + near) * value - (k === 3 ? 2 * far * near : 0)) / (far - near));
-    return Float32Array.from({ length: 16 }, (_, k) => [x, y, z, T[2]][k % 4][k >> 2]);
+  function viewMatrix({ focal, centre }) {
+    const { T, near, far } = scene.camera, [w, h] = [canvas.width, canvas.height];
+    const row = (axis, factor, shift) => T[axis].map((value, k) => factor * value + shift * T[2][k]);
+    const depth = T[2].map((value, k) => ((far + near) * value - (k === 3 ? 2 * far * near : 0)) / (far - near));
+    const rows = [row(0, (2 * focal) / w, (2 * centre[0]) / w - 1), row(1, (-2 * focal) / h, 1 - (2 * centre[1]) / h), depth, T[2]];
+    return Float32Array.from({ length: 16 }, (_, k) => rows[k % 4][k >> 2]);
   }
 
   function outline(points, view, margin = 0) {
@@ -155,43 +128,41 @@ function start(scene, arrays, graph) {
 
   function draw(quality) {
     resize(quality);
-    const view = fit(), { result } = state, now = result.outside ? scene.inks.doubtful : scene.inks.tumour;
-    const edge = outline(result.tumour, view), error = positionError(result), lines = [], r = view.ratio;
-    const perMetre = view.scale * scene.camera.focal / toCamera(pointAt(result.tumour, 0))[2];
+    const view = fit(), { result } = state, now = result.doubt ? scene.inks.doubtful : scene.inks.tumour, r = view.ratio;
+    const edge = outline(result.tumour, view), error = positionError(result), lines = [];
     if (error !== null) {
-      lines.push([outline(result.tumour, view, error), [...now.map((one) => 0.75 * one), 0.9], 0.6 * r, 0, [12 * r, 7 * r]]);
+      const ink = [...now.map((one) => 0.75 * one), 0.9];
+      lines.push([outline(result.tumour, view, error), ink, 0.6 * r, 0, [12 * r, 7 * r]]);
     }
-    if (result.bound !== null && state.force > 0) lines.push([edge, [...now, 0.3], result.bound * perMetre]);
-    lines.push([edge, [...now, 1], 1.4 * r, r, result.outside ? [9 * r, 6 * r] : [1, 0]]);
+    const band = ((result.bound ?? 0) * view.focal) / toCamera(pointAt(result.tumour, 0))[2];
+    if (band) lines.push([edge, [...now, 0.3], band]);
+    lines.push([edge, [...now, 1], 1.4 * r, r, result.doubt ? [9 * r, 6 * r] : [1, 0]]);
     lines.push([outlineInScan(view), [...scene.inks.scan, 1], 0.9 * r, 0.7 * r, [2.5 * r, 5 * r]]);
     const ball = along(result.tip, frame.axis, -tool.radius);
-    paint?.({
-      view: viewMatrix(view), positions: result.cortex, tumourPositions: result.tumour, tip: result.tip, ball, glow: now,
-      lines,
-    });
-    Object.assign(state, { edge, view, error });
+    paint({ ...result, view: viewMatrix(view), ball, ink: now, lines });
+    Object.assign(state, { edge, view });
     describe(result, error);
   }
 
-  const upTo = (metres, digits) => {
-    const unit = 10 ** digits;
-    return `${(Math.max(Math.ceil(+(1e3 * metres * unit).toFixed(6)), 1) / unit).toFixed(digits)} mm`;
-  };
+  // Bound in millimetres, rounded up.
+  function upTo(metres, digits) {
+    const unit = 10 ** digits, whole = Math.max(Math.ceil(+(1e3 * metres * unit).toFixed(6)), 1);
+    return `\u2264 ${(whole / unit).toFixed(digits)} mm`;
+  }
 
-  function describe(result, error) {
-    const moved = `tumour moved ${(1e3 * result.moved).toFixed(2)} mm`, known = result.bound !== null;
-    byId("result").textContent = state.force === 0 ? words.still
-      : known ? `${moved} (model error ≤ ${upTo(result.bound, 2)})` : `${moved} (error not known)`;
-    byId("doubt").textContent = result.outside ? words.outside : "";
-    byId("position").textContent = error === null ? words.unknown : `${words.position} ≤ ${upTo(error, 1)} (95 %)${words.guess}`;
-    document.body.classList.toggle("doubtful", result.outside);
+  function describe({ moved, bound, doubt }, error) {
+    const within = bound === null ? "error not known" : `model error ${upTo(bound, 2)}`;
+    byId("result").textContent = state.force ? `tumour moved ${(1e3 * moved).toFixed(2)} mm (${within})` : words.still;
+    byId("doubt").textContent = doubt;
+    byId("position").textContent = error === null ? words.unknown : `${words.position} ${upTo(error, 1)} ${words.guess}`;
+    document.body.classList.toggle("doubtful", !!doubt);
   }
 
   let last = 0, slow = 0;
   function loop(time) {
     if (state.dirty) {
       const late = time - last > MAX_INTERVAL && time - last < PAUSE;
-      slow = late ? slow + 1 : Math.max(0, slow - 1);
+      slow = late ? slow + 1 : Math.max(0, slow - 0.3);
       if (slow > 4 && state.quality > MIN_QUALITY) [state.quality, slow] = [Math.max(MIN_QUALITY, 0.75 * state.quality), 0];
       last = time;
       state.dirty = false;
@@ -207,40 +178,35 @@ function start(scene, arrays, graph) {
   }
 
   // Place (x, y) in the tangent plane under a pixel of the canvas, at the height of the contact.
-  function pick(column, row) {
-    const { scale, left, top } = fit(), { focal, centre, T } = scene.camera;
-    const seen = [(column - left) / scale - 0.5 - centre[0], (row - top) / scale - 0.5 - centre[1], focal];
-    const ray = [0, 1, 2].map((axis) => T[0][axis] * seen[0] + T[1][axis] * seen[1] + T[2][axis] * seen[2]);
-    let depth = 0, x = 0, y = 0;
+  function pick([column, row]) {
+    const { focal, centre } = fit(), T = scene.camera.T, seen = [column - centre[0], row - centre[1], focal];
+    const ray = [0, 1, 2].map((axis) => dot(T.map((row) => row[axis]), seen));
+    let depth = 0, place = [0, 0];
     for (let k = 0; k < 4; k++) {
       const from = minus(scene.light.eye, along(frame.origin, frame.axis, depth));
       const at = along(from, ray, -dot(from, frame.axis) / dot(ray, frame.axis));
-      [x, y] = [dot(at, frame.right), dot(at, frame.up)];
-      const share = Math.min(1, frame.reach / Math.max(Math.hypot(x, y), 1e-12));
-      depth = dot(minus(contactAt(share * x, share * y).point, frame.origin), frame.axis);
+      place = [dot(at, frame.right), dot(at, frame.up)];
+      depth = dot(minus(contactAt(...inReach(...place)).point, frame.origin), frame.axis);
     }
-    return [x, y];
+    return place;
   }
 
-  let grasp = null; // offset between the pointer and the tool's contact while it is dragged
-  const pixelOf = (event) => {
-    const box = canvas.getBoundingClientRect(), { ratio } = fit();
-    return [(event.clientX - box.left) * ratio, (event.clientY - box.top) * ratio];
-  };
+  let grasp = null; // offset from the pointer to the tool's contact while it is dragged [pixel of the window]
+  function pointerAt(event, ratio) {
+    const box = canvas.getBoundingClientRect();
+    return [event.clientX - box.left + (grasp?.[0] ?? 0), event.clientY - box.top + (grasp?.[1] ?? 0)].map((at) => at * ratio);
+  }
+  const drag = (event) => grasp && moveTo(...pick(pointerAt(event, fit().ratio)));
   canvas.addEventListener("pointerdown", (event) => {
-    const at = pixelOf(event), view = fit(), contact = project(state.result.contact.point, view);
+    const view = fit(), at = pointerAt(event, view.ratio), contact = project(state.result.contact.point, view);
     const ball = project(along(state.result.tip, frame.axis, -tool.radius), view);
-    const reach = 1.3 * tool.radius * view.scale * scene.camera.focal / toCamera(state.result.tip)[2];
-    const grasped = Math.hypot(at[0] - ball[0], at[1] - ball[1]) < reach;
-    grasp = grasped ? [contact[0] - at[0], contact[1] - at[1]] : [0, 0];
+    const reach = (1.3 * tool.radius * view.focal) / toCamera(state.result.tip)[2];
+    const grasped = Math.hypot(at[0] - ball[0], at[1] - ball[1]) < reach; // else the tool comes to the pointer
+    grasp = [0, 1].map((axis) => (grasped ? (contact[axis] - at[axis]) / view.ratio : 0));
     canvas.setPointerCapture(event.pointerId);
-    moveTo(...pick(at[0] + grasp[0], at[1] + grasp[1]));
+    drag(event);
   });
-  canvas.addEventListener("pointermove", (event) => {
-    if (!grasp) return;
-    const at = pixelOf(event);
-    moveTo(...pick(at[0] + grasp[0], at[1] + grasp[1]));
-  });
+  canvas.addEventListener("pointermove", drag);
   for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => (grasp = null));
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();

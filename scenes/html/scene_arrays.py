@@ -16,6 +16,7 @@ from ar.rendering.layer import Layer
 from ar.rendering.renderer import DRAPE_COLOUR
 from surrogate.data.cortex_patch import open_patch
 
+from ..play.player import BLOCKED_DEPTH, CARRIED_DEPTH
 from ..play.stage import RIM_DISTANCE, TUMOUR_COLOUR, Stage
 from ..script.tool import Probe
 from ..script.tool_paths import IDLE_HEIGHT, MIN_VISIBLE_FORCE
@@ -99,10 +100,13 @@ def describe_stage(stage: Stage, camera: Camera) -> dict[str, Any]:
             "light": [lamp.strength, lamp.ambient], "right": frame["right"], "up": frame["up"],
         },
         "looks": _describe_layers(stage),
-        "background": (0.75 * np.array(DRAPE_COLOUR)).tolist(),
+        "background": (0.25 * np.array(DRAPE_COLOUR)).tolist(),
         "inks": {"tumour": TUMOUR_COLOUR, "doubtful": DOUBTFUL_COLOUR, "scan": BEFORE_COLOUR},
         "tool": _describe_tool(tool, site.axis, site.right),
-        "force": {"lift": IDLE_HEIGHT, "visible": MIN_VISIBLE_FORCE, "start": max(scene.path(time).force for time in scene.times)},
+        "force": {
+            "lift": IDLE_HEIGHT, "visible": MIN_VISIBLE_FORCE, "carried": CARRIED_DEPTH, "blocked": BLOCKED_DEPTH,
+            "start": max(scene.path(float(time)).force for time in scene.times),
+        },
     }  # fmt: skip
 
 
