@@ -46,7 +46,8 @@ function shadowPlace(point, lamp, start, rod) {
 // True if no graphics card draws: smooth edges would take too long.
 function isSoftware() {
   const gl = document.createElement("canvas").getContext("webgl"), info = gl?.getExtension("WEBGL_debug_renderer_info");
-  return !gl || /swiftshader|llvmpipe|software|basic render/i.test(gl.getParameter(info?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER));
+  const name = gl?.getParameter(info?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER) ?? "";
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
 }
 
 function buildPainter(canvas, scene, arrays) {
@@ -98,15 +99,16 @@ function buildPainter(canvas, scene, arrays) {
 
   // Draw a surface: first the triangles that the tool's shadow cannot reach, then the others, which take longer.
   function drawShaded(name, surface, values) {
-    const { ball, rod, lamp } = values, parts = [[], []], reach = 1.3 * scene.tool.radius;
-    const lines = Array.from({ length: surface.points.length / 3 }, (_, n) => shadowPlace(pointAt(surface.points, n), lamp, ball, rod));
+    const { ball, rod, lamp } = values, { points } = surface, parts = [[], []], reach = 1.3 * scene.tool.radius;
+    const lines = Array.from({ length: points.length / 3 }, (_, n) => shadowPlace(pointAt(points, n), lamp, ball, rod));
     for (let t = 0; t < surface.triangles.length; t += 3) {
       const corners = surface.triangles.subarray(t, t + 3), [a, b, c] = [...corners].map((n) => lines[n]);
-      const along = Math.max(a[1], b[1], c[1]) > -2 * reach;
+      const beyond = Math.max(a[1], b[1], c[1]) < -2 * reach; // the end of the tool
       const beside = Math.min(a[0], b[0], c[0]) > reach || Math.max(a[0], b[0], c[0]) < -reach;
-      parts[beside || !along ? 0 : 1].push(...corners);
+      parts[beside || beyond ? 0 : 1].push(...corners);
     }
-    for (const [k, program] of [name, `${name}Shaded`].entries()) drawSurface(program, surface, values, Uint16Array.from(parts[k]));
+    drawSurface(name, surface, values, Uint16Array.from(parts[0]));
+    drawSurface(`${name}Shaded`, surface, values, Uint16Array.from(parts[1]));
   }
 
   function drawSurface(name, surface, values, triangles = surface.triangles) {
@@ -146,19 +148,16 @@ function buildPainter(canvas, scene, arrays) {
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 2 * (loop.length + 1));
   }
 
-  function addTexture(values, side) {
+  const cortex = addSurface(arrays.cortex, arrays.cortexTriangles, arrays.texels);
+  const [drape, tool, tumour] = ["drape", "tool", "tumour"].map(
+    (name) => addSurface(arrays[name], arrays[`${name}Triangles`]));
+  if (arrays.scan) {
+    const side = Math.sqrt(arrays.scan.length / 3);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, side, side, 0, gl.RGB, gl.UNSIGNED_BYTE, values);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, side, side, 0, gl.RGB, gl.UNSIGNED_BYTE, arrays.scan);
     for (const edge of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, edge, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
   }
-
-  const cortex = addSurface(arrays.cortex, arrays.cortexTriangles, arrays.texels);
-  const drape = addSurface(arrays.drape, arrays.drapeTriangles);
-  const tool = addSurface(arrays.tool, arrays.toolTriangles);
-  const tumour = addSurface(arrays.tumour, arrays.tumourTriangles);
-  if (arrays.scan) addTexture(arrays.scan, Math.sqrt(arrays.scan.length / 3));
 
   // Draw one image: the view matrix, vertices of cortex and tumour, tip and ball of the tool, ink of the tumour, lines.
   return function paint(image) {
@@ -170,7 +169,8 @@ function buildPainter(canvas, scene, arrays) {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
-    const all = { ...scene.light, view, ball, rod: scene.tool.rod, radii: scene.tool.radii, shift: [0, 0, 0], textured: false };
+    const { rod, radii } = scene.tool;
+    const all = { ...scene.light, view, ball, rod, radii, shift: [0, 0, 0], textured: false };
     drawShaded("lit", cortex, { ...all, ...scene.looks.cortex, textured: !!arrays.scan });
     drawShaded("plain", drape, { ...all, ...scene.looks.drape });
     gl.disable(gl.DEPTH_TEST);

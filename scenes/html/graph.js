@@ -124,15 +124,9 @@ function transpose(input) {
   return { shape, data: Float64Array.from(offsets, (place) => input.data[place]) };
 }
 
-function reshape(input, lengths) {
-  const known = lengths.reduce((product, length) => (length < 0 ? product : product * length), 1);
-  return { shape: [...lengths].map((length) => (length < 0 ? input.data.length / known : length)), data: input.data };
-}
-
-function unsqueeze(input, axes) {
-  const shape = [...input.shape];
-  [...axes].sort((a, b) => a - b).forEach((axis) => shape.splice(axis, 0, 1));
-  return { shape, data: input.data };
+function reshape({ data }, lengths) {
+  const known = lengths.filter((length) => length >= 0);
+  return { shape: [...lengths].map((length) => (length < 0 ? data.length / countOf(known) : length)), data };
 }
 
 const FUNCTIONS = {
@@ -149,7 +143,7 @@ const OPERATORS = {
   Concat: ({ axis }, ...inputs) => concatenate(inputs, axis),
   Transpose: (_, input) => transpose(input),
   Reshape: (_, input, lengths) => reshape(input, lengths.data),
-  Unsqueeze: (_, input, axes) => unsqueeze(input, axes.data),
+  Unsqueeze: (_, { shape, data }, axes) => ({ shape: shape.toSpliced(axes.data[0], 0, 1), data }), // of one axis
   ArgMin: ({ axis }, input) => smallestIndex(input, axis),
   ReduceSum: ({ keepdims }, input, axes) => reduce(input, [...axes.data], keepdims, 0, (sum, value) => sum + value),
   ReduceMin: ({ keepdims, axes }, input) => reduce(input, axes, keepdims, Infinity, Math.min),

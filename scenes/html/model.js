@@ -28,7 +28,8 @@ async function openModel(scene, text) {
     if (name.startsWith("constant_")) constants[name] = { shape, data: Float64Array.from(data) };
     else arrays[name] = data;
   }
-  const graph = buildGraph(scene.graph, constants), surface = { points: arrays.patch, triangles: arrays.patchTriangles };
+  const graph = buildGraph(scene.graph, constants);
+  const surface = { points: arrays.patch, triangles: arrays.patchTriangles };
   const row = (values, shape) => ({ shape: [1, ...shape], data: Float64Array.from(values) });
   function solve(point, force, footprint) {
     const inputs = { point: row(point, [3]), force: row(force, [3]), footprint: row([footprint], []) };

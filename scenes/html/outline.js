@@ -1,5 +1,5 @@
 "use strict";
-// Smooth outline of a projected surface: its mask on a small canvas, the contour at half coverage, resampled and smoothed.
+// Smooth outline of a projected surface: the contour of its mask on a small canvas, resampled and smoothed.
 
 const MASK_SIDE = 160; // longer side of the mask [pixel]
 const OUTLINE_POINTS = 180;
@@ -65,13 +65,11 @@ function longestContour(rgba) {
 
 // Equally spaced points of a closed line.
 function resample(loop) {
-  const lengths = loop.map((point, k) => {
-    const other = loop[(k + 1) % loop.length];
-    return Math.hypot(other[0] - point[0], other[1] - point[1]);
-  });
+  const after = (k) => loop[(k + 1) % loop.length];
+  const lengths = loop.map(([x, y], k) => Math.hypot(after(k)[0] - x, after(k)[1] - y));
   const step = lengths.reduce((sum, length) => sum + length, 0) / OUTLINE_POINTS, out = [];
   for (let k = 0, before = 0; k < loop.length && out.length < OUTLINE_POINTS; before += lengths[k++]) {
-    const [a, b] = [loop[k], loop[(k + 1) % loop.length]];
+    const a = loop[k], b = after(k);
     while (out.length < OUTLINE_POINTS && out.length * step <= before + lengths[k]) {
       const share = lengths[k] ? (out.length * step - before) / lengths[k] : 0;
       out.push([a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])]);

@@ -65,18 +65,14 @@ function start(scene, { arrays, surface, solve }) {
     const answer = solve(contact.point, force, tool.radius), displacement = answer.displacement.data;
     const { tip, beyond } = placeTool(contact, displacement), rows = [...arrays.tumourRows];
     const blocked = beyond > scene.force.blocked ? words.blocked : "", ofLoad = answer.bound.data[0];
-    const doubt = answer.extrapolated.data[0] ? words.outside : blocked;
-    state.result = {
-      contact, displacement, tip, doubt, bound: doubt ? null : Number.isFinite(ofLoad) ? ofLoad : scene.bound,
-      moved: rows.reduce((sum, row) => sum + sizeOf(pointAt(displacement, row)), 0) / rows.length,
-      tumour: displace(arrays.tumour, rows, displacement), cortex: displace(arrays.cortex, arrays.cortexRows, displacement),
-    };
-  }
-
-  function resize(quality) {
-    const ratio = (window.devicePixelRatio || 1) * quality;
-    const size = [canvas.clientWidth, canvas.clientHeight].map((length) => Math.max(1, Math.round(length * ratio)));
-    if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+    const doubt = answer.extrapolated.data[0] ? words.outside : blocked, known = scene.positionError;
+    const bound = doubt ? null : Number.isFinite(ofLoad) ? ofLoad : scene.bound; // error of the model [m]
+    const moved = rows.reduce((sum, row) => sum + sizeOf(pointAt(displacement, row)), 0) / rows.length;
+    // Error of the tumour position in the patient [m], in proportion to the motion; null: not known.
+    const error = known && bound !== null ? Math.hypot(known.rest, known.surface * moved, bound) : null;
+    const tumour = displace(arrays.tumour, rows, displacement);
+    const cortex = displace(arrays.cortex, arrays.cortexRows, displacement);
+    state.result = { contact, displacement, tip, doubt, bound, moved, error, tumour, cortex };
   }
 
   // Mapping to the canvas: the camera's image is as large as fits, in the middle. Focal length and centre in pixels, of
@@ -97,10 +93,10 @@ function start(scene, { arrays, surface, solve }) {
 
   // The same as a matrix of WebGL, column by column.
   function viewMatrix({ focal, centre }) {
-    const { T, near, far } = scene.camera, [w, h] = [canvas.width, canvas.height];
+    const { T, near, far } = scene.camera, x = 2 / canvas.width, y = 2 / canvas.height;
     const row = (axis, factor, shift) => T[axis].map((value, k) => factor * value + shift * T[2][k]);
     const depth = T[2].map((value, k) => ((far + near) * value - (k === 3 ? 2 * far * near : 0)) / (far - near));
-    const rows = [row(0, (2 * focal) / w, (2 * centre[0]) / w - 1), row(1, (-2 * focal) / h, 1 - (2 * centre[1]) / h), depth, T[2]];
+    const rows = [row(0, x * focal, x * centre[0] - 1), row(1, -y * focal, 1 - y * centre[1]), depth, T[2]];
     return Float32Array.from({ length: 16 }, (_, k) => rows[k % 4][k >> 2]);
   }
 
@@ -120,20 +116,14 @@ function start(scene, { arrays, surface, solve }) {
     return still.edge;
   }
 
-  // Error of the tumour position in the patient [m], in proportion to the motion; null: not known.
-  function positionError({ moved, bound }) {
-    const error = scene.positionError;
-    return error && bound !== null ? Math.hypot(error.rest, error.surface * moved, bound) : null;
-  }
-
   function draw(quality) {
-    resize(quality);
-    const view = fit(), { result } = state, now = result.doubt ? scene.inks.doubtful : scene.inks.tumour, r = view.ratio;
-    const edge = outline(result.tumour, view), error = positionError(result), lines = [];
-    if (error !== null) {
-      const ink = [...now.map((one) => 0.75 * one), 0.9];
-      lines.push([outline(result.tumour, view, error), ink, 0.6 * r, 0, [12 * r, 7 * r]]);
-    }
+    const pixels = (window.devicePixelRatio || 1) * quality;
+    const size = [canvas.clientWidth, canvas.clientHeight].map((length) => Math.max(1, Math.round(length * pixels)));
+    if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+    const view = fit(), r = view.ratio, { result } = state, lines = [];
+    const now = result.doubt ? scene.inks.doubtful : scene.inks.tumour;
+    const edge = outline(result.tumour, view), pale = [...now.map((one) => 0.75 * one), 0.9];
+    if (result.error) lines.push([outline(result.tumour, view, result.error), pale, 0.6 * r, 0, [12 * r, 7 * r]]);
     const band = ((result.bound ?? 0) * view.focal) / toCamera(pointAt(result.tumour, 0))[2];
     if (band) lines.push([edge, [...now, 0.3], band]);
     lines.push([edge, [...now, 1], 1.4 * r, r, result.doubt ? [9 * r, 6 * r] : [1, 0]]);
@@ -141,7 +131,7 @@ function start(scene, { arrays, surface, solve }) {
     const ball = along(result.tip, frame.axis, -tool.radius);
     paint({ ...result, view: viewMatrix(view), ball, ink: now, lines });
     Object.assign(state, { edge, view });
-    describe(result, error);
+    describe(result);
   }
 
   // Bound in millimetres, rounded up.
@@ -150,11 +140,12 @@ function start(scene, { arrays, surface, solve }) {
     return `\u2264 ${(whole / unit).toFixed(digits)} mm`;
   }
 
-  function describe({ moved, bound, doubt }, error) {
+  function describe({ moved, bound, error, doubt }) {
     const within = bound === null ? "error not known" : `model error ${upTo(bound, 2)}`;
     byId("result").textContent = state.force ? `tumour moved ${(1e3 * moved).toFixed(2)} mm (${within})` : words.still;
     byId("doubt").textContent = doubt;
-    byId("position").textContent = error === null ? words.unknown : `${words.position} ${upTo(error, 1)} ${words.guess}`;
+    const known = error !== null && `${words.position} ${upTo(error, 1)} ${words.guess}`;
+    byId("position").textContent = known || words.unknown;
     document.body.classList.toggle("doubtful", !!doubt);
   }
 
@@ -163,7 +154,7 @@ function start(scene, { arrays, surface, solve }) {
     if (state.dirty) {
       const late = time - last > MAX_INTERVAL && time - last < PAUSE;
       slow = late ? slow + 1 : Math.max(0, slow - 0.3);
-      if (slow > 4 && state.quality > MIN_QUALITY) [state.quality, slow] = [Math.max(MIN_QUALITY, 0.75 * state.quality), 0];
+      if (slow > 4) [state.quality, slow] = [Math.max(MIN_QUALITY, 0.75 * state.quality), 0];
       last = time;
       state.dirty = false;
       compute();
@@ -193,11 +184,12 @@ function start(scene, { arrays, surface, solve }) {
 
   let grasp = null; // offset from the pointer to the tool's contact while it is dragged [pixel of the window]
   function pointerAt(event, ratio) {
-    const box = canvas.getBoundingClientRect();
-    return [event.clientX - box.left + (grasp?.[0] ?? 0), event.clientY - box.top + (grasp?.[1] ?? 0)].map((at) => at * ratio);
+    const box = canvas.getBoundingClientRect(), [x, y] = grasp ?? [0, 0];
+    return [ratio * (event.clientX - box.left + x), ratio * (event.clientY - box.top + y)];
   }
   const drag = (event) => grasp && moveTo(...pick(pointerAt(event, fit().ratio)));
   canvas.addEventListener("pointerdown", (event) => {
+    grasp = null;
     const view = fit(), at = pointerAt(event, view.ratio), contact = project(state.result.contact.point, view);
     const ball = project(along(state.result.tip, frame.axis, -tool.radius), view);
     const reach = (1.3 * tool.radius * view.focal) / toCamera(state.result.tip)[2];
@@ -216,15 +208,15 @@ function start(scene, { arrays, surface, solve }) {
   window.addEventListener("keydown", (event) => {
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     const change = { "+": 1, "=": 1, "-": -1 }[event.key];
-    if (event.ctrlKey || event.metaKey || event.altKey || (!step && !change) || (step && event.target === slider)) return;
-    event.preventDefault();
+    if (event.ctrlKey || event.metaKey || event.altKey || (step && event.target === slider)) return;
     if (step) moveTo(state.x + KEY_STEP * step[0], state.y + KEY_STEP * step[1]);
-    else press(state.force + FORCE_STEP * change);
+    if (change) press(state.force + FORCE_STEP * change);
+    if (step || change) event.preventDefault();
   });
   new ResizeObserver(() => (state.dirty = true)).observe(canvas);
   press(state.force);
   requestAnimationFrame(loop);
-  return { scene, state, solve, moveTo, press, project, fit, draw };
+  return { scene, state, solve, moveTo, press, project, fit };
 }
 
 // For other scripts and tests: a promise of the page's state and functions.

@@ -1,5 +1,4 @@
-// Shaders of the page. A line with //@ begins one of this name; those of surfaces follow LIGHT, and SHADOW if they have it.
-// The light is that of ar/rendering/shade.py.
+// Parts of the page's shaders, each after its name. The light is that of ar/rendering/shade.py.
 //@ LIGHT
 precision highp float;
 uniform vec3 eye, lamp, lampAxis, base; uniform vec2 cone, light, shine;
@@ -63,7 +62,8 @@ void main() {
   float came = arriving * shareOfLamp(), grazing = 1.0 - dot(sight, middle);
   float fresnel = 0.04 + 0.96 * grazing * grazing * grazing * grazing * grazing;
   float lobe = exp(shine.y * (dot(n, middle) - 1.0)) * (shine.y + 8.0) * 0.12 * fresnel;
-  gl_FragColor = vec4(tone(colour * (ambientOn(dot(n, sight)) + came * diffuse(dot(n, ray))) + came * shine.x * lobe), 1.0);
+  vec3 dull = colour * (ambientOn(dot(n, sight)) + came * diffuse(dot(n, ray)));
+  gl_FragColor = vec4(tone(dull + came * shine.x * lobe), 1.0);
 }
 //@ GLOW_FRAGMENT
 precision highp float;
