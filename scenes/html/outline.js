@@ -37,7 +37,8 @@ function longestContour(rgba) {
     at.set(key, high - low === 1 ? [u + share, v] : [u, v + share]);
     return key;
   };
-  const inside = Uint8Array.from({ length: MASK_SIDE ** 2 }, (_, place) => +(rgba[4 * place + 3] > 127));
+  const inside = new Uint8Array(MASK_SIDE ** 2);
+  for (let place = 0; place < inside.length; place++) inside[place] = rgba[4 * place + 3] > 127 ? 1 : 0;
   for (let place = 0; place < MASK_SIDE * (MASK_SIDE - 1) - 1; place++) { // the mask's border is empty
     const below = place + MASK_SIDE, count = inside[place] + inside[place + 1] + inside[below] + inside[below + 1];
     if (count === 0 || count === 4) continue;

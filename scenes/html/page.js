@@ -4,7 +4,7 @@
 const MAX_INTERVAL = 34; // time between two images above which fewer pixels are drawn [ms]
 const PAUSE = 1000; // time between two images that counts as a pause [ms]
 const REST = 200; // time without a change after which the image is drawn with all pixels [ms]
-const MIN_QUALITY = 0.5; // smallest share of the window's pixels along each axis
+const MIN_QUALITY = 0.4; // smallest share of the window's pixels along each axis
 const KEY_STEP = 1e-3, FORCE_STEP = 0.02; // of one key press [m], [N]
 const byId = (id) => document.getElementById(id);
 
