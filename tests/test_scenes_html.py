@@ -16,7 +16,7 @@ from chromium import PROGRAM, SIZES, Chromium
 from ar.overlay.hud import bound_words as words
 from ar.overlay.outlines import compute_silhouette, find_outlines
 from scenes.cli import main
-from scenes.html.document import MAX_BYTES, SCRIPTS, build_html, choose_model
+from scenes.html.document import MAX_BYTES, SCRIPTS, build_exported_model, build_html, choose_model
 from scenes.html.packing import pack_arrays
 from scenes.play.deformers import open_theatre
 from scenes.play.frame_text import OUTCOME_WARNINGS
@@ -95,12 +95,13 @@ def assert_alike(answer, wanted):
     assert 10 < sum(outside) < LOADS - 10
 
 
-@pytest.mark.parametrize("name", ["ann", "svr", "linear"])
-def test_the_page_answers_as_the_model(theatre, page, tmp_path, name):
+@pytest.mark.parametrize(("name", "cortex"), [("ann", True), ("ann", False), ("svr", True), ("linear", True)])
+def test_the_page_answers_as_the_model(theatre, tmp_path, name, cortex):
     if NODE is None:
         pytest.skip("node is not installed")
     out, script = tmp_path / "page.html", tmp_path / "harness.js"
-    assert main(["export", "--out", str(out), "--learner", name]) == 0
+    exported = build_exported_model(name, theatre.models[name], cortex)
+    out.write_text(build_html(theatre, find_scene("press"), exported))
     parts = [(FOLDER / each).read_text() for each in SCRIPTS[:3]]
     script.write_text("\n".join([*parts, ANSWERS, HARNESS]))
     loads = sampled(theatre.anatomy)

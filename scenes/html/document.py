@@ -20,10 +20,10 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.versions import get_version
 from surrogate.model.learned import Learned
-from surrogate.onnx_export.export import trace_model
+from surrogate.onnx_export.export import build_graph
 from surrogate.onnx_export.graph import Sheet
 
-from ..page.text import RESEARCH_ONLY, describe_scene, format_legend, to_stroke
+from ..page.text import RESEARCH_ONLY, format_legend, to_stroke
 from ..play.deformers import PatientSetup
 from ..play.frame_text import OUTCOME_WARNINGS
 from ..play.player import BONE_WARNING
@@ -62,23 +62,24 @@ def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: s
     Raises
     ------
     InputError
-        No model of that name, or none that a page evaluates; a scene without a palpation ball; a page of more than
-        `MAX_BYTES`; a path that does not end in .html, or a folder that cannot be written.
+        No model of that name, or none that a page evaluates; a scene without a palpation ball; a mesh of too many
+        points, or a page of more than `MAX_BYTES`; a path that does not end in .html, or a folder that cannot be
+        written.
     """
     if not isinstance(scene.tool, Probe):
         raise InputError(f"{scene.name}: the page pushes with a palpation ball, which this scene has not.")
     found = choose_model(theatre, learner)
-    text = build_html(theatre, scene, found)
-    if found.cortex and len(text) > MAX_BYTES:
-        found = trace(found.name, found.model, cortex=False)
-        text = build_html(theatre, scene, found)
-    if len(text) > MAX_BYTES:
+    page = build_html(theatre, scene, found).encode()
+    if found.cortex and len(page) > MAX_BYTES:
+        found = build_exported_model(found.name, found.model, cortex=False)
+        page = build_html(theatre, scene, found).encode()
+    if len(page) > MAX_BYTES:
         raise InputError(
-            f"{found.name}: the page would have {len(text) / 1e6:.1f} MB, but at most {MAX_BYTES / 1e6:g} MB are "
+            f"{found.name}: the page would have {len(page) / 1e6:.1f} MB, but at most {MAX_BYTES / 1e6:g} MB are "
             "allowed: choose another model by --learner."
         )
     with write_atomically(path, ".html") as partial:
-        partial.write_text(text, encoding="ascii")
+        partial.write_bytes(page)
     return found
 
 
@@ -95,7 +96,7 @@ def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedM
     found, reasons = [], []
     for name in theatre.models if learner is None else [learner]:
         try:
-            found.append(trace(name, theatre.models[name], cortex=True))
+            found.append(build_exported_model(name, theatre.models[name], cortex=True))
         except InputError as error:
             reasons.append(str(error))
     if not found:
@@ -103,17 +104,17 @@ def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedM
     return min(found, key=lambda one: _count_bytes(one.sheet))
 
 
-def trace(name: str, model: Learned, cortex: bool) -> ExportedModel:
+def build_exported_model(name: str, model: Learned, cortex: bool) -> ExportedModel:
     """Trace a model of the tumour, or of the cortex too.
 
     Raises
     ------
     InputError
-        A model of poses, a model that is far too large, and what `trace_model` rejects.
+        A model of poses, a model that is far too large, and what `build_graph` rejects.
     """
     if model.tool is not None:
         raise InputError(f"{name} is a model of poses, but the page pushes by a force: export another learner.")
-    sheet = trace_model(name, model, cortex)
+    sheet = build_graph(name, model, cortex)
     if _count_bytes(sheet) > MAX_MODEL_BYTES:
         raise InputError(
             f"{name} has {_count_bytes(sheet) / 1e6:.0f} MB of numbers, too many for a page: export another learner."
@@ -131,8 +132,7 @@ def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> 
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
     table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
     described = describe_stage(stage, scene.viewpoint.build_camera(stage.site))
-    most = round(FORCE_RANGE * model.envelope.force[1], 2)
-    described["force"] |= {"most": most}
+    most = described["force"]["most"] = round(FORCE_RANGE * model.envelope.force[1], 2)
     described |= {
         "arrays": table,
         "graph": exported.sheet.to_json(),
@@ -146,7 +146,7 @@ def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> 
         "heading": escape(f"Simulation: {describe_location(theatre.anatomy)} tumour, scene {scene.name}"),
         "caption": escape(" ".join(scene.title.split())),
         "restriction": escape(RESEARCH_ONLY),
-        "facts": "".join(f'<p class="dim">{escape(fact)}</p>' for fact in _list_facts(theatre, scene, exported)),
+        "facts": "".join(f'<p class="dim">{escape(fact)}</p>' for fact in _list_facts(theatre, exported)),
         "legend": _format_legend(),
         "most": f"{most:g}",
     }
@@ -171,7 +171,7 @@ def _describe_errors(theatre: PatientSetup, scene: Scene) -> dict[str, Any]:
     return {"positionError": known, "words": words}
 
 
-def _list_facts(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> list[str]:
+def _list_facts(theatre: PatientSetup, exported: ExportedModel) -> list[str]:
     """Return sentences about model, error bound, anatomy and program."""
     model = exported.model
     bound = f"at most {1e3 * model.bound:.2f} mm" if np.isfinite(model.bound) else "not known"
@@ -179,7 +179,7 @@ def _list_facts(theatre: PatientSetup, scene: Scene, exported: ExportedModel) ->
         f"Fast model: {model.source}.",
         f"Model error (95 % of loads like those of the training, relative to FEM): {bound} at any point of the tumour; "
         "the page shows that of each load.",
-        describe_scene(theatre, scene, "the anatomy of the model"),
+        f"Brain: {len(theatre.anatomy.mesh.nodes)} mesh points.",
         f"Written by sulcus {get_version('sulcus')}; this file loads nothing from elsewhere.",
     ]
 

@@ -1,5 +1,5 @@
 "use strict";
-// The fast model of the page: its arrays, and its answer to one load.
+// The fast model of the page: its arrays, and its result for one load.
 
 const TYPES = { f4: Float32Array, f8: Float64Array, i4: Int32Array, u2: Uint16Array, u1: Uint8Array };
 

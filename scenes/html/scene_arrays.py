@@ -14,6 +14,7 @@ from ar.overlay.composite import DOUBTFUL_COLOUR
 from ar.overlay.marks import BEFORE_COLOUR
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import DRAPE_COLOUR
+from sim.errors import InputError
 from surrogate.data.cortex_patch import open_patch
 
 from ..play.player import BLOCKED_DEPTH, CARRIED_DEPTH
@@ -28,9 +29,17 @@ NEAR, FAR = 0.2, 2.0  # Smallest and largest drawn depth, relative to the distan
 
 
 def build_arrays(stage: Stage, nodes: np.ndarray) -> dict[str, np.ndarray]:
-    """Build the arrays of the page, by name, for a model that predicts the vertices `nodes` (n,)."""
+    """Build the arrays of the page, by name, for a model that predicts the vertices `nodes` (n,).
+
+    Raises
+    ------
+    InputError
+        A mesh of more points than 16 bits can number.
+    """
     anatomy, rest, tool = stage.anatomy, stage.anatomy.mesh.nodes, stage.scene.tool
     assert isinstance(tool, Probe)
+    if len(rest) >= NO_ROW:
+        raise InputError(f"the mesh has {len(rest)} points, but a page draws at most {NO_ROW - 1}: use a coarser mesh.")
     cortex, drape = stage.build_layers(rest, None)
     patch = open_patch(anatomy)
     pose = tool.pose(np.zeros(3), stage.site.axis, stage.site.right)

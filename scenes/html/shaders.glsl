@@ -51,7 +51,7 @@ void main() {
 varying vec3 normal, ray, sight, middle; varying vec2 where; varying float arriving;
 uniform vec3 dark, right, up; uniform float relief; uniform bool textured; uniform sampler2D scan;
 void main() {
-  vec3 n = normal * sign(dot(normal, sight)), colour = base;
+  vec3 n = normal, colour = base;
   if (textured) { // value of the scan, and its slopes along right and up
     vec3 texel = texture2D(scan, where).rgb;
     vec3 tilt = relief * ((texel.g - 0.5) * right + (texel.b - 0.5) * up);

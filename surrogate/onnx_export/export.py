@@ -40,19 +40,19 @@ DESCRIPTION = (  # Description in the ONNX file.
 
 
 def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
-    """Build the ONNX graph of `trace_model`.
+    """Build the ONNX graph of `build_graph`.
 
     Raises
     ------
     InputError
-        See `trace_model`; the package `onnx` not installed.
+        See `build_graph`; the package `onnx` not installed.
     """
-    return trace_model(name, model, cortex).build_model(
+    return build_graph(name, model, cortex).build_model(
         name, DESCRIPTION, get_version("sulcus"), _build_metadata(name, model)
     )
 
 
-def trace_model(name: str, model: Learned, cortex: bool = False) -> Sheet:
+def build_graph(name: str, model: Learned, cortex: bool = False) -> Sheet:
     """Trace the graph of a model: of the tumour, or of all its vertices.
 
     Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
