@@ -119,6 +119,7 @@ def test_the_page_is_small_and_loads_nothing(page):
     assert len(text) <= MAX_BYTES and len(SCRIPTS) == len(list(FOLDER.glob("*.js")))
     assert not re.search(r"https?:|//\w+\.\w+/|\bimport\b|src=|href=|url\(", text)
     assert "default-src 'none'" in text and "Not a medical device" in text
+    assert "Copyright (C) 1993-2004 Louis Collins" in text  # the notice of the template's brain
     assert sum((FOLDER / each).read_text().count("\n") for each in SCRIPTS) <= 800
 
 

@@ -23,6 +23,7 @@ from surrogate.model.learned import Learned
 from surrogate.onnx_export.export import build_graph
 from surrogate.onnx_export.graph import Sheet
 
+from ..episodes.reading.bodies import is_template
 from ..page.text import RESEARCH_ONLY, format_legend, to_stroke
 from ..play.deformers import PatientSetup
 from ..play.frame_text import OUTCOME_WARNINGS
@@ -30,6 +31,7 @@ from ..play.player import BONE_WARNING
 from ..play.stage import TUMOUR_COLOUR
 from ..script.registration import REGISTRATIONS, describe_registration
 from ..script.scene import Scene
+from ..script.shipped_files import get_template_path
 from ..script.tool import Probe
 from .packing import pack_arrays
 from .scene_arrays import build_arrays, describe_stage
@@ -147,6 +149,7 @@ def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> 
         "caption": escape(" ".join(scene.title.split())),
         "restriction": escape(RESEARCH_ONLY),
         "facts": "".join(f'<p class="dim">{escape(fact)}</p>' for fact in _list_facts(theatre, exported)),
+        "notice": _format_notice() if is_template(theatre.anatomy.digest) else "",
         "legend": _format_legend(),
         "most": f"{most:g}",
     }
@@ -182,6 +185,13 @@ def _list_facts(theatre: PatientSetup, exported: ExportedModel) -> list[str]:
         f"Brain: {len(theatre.anatomy.mesh.nodes)} mesh points.",
         f"Written by sulcus {get_version('sulcus')}; this file loads nothing from elsewhere.",
     ]
+
+
+def _format_notice() -> str:
+    """Return the notice that the template's authors require in all copies, as HTML."""
+    text = get_template_path().with_suffix(".notice.txt").read_text(encoding="utf-8")
+    head = "The brain is made from the ICBM 152 template of 2009 (MNI152). Its notice"
+    return f'<details class="dim"><summary>{head}</summary>{escape(text)}</details>'
 
 
 def _format_legend() -> str:
