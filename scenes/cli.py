@@ -67,7 +67,7 @@ GROUPS = {
         "solve": "compute the static equilibrium of any tetrahedral mesh",
         "warp": "write a deformed brain for 3D Slicer and ITK: fields, the patient's images, meshes, points",
         "link": "send the tumour to 3D Slicer, PLUS and others by OpenIGTLink, live, from the poses that they send",
-        "export": "write a trained model as an ONNX file",
+        "export": "write a trained model as an ONNX file, or as a page that needs no server",
     },
 }
 # Descriptions of all commands, by name.

@@ -46,7 +46,7 @@ ORDER = (
     {"scenes.tracked"},
     {"scenes.gym", "scenes.link"},
     {"scenes.episodes"},
-    {"scenes.report", "scenes.warp"},
+    {"scenes.html", "scenes.report", "scenes.warp"},
     {"scenes.options"},
     {"scenes.commands"},
     {"benchmarks.peers", "benchmarks.published", "benchmarks.studies"},

@@ -209,6 +209,11 @@ class Stage:
         """Mesh vertices (n,) of the tumour's surface, in the order in which they are drawn."""
         return self._tumour[0]
 
+    @property
+    def visible_vertices(self) -> np.ndarray:
+        """Mesh vertices (n,) of the layer of `build_visible`, in the order in which they are drawn."""
+        return self._visible.vertices
+
     @cached_property
     def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
         return np.unique(self.anatomy.tumour_surface, return_inverse=True)

@@ -40,7 +40,20 @@ DESCRIPTION = (  # Description in the ONNX file.
 
 
 def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
-    """Build the graph of a model: of the tumour, or of all its vertices.
+    """Build the ONNX graph of `build_graph`.
+
+    Raises
+    ------
+    InputError
+        See `build_graph`; the package `onnx` not installed.
+    """
+    return build_graph(name, model, cortex).build_model(
+        name, DESCRIPTION, get_version("sulcus"), _build_metadata(name, model)
+    )
+
+
+def build_graph(name: str, model: Learned, cortex: bool = False) -> Sheet:
+    """Trace the graph of a model: of the tumour, or of all its vertices.
 
     Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
     If the result depends on a compliance matrix, which that of the cortex always does, also `weight` (B, m). It is the
@@ -55,7 +68,7 @@ def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelPr
     Raises
     ------
     InputError
-        A regressor that has no graph; a model that follows its tissue in time; the package `onnx` not installed.
+        A regressor that has no graph; a model that follows its tissue in time.
     """
     if model.series:
         raise InputError(f"{name} follows tissue that relaxes in time, which no graph does: export another model.")
@@ -103,7 +116,7 @@ def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelPr
     sheet.add_output(
         sheet.add_constant(rest), Port("rest", np.float32, rest.shape, "where the vertices `nodes` lie [m], RAS")
     )
-    return sheet.build_model(name, DESCRIPTION, get_version("sulcus"), _build_metadata(name, model))
+    return sheet
 
 
 def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False) -> None:

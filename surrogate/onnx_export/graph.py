@@ -189,6 +189,20 @@ class Sheet:
         self._nodes.append(Node("Identity", (wire.astype(port.kind).name,), port.name, {}))
         self._outputs.append(port)
 
+    @property
+    def constants(self) -> Mapping[str, np.ndarray]:
+        """Constants by name."""
+        return self._constants
+
+    def to_json(self) -> dict[str, list]:
+        """Return inputs and outputs by name, and the operators in the order of evaluation, for JSON."""
+        nodes = [[node.kind, node.inputs, node.output, _to_plain(node.attributes)] for node in self._nodes]
+        return {
+            "inputs": [port.name for port in self._inputs],
+            "outputs": [port.name for port in self._outputs],
+            "nodes": nodes,
+        }
+
     def build_model(self, name: str, text: str, version: str, notes: Mapping[str, str]) -> ModelProto:
         """Build the ONNX model; `notes` are its metadata.
 
@@ -224,6 +238,11 @@ class Sheet:
         )
         helper.set_model_props(model, dict(notes))
         return model
+
+
+def _to_plain(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert attributes to those that JSON has."""
+    return {name: value if isinstance(value, str | tuple) else int(value) for name, value in attributes.items()}
 
 
 def _sample(operand: Operand) -> np.ndarray | float:

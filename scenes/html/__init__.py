@@ -1,0 +1,1 @@
+"""Export of a scene with a fast model as one HTML file that needs no server."""

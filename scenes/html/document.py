@@ -1,0 +1,220 @@
+"""One HTML file of a scene: the tool is dragged over the cortex, and a fast model moves the tumour in the browser."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from sim.bodies.lobes import describe_location
+from sim.deformation import Outcome
+from sim.errors import InputError
+from sim.runtime.atomic_files import write_atomically
+from sim.runtime.versions import get_version
+from surrogate.model.learned import Learned
+from surrogate.onnx_export.export import build_graph
+from surrogate.onnx_export.graph import Sheet
+
+from ..episodes.reading.bodies import is_template
+from ..page.text import RESEARCH_ONLY, format_legend, to_stroke
+from ..play.deformers import PatientSetup
+from ..play.frame_text import OUTCOME_WARNINGS
+from ..play.player import BONE_WARNING
+from ..play.stage import TUMOUR_COLOUR
+from ..script.registration import REGISTRATIONS, describe_registration
+from ..script.scene import Scene
+from ..script.shipped_files import get_template_path
+from ..script.tool import Probe
+from .packing import pack_arrays
+from .scene_arrays import build_arrays, describe_stage
+
+MAX_BYTES = 2_000_000  # Largest size of the file [bytes].
+MAX_MODEL_BYTES = 32_000_000  # Size of a model's arrays above which they do not fit, compressed [bytes].
+FORCE_RANGE = 1.5  # Largest force of the page, relative to that of the training.
+SCRIPTS = ("graph.js", "contact.js", "model.js", "outline.js", "draw.js", "page.js")
+"""Scripts of the page, in the order in which they depend on each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedModel:
+    """Fast model that a page evaluates: its name, the model, its graph, and whether that moves the cortex too."""
+
+    name: str
+    model: Learned
+    sheet: Sheet
+    cortex: bool
+
+
+def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: str | None = None) -> ExportedModel:
+    """Write the page of a scene atomically, without the motion of the cortex if that is too large; return its model.
+
+    Parameters
+    ----------
+    learner
+        Name of the model; None: the one with the fewest numbers.
+
+    Raises
+    ------
+    InputError
+        No model of that name, or none that a page evaluates; a scene without a palpation ball; a mesh of too many
+        points, or a page of more than `MAX_BYTES`; a path that does not end in .html, or a folder that cannot be
+        written.
+    """
+    if not isinstance(scene.tool, Probe):
+        raise InputError(f"{scene.name}: the page pushes with a palpation ball, which this scene has not.")
+    found = choose_model(theatre, learner)
+    page = build_html(theatre, scene, found).encode()
+    if found.cortex and len(page) > MAX_BYTES:
+        found = build_exported_model(found.name, found.model, cortex=False)
+        page = build_html(theatre, scene, found).encode()
+    if len(page) > MAX_BYTES:
+        raise InputError(
+            f"{found.name}: the page would have {len(page) / 1e6:.1f} MB, but at most {MAX_BYTES / 1e6:g} MB are "
+            "allowed: choose another model by --learner."
+        )
+    with write_atomically(path, ".html") as partial:
+        partial.write_bytes(page)
+    return found
+
+
+def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedModel:
+    """Trace the model of that name, or the one with the fewest numbers.
+
+    Raises
+    ------
+    InputError
+        See `write_html`.
+    """
+    if learner is not None and learner not in theatre.models:
+        raise InputError(f"no learner is called {learner}: choose from {', '.join(theatre.models)}.")
+    found, reasons = [], []
+    for name in theatre.models if learner is None else [learner]:
+        try:
+            found.append(build_exported_model(name, theatre.models[name], cortex=True))
+        except InputError as error:
+            reasons.append(str(error))
+    if not found:
+        raise InputError(" ".join(reasons) or "there is no model next to this anatomy: make one by `sulcus train`.")
+    return min(found, key=lambda one: _count_bytes(one.sheet))
+
+
+def build_exported_model(name: str, model: Learned, cortex: bool) -> ExportedModel:
+    """Trace a model of the tumour, or of the cortex too.
+
+    Raises
+    ------
+    InputError
+        A model of poses, a model that is far too large, and what `build_graph` rejects.
+    """
+    if model.tool is not None:
+        raise InputError(f"{name} is a model of poses, but the page pushes by a force: export another learner.")
+    sheet = build_graph(name, model, cortex)
+    if _count_bytes(sheet) > MAX_MODEL_BYTES:
+        raise InputError(
+            f"{name} has {_count_bytes(sheet) / 1e6:.0f} MB of numbers, too many for a page: export another learner."
+        )
+    return ExportedModel(name, model, sheet, cortex)
+
+
+def _count_bytes(sheet: Sheet) -> int:
+    return sum(array.nbytes for array in sheet.constants.values())
+
+
+def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> str:
+    """Build the text of the page, with all that it needs: model, surfaces, scripts and style."""
+    stage, model = theatre.build_stage(scene), exported.model
+    nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
+    table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
+    described = describe_stage(stage, scene.viewpoint.build_camera(stage.site))
+    most = described["force"]["most"] = round(FORCE_RANGE * model.envelope.force[1], 2)
+    described |= {
+        "arrays": table,
+        "graph": exported.sheet.to_json(),
+        "bound": model.bound if np.isfinite(model.bound) else None,
+        **_describe_errors(theatre, scene),
+    }
+    script = "\n".join(_read(name) for name in SCRIPTS)
+    style = _read("page.css")
+    fields = {
+        "title": escape(f"sulcus: {scene.name}"),
+        "heading": escape(f"Simulation: {describe_location(theatre.anatomy)} tumour, scene {scene.name}"),
+        "caption": escape(" ".join(scene.title.split())),
+        "restriction": escape(RESEARCH_ONLY),
+        "facts": "".join(f'<p class="dim">{escape(fact)}</p>' for fact in _list_facts(theatre, exported)),
+        "notice": _format_notice() if is_template(theatre.anatomy.digest) else "",
+        "legend": _format_legend(),
+        "most": f"{most:g}",
+    }
+    return Template(_read("page.html")).substitute(
+        fields, style=style, style_digest=_digest(style), script=script, script_digest=_digest(script),
+        scene=_to_script_json(described), arrays=packed, shaders=_read("shaders.glsl"),
+    )  # fmt: skip
+
+
+def _describe_errors(theatre: PatientSetup, scene: Scene) -> dict[str, Any]:
+    """Return the error of the tumour position in proportion to its motion, and the words of the page."""
+    error, registration = theatre.estimate_motion_error(scene), scene.registration
+    known = None if error is None else {"rest": error.rest[registration], "surface": error.surface}
+    words = {
+        "still": "the tool does not push: the tumour is where the scan has it",
+        "outside": OUTCOME_WARNINGS[Outcome.EXTRAPOLATED],
+        "blocked": BONE_WARNING,
+        "position": "tumour position error",
+        "guess": f"(95\N{NO-BREAK SPACE}%), rough estimate; {describe_registration(REGISTRATIONS[registration])}",
+        "unknown": "tumour position error: not known",
+    }
+    return {"positionError": known, "words": words}
+
+
+def _list_facts(theatre: PatientSetup, exported: ExportedModel) -> list[str]:
+    """Return sentences about model, error bound, anatomy and program."""
+    model = exported.model
+    bound = f"at most {1e3 * model.bound:.2f} mm" if np.isfinite(model.bound) else "not known"
+    return [
+        f"Fast model: {model.source}.",
+        f"Model error (95 % of loads like those of the training, relative to FEM): {bound} at any point of the tumour; "
+        "the page shows that of each load.",
+        f"Brain: {len(theatre.anatomy.mesh.nodes)} mesh points.",
+        f"Written by sulcus {get_version('sulcus')}; this file loads nothing from elsewhere.",
+    ]
+
+
+def _format_notice() -> str:
+    """Return the notice that the template's authors require in all copies, as HTML."""
+    text = get_template_path().with_suffix(".notice.txt").read_text(encoding="utf-8")
+    head = "The brain is made from the ICBM 152 template of 2009 (MNI152). Its notice"
+    return f'<details class="dim"><summary>{head}</summary>{escape(text)}</details>'
+
+
+def _format_legend() -> str:
+    now = to_stroke(TUMOUR_COLOUR)
+    return format_legend(
+        [
+            (f'{now} stroke-width="3"', "predicted tumour"),
+            (f'{now} stroke-width="7" stroke-opacity="0.35"', "model error"),
+            (f'{now} stroke-width="1.5" stroke-dasharray="4 3"', "95 % error band"),
+            ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan"),
+        ]
+    )
+
+
+def _read(name: str) -> str:
+    return files("scenes.html").joinpath(name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    """Digest by which the page's policy allows an inline script or style, and no other."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def _to_script_json(content: dict[str, Any]) -> str:
+    """Convert to JSON that ends no script element."""
+    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
