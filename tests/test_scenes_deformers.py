@@ -1,6 +1,7 @@
 """Theatres read from their files, and the models in them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scenes.script.tool_paths import Touch
 from sim.bodies.intensity import to_intensity_path
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
+from surrogate.model.store import save
 
 
 def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
@@ -39,6 +41,22 @@ def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
         bare.build_deformer("linear", short())
 
 
+def test_models_of_a_scene_are_read_beside_the_others(theatre, tmp_path):
+    path = put(theatre, tmp_path / "box.vtu")
+    save(to_model_path(path, "spatula"), {"linear": theatre.models["svr"], "gp": theatre.models["linear"]})
+    found = open_theatre(path, device="cpu").models
+    assert list(found) == [*theatre.models, "linear-spatula", "gp-spatula"]
+    assert found["linear-spatula"].bound == theatre.models["svr"].bound
+    assert list(open_theatre(path, to_model_path(path), "cpu").models) == list(theatre.models)
+
+
+def test_the_default_scene_is_one_that_a_model_supports():
+    theatre = open_theatre(device="cpu")
+    assert theatre.select_default_scene() == "spatula"
+    assert replace(theatre, models={"ann": theatre.models["ann"]}).select_default_scene() == "press"
+    assert replace(theatre, models={}).select_default_scene() == "press"
+
+
 def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_path):
 
     put(theatre, tmp_path / "box.vtu")
@@ -59,7 +77,7 @@ def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
     theatre = open_theatre(device="cpu")
     assert {"linear", "ann", "svr"} <= set(theatre.models) and theatre.intensity is not None
     assert (
-        all(model.bound < 1e-3 for model in theatre.models.values())
+        all(model.bound < 1e-3 for model in theatre.select_models(find_scene("press")).values())
         and theatre.select_best(find_scene("press")) != "fem"
     )
     assert main(["check", *PUSHING, "--every", "60", "--device", "cpu", "--json"]) == 0

@@ -22,7 +22,13 @@ from sim.terms.inertia import compute_lumped_mass
 
 TIGHT = Accuracy(tolerance=1e-10)
 # When the load of each scene is taken that then stays [s]: something acts, and tools are in the tissue.
-TAKEN = {name: 2.0 for name in SCENES} | {"retract": 0.8, "brain_shift": 5.0, "resection": 3.0, "pulsation": 3.0}
+TAKEN = {name: 2.0 for name in SCENES} | {
+    "spatula": 0.7,
+    "retract": 0.8,
+    "brain_shift": 5.0,
+    "resection": 3.0,
+    "pulsation": 3.0,
+}
 # How swollen tissue is as the pulse stands still: it takes weeks for one beat.
 STILL, LATE = 1e-6, 2.5e5
 STEPS = 12

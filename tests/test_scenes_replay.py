@@ -206,7 +206,7 @@ def test_plain_statics_are_not_run_again(theatre, monkeypatch):
 
 def test_which_scenes_remember() -> None:
     found = {name: remember(find_scene(name).effects) or bool(find_scene(name).surgery) for name in SCENES}
-    assert {name for name, does in found.items() if does} == {"palpate", "retract", "resection", "pulsation"}
+    assert {name for name, does in found.items() if does} == {"spatula", "palpate", "retract", "resection", "pulsation"}
     relaxing = Material("neo-hookean", 3000.0, 0.45, prony=((0.4, 1.0),))
     assert remember((Elasticity(None, {1: relaxing}), Held())) and not remember((Elasticity(None), Held()))
     assert not remember(sinking().effects)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.script.shipped_files import get_spatula_model_path, get_template_path
+from scenes.script.shipped_files import get_gym_model_path, get_template_path
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy
 from sim.contact_pressure import compute_pressure
@@ -106,7 +106,7 @@ def test_pressure_is_that_of_the_finite_elements(model, box):
 
 def test_the_spatula_that_ships_has_the_finite_elements_answers():
     """Fresh poses, two of which have contacts whose single precision is no longer positive definite."""
-    model = load(get_spatula_model_path(), read_anatomy(get_template_path()))["contact-gp"]
+    model = load(get_gym_model_path(), read_anatomy(get_template_path()))["contact-gp"]
     kept = np.load(Path(__file__).parent / "data" / "spatula_poses.npz")
     answer = model.deform(Loads((Touching(kept["pose"][:, None]),)))
     off = np.linalg.norm(answer.restrict(model.anatomy.tumour_nodes).displacement - kept["tumour"], axis=2)

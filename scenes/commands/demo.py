@@ -25,7 +25,11 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", nargs="?", default="press", help="a built-in scene or MY_SCENE.py")
+    parser.add_argument(
+        "scene", nargs="?",
+        help="a built-in scene or MY_SCENE.py (default: the first scene that a trained model supports, spatula on the "
+        "template, or else press)",
+    )  # fmt: skip
     add_theatre(parser)
     add_camera(parser)
     add_style(parser)
@@ -45,7 +49,8 @@ def run(args: argparse.Namespace) -> int:
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
 
-    if args.scene.isdecimal() or Path(args.scene).suffix.lower() in VIDEO_SUFFIXES or Path(args.scene).is_dir():
+    asked = args.scene or ""
+    if asked.isdecimal() or Path(asked).suffix.lower() in VIDEO_SUFFIXES or (asked and Path(asked).is_dir()):
         own = f"sulcus overlay {args.scene} --page --camera K.yaml --registration R.json --tool T.json"
         raise InputError(f"{args.scene} is not a scene. For your own video or camera: {own}")
     if not args.seconds > 0.0:
@@ -72,12 +77,12 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
 
     from ..page.demo import Demo
 
-    theatre = build_requested_theatre(args, args.scene)
+    theatre = build_requested_theatre(args, *([] if args.scene is None else [args.scene]))
 
     def asked(scene: str) -> Scene:
         return apply_camera_options(args, build_requested_scene(args, scene, theatre))
 
-    scene = asked(args.scene)
+    scene = asked(args.scene or theatre.select_default_scene())
     name = choose_deformer(args, theatre, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:

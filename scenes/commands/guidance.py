@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # Names of the scenes. Repeated here, so that a command's help does not import scenes.
-NAMES = "press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force, microscope"
+NAMES = "spatula, press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force, microscope"
 PLAYING_COMMANDS = ("demo", "render", "film", "collect", "check", "effects")
 """Commands that take the scene to play."""
 

@@ -72,6 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "radius)",
     )
     shape = parser.add_mutually_exclusive_group()
+    shape.add_argument(
+        "--scene", metavar="NAME", help="tool and poses of a scene, as a hand sets them on its page, such as spatula"
+    )
     shape.add_argument("--ball", type=float, metavar="MM", help="radius of a ball [mm], such as 7 in the scene palpate")
     shape.add_argument(
         "--capsule",
@@ -157,6 +160,8 @@ def run(args: argparse.Namespace) -> int:
 def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
     """Return the tool of pose control, or None, and sampled loads, with times for viscoelastic tissue."""
     asked = _build_requested_tool(args)
+    if args.scene is not None:
+        return _sample_scene(args, anatomy, tissue)
     if not args.pose_control:
         if asked is not None:
             raise InputError(
@@ -165,6 +170,18 @@ def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) ->
         return None, draw(args.tool_preset, anatomy, args.count, args.seed)
     tool = choose_ball(args.tool_preset) if asked is None else asked
     loads = draw_poses(args.tool_preset, anatomy, args.count, args.seed, tool)
+    return tool, Loads(loads.causes, sample_times(len(loads), args.seed)) if tissue.prony else loads
+
+
+def _sample_scene(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn, Loads]:
+    """Return the tool of a scene, and its sampled poses."""
+    from ..script.craniotomy_frame import build_craniotomy_frame
+    from ..script.scene import find_scene
+    from ..script.scene_poses import draw_scene_poses
+
+    if not args.pose_control:
+        raise InputError("--scene gives poses of a tool: give --pose-control too, or leave it out.")
+    tool, loads = draw_scene_poses(find_scene(args.scene), build_craniotomy_frame(anatomy), args.count, args.seed)
     return tool, Loads(loads.causes, sample_times(len(loads), args.seed)) if tissue.prony else loads
 
 

@@ -27,7 +27,7 @@ from ..play.learned_regions import find_learned_regions
 from ..play.stage import Stage
 from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
-from ..script.shipped_files import get_spatula_model_path
+from ..script.shipped_files import get_gym_model_path
 from ..script.tool import Blade, Probe
 from .fem_responses import CutElements, PosedElements
 from .model_responses import Hertz, PosedModel, PressedModel
@@ -241,7 +241,7 @@ def _open_setup(anatomy: str, model: str | None, device: str) -> PatientSetup:
 
 
 def _get_shipped_model(task: GymTask) -> str | None:
-    return str(get_spatula_model_path()) if isinstance(task.tool, Blade) else None
+    return str(get_gym_model_path()) if isinstance(task.tool, Blade) else None
 
 
 def check_arguments(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:

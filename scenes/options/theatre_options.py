@@ -152,14 +152,14 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
             )
             why = next(iter(theatre.list_rejections(scene).values()), none)
             print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {why}", file=sys.stderr)
-        best = theatre.select_best(scene)
-        if args.deformer is None and best in theatre.models:
+        default, best = theatre.select_default(scene), theatre.select_best(scene)
+        if args.deformer is None and best in theatre.models and default != scene.deformer:
             from surrogate.model.guarded import describe_error, get_held_out_error
 
             model = theatre.models[best]
             if get_held_out_error(model).weak:
                 print(f"{args.program}: on left-out cortex {best} is {describe_error(model)}", file=sys.stderr)
-        return args.deformer or theatre.select_default(scene)
+        return args.deformer or default
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
     from surrogate.evaluation.choose import choose

@@ -24,23 +24,24 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
         what = f"the same {_format_load_count(rows[0].loads)}; bold: no other is both faster and more accurate"
     else:
         what = "the loads up to now" if len(rows) == 1 else "different loads: not comparable"
-    x, ticks = _scale([row.milliseconds for row in rows], LEFT, WIDTH - RIGHT)
-    y, levels = _scale([max(row.millimetres, MIN_ERROR) for row in rows], HEIGHT - BOTTOM, TOP)
-    parts = [_draw_tick(place, HEIGHT - BOTTOM + 12, f"{value:g}", "middle") for value, place in ticks]
+    across, ticks = _scale([row.milliseconds for row in rows], LEFT, WIDTH - RIGHT)
+    along, levels = _scale([max(row.millimetres, MIN_ERROR) for row in rows], HEIGHT - BOTTOM, TOP)
+    ends = {ticks[-1][0]: "end"}  # the last label stays inside
+    parts = [_draw_tick(x, HEIGHT - BOTTOM + 12, f"{value:g}", ends.get(value, "middle")) for value, x in ticks]
     parts += [_draw_tick(LEFT - 5, place + 4, f"{value:g}", "end") for value, place in levels]
     grid = [f"M{place:.0f} {TOP}V{HEIGHT - BOTTOM}" for _, place in ticks]
     grid += [f"M{LEFT} {place:.0f}H{WIDTH - RIGHT}" for _, place in levels]
     placed: list[tuple[float, float]] = []
-    for row, across, along in zip(rows, x, y, strict=True):
-        low = along + 4.0
-        while any(abs(low - other) < LABEL_HEIGHT and abs(across - at) < LABEL_WIDTH for at, other in placed):
+    for row, x, y in zip(rows, across, along, strict=True):
+        low = y + 4.0
+        while any(abs(low - other) < LABEL_HEIGHT and abs(x - at) < LABEL_WIDTH for at, other in placed):
             low += 2.0
-        placed.append((across, low))
-        right = across > 0.6 * WIDTH
-        label = _draw_tick(across + (-7 if right else 7), low, row.name, "end" if right else "start")
+        placed.append((x, low))
+        right = x > 0.6 * WIDTH
+        label = _draw_tick(x + (-7 if right else 7), low, _name(row), "end" if right else "start")
         parts.append(
             f"<g{' class=best' if row.best else ''}><title>{escape(describe_row(row))}</title>"
-            f'<circle cx="{across:.0f}" cy="{along:.0f}" r="4"/>{label}</g>'
+            f'<circle cx="{x:.0f}" cy="{y:.0f}" r="4"/>{label}</g>'
         )
     words = "; ".join(map(describe_row, rows))
     return (
@@ -54,7 +55,11 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
 def describe_row(row: ComparisonRow) -> str:
     """Describe the time and the error of a deformer."""
     error = f"{row.millimetres:.3f}" if row.millimetres >= MIN_ERROR else f"under {MIN_ERROR:.3f}"
-    return f"{row.name}: {row.milliseconds:.1f} ms, error {error} mm, {_format_load_count(row.loads)}"
+    return f"{_name(row)}: {row.milliseconds:.1f} ms, error {error} mm, {_format_load_count(row.loads)}"
+
+
+def _name(row: ComparisonRow) -> str:
+    return "FEM (reference)" if row.name == "fem" else row.name
 
 
 def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[float], list[tuple[float, float]]]:

@@ -56,7 +56,7 @@ TRUTH_TEXT = "what an estimate is held against is the truth, as finite elements 
 
 @dataclass(frozen=True, eq=False)
 class PatientSetup:
-    """Anatomy, its T1 scan if there is one, models by name, trained on one data set, and uncertainties by scene.
+    """Anatomy, its T1 scan if there is one, models by name, and uncertainties by scene.
 
     `locator_file` is the locator of its tumour, for scenes with an observation model. `limit` [m] is that of a guarded
     model; None: the limit derived from its own errors on held-out cortex.
@@ -158,6 +158,10 @@ class PatientSetup:
         knowing = self.select_models(scene)
         return min(knowing, key=lambda name: knowing[name].bound, default="fem")
 
+    def select_default_scene(self) -> str:
+        """Select the first built-in scene that a trained model supports, or press."""
+        return next((name for name in SCENES if self.select_models(find_scene(name))), "press")
+
     def limit_of(self, scene: Scene) -> float:
         """Return the predicted error [m] above which FEM replaces the best model of a scene."""
         stated = self.models[self.select_best(scene)].left_out
@@ -166,11 +170,13 @@ class PatientSetup:
         return MAX_VERTEX_ERROR if stated is None else stated.limit
 
     def select_default(self, scene: Scene) -> str:
-        """Select the default deformer of a scene: the best model, guarded if its bound is weak.
+        """Select the default deformer of a scene: its own, or the best model, guarded if its bound is weak.
 
         A model of tissue that relaxes is used without guard, with its bound: see `_can_guard`.
         """
         name = self.select_best(scene)
+        if scene.deformer in self.select_models(scene):
+            return scene.deformer
         return GUARDED if self._can_guard(scene) and get_held_out_error(self.models[name]).weak else name
 
     def _can_guard(self, scene: Scene) -> bool:
@@ -291,9 +297,25 @@ def plan_of(deformer: Deformer) -> tuple[str, ...]:
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
-def to_model_path(anatomy: Path) -> Path:
-    """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu."""
-    return anatomy.with_suffix(".model.npz")
+def to_model_path(anatomy: Path, scene: str = "model") -> Path:
+    """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu; MESH.SCENE.npz: of a scene."""
+    return anatomy.with_suffix(f".{scene}.npz")
+
+
+def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:
+    """Load the models next to an anatomy, by name; those of one scene are called NAME-SCENE.
+
+    Raises
+    ------
+    InputError
+        Unreadable or inconsistent files.
+    """
+    found: dict[str, Learned] = {}
+    for scene in ("model", *SCENES):
+        file = to_model_path(path, scene)
+        for name, model in (load(file, anatomy) if file.is_file() else {}).items():
+            found[name if scene == "model" else f"{name}-{scene}"] = model
+    return found
 
 
 def open_theatre(
@@ -323,8 +345,7 @@ def open_theatre(
     path = get_template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)
     scan = to_intensity_path(path)
-    learnt = to_model_path(path) if model is None else Path(model)
-    models = load(learnt, body) if model is not None or learnt.is_file() else {}
+    models = load_models(path, body) if model is None else load(Path(model), body)
     intensity = read_intensity(scan) if scan.is_file() else None
     uncertainties = read_uncertainties(to_uncertainty_path(path))
     return PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties)

@@ -100,6 +100,9 @@ class Scene:
         solution is then the ground truth.
     registration
         Registration of the scan to the patient: "perfect", as simulated images have it, or "clinical".
+    deformer
+        Trained model that plays the scene where it supports it, with its bound; None: the one with the smallest bound,
+        with FEM where it is unreliable.
     element
         Element, one of `sim.elements.ELEMENTS`; None: the recommended one for the mesh.
 
@@ -122,6 +125,7 @@ class Scene:
     viewpoint: Viewpoint = USUAL_VIEWPOINT
     look: Appearance = PLAIN_APPEARANCE
     registration: Registration = "perfect"
+    deformer: str | None = None
     element: str | None = None
     accuracy: Accuracy = LIVE
     bounds: Bounds = Bounds()
@@ -259,8 +263,8 @@ def _build_resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
 
 
 SCENES = (
-    "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag", "lost_force",
-    "microscope",
+    "spatula", "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag",
+    "lost_force", "microscope",
 )  # fmt: skip
 """The built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
 

@@ -11,6 +11,6 @@ def get_template_path() -> Path:
     return Path(str(files("scenes"))) / "data" / "template.vtu"
 
 
-def get_spatula_model_path() -> Path:
-    """Return a model of a spatula on the template, by its pose, in tissue that does not relax."""
-    return get_template_path().with_suffix(".spatula.npz")
+def get_gym_model_path() -> Path:
+    """Return a model of the gym's blade on the template, by its pose, in tissue that does not relax."""
+    return get_template_path().with_suffix(".gym.npz")

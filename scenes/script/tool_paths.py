@@ -115,11 +115,14 @@ def palpate(
     return path
 
 
-def lay(depth: float, tilt: float = 0.0, rise: float = 1.5, at: tuple[float, float] = (0.0, 0.0)) -> Path:
-    """Lower by `IDLE_HEIGHT` [m] and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x, and stay there."""
+def lay(
+    depth: float, tilt: float = 0.0, rise: float = 1.5, at: tuple[float, float] = (0.0, 0.0), hold: float = np.inf
+) -> Path:
+    """Lower by `IDLE_HEIGHT` and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x; hold [s]; lift off."""
 
     def path(time: float) -> Touch:
-        return Touch(*at, tilt=(tilt, 0.0), depth=_interpolate_depth(smooth(time / rise), depth))
+        share = smooth(time / rise) - smooth((time - rise - hold) / rise)
+        return Touch(*at, tilt=(tilt, 0.0), depth=_interpolate_depth(share, depth))
 
     return path
 
