@@ -40,12 +40,13 @@ class Demo:
 
 theatre = Names(models={"linear": Names(bound=1e-4, left_out=None)}, learned_tissue=None, anatomy=Names(mesh=None),
                 select_best=lambda scene: "linear", select_default=lambda scene: "linear",
+                select_default_scene=lambda: "none",
                 select_models=lambda scene: True, list_rejections=lambda scene: {},
                 describe_deformer=lambda name, scene: name)
 sys.modules["ar.overlay.composite"] = Names(load_kernels=lambda: None)
 sys.modules["sim.runtime.device"] = Names(find_device=lambda *words: None)
 sys.modules["scenes.page.demo"] = Names(Demo=Demo)
-scene = Names(name="none", viewpoint=None, elasticity=Names(default=None, regions={}),
+scene = Names(name="none", viewpoint=None, deformer=None, elasticity=Names(default=None, regions={}),
               replace_tissue=lambda tissue, element: scene, replace_regions=lambda regions: scene)
 sys.modules["scenes.script.scene"] = Names(find_scene=lambda name: scene, SCENES=("none",), check_scene_exists=len)
 sys.modules["scenes.play.deformers"] = Names(open_theatre=lambda *words: theatre)

@@ -116,6 +116,7 @@ class PageState:
     plan: tuple[str, ...] | None = None
 
 
+MIN_COMPARED_MOTION = 0.1e-3  # Smallest mean motion of the tumour of a load that is compared [m].
 MAX_RECENT_LOADS = 120  # Number of last loads that are kept for each deformer.
 
 

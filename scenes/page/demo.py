@@ -28,6 +28,7 @@ from .background_study import build_studies
 from .comparison import (
     FEM_REFERENCE,
     FEM_SHOWN,
+    MIN_COMPARED_MOTION,
     AccuracyTimeTable,
     PageState,
     compare_with_fem,
@@ -313,9 +314,10 @@ class Demo:
             elif not off:
                 shown = now.frame.deformation if whole.follows else None
                 now.judged = compare_with_fem(truth, whole, name == "fem", shown)
-                if now.judged.mean is not None:
-                    self.tally.record_error(name, compute_loads_digest(truth.loads), now.judged.mean)
-                self.cast.compare_models(truth, self.tally, skip=name)
+                if now.judged.motion > MIN_COMPARED_MOTION:
+                    if now.judged.mean is not None:
+                        self.tally.record_error(name, compute_loads_digest(truth.loads), now.judged.mean)
+                    self.cast.compare_models(truth, self.tally, skip=name)
             now.truth, now.by = truth, (name, off)
         if now.stale is not (not fresh):
             now.stale = not fresh
