@@ -57,10 +57,11 @@ class TestEpisode:
         _, file, _, frames = episode
         assert file.attrs["depth_scale_m"] == DEPTH_SCALE and len(file["pictures/colour"]) == len(frames) == 7
         for frame in frames:
-            for name, truth in (("colour", frame.picture.colour), ("overlay", frame.shown)):
+            # Thin lines over the tool cost JPEG more than the scene alone.
+            for name, truth, most in (("colour", frame.picture.colour, 2.0), ("overlay", frame.shown, 2.2)):
                 picture = decode_recorded(file, name, frame.number, cv2.IMREAD_COLOR)[..., ::-1]
                 assert picture.shape == truth.shape
-                assert np.abs(picture.astype(int) - truth).mean() < 2.0
+                assert np.abs(picture.astype(int) - truth).mean() < most
             depth = decode_recorded(file, "depth", frame.number)
             assert depth.dtype == np.uint16
             assert np.abs(depth * DEPTH_SCALE - frame.picture.depth).max() <= 0.51 * DEPTH_SCALE

@@ -142,7 +142,7 @@ def test_warm_starts_of_the_loop_change_nothing_that_is_seen(theatre):
 
 
 @pytest.mark.parametrize("name", PUSHING)
-def test_the_tool_is_never_tinted(name):
+def test_lines_alone_cross_the_tool(name):
     play = on_template(name)
     for number in (20, 50, 75):
         time = float(play.scene.times[number])
@@ -153,7 +153,7 @@ def test_the_tool_is_never_tinted(name):
         rows = np.flatnonzero(changed.any(axis=1))
         label[rows.max() - 26 :] = True
         label[:, :125] = True  # where so small a picture has the errors
-        assert tool.sum() > 500 and not (tool & changed & ~label).any()
+        assert tool.sum() > 500 and 0 < (tool & changed & ~label).sum() < 0.2 * tool.sum()
         assert (changed & (frame.picture.segmentation == CORTEX)).sum() > 500
 
 
