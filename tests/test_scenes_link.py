@@ -11,6 +11,7 @@ from films import FILM
 from programs import main
 
 from scenes.link.frame import HEADER, read_header
+from scenes.play.deformers import to_model_path
 from scenes.script.shipped_files import get_template_path
 
 SELF = "localhost", "127.0.0.1", socket.gethostname()
@@ -63,7 +64,7 @@ def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay
         (["--client", ":18944"], "--client :18944"),
         *((["--client", host], f"--client {host}: port 18944 of this machine") for host in SELF),
         (["--registration", "none.json"], "none.json: no such file"),
-        ([], "no model next to"),
+        (["--model", str(to_model_path(get_template_path()))], "no model next to"),
         (
             ["--host", "198.51.100.1", "--tool", str(FILM / "tool.json"), "--deformer", "rest"],
             "no server on 198.51.100.1",

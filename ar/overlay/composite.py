@@ -143,7 +143,7 @@ def composite(
         "contour": the outline. "window": also the surface, shaded and darker with depth, while the ground around the
         outline is dimmed. "fill": outline and a flat tint. "depth": outline and a tint that is stronger at smaller
         depth, with its scale. "rings": lines of equal distance from the surface on the ground (`distances.py`).
-        "cut": an inset (`cut.py`). "none": only warnings. Occluders are crossed by outlines alone.
+        "cut": an inset (`cut.py`). "none": only warnings. Outlines alone cross occluding layers.
     cover, marks, words
         Occluders of the surface, and additional marks and text.
 
@@ -213,6 +213,8 @@ def _draw_sketch(
     if opening is not None:
         role = measure.roles.read_roles(picture.segmentation, around)
         ground, front = find_ground(picture.segmentation[around], role, found, opening), role == FRONT
+        if measure.roles.covered is not None:  # a mask of the user stays as it is
+            front &= ~measure.roles.covered[around]
     for trace in marks.traces:
         draw_trace(under, part, trace)
     draw_broken(under, found, compute_ink(hidden.colour), ground, doubtful)

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "anatomy", type=Path, metavar="PATIENT.vtu", help="anatomy from `sulcus patient` or `sulcus anatomy`"
     )
     parser.add_argument(
-        "--model", type=Path, help="model of a pose-controlled tool (default: PATIENT.model.npz next to the anatomy)"
+        "--model", type=Path, help="model of a pose-controlled tool (default: those next to the anatomy)"
     )
     parser.add_argument(
         "--deformer", metavar="NAME",
