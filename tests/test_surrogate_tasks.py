@@ -17,7 +17,7 @@ def body():
 
 
 def test_killed_process_loses_no_finished_case(tmp_path, body):
-    """One process dies at the sixth of ten batches; the other goes on and writes the bytes of an undisturbed run."""
+    """Resume after one of two processes died at the sixth of ten batches: the bytes are those of an undisturbed run."""
     loads, whole, path = draw("palpation", body, COUNT, 0), tmp_path / "whole.h5", tmp_path / "data.h5"
     undisturbed = mortal("cpu", COUNT, 0, tmp_path)
     simulate(whole, undisturbed, loads, SAID, 2)

@@ -222,17 +222,18 @@ def _draw_sketch(
         above = allocate_sheet(part)
     if gauge is not None and above is not None:
         draw_line(above, part, gauge)
-    bare, outlines = under[..., 3] == 0, under.copy()
+    bare = under[..., 3] == 0
+    crossing = under.copy() if front is not None and front.any() else None  # without the lines of the style
     measure.draw(under, under if above is None else above, around)
     if style == "rings":
         thin[around] = separate_rings(bare & (under[..., 3] > 0))
     lines = Lines(compute_ink(hidden.colour), not doubtful, under, above)
     out, taken[around] = draw_overlay(picture.drawn, around, part, hidden, found, measure.roles, style, lines)
-    if front is not None and front.any():
+    if front is not None and crossing is not None:
         if not doubtful:
             pieces = cut_outlines(find_outlines(found.mask), front)
-            draw_dashes(outlines, pieces, lines.ink, HIDDEN_STROKES, HIDDEN_LINE_WIDTH)
-        lay_lines(out[around], outlines, front)
+            draw_dashes(crossing, pieces, lines.ink, HIDDEN_STROKES, HIDDEN_LINE_WIDTH)
+        lay_lines(out[around], crossing, front)
     return Sketch(out, taken, faint, thin, around, ground)
 
 

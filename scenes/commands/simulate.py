@@ -160,28 +160,21 @@ def run(args: argparse.Namespace) -> int:
 def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
     """Return the tool of pose control, or None, and sampled loads, with times for viscoelastic tissue."""
     asked = _build_requested_tool(args)
-    if args.scene is not None:
-        return _sample_scene(args, anatomy, tissue)
     if not args.pose_control:
-        if asked is not None:
+        if asked is not None or args.scene is not None:
             raise InputError(
-                "--ball, --capsule and --blade are moved by pose: give --pose-control too, or leave them out."
+                "--scene, --ball, --capsule and --blade are moved by pose: give --pose-control too, or leave them out."
             )
         return None, draw(args.tool_preset, anatomy, args.count, args.seed)
-    tool = choose_ball(args.tool_preset) if asked is None else asked
-    loads = draw_poses(args.tool_preset, anatomy, args.count, args.seed, tool)
-    return tool, Loads(loads.causes, sample_times(len(loads), args.seed)) if tissue.prony else loads
+    if args.scene is None:
+        tool = choose_ball(args.tool_preset) if asked is None else asked
+        loads = draw_poses(args.tool_preset, anatomy, args.count, args.seed, tool)
+    else:  # imports that a machine which only trains does without
+        from ..script.craniotomy_frame import build_craniotomy_frame
+        from ..script.scene import find_scene
+        from ..script.scene_poses import draw_scene_poses
 
-
-def _sample_scene(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn, Loads]:
-    """Return the tool of a scene, and its sampled poses."""
-    from ..script.craniotomy_frame import build_craniotomy_frame
-    from ..script.scene import find_scene
-    from ..script.scene_poses import draw_scene_poses
-
-    if not args.pose_control:
-        raise InputError("--scene gives poses of a tool: give --pose-control too, or leave it out.")
-    tool, loads = draw_scene_poses(find_scene(args.scene), build_craniotomy_frame(anatomy), args.count, args.seed)
+        tool, loads = draw_scene_poses(find_scene(args.scene), build_craniotomy_frame(anatomy), args.count, args.seed)
     return tool, Loads(loads.causes, sample_times(len(loads), args.seed)) if tissue.prony else loads
 
 

@@ -92,7 +92,7 @@ def describe_stage(stage: Stage, camera: Camera) -> dict[str, Any]:
     """Return coordinate system, camera, light, colours and tool, for JSON; lengths [m], colours scene-linear."""
     site, tool, lamp, scene = stage.site, stage.scene.tool, stage.lamp, stage.scene
     assert isinstance(tool, Probe)
-    axis = lamp.target - lamp.position
+    axis, pose = lamp.target - lamp.position, tool.pose(np.zeros(3), site.axis, site.right)
     angle = np.arctan(lamp.radius / np.linalg.norm(axis))
     distance = float(camera.to_camera_frame(site.origin)[2])
     frame = {name: getattr(site, name).tolist() for name in ("origin", "axis", "right", "up")}
@@ -108,10 +108,13 @@ def describe_stage(stage: Stage, camera: Camera) -> dict[str, Any]:
             "cone": [np.cos(angle), 1.0 / (np.cos(0.55 * angle) - np.cos(angle))],
             "light": [lamp.strength, lamp.ambient], "right": frame["right"], "up": frame["up"],
         },
-        "looks": _describe_layers(stage),
+        "looks": _describe_layers(stage, pose),
         "background": (0.25 * np.array(DRAPE_COLOUR)).tolist(),
         "inks": {"tumour": TUMOUR_COLOUR, "doubtful": DOUBTFUL_COLOUR, "scan": BEFORE_COLOUR},
-        "tool": _describe_tool(tool, site.axis, site.right),
+        # Direction of the shaft; radii of ball, shaft and grip, and distance from ball to grip.
+        "tool": {
+            "radius": tool.radius, "rod": pose[:3, 2].tolist(), "radii": [tool.radius, tool.shaft, *tool.grip],
+        },
         "force": {
             "lift": IDLE_HEIGHT, "visible": MIN_VISIBLE_FORCE, "carried": CARRIED_DEPTH, "blocked": BLOCKED_DEPTH,
             "start": max(scene.path(float(time)).force for time in scene.times),
@@ -119,9 +122,8 @@ def describe_stage(stage: Stage, camera: Camera) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _describe_layers(stage: Stage) -> Mapping[str, Any]:
-    """Colour, highlight, and relief of the layers that the page draws."""
-    pose = stage.scene.tool.pose(np.zeros(3), stage.site.axis, stage.site.right) if stage.scene.tool else None
+def _describe_layers(stage: Stage, pose: np.ndarray) -> Mapping[str, Any]:
+    """Colour, highlight, and relief of the layers that the page draws, with the tool at a pose (4, 4)."""
     looks = {}
     for layer in stage.build_layers(stage.anatomy.mesh.nodes, pose):
         looks[layer.name] = {
@@ -131,10 +133,3 @@ def _describe_layers(stage: Stage) -> Mapping[str, Any]:
         if layer.solid is not None:
             looks[layer.name] |= {"dark": layer.solid.dark, "relief": 2.0 * MAX_SLOPE * layer.solid.relief}
     return looks
-
-
-def _describe_tool(tool: Probe, inward: np.ndarray, aside: np.ndarray) -> dict[str, Any]:
-    """Radius of the ball, direction of the shaft; radii of ball, shaft and grip, and distance from ball to grip."""
-    pose = tool.pose(np.zeros(3), inward, aside)
-    radii = [tool.radius, tool.shaft, 2.2 * tool.shaft, 0.55 * tool.length]
-    return {"radius": tool.radius, "rod": pose[:3, 2].tolist(), "radii": radii}

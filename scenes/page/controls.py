@@ -201,7 +201,7 @@ def build_strength_slider(scene: Scene, wish: Requests, take: Callable[..., None
     touch = wish.touch
     if scene.posed:
         low = -1e3 * IDLE_HEIGHT
-        high = max(MAX_DEPTH, *(round(1e3 * scene.path(time).depth, 1) for time in scene.times.tolist()))
+        high = max(MAX_DEPTH, round(1e3 * scene.max_depth, 1))
         now = min(max(1e3 * touch.depth, low), high)
         hint = "how far the tool is beyond where it just touches; negative: in the air"
         return Slider("depth [mm]", low, high, 0.1, now, lambda value: take(depth=1e-3 * value), hint=hint)

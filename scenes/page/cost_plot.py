@@ -27,8 +27,8 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
     across, ticks = _scale([row.milliseconds for row in rows], LEFT, WIDTH - RIGHT)
     along, levels = _scale([max(row.millimetres, MIN_ERROR) for row in rows], HEIGHT - BOTTOM, TOP)
     ends = {ticks[-1][0]: "end"}  # the last label stays inside
-    parts = [_draw_tick(x, HEIGHT - BOTTOM + 12, f"{value:g}", ends.get(value, "middle")) for value, x in ticks]
-    parts += [_draw_tick(LEFT - 5, place + 4, f"{value:g}", "end") for value, place in levels]
+    parts = [_draw_text(x, HEIGHT - BOTTOM + 12, f"{value:g}", ends.get(value, "middle")) for value, x in ticks]
+    parts += [_draw_text(LEFT - 5, place + 4, f"{value:g}", "end") for value, place in levels]
     grid = [f"M{place:.0f} {TOP}V{HEIGHT - BOTTOM}" for _, place in ticks]
     grid += [f"M{LEFT} {place:.0f}H{WIDTH - RIGHT}" for _, place in levels]
     placed: list[tuple[float, float]] = []
@@ -38,7 +38,7 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
             low += 2.0
         placed.append((x, low))
         right = x > 0.6 * WIDTH
-        label = _draw_tick(x + (-7 if right else 7), low, _name(row), "end" if right else "start")
+        label = _draw_text(x + (-7 if right else 7), low, _name(row), "end" if right else "start")
         parts.append(
             f"<g{' class=best' if row.best else ''}><title>{escape(describe_row(row))}</title>"
             f'<circle cx="{x:.0f}" cy="{y:.0f}" r="4"/>{label}</g>'
@@ -46,8 +46,8 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
     words = "; ".join(map(describe_row, rows))
     return (
         f'<svg class="cost" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(words)}">'
-        f'<path d="{"".join(grid)}"/>{"".join(parts)}{_draw_tick(WIDTH - RIGHT, HEIGHT - 4, "time [ms]", "end")}'
-        f"{_draw_tick(2, HEIGHT - 4, 'error [mm]', 'start')}</svg>"
+        f'<path d="{"".join(grid)}"/>{"".join(parts)}{_draw_text(WIDTH - RIGHT, HEIGHT - 4, "time [ms]", "end")}'
+        f"{_draw_text(2, HEIGHT - 4, 'error [mm]', 'start')}</svg>"
         f'<p class="dim">Mean error relative to FEM against time, medians over {what}.</p>'
     )
 
@@ -73,7 +73,7 @@ def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[floa
     return [place(value) for value in values], [(ten, place(ten)) for ten in 10.0 ** np.arange(low, low + span + 0.5)]
 
 
-def _draw_tick(x: float, y: float, words: str, anchor: str) -> str:
+def _draw_text(x: float, y: float, words: str, anchor: str) -> str:
     """Return a text of the plot."""
     return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}">{escape(words)}</text>'
 

@@ -171,9 +171,9 @@ class Demo:
         # The frame that is shown.
         self.reached: int | None = None
         self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=is_animated(scene, self.theatre.site))
-        # The browser opens later.
-        notes = (self.theatre, scene, self.wish, self.turn, lambda *said: self.browser.write(*said))
-        self.studies = build_studies(*notes)
+        self.studies = build_studies(
+            self.theatre, scene, self.wish, self.turn, lambda *said: self.browser.write(*said)
+        )  # the browser opens later
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""

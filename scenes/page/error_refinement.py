@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from html import escape
 
 from ..analysis.uncertainty import Answer, estimate_uncertainty, solve_ensemble, solve_nominal
 from ..play.deformers import PatientSetup
 from ..script.priors import sample_priors
 from ..script.scene import Scene
 from ..script.tool_paths import Touch
+from .text import format_tumour_trust, format_unbroken
 
 DRAWS = 16  # Number of sampled patients: two for each number that is fitted to them.
 
@@ -33,10 +33,8 @@ def refine_error(theatre: PatientSetup, scene: Scene, touch: Touch, time: float,
         yield f"<p>{len(found)} of {count} sampled patients are solved.</p>"
     refined = estimate_uncertainty(theatre, held, still, draws, found)
     error = refined.evaluate(time, 0.0, scene.registration)
-    moved, off = 1e3 * refined.read(refined.moved, time), 1e3 * (error.moved or 0.0)
+    moved = format_unbroken(refined.read(refined.moved, time), error.moved)
     yield (
-        f"<p>Refined for this load, from {count} sampled patients: the tumour moves {moved:.1f} \N{PLUS-MINUS SIGN} "
-        f"{off:.1f} mm; position error <= {1e3 * (error.prior or 0.0):.1f} mm (95 %"
-        f"{', rough estimate' if error.guess else ''}), {escape(error.registration_words)}. Largest contribution: "
-        f"{escape(error.largest)}.</p>"
+        f"<p>Refined for this load, from {count} sampled patients: the tumour moves {moved}.</p>"
+        f"{format_tumour_trust(error)}"
     )

@@ -124,7 +124,7 @@ class SceneSolvers:
     def compare_models(self, truth: FemResult, tally: AccuracyTimeTable, skip: str) -> None:
         """Record time and error of FEM and of each trained model but `skip`, for the load of an FEM solution."""
         load, scene = compute_loads_digest(truth.loads), self.get_stage().scene
-        tally.record_time("fem", load, truth.seconds)
+        tally.record_time("fem", load, truth.deformation.cost.total)
         tally.record_error("fem", load, 0.0)
         for name in self.theatre.select_models(scene):
             player = self.get_player(name)

@@ -297,9 +297,9 @@ def plan_of(deformer: Deformer) -> tuple[str, ...]:
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
-def to_model_path(anatomy: Path, scene: str = "model") -> Path:
-    """Return the default path of an anatomy's models: MESH.model.npz next to MESH.vtu; MESH.SCENE.npz: of a scene."""
-    return anatomy.with_suffix(f".{scene}.npz")
+def to_model_path(anatomy: Path, kind: str = "model") -> Path:
+    """Return the path of models next to MESH.vtu: MESH.model.npz by default, MESH.SCENE.npz for those of one scene."""
+    return anatomy.with_suffix(f".{kind}.npz")
 
 
 def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:
@@ -311,10 +311,10 @@ def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:
         Unreadable or inconsistent files.
     """
     found: dict[str, Learned] = {}
-    for scene in ("model", *SCENES):
-        file = to_model_path(path, scene)
+    for kind in ("model", *SCENES):
+        file = to_model_path(path, kind)
         for name, model in (load(file, anatomy) if file.is_file() else {}).items():
-            found[name if scene == "model" else f"{name}-{scene}"] = model
+            found[name if kind == "model" else f"{name}-{kind}"] = model
     return found
 
 

@@ -186,6 +186,11 @@ class Scene:
         """Time of every frame (n,) [s]."""
         return np.arange(round(self.duration * self.frames_per_second) + 1) / self.frames_per_second
 
+    @property
+    def max_depth(self) -> float:
+        """Largest depth of the scripted tool at any frame [m]."""
+        return max(self.path(time).depth for time in self.times.tolist())
+
     def get_effects_on(self, anatomy: Anatomy) -> tuple[Effect, ...]:
         """Return the effects on an anatomy: without skull contact if there is no skull, and with the resection."""
         gone = () if anatomy.slide_normal.any() else (SkullContact,)

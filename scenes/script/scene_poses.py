@@ -28,7 +28,7 @@ def draw_scene_poses(scene: Scene, site: CraniotomyFrame, count: int, seed: int)
     InputError
         A scene without a ball, capsule or blade that is moved by its pose into the tissue.
     """
-    deepest = DEPTH_MARGIN * max((scene.path(time).depth for time in scene.times.tolist()), default=0.0)
+    deepest = DEPTH_MARGIN * scene.max_depth
     shape = None if scene.tool is None else scene.tool.shape
     if scene.tool is None or not isinstance(shape, BuiltIn) or not scene.posed or deepest <= 0.0:
         raise InputError(

@@ -96,9 +96,15 @@ class Probe:
         ball.apply_translation([0.0, 0.0, self.radius])
         shaft = trimesh.creation.cylinder(self.shaft, self.length, sections=24)
         shaft.apply_translation([0.0, 0.0, self.radius + 0.5 * self.length])
-        grip = trimesh.creation.capsule(0.6 * self.length, 2.2 * self.shaft, count=(16, 24))
-        grip.apply_translation([0.0, 0.0, self.radius + 0.55 * self.length])
+        radius, start = self.grip
+        grip = trimesh.creation.capsule(0.6 * self.length, radius, count=(16, 24))
+        grip.apply_translation([0.0, 0.0, self.radius + start])
         return ball + shaft + grip
+
+    @property
+    def grip(self) -> tuple[float, float]:
+        """Radius of the grip, and its distance from the centre of the ball [m]."""
+        return 2.2 * self.shaft, 0.55 * self.length
 
     @property
     def shape(self) -> Ball:
