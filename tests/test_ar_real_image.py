@@ -1,11 +1,11 @@
-"""The round field of a microscope."""
+"""The round field of a microscope, and enlarged images."""
 
 import numpy as np
 import pytest
 from test_scenes_stage import seen
 from theatres import template_theatre
 
-from ar.rendering.real_image import add_vignette
+from ar.rendering.real_image import add_vignette, enlarge_picture
 from scenes.script.viewpoint import Viewpoint
 from sim.errors import InputError
 
@@ -25,3 +25,14 @@ def test_round_field_darkens_only_beyond_its_edge():
         Viewpoint(field=0.0)
     with pytest.raises(ValueError, match="round field"):
         add_vignette(seen(grey), float("nan"))
+
+
+def test_enlarged_image_keeps_ids_and_colours():
+    sharp = seen(template_theatre().intensity.values)
+    large = enlarge_picture(sharp, 640, 480)
+    assert large.drawn.colour.shape == (1, 480, 640) and large.colour.dtype == np.uint8
+    for name in ("depth", "segmentation"):  # no new values, and each pixel where it was
+        np.testing.assert_array_equal(getattr(large, name)[::2, ::2], getattr(sharp, name))
+        np.testing.assert_array_equal(getattr(large, name)[1::2, 1::2], getattr(sharp, name))
+    means = large.colour.reshape(240, 2, 320, 2, 3).mean(axis=(1, 3))
+    assert np.abs(means - sharp.colour).mean() < 1.0

@@ -219,6 +219,32 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
         assert (moment.picture != before).any() == moves and asked == []
 
 
+def test_images_in_motion_are_coarse_and_get_sharp_at_rest(demo, monkeypatch):
+    monkeypatch.setattr("scenes.page.comparison.MAX_RENDER_TIME", 0.0)  # every renderer is slow
+    monkeypatch.setattr("scenes.page.comparison.STILL_TIME", 1.0)
+    now = PageState()
+    demo.wish.set(plays=False, number=29)
+    demo.update_page(now)
+    assert not now.coarse  # nothing has moved yet
+    demo.wish.set(number=30)
+    demo.update_page(now)
+    moving = now.frame
+    assert now.coarse and moving is not None
+    demo.update_page(now)
+    assert now.coarse
+    assert wait_for(lambda: demo.update_page(now) == 0 and not now.coarse)
+    still = now.frame
+    assert still is not None and (still.shown != moving.shown).any()
+    assert still.shown.shape == moving.shown.shape and still.distance == moving.distance
+    np.testing.assert_array_equal(still.tumour_error.bound, moving.tumour_error.bound)
+    assert np.abs(still.shown.astype(int) - moving.shown).mean() < 4.0
+    # A fast renderer always draws sharp images.
+    monkeypatch.setattr("scenes.page.comparison.MAX_RENDER_TIME", 1e9)
+    demo.wish.set(number=31)
+    demo.update_page(now)
+    assert not now.coarse
+
+
 def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
     answer, said = Learned.deform, []
     monkeypatch.setattr(demo.browser, "show_status", said.append)

@@ -1,11 +1,21 @@
 """Threads: a limit that belongs to the whole process, and tasks that are all done, with errors raised at the end."""
 
 import threading
+from types import SimpleNamespace
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from sim.runtime.threads import Sharing, choose_threads, limit_to_one_thread, run_together
+from sim.runtime.device import find_device
+from sim.runtime.threads import (
+    Sharing,
+    choose_threads,
+    enter_background,
+    limit_to_one_thread,
+    run_in_foreground,
+    run_together,
+    wait_for_foreground,
+)
 
 
 def threads() -> set[int]:
@@ -55,3 +65,30 @@ def test_one_core_at_least_and_one_for_little() -> None:
     assert choose_threads(10**6) >= 1
     assert choose_threads(Sharing().min_size - 1) == 1
     assert choose_threads(10**6, Sharing(max_threads=1)) == 1
+
+
+def test_background_waits_for_the_foreground(monkeypatch) -> None:
+    monkeypatch.setattr("sim.runtime.threads.MAX_PAUSE", 30.0)
+    passed = threading.Event()
+
+    def work():
+        enter_background()
+        wait_for_foreground()
+        passed.set()
+
+    thread = threading.Thread(target=work)
+    with run_in_foreground():
+        wait_for_foreground()  # this thread is not in the background
+        thread.start()
+        assert not passed.wait(0.1)
+    assert passed.wait(5.0)
+    thread.join()
+
+
+def test_kernels_of_the_background_wait(monkeypatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr("sim.runtime.device.wait_for_foreground", lambda: asked.append(1))
+    monkeypatch.setattr("sim.runtime.device.wp.launch", lambda *_, **__: None)
+    monkeypatch.setattr("sim.runtime.device.load", lambda _: None)
+    find_device("cpu", "float64").launch(SimpleNamespace(module=None), (1,), [], [])
+    assert asked == [1]

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -138,6 +139,11 @@ def wrap_line(text: str, room: float, scale: float = TEXT_SCALE) -> list[str]:
 
     A number stays next to its name, its error and its unit, even if that takes more space.
     """
+    return list(_wrap_line(text, room, scale))
+
+
+@lru_cache(maxsize=256)  # most texts stay from image to image, and this takes 1 ms
+def _wrap_line(text: str, room: float, scale: float) -> list[str]:
     if cv2.getTextSize(text, FONT, scale, 1)[0][0] <= room:
         return [text] if text else []
     lines = _break_lines(text, room, scale)

@@ -122,8 +122,9 @@ def draw_dashes(
 
 def lay_lines(colour: np.ndarray, sheet: np.ndarray, mask: np.ndarray) -> None:
     """Draw a sheet (h, w, 4) of lines over an image (h, w, 3) uint8 where a mask (h, w) is True, in place."""
-    line, left = sheet[mask, :3], 255 - sheet[mask, 3:].astype(int)
-    colour[mask] = (colour[mask] * left // 255 + line).astype(np.uint8)
+    drawn = mask & (sheet[..., 3] > 0)
+    line, left = sheet[drawn, :3], 255 - sheet[drawn, 3:].astype(int)
+    colour[drawn] = (colour[drawn] * left // 255 + line).astype(np.uint8)
 
 
 def clip_to_sheet(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:

@@ -58,7 +58,7 @@ class ConnectionLimits:
     visitors: int = 32
     burst: float = 1000.0
     per_second: float = 200.0
-    sendings: float = 15.0
+    sendings: float = 30.0
     asides: float = 2.0
 
 

@@ -1,7 +1,8 @@
 """HTML document that a browser loads first: viser's own, with this page's title and icon, and usable without WebGL.
 
 Viser's client reads the server's messages only while it draws. In a browser without WebGL, a null renderer takes its
-place: image, controls and tabs work, and only the 3-D view is unavailable.
+place: image, controls and tabs work, and only the 3-D view is unavailable. Where WebGL is computed by the processor,
+the 3-D view is drawn a few times a second, so that the image keeps its rate.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ ICON = (  # Icon of the page (SVG).
 )
 NO_WEBGL_CLASS = "sulcus-without-webgl"
 """Class of the document's element in a browser without WebGL."""
+SOFTWARE_PERIOD = 150  # Shortest time between two drawings of the 3-D view without a graphics card [ms].
 # Each WebGL constant equals its own name here, so that results are looked up by name.
 SCRIPT = """
 (() => {
@@ -44,8 +46,35 @@ SCRIPT = """
       return answers[name] ?? (name.startsWith('create') ? () => ({}) : () => undefined);
     },
   });
+  // Drawings to the screen are skipped until the period is over; one task of the browser draws all or nothing.
+  const slowDown = gl => {
+    let last = -Infinity, drawn = null;
+    const isDue = () => {
+      if (drawn === null) {
+        drawn = performance.now() - last >= PERIOD;
+        if (drawn) last = performance.now();
+        queueMicrotask(() => { drawn = null; });
+      }
+      return drawn;
+    };
+    for (const name of ['clear', 'drawArrays', 'drawElements', 'drawArraysInstanced', 'drawElementsInstanced']) {
+      const draw = gl[name];
+      gl[name] = function (...values) {
+        if (gl.getParameter(gl.FRAMEBUFFER_BINDING) || isDue()) draw.apply(gl, values);
+      };
+    }
+  };
+  const isSoftware = gl => {
+    const info = gl.getExtension('WEBGL_debug_renderer_info');
+    const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+    return /swiftshader|llvmpipe|softpipe|basic render/i.test(name);
+  };
   HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
     const found = given.call(this, kind, ...more);
+    if (found && /webgl/.test(kind) && !found.sulcusSeen) {
+      found.sulcusSeen = true;
+      if (isSoftware(found)) slowDown(found);
+    }
     if (found || !/webgl/.test(kind)) return found;
     document.documentElement.classList.add('WITHOUT');
     return this.sulcusNothing ??= nothing(this);
@@ -59,7 +88,7 @@ def build_document(document: bytes, is_zipped: bool) -> bytes:
     """Insert this page's title, icon and script into viser's document."""
     text = (gzip.decompress(document) if is_zipped else document).decode()
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'
-    script = f"<script>{SCRIPT.replace('WITHOUT', NO_WEBGL_CLASS)}</script>"
+    script = f"<script>{SCRIPT.replace('WITHOUT', NO_WEBGL_CLASS).replace('PERIOD', str(SOFTWARE_PERIOD))}</script>"
     for pattern, own in (
         (r"<title>[^<]*</title>", f"<title>{TITLE}</title>"),
         (r'<link\s+rel="icon"[^>]*>', icon),

@@ -14,6 +14,7 @@ A lens changes the pixels, not the formulas: p is then the undistorted position 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -42,7 +43,7 @@ class Fragments:
     weights: np.ndarray
     depth: np.ndarray
 
-    @property
+    @cached_property
     def mask(self) -> np.ndarray:
         """(H, W) bool: mask of covered pixels."""
         return self.face >= 0
@@ -103,11 +104,11 @@ class RasterisedSurface:
     rows: slice
     unbent: Unbent
 
-    @property
+    @cached_property
     def mask(self) -> np.ndarray:
         """(H, W) bool: mask of the pixels whose centres the surface covers."""
         mask = wp.empty(self.nearest.size, dtype=wp.uint8, device=self.nearest.device)
-        launch_in_bands(mark_covered, [self.nearest.flatten()], [mask], self.nearest.size, str(self.nearest.device))
+        launch_in_bands(mark_covered, [self.nearest.flatten()], [mask], mask.size, str(mask.device))
         return mask.numpy().reshape(self.nearest.shape[1:]).view(bool)
 
 

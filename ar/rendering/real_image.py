@@ -1,9 +1,10 @@
-"""Real images instead of rendered ones, and the round field of view of an operating microscope."""
+"""Real and enlarged images instead of rendered ones, and the round field of view of an operating microscope."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import warp as wp
 
@@ -87,19 +88,31 @@ def build_real_image(
     """
     if colour.shape != (camera.height, camera.width, 3):
         raise ValueError(f"the image is {colour.shape}, the camera {(camera.height, camera.width, 3)}.")
-    depth = np.zeros((1, *colour.shape[:2]), np.float32)
-    segmentation = np.zeros(depth.shape, np.uint8)
+    depth, segmentation = np.zeros(colour.shape[:2], np.float32), np.zeros(colour.shape[:2], np.uint8)
     if layers:
         starts = np.cumsum([0, *(len(layer.vertices) for layer in layers)])
         triangles = [layer.triangles + start for layer, start in zip(layers, starts, strict=False)]
         ids = np.repeat([layer.id for layer in layers], [len(each) for each in triangles]).astype(np.uint8)
         vertices = np.concatenate([layer.vertices for layer in layers])
         found = rasterise(camera.crop_to(*box), vertices, np.concatenate(triangles), device=device)
-        depth[0][box] = found.depth
-        segmentation[0][box] = np.where(found.mask, ids[found.face], 0)
-    drawn = Pictures(
-        wp.array(np.ascontiguousarray(colour)[None], dtype=wp.vec3ub, device=device),
-        wp.array(depth, dtype=wp.float32, device=device),
-        wp.array(segmentation, dtype=wp.uint8, device=device),
+        depth[box] = found.depth
+        segmentation[box] = np.where(found.mask, ids[found.face], 0)
+    return _upload_picture(colour.copy(), depth, segmentation, device)
+
+
+def enlarge_picture(picture: Picture, width: int, height: int) -> Picture:
+    """Return an image on more pixels: colours interpolated, depths and ids of the nearest pixel."""
+    size, device = (width, height), str(picture.drawn.colour.device)
+    depth, segmentation = (
+        cv2.resize(values, size, interpolation=cv2.INTER_NEAREST) for values in (picture.depth, picture.segmentation)
     )
-    return Picture(drawn)
+    return _upload_picture(cv2.resize(picture.colour, size), depth, segmentation, device)
+
+
+def _upload_picture(colour: np.ndarray, depth: np.ndarray, segmentation: np.ndarray, device: str) -> Picture:
+    """Move an image (H, W, 3) uint8 with depth (H, W) float32 and segmentation (H, W) uint8 to a device."""
+    arrays = (
+        wp.array(np.ascontiguousarray(values)[None], dtype=dtype, device=device, copy=False)
+        for values, dtype in ((colour, wp.vec3ub), (depth, wp.float32), (segmentation, wp.uint8))
+    )
+    return Picture(Pictures(*arrays))

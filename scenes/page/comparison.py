@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -98,6 +99,7 @@ class PageState:
     """State of the page: the request, its solution, the frame, and the FEM comparison.
 
     `goal` is the request that the frame is on the way to, `asked` the one that it fulfils, `look` the display style.
+    If nothing changes, the page is still from `still_at` on [s]. `render_time` [s] is that of a sharp image.
     """
 
     goal: tuple | None = None
@@ -107,6 +109,9 @@ class PageState:
     look: Look | None = None
     load: str = ""
     frame: Frame | None = None
+    still_at: float = 0.0
+    render_time: float = 0.0
+    coarse: bool = False
     picture: np.ndarray | None = None
     truth: FemResult | None = None
     own: FemResult | None = None
@@ -115,7 +120,26 @@ class PageState:
     stale: bool | None = None
     plan: tuple[str, ...] | None = None
 
+    def choose_resolution(self) -> bool:
+        """Return whether the next image is coarse: in motion, if rendering a sharp one takes long."""
+        time = clock.perf_counter()
+        self.coarse = self.render_time > MAX_RENDER_TIME and time < self.still_at
+        self.still_at = time + STILL_TIME
+        return self.coarse
 
+    def record_rendering(self, seconds: float) -> None:
+        """Record the duration of rendering the image."""
+        self.render_time = seconds * (COARSE_SAVING if self.coarse else 1.0)
+
+    @property
+    def is_still(self) -> bool:
+        """True if nothing has changed for some time."""
+        return clock.perf_counter() >= self.still_at
+
+
+STILL_TIME = 0.5  # Time after a change from which the page is still [s].
+MAX_RENDER_TIME = 0.015  # Duration of rendering above which images in motion are coarse [s].
+COARSE_SAVING = 5.0  # Duration of rendering a sharp image relative to a coarse one, at most.
 MIN_COMPARED_MOTION = 0.1e-3  # Smallest mean motion of the tumour of a load that is compared [m].
 MAX_RECENT_LOADS = 120  # Number of last loads that are kept for each deformer.
 

@@ -16,6 +16,7 @@ from ar.page.history import History
 from ar.page.parts import Playback
 from sim.errors import InputError
 from sim.loads import Loads
+from sim.runtime.threads import run_in_foreground
 from surrogate.data.dataset import compute_loads_digest
 
 from ..play.deformers import AtRest, PatientSetup
@@ -53,8 +54,8 @@ from .view import (
 )
 
 WAITING_TEXT = "The finite elements are working on this load."  # Text while FEM solves.
-# Text before the first result.
 UNDEFORMED_TEXT = '<p class="stale">The undeformed body, as in the scan. The first result is being computed.</p>'
+MIN_REST = 0.007  # Shortest pause after an image, in which FEM in the background goes on [s].
 MESSAGE_TIME = 2.0  # Time for which a playing page shows why a frame is skipped [s].
 
 
@@ -138,7 +139,7 @@ class Demo:
                 continue
             self._check(now)
             rest = 1.0 / self.stage.scene.frames_per_second - (clock.perf_counter() - begun)
-            clock.sleep(max(0.0, rest))
+            clock.sleep(max(MIN_REST, rest))
 
     def _tell(self) -> None:
         """Tell each visitor who has the tool, and who leads."""
@@ -205,9 +206,10 @@ class Demo:
         if self.asked == now.asked:
             self._mark_shown()
         elif (found := self._find_result(now)) is not None:
-            self._draw(now, found)
+            with run_in_foreground():
+                self._draw(now, found)
             return 1
-        if now.frame is not None and self.wish.look != now.look:
+        if now.frame is not None and (self.wish.look != now.look or (now.coarse and now.is_still)):
             self._draw_in_style(now)
         return 0
 
@@ -251,18 +253,18 @@ class Demo:
     def _draw(self, now: PageState, found: FemResult) -> None:
         """Draw a solution, and have it compared with FEM unless it is by FEM."""
         number, name, touch, off = self.asked
-        fem = name == "fem" or bool(off)
         look = self.wish.look
-        player = self._get_player(self.asked, look)
+        player = replace(self._get_player(self.asked, look), coarse=now.choose_resolution())
         hand = touch or player.get_touch(found.number)
         self.reached, now.goal, now.asked = found.number, self.asked, (found.number, name, touch, off)
         now.look, now.shown, now.own = look, found, None
         now.load = compute_loads_digest(self._build_loads(found.number, touch) if off else found.loads)
         now.frame = frame = player.draw_frame(found.number, hand, found.loads, found.deformation, found.seconds)
+        now.record_rendering(frame.seconds["render"])
         self.history.add(sample_of(frame, self.stage.scene, clock.monotonic()))
         if found.number == number:
             self._mark_shown()
-        if fem and not off:
+        if name == "fem" and not off:
             now.own = found
         elif found.number == number:
             self.referee.ask(number, touch)
@@ -283,7 +285,7 @@ class Demo:
     def _draw_in_style(self, now: PageState) -> None:
         """Render the same solution in another style."""
         assert now.frame is not None and now.asked is not None
-        frame, now.look = now.frame, self.wish.look
+        frame, now.look, now.coarse = now.frame, self.wish.look, False
         player, seconds = self._get_player(now.asked, now.look), frame.seconds["deform"]
         now.frame = player.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
         now.picture = render_page_image(now.frame)
@@ -324,14 +326,12 @@ class Demo:
             self.browser.tint("finite elements", FEM_COLOUR if fresh else STALE_COLOUR)
         gone = [describe_effect(effect) for effect in sorted(off)]
         if self.referee.failure is not None:
-            what = "this" if self.referee.thread.is_alive() else "any more"
-            why = escape(str(self.referee.failure))
-            verdict = f'<p class="warn">error: the finite elements do not solve {what} ({why})</p>'
+            rest, reason = "this" if self.referee.thread.is_alive() else "any more", escape(str(self.referee.failure))
+            verdict = f'<p class="warn">error: the finite elements do not solve {rest} ({reason})</p>'
         elif off and truth is not None:
-            shown, whole = now.frame.deformation, self.cast.get_player(name)
-            verdict = (
-                describe_change(truth, whole, shown, gone) if fresh else format_comparison(None, True, WAITING_TEXT)
-            )
+            verdict = format_comparison(None, True, WAITING_TEXT)
+            if fresh:
+                verdict = describe_change(truth, self.cast.get_player(name), now.frame.deformation, gone)
         else:
             own = FEM_SHOWN if now.frame.estimate is None else FEM_REFERENCE
             verdict = format_comparison(now.judged if truth is not None else None, not fresh, WAITING_TEXT, own)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.loads import Loads
+from sim.runtime.threads import enter_background
 
 from ..play.deformers import PatientSetup, plan_of
 from ..play.player import Player
@@ -37,6 +38,7 @@ class FemResult:
 class FemWorker:
     """Thread that solves the newest frame by FEM; older requests that it did not reach are dropped.
 
+    It pauses while an image is drawn.
     It is prepared at the first request. Frames on the way to the requested one are solved too. If FEM fails, `failure`
     is the reason, and no further frames are solved; if loads are rejected, only that frame is skipped, and `refused` is
     its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.
@@ -96,6 +98,7 @@ class FemWorker:
         self.thread.join()
 
     def _serve(self, theatre: PatientSetup, scene: Scene) -> None:
+        enter_background()
         try:
             self._solve_questions(theatre, scene)
         except Exception as error:  # the page says it; the thread's own report goes to the terminal

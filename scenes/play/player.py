@@ -16,7 +16,6 @@ from ar.overlay.legend import LegendNames
 from ar.overlay.marks import Cover, Marks, Trace, Words
 from ar.overlay.styles import Style
 from ar.rendering.layer import Layer
-from ar.rendering.real_image import add_vignette
 from ar.rendering.renderer import Picture
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
@@ -149,7 +148,8 @@ class HeldTool:
 class Player:
     """Scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous solution.
 
-    If not `composed`, no overlay and no text are drawn, and `Frame.shown` is the camera image.
+    If not `composed`, `Frame.shown` is the camera image without overlay and text. If `coarse`, as for images in motion,
+    the camera image has half the resolution, enlarged, under a sharp overlay.
 
     Examples
     --------
@@ -166,6 +166,7 @@ class Player:
     uncertainty: Uncertainty | None = None
     motion_error: MotionError | None = None
     composed: bool = True
+    coarse: bool = False
 
     @property
     def scene(self) -> Scene:
@@ -177,15 +178,14 @@ class Player:
         """The open cortex that it is played on."""
         return self.stage.site
 
-    @cached_property
+    @property
     def camera(self) -> Camera:
         """The scene's camera as it starts."""
-        return self.scene.viewpoint.build_camera(self.site)
+        return self.stage.camera
 
     def get_camera(self, time: float) -> Camera:
         """Return the scene's camera at a time [s]: one that stays is the same, whose backdrop is kept."""
-        view = self.scene.viewpoint
-        return self.camera if view.path is None else view.build_camera(self.site, time)
+        return self.camera if self.scene.viewpoint.path is None else self.scene.viewpoint.build_camera(self.site, time)
 
     @cached_property
     def remembers(self) -> bool:
@@ -225,13 +225,10 @@ class Player:
         positions = self.compute_positions(deformation)
         held = None if self.scene.tool is None else self.place_tool(self.scene.tool, touch, positions)
         stage, camera = self.stage.select_stage(loads), self.get_camera(float(loads.times[0]))
-        picture = stage.render(camera, positions, None if held is None else held.pose)
-        field = self.scene.viewpoint.field
-        picture = picture if field is None else add_vignette(picture, field)
+        picture = stage.render_view(camera, positions, None if held is None else held.pose, self.coarse)
         corners = stage.compute_corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
-        # # The observer's rendering time is not part of the estimate.
-        seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds
+        seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds  # without rendering
         tumour, rest = stage.build_tumour(_estimate_positions(positions, estimate)), stage.tumour_at_rest
         doubt = describe_outcome(deformation.outcome[0]) or (
             BONE_WARNING if held is not None and held.beyond > BLOCKED_DEPTH else ""

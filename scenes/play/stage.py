@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,6 +12,7 @@ from ar.optics.camera import Camera
 from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
+from ar.rendering.real_image import add_vignette, enlarge_picture
 from ar.rendering.renderer import Lamp, Picture, Renderer, build_lamp
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
@@ -114,10 +115,15 @@ class Stage:
         return np.union1d(np.unique(anatomy.open_surface), anatomy.tumour_nodes)
 
     @cached_property
+    def camera(self) -> Camera:
+        """The scene's camera as it starts. One that stays is always this object: a `Renderer` keeps its backdrop."""
+        return self.scene.viewpoint.build_camera(self.site)
+
+    @cached_property
     def lamp(self) -> Lamp:
         """A lamp over the surgeon's shoulder."""
-        camera, site, look = self.scene.viewpoint.build_camera(self.site), self.site, self.scene.look
-        lamp = build_lamp(camera, site.origin, radius=1.6 * site.radius)
+        site, look = self.site, self.scene.look
+        lamp = build_lamp(self.camera, site.origin, radius=1.6 * site.radius)
         turned = Rotation.from_rotvec(look.turn * site.axis).apply(lamp.position - site.origin)
         return replace(lamp, position=site.origin + turned, strength=look.lamp, ambient=look.ambient)
 
@@ -168,6 +174,13 @@ class Stage:
     def render(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None) -> Picture:
         """Render the image of `layers` by a camera."""
         return self.render_tool_corners(camera, positions, self.compute_corners(pose))
+
+    def render_view(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool) -> Picture:
+        """Return the same in the round field of the scene's microscope; if `coarse`, of half the resolution."""
+        picture = self.render(halve_resolution(camera) if coarse else camera, positions, pose)
+        if self.scene.viewpoint.field is not None:
+            picture = add_vignette(picture, self.scene.viewpoint.field)
+        return enlarge_picture(picture, camera.width, camera.height) if coarse else picture
 
     def render_tool_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
         """Return the same, of a tool by its corners (t, 3) [m]."""
@@ -266,6 +279,12 @@ class Stage:
         wall = np.concatenate([corner[:, [0, 1, 3]], corner[:, [0, 3, 2]]])
         points = np.concatenate([points, np.concatenate([points[rim], low], axis=1).reshape(-1, 3)])
         return Layer("drape", DRAPE, points, np.concatenate([triangles, wall]), DRAPE_COLOUR, gloss=0.05, still=True)
+
+
+@lru_cache(maxsize=2)
+def halve_resolution(camera: Camera) -> Camera:
+    """Return a camera with half the pixels along each side, the same object for the same camera."""
+    return camera.scale(0.5)
 
 
 def clip_surface(

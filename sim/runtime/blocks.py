@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from .device import Device
+from .threads import wait_for_foreground
 
 
 @wp.func_native(
@@ -87,6 +88,7 @@ def launch(device: Device, kernel: wp.Kernel, columns: int, inputs: list[Any], o
     """Launch a kernel over (load case, thread)."""
     rows, along = get_block_shape(device)
     if columns:
+        wait_for_foreground()
         wp.launch(
             kernel,
             dim=(columns, rows * along),

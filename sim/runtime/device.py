@@ -17,6 +17,7 @@ import warp as wp
 from ..accuracy import Precision
 from ..errors import InputError
 from .kernel_cache import ensure_writable_cache
+from .threads import wait_for_foreground
 
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 """`wp.kernel` without adjoint, which is not used, and launched without grid-stride loop, which saves registers."""
@@ -66,6 +67,7 @@ class Device:
     def launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel on the device; an empty launch is skipped."""
         if min(dim) > 0:
+            wait_for_foreground()
             if not self.on_cuda:
                 load(kernel.module)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.name, record_tape=False)

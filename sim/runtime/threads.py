@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from queue import SimpleQueue
-from threading import Lock, Thread
+from threading import Event, Lock, Thread, local
 
 from threadpoolctl import ThreadpoolController
 
@@ -38,6 +38,32 @@ def limit_to_one_thread() -> Iterator[None]:
             limit = _inside.pop()
             if not _inside:
                 limit.restore_original_limits()
+
+
+MAX_PAUSE = 0.1  # Longest pause of a background thread before a kernel [s].
+_thread, _is_idle = local(), Event()
+_is_idle.set()
+
+
+@contextmanager
+def run_in_foreground() -> Iterator[None]:
+    """Pause the kernels of background threads: two threads that run Python code delay each other at each call."""
+    _is_idle.clear()
+    try:
+        yield
+    finally:
+        _is_idle.set()
+
+
+def enter_background() -> None:
+    """Let the kernels of this thread wait while another thread is inside `run_in_foreground`."""
+    _thread.background = True
+
+
+def wait_for_foreground() -> None:
+    """Pause a background thread while another one is in the foreground."""
+    if getattr(_thread, "background", False):
+        _is_idle.wait(MAX_PAUSE)
 
 
 Task = Callable[[], object]  # Function to run on a thread.
