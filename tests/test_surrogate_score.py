@@ -72,5 +72,5 @@ def test_of_few_loads_no_percentile_of_a_thousand_is_reported(pretender, box, fr
 def test_force_score_leaves_out_tools_that_do_not_press():
     truth = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0], [0.0, 4.0, 0.0]])
     found = score_forces(np.array([9.0, 0.2, 0.2]), truth, np.array([[0.1, 0.3, 0.1], [0.1, 0.5, 0.4]]))
-    assert (found.loads, found.force, found.held) == (2, 3.0, (0.5, 1.0))
+    assert (found.loads, found.force, found.shares) == (2, 3.0, (0.5, 1.0))
     assert (found.mean, found.mean_percent, found.bound) == pytest.approx((0.2, 7.5, 0.2))

@@ -105,7 +105,7 @@ def _summarise_result(found: Location, points: int, regions: tuple[Region, ...],
         "bias_degrees": np.degrees(found.rotation).tolist(),
         "points": points,
         "outliers": found.outliers.tolist(),
-        "tips_left_out": found.tips_left_out.tolist(),
+        "tips_left_out": found.outlier_tips.tolist(),
         "slipped": found.slipped,
         "calibrated": found.calibrated,
         "warnings": _list_warnings(found),
@@ -136,7 +136,7 @@ def _list_warnings(found: Location) -> list[str]:
         said.append("If it was checked, say so by --registration-checked.")
     if len(found.outliers):
         said.append(describe_left_out(found.outliers))
-    return said + [f"Left out, as the points do not support it: tip {number + 1}." for number in found.tips_left_out]
+    return said + [f"Left out, as the points do not support it: tip {number + 1}." for number in found.outlier_tips]
 
 
 def describe_left_out(numbers: np.ndarray) -> str:

@@ -116,9 +116,9 @@ def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
             format_scores(trained.scores, 1e3 * trained.motion),
             f"95th percentile of the maximum vertex error on held-out loads [mm]: {bounds}; scenes use the smallest",
             *(f"on those discs {name} is {describe_error(model)}" for name, model in trained.models.items()),
-            *(f"on those discs bounds of {name} held for {found}" for name, found in trained.left_out.items()),
+            *(f"on those discs bounds of {name} cover {found}" for name, found in trained.left_out.items()),
             *(
-                f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
+                f"on those discs, bounds of the distance from tip to tumour by {name} cover {found}"
                 for name, found in trained.distance_left_out.items()
             ),
             *(f"on those discs, the tool's force by {name}: {found}" for name, found in trained.force.items()),
@@ -137,9 +137,9 @@ def _describe_calibration(trained: Trained) -> str:
 
 def _describe_error(model: Learned) -> dict[str, object]:
     """Describe the model's own reported errors, next to its score."""
-    known = get_held_out_error(model)
-    discs = None if known.left_out is None else asdict(known.left_out)
-    return {"bound_mm": 1e3 * known.bound, "discs": discs, "weak": known.weak}
+    reported = get_held_out_error(model)
+    discs = None if reported.held_out is None else asdict(reported.held_out)
+    return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.weak}
 
 
 def _format_json(trained: Trained, out: str, failed: int, preset: str) -> str:

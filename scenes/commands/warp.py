@@ -234,6 +234,6 @@ def format_warp(report: dict, out: Path) -> str:
         else f"Tumour position error in the patient (95 %): maximum surface error {bound:.1f} mm.",
     ]
     for image in report["images"]:
-        lost = image["outside"] + image["gone"]
+        lost = image["outside"] + image["resected"]
         lines.append(f"{image['name']}: {image['moved']:,} voxels moved, {lost:,} without source data are set to 0.")
     return "\n".join([*lines, f"Written to {out}; README.txt there says how to open it."])

@@ -164,7 +164,7 @@ class PatientSetup:
 
     def limit_of(self, scene: Scene) -> float:
         """Return the predicted error [m] above which FEM replaces the best model of a scene."""
-        stated = self.models[self.select_best(scene)].left_out
+        stated = self.models[self.select_best(scene)].held_out
         if self.limit is not None:
             return self.limit
         return MAX_VERTEX_ERROR if stated is None else stated.limit
