@@ -127,8 +127,8 @@ def solve_with_debonding(
     last, rounds = None, 0
     while True:
         rounds += 1
-        held = anatomy.held | bonded[:, None]
-        body = replace(anatomy, held=held, slide_normal=np.where(sliding[:, None], anatomy.slide_normal, 0.0))
+        held = anatomy.fixed | bonded[:, None]
+        body = replace(anatomy, fixed=held, slide_normal=np.where(sliding[:, None], anatomy.slide_normal, 0.0))
         fem = Fem(body, (*others, Slide()), accuracy, device, element=element)
         last = fem.deform(loads, start=last)
         force = _compute_reactions(fem, loads, last)

@@ -155,7 +155,7 @@ def test_contradictions_are_sentences(effects: tuple[Effect, ...], sentence: str
 
 
 def test_a_skull_that_touches_nothing_is_pointless() -> None:
-    bare = Anatomy(MESH, LID.held, np.zeros_like(LID.slide_normal), LID.craniotomy)
+    bare = Anatomy(MESH, LID.fixed, np.zeros_like(LID.slide_normal), LID.craniotomy)
     with pytest.raises(InputError, match="SkullContact finds no node"):
         Fem(bare, [Elasticity(), Held(), SkullContact()], REFERENCE, "cpu", element="p1")
 

@@ -366,7 +366,7 @@ def test_stored_models_answer_alike(trained, box, fresh, tmp_path):
 def test_a_model_of_another_body_is_refused(trained, box, tmp_path):
     path = tmp_path / "model.npz"
     save(path, {"linear": trained.models["linear"]})
-    other = Anatomy(box.mesh, box.held, box.slide_normal, box.craniotomy & (box.mesh.nodes[:, 0] < 20e-3))
+    other = Anatomy(box.mesh, box.fixed, box.slide_normal, box.craniotomy & (box.mesh.nodes[:, 0] < 20e-3))
     with pytest.raises(InputError, match=f"{box.digest}.*{other.digest}"):
         load(path, other)
     with pytest.raises(InputError, match="one anatomy, not of 2"):

@@ -324,7 +324,7 @@ def build_tool_contact(
         return ToolPath(_find_path_starts(last, cases.restarted, lambda pose: pose, laid), held)
 
     whole = space.surface[:, :3]
-    solid = np.logical_or(anatomy.held.all(axis=1), anatomy.slide_normal.any(axis=1))
+    solid = np.logical_or(anatomy.fixed.all(axis=1), anatomy.slide_normal.any(axis=1))
     bone = space.surface[solid[whole].all(axis=1)]
     return ToolContactTerm(
         name, tools, way, nodes=space.nodes, triangles=triangles, whole=whole, bone=bone,
