@@ -200,7 +200,7 @@ def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):
     assert load(tmp_path / "a.npz", model.anatomy)[name].held_out == stated
     for bad in (replace(stated, mean=float("nan")), replace(stated, solved=1.1), replace(stated, p999="1")):
         save(tmp_path / "b.npz", {name: replace(model, held_out=bad)})
-        with pytest.raises(InputError, match="left-out"):
+        with pytest.raises(InputError, match="held-out"):
             load(tmp_path / "b.npz", model.anatomy)
 
 

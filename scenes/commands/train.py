@@ -36,8 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--learners",
         help=f"model types: {', '.join(LEARNERS)}, or for poses {', '.join(POSE_LEARNERS)}, separated by commas "
-        "(default: "
-        "all that the data can train)",
+        "(default: all that the data can train)",
     )
     parser.add_argument("--most", type=int, metavar="LOADS", help="maximum number of training loads (default: all)")
     add_devices(parser, "; the power series is computed by FEM on the first")
@@ -97,8 +96,7 @@ def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
     if good // CALIBRATION_STRIDE < MIN_CALIBRATION_LOADS:
         notes.append(
             f"of {good} loads {good // CALIBRATION_STRIDE} calibrate error bounds; at least {MIN_CALIBRATION_LOADS} "
-            "are needed: the "
-            "models will have one bound for all loads instead of one for each. "
+            "are needed: the models will have one bound for all loads instead of one for each. "
             f"`sulcus simulate --count {CALIBRATION_STRIDE * MIN_CALIBRATION_LOADS}` gives enough."
         )
     return notes

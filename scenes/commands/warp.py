@@ -188,8 +188,7 @@ def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float,
         middle = ", ".join(f"{1e3 * value:.0f}" for value in site.origin)
         raise InputError(
             f"--load: the place is {apart:.0f} mm from the open cortex; {MAX_DISTANCE:g} mm is the most. The middle "
-            "of the "
-            f"open cortex is at {middle} mm (RAS)."
+            f"of the open cortex is at {middle} mm (RAS)."
         )
     arm = nearest - site.origin
     touch = Touch(float(arm @ site.right), float(arm @ site.up), newton)

@@ -129,8 +129,8 @@ def list_playable(args: argparse.Namespace, theatre: PatientSetup, scenes: Seque
     left = [] if args.scenes else [scene for scene in scenes if theatre.is_without_locator(scene)]
     if left:
         names = ", ".join(scene.name for scene in left)
-        said = f"no {names}: this anatomy has no locator, which `sulcus locator` makes"
-        print(f"{args.program}: {said}", file=sys.stderr)
+        message = f"no {names}: this anatomy has no locator. Make one with `sulcus locator`"
+        print(f"{args.program}: {message}", file=sys.stderr)
     return [scene for scene in scenes if scene not in left]
 
 
@@ -150,8 +150,8 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
             none = (
                 "no model exists next to this anatomy; `sulcus train` trains one" if scene.sight is None else TRUTH_TEXT
             )
-            why = next(iter(theatre.list_rejections(scene).values()), none)
-            print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {why}", file=sys.stderr)
+            reason = next(iter(theatre.list_rejections(scene).values()), none)
+            print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {reason}", file=sys.stderr)
         default, best = theatre.select_default(scene), theatre.select_best(scene)
         if args.deformer is None and best in theatre.models and default != scene.deformer:
             from surrogate.model.guarded import describe_error, get_held_out_error

@@ -186,8 +186,7 @@ class Learned:
                 raise InputError(
                     f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was trained on "
                     f"{unit * most:.3g} {symbol} at most: give up to {MAX_TRAINING_RATIO:g} times that, or ask the "
-                    "finite "
-                    "elements."
+                    "finite elements."
                 )
         away = find_nearest(pushed.point[doubtful], self._patch.points)[1]
         if (away > pushed.footprint[doubtful]).any():  # away from nodes, but perhaps not from triangles
