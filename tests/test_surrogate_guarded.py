@@ -190,7 +190,7 @@ def test_default_deformer_is_model_alone_where_valid(theatre, mean, bound, who):
     some = replace(theatre, models={"series-gp": replace(model, bound=bound, held_out=stated)})
     assert some.select_default(small()) == who and some.select_best(small()) == "series-gp"
     said = describe_error(some.models["series-gp"])
-    assert said.endswith(": scenes play it guarded" if who == GUARDED else ": it may answer alone")
+    assert said.endswith(": scenes play it guarded" if who == GUARDED else ": scenes play it without FEM")
 
 
 def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):

@@ -186,7 +186,7 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, small_box,
     assert main(["simulate", str(folder / "box.vtu"), "--out", little, *count]) == 0
     assert main(["train", little, "--out", few, "--learners", "linear"]) == 0
     printed, (weak,) = capsys.readouterr().out, [known.weak for known in read_reported_errors(few).values()]
-    said = "scenes play it guarded" if weak else "it may answer alone"
+    said = "scenes play it guarded" if weak else "scenes play it without FEM"
     assert re.search(rf"\(limit [\d.]+ (?:mm|%)\): {said}", printed)
     assert main(["judge", few, fresh]) == 0
     printed = capsys.readouterr().out

@@ -209,7 +209,7 @@ def _format_report(figures: dict) -> str:
         *(f"{name} {held} nodes that do not move" for name, held in figures["septa_nodes"].items()),
         *_format_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
         f"opening: {_format_place(figures['opening'])}",
-        "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} at the skull, {held_nodes} held",
+        "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} at the skull, {held_nodes} fixed",
         "written to {mesh}" + (", intensities to {t1}" if figures["t1"] else "") + " in {seconds} s",
     ]
     return "\n".join(lines).format(**figures)

@@ -1,4 +1,4 @@
-"""`sulcus train`: fit the learners to a data set, score them on left-out discs, and say who wins."""
+"""`sulcus train`: fit the learners to a data set, and compare their errors on held-out discs."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
 
 
 def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
-    notes = [f"{failed} cases that did not converge were excluded."] if failed else []
+    notes = [f"{failed} unreliable solutions were excluded."] if failed else []
     notes += [words for words in [describe_rejected(preset)] if words]
     bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
     return "\n".join(
@@ -113,8 +113,8 @@ def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
             "error at the tumour's vertices on the held-out loads, relative to FEM on the same mesh:",
             format_scores(trained.scores, 1e3 * trained.motion),
             f"95th percentile of the maximum vertex error on held-out loads [mm]: {bounds}; scenes use the smallest",
-            *(f"on those discs {name} is {describe_error(model)}" for name, model in trained.models.items()),
-            *(f"on those discs bounds of {name} cover {found}" for name, found in trained.left_out.items()),
+            *(f"on those discs, {name}: {describe_error(model)}" for name, model in trained.models.items()),
+            *(f"on those discs, bounds of {name} cover {found}" for name, found in trained.left_out.items()),
             *(
                 f"on those discs, bounds of the distance from tip to tumour by {name} cover {found}"
                 for name, found in trained.distance_left_out.items()

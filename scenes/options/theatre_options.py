@@ -158,7 +158,7 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
 
             model = theatre.models[best]
             if get_held_out_error(model).weak:
-                print(f"{args.program}: on left-out cortex {best} is {describe_error(model)}", file=sys.stderr)
+                print(f"{args.program}: on held-out cortex, {best}: {describe_error(model)}", file=sys.stderr)
         return args.deformer or default
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
