@@ -1,6 +1,6 @@
 """A mesh of your own: a beam from another program, bent by a force at its end.
 
-Here meshio writes the file, as your mesher would. `read_mesh` reads it, an `Anatomy` says which nodes are held, and
+Here meshio writes the file, as your mesher would. `read_mesh` reads it, an `Anatomy` says which nodes are fixed, and
 `Nodal` says which are pulled. `sulcus solve` does the same where the file holds point data `fixed` and `force`.
 """
 
@@ -23,10 +23,10 @@ meshio.write("beam.vtu", meshio.Mesh(grid, [("tetra", tets)]))
 
 mesh = read_mesh("beam.vtu", unit="mm").mesh
 x = mesh.nodes[:, 0]
-held, end = x < 1e-6, x > LENGTH - 1e-6
+fixed, end = x < 1e-6, x > LENGTH - 1e-6
 beam = Anatomy(
     mesh,
-    held=np.repeat(held[:, None], 3, axis=1),
+    fixed=np.repeat(fixed[:, None], 3, axis=1),
     slide_normal=np.zeros_like(mesh.nodes),  # no skull
     craniotomy=np.zeros(len(x), bool),  # and no opening in it
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class Anatomy:
     ----------
     mesh
         Tetrahedra; regions `BRAIN_LABEL`, `TUMOUR_LABELS` if there is a tumour, and those of `PART_LABELS`.
-    held
+    fixed
         Mask (V, 3) of displacement components that are prescribed (zero unless a load sets them).
     slide_normal
         Unit outward normals (V, 3) of nodes under the skull, zero elsewhere. `Bonded`, `Slide` and `SkullContact`
@@ -62,16 +63,16 @@ class Anatomy:
     """
 
     mesh: TetMesh
-    held: np.ndarray
+    fixed: np.ndarray
     slide_normal: np.ndarray
     craniotomy: np.ndarray
 
     def __post_init__(self) -> None:
         count = len(self.mesh.nodes)
-        object.__setattr__(self, "held", np.ascontiguousarray(self.held, bool))
+        object.__setattr__(self, "fixed", np.ascontiguousarray(self.fixed, bool))
         object.__setattr__(self, "slide_normal", np.ascontiguousarray(self.slide_normal, np.float64))
         object.__setattr__(self, "craniotomy", np.ascontiguousarray(self.craniotomy, bool))
-        for name, shape in (("held", (count, 3)), ("slide_normal", (count, 3)), ("craniotomy", (count,))):
+        for name, shape in (("fixed", (count, 3)), ("slide_normal", (count, 3)), ("craniotomy", (count,))):
             if getattr(self, name).shape != shape:
                 raise InputError(f"{name} has shape {getattr(self, name).shape}: this mesh needs {shape}.")
         length = np.linalg.norm(self.slide_normal, axis=1)
@@ -107,12 +108,12 @@ class Anatomy:
         middles = None if mesh.middles is None else mesh.middles[left]
         rest = Anatomy(
             TetMesh(mesh.nodes, mesh.tets[left], mesh.region[left], middles),
-            self.held, self.slide_normal, self.craniotomy,
+            self.fixed, self.slide_normal, self.craniotomy,
         )  # fmt: skip
         orphaned = rest.orphaned
         return Anatomy(
             rest.mesh,
-            self.held | orphaned[:, None],
+            self.fixed | orphaned[:, None],
             np.where(orphaned[:, None], 0.0, self.slide_normal),
             self.craniotomy & ~orphaned,
         )
@@ -141,12 +142,12 @@ class Anatomy:
     @cached_property
     def bare(self) -> np.ndarray:
         """Mask (S,) of surface triangles with a corner that is neither fixed nor sliding: tools may touch them."""
-        covered = np.logical_or(self.held.any(axis=1), self.slide_normal.any(axis=1))
+        covered = np.logical_or(self.fixed.any(axis=1), self.slide_normal.any(axis=1))
         return np.logical_not(covered[self.mesh.surface].all(axis=1))
 
     @cached_property
     def digest(self) -> str:
         """Hash of the mesh and its boundary conditions."""
-        return compute_digest(*self.mesh.arrays, self.held, self.slide_normal, self.craniotomy)
+        return compute_digest(*self.mesh.arrays, self.fixed, self.slide_normal, self.craniotomy)
 
-    without = remove_elements  # Former names, for one release.
+    without, held = remove_elements, property(attrgetter("fixed"))  # Former names, for one release.

@@ -95,14 +95,14 @@ def compile_problem(
     terms: list[Term] = []
     own: list[Term] = []
     barriers: list[Barrier] = []
-    held, normal = np.zeros_like(anatomy.held), np.zeros_like(anatomy.slide_normal)
+    held, normal = np.zeros_like(anatomy.fixed), np.zeros_like(anatomy.slide_normal)
     pulsation = next((effect for effect in effects if isinstance(effect, Pulsation)), None)
     for effect in effects:
         match effect:
             case Elasticity():
                 terms += _build_elasticity(effect, space, device, pulsation=pulsation)
             case Held():
-                held = held | anatomy.held
+                held = held | anatomy.fixed
             case Bonded():
                 held = held | (anatomy.slide_normal != 0.0).any(axis=1)[:, None]
             case Slide():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 import warp as wp
@@ -51,21 +52,24 @@ class DebondedSolution:
 
     Parameters
     ----------
-    answer
+    deformation
         Equilibrium; its `bond` is the largest traction ratio of intact bonds.
     sliding, free
         Debonded mesh vertices (n,): pressed on the skull and sliding without friction, or separated from it.
     rounds
         Number of solves.
-    rested
+    converged
         True if the active set has converged.
     """
 
-    answer: Deformation
+    deformation: Deformation
     sliding: np.ndarray
     free: np.ndarray
     rounds: int
-    rested: bool
+    converged: bool
+
+    # Former names, for one release.
+    answer, rested = property(attrgetter("deformation")), property(attrgetter("converged"))
 
 
 def solve_with_debonding(
@@ -109,7 +113,7 @@ def solve_with_debonding(
     >>> anatomy = read_anatomy(get_template_path())
     >>> place, effects = open_cortex(anatomy).place(), build_push_effects(anatomy, BRAIN)
     >>> found = solve_with_debonding(anatomy, effects, push(place.point, 0.3 * place.inward, 7e-3), element="p1")
-    >>> found.rested, len(found.sliding), len(found.free)
+    >>> found.converged, len(found.sliding), len(found.free)
     (True, 0, 0)
     """
     if len(loads) != 1:
@@ -123,8 +127,8 @@ def solve_with_debonding(
     last, rounds = None, 0
     while True:
         rounds += 1
-        held = anatomy.held | bonded[:, None]
-        body = replace(anatomy, held=held, slide_normal=np.where(sliding[:, None], anatomy.slide_normal, 0.0))
+        held = anatomy.fixed | bonded[:, None]
+        body = replace(anatomy, fixed=held, slide_normal=np.where(sliding[:, None], anatomy.slide_normal, 0.0))
         fem = Fem(body, (*others, Slide()), accuracy, device, element=element)
         last = fem.deform(loads, start=last)
         force = _compute_reactions(fem, loads, last)
@@ -134,14 +138,14 @@ def solve_with_debonding(
         pressed = (bonded & ~holding | sliding) & (pull <= tearing.tension_tolerance * -pull.min())
         passing = (last.displacement[0] * anatomy.slide_normal).sum(axis=1) > tearing.penetration_tolerance
         pressed |= covered & ~bonded & ~sliding & passing
-        rested = bool((holding == bonded).all() and (pressed == sliding).all())
-        if rested or rounds == tearing.max_solves or not last.outcome[0].good:
+        converged = bool((holding == bonded).all() and (pressed == sliding).all())
+        if converged or rounds == tearing.max_solves or not last.outcome[0].good:
             break
         bonded, sliding = holding, pressed
     most = share[bonded].max(initial=0.0)
     off = covered & ~bonded & ~sliding
     return DebondedSolution(
-        replace(last, bond=np.array([most])), np.flatnonzero(sliding), np.flatnonzero(off), rounds, rested
+        replace(last, bond=np.array([most])), np.flatnonzero(sliding), np.flatnonzero(off), rounds, converged
     )
 
 

@@ -70,7 +70,7 @@ def _get_enclosing_region(label: int) -> int:
 
 @dataclass(frozen=True)
 class Held:
-    """Fixed nodes: components marked in `Anatomy.held` do not move, or as `Prescribed` loads define."""
+    """Fixed nodes: components marked in `Anatomy.fixed` do not move, or as `Prescribed` loads define."""
 
 
 @dataclass(frozen=True)

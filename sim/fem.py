@@ -333,7 +333,7 @@ class Fem:
     ) -> Deformation:
         """Build the deformation from a solver result, with reactions, warm-start data `more` and `seconds` by stage."""
         solved = time.perf_counter()
-        self.problem.begin(replace(cases, share=found.path_fraction, anew=found.restarted))
+        self.problem.begin(replace(cases, share=found.path_fraction, restarted=found.restarted))
         memory = dict(self.problem.end(found.u))
         displaced = cases.loads.get(Displaced) is not None
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None

@@ -19,13 +19,13 @@ def in_a_skull() -> Anatomy:
     """A small box on a floor that is held, with a skull round its sides, off the origin as openings are."""
     box = make_box(cells=(8, 8, 5), spacing=9e-3, tumour=12e-3, opening=30e-3)
     nodes = box.mesh.nodes
-    normal, held = np.zeros_like(nodes), box.held.copy()
+    normal, held = np.zeros_like(nodes), box.fixed.copy()
     for axis in (0, 1):
         side = (np.abs(nodes[:, axis]) > 36e-3 - 1e-9) & (nodes[:, 2] > -45e-3 + 1e-9) & ~normal.any(axis=1)
         normal[side] = np.sign(nodes[side]) * np.eye(3)[axis]
         held[side] = False
     mesh = replace(box.mesh, nodes=nodes + [0.04, 0.03, 0.02])
-    return replace(box, mesh=mesh, held=held, slide_normal=normal)
+    return replace(box, mesh=mesh, fixed=held, slide_normal=normal)
 
 
 def dent(body: Anatomy, random: np.random.Generator) -> np.ndarray:

@@ -68,7 +68,7 @@ def test_every_peer_can_be_named():
 
 
 def test_a_case_holds_what_slides_and_carries_the_whole_push(box, case):
-    assert case.held.sum() == (box.held.any(axis=1) | box.slide_normal.any(axis=1)).sum() > 0
+    assert case.held.sum() == (box.fixed.any(axis=1) | box.slide_normal.any(axis=1)).sum() > 0
     assert not case.held.all()
     total = np.linalg.norm(case.force.sum(axis=1), axis=1)
     assert ((total > 0.04) & (total < 0.41)).all()

@@ -18,7 +18,7 @@ class TestAdapting:
         assert 0.8 * volume[1] <= volume[0] <= 0.8 * volume[1] + element
         assert after.mesh.volumes.sum() == pytest.approx(study_box.mesh.volumes.sum() - volume[1] + volume[0])
         assert len(np.unique(after.mesh.tets)) == len(after.mesh.nodes)
-        for name in ("held", "slide_normal"):
+        for name in ("fixed", "slide_normal"):
             known = {
                 tuple(place): tuple(value)
                 for place, value in zip(study_box.mesh.nodes, getattr(study_box, name), strict=True)

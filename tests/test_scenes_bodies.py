@@ -116,7 +116,7 @@ def test_files_say_what_their_models_state(made):
     (model,) = load(path, anatomy).values()
     (to_body_path(folder, 1)).mkdir()  # of a body that plays by another's model there is none
     assert (
-        read_reported_errors(path) == {"linear": HeldOutError(model.bound, model.left_out)}
+        read_reported_errors(path) == {"linear": HeldOutError(model.bound, model.held_out)}
         and model.bound > MAX_VERTEX_ERROR
     )
     assert list_model_errors(folder) == {0: HeldOutError(model.bound, None)}

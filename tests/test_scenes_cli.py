@@ -88,7 +88,7 @@ def folder(box, tmp_path_factory):
     theatre = theatre_of(box)
     put(theatre, folder / "box.vtu")
     put(theatre, folder / "other.vtu")
-    write_anatomy(folder / "other.vtu", replace(box, held=box.held | True))
+    write_anatomy(folder / "other.vtu", replace(box, fixed=box.fixed | True))
     write_mesh(folder / "mesh.vtu", box.mesh, {})
     write_anatomy(folder / "closed.vtu", base_held(cube((2, 2, 2))))
     for name in ("text.npz", "text.vtu"):

@@ -44,7 +44,7 @@ def sliding_box() -> Anatomy:
         for side, way in ((low, -1.0), (high, 1.0)):
             normal[nodes[:, axis] == side[axis]] = way * np.eye(3)[axis]
     floor = nodes[:, 2] == low[2]
-    return replace(made, held=np.repeat(floor[:, None], 3, axis=1), slide_normal=np.where(floor[:, None], 0.0, normal))
+    return replace(made, fixed=np.repeat(floor[:, None], 3, axis=1), slide_normal=np.where(floor[:, None], 0.0, normal))
 
 
 BODY = sliding_box()

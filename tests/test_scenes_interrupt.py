@@ -38,7 +38,7 @@ class Demo:
         self.solve.join()
         print("all closed", flush=True)
 
-theatre = Names(models={"linear": Names(bound=1e-4, left_out=None)}, learned_tissue=None, anatomy=Names(mesh=None),
+theatre = Names(models={"linear": Names(bound=1e-4, held_out=None)}, learned_tissue=None, anatomy=Names(mesh=None),
                 select_best=lambda scene: "linear", select_default=lambda scene: "linear",
                 select_default_scene=lambda: "none",
                 select_models=lambda scene: True, list_rejections=lambda scene: {},

@@ -91,7 +91,7 @@ def test_solving_does_not_replace_its_own_mesh(tmp_path, capsys):
     body = base_held(cube((2, 2, 2)))
     path = tmp_path / "mesh.vtu"
     force = top_forces(body.mesh, np.array([0.0, 0.0, -0.01]))[0]
-    write_mesh(path, body.mesh, {"fixed": body.held.astype(np.uint8), "force": force})
+    write_mesh(path, body.mesh, {"fixed": body.fixed.astype(np.uint8), "force": force})
     before = path.read_bytes()
     (tmp_path / "link.vtu").symlink_to(path)
     for out in ("mesh.vtu", "link.vtu"):

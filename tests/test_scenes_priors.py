@@ -25,7 +25,7 @@ SAME = PatientSample(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
 class TestPriors:
     def test_each_says_what_it_is_and_where_it_is_from(self):
         assert len({prior.name for prior in PRIORS}) == len(PRIORS)
-        assert all(prior.what and prior.source for prior in PRIORS)
+        assert all(prior.meaning and prior.source for prior in PRIORS)
 
     def test_draws_cover_each_prior_evenly(self):
         """One draw in each of so many parts of equal probability."""

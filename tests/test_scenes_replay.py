@@ -132,9 +132,9 @@ class TestReel:
 def test_jumps_use_frames_where_brain_separates(theatre) -> None:
     """And nowhere else; tissue that relaxes is answered in order."""
     box = theatre.anatomy
-    sides = box.held.any(axis=1) & (box.mesh.nodes[:, 2] > box.mesh.nodes[:, 2].min() + 1e-9)
+    sides = box.fixed.any(axis=1) & (box.mesh.nodes[:, 2] > box.mesh.nodes[:, 2].min() + 1e-9)
     normal = np.where(sides[:, None], [1.0, 0.0, 0.0], 0.0)
-    sliding = replace(box, held=box.held & ~sides[:, None], slide_normal=normal)
+    sliding = replace(box, fixed=box.fixed & ~sides[:, None], slide_normal=normal)
 
     def course(name: str, anatomy: Anatomy, **values: object) -> ReplayOrder | None:
         scene = replace(find_scene(name), **values)

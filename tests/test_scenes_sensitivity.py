@@ -43,20 +43,20 @@ def anatomy():
     """A small box whose sides slide."""
     box = make_box(cells=(8, 8, 5), spacing=9e-3, tumour=12e-3, opening=27e-3)
     nodes = box.mesh.nodes
-    normal, held = np.zeros_like(nodes), box.held.copy()
+    normal, held = np.zeros_like(nodes), box.fixed.copy()
     for axis in (0, 1):
         side = (np.abs(nodes[:, axis]) > 36e-3 - 1e-9) & (nodes[:, 2] > -45e-3 + 1e-9) & ~normal.any(axis=1)
         normal[side, axis] = 1.0
         held[side] = False
-    return replace(box, held=held, slide_normal=normal)
+    return replace(box, fixed=held, slide_normal=normal)
 
 
 @pytest.fixture(scope="module")
 def found(anatomy):
-    """All rows of the linear law, by what and now."""
+    """All rows of the linear law, by factor and changed value."""
     study = SensitivityStudy(anatomy, draw("palpation", anatomy, 4, 0), LINEAR, TIGHT, "cpu")
     all_rows = list(measure_variants(study, list_variants(anatomy, LINEAR, ["smoothed"])))
-    return {(row.variant.what, row.variant.now): row for row in all_rows}
+    return {(row.variant.factor, row.variant.now): row for row in all_rows}
 
 
 def test_every_thing_has_its_row(found):

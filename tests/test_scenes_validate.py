@@ -42,4 +42,4 @@ def test_statistics_cover_whole_episodes_and_name_missing(box, tmp_path, capsys)
     unit, gone, *_, frames, error = capsys.readouterr().out.splitlines()
     assert "'mN'" in unit and "episode_000002.h5: is gone; episodes.csv lists it" in gone
     assert "1 of 3 episodes are whole: 4 frames, 4 of them solved" in frames
-    assert "0.000200 mm on average, 0.000200 mm at most" in error
+    assert "mean 0.000200 mm, maximum 0.000200 mm" in error

@@ -185,7 +185,7 @@ def test_what_comes_from_outside_or_was_cut_is_zero_and_counted(box, fields):
     cut = warp_fields(box, dimple(box.mesh.nodes), 2e-3, box.remove_elements(np.flatnonzero(box.mesh.region == 2)))
     affine[2, 3] = -40e-3
     out, counts = warp_values(np.full((20, 20, 36), 9, np.uint8), affine, cut, 0)
-    assert counts.gone > 1000 and (out == 0).sum() == counts.gone + counts.outside
+    assert counts.resected > 1000 and (out == 0).sum() == counts.resected + counts.outside
 
 
 def nan_place(path):

@@ -114,7 +114,7 @@ SHIFT = np.array([0.3, -0.2, 0.1])
 
 def turned(anatomy: Anatomy) -> Anatomy:
     mesh = anatomy.mesh
-    return hold(TetMesh(mesh.nodes @ TURN.T + SHIFT, mesh.tets, mesh.region), anatomy.held)
+    return hold(TetMesh(mesh.nodes @ TURN.T + SHIFT, mesh.tets, mesh.region), anatomy.fixed)
 
 
 BALL, ROD, BLADE = Ball(6e-3), Capsule(3e-3, 0.02), Spatula(0.012, 0.02, 1.5e-3)

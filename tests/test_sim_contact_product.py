@@ -69,7 +69,7 @@ def test_contact_product_ends_outside_or_says_so(skull: str, element: str) -> No
         found = fem.deform(Loads((Touching(poses),), np.full(len(CASES), step or 0.0)))
         assert np.isfinite(found.displacement).all() and np.isfinite(found.reaction).all()
         bone = anatomy.mesh.surface[
-            (anatomy.held.all(axis=1) | anatomy.slide_normal.any(axis=1))[anatomy.mesh.surface].all(axis=1)
+            (anatomy.fixed.all(axis=1) | anatomy.slide_normal.any(axis=1))[anatomy.mesh.surface].all(axis=1)
         ]
         share = np.array([(i, j, 12 - i - j) for i in range(13) for j in range(13 - i)]) / 12.0
         solid = np.einsum("qc,scx->sqx", share, anatomy.mesh.nodes[bone]).reshape(-1, 3)

@@ -164,7 +164,7 @@ def test_a_skull_that_lets_go(box, element, precision):
     accuracy = Accuracy(1e-7) if precision == "float64" else TRAIN
     height = box.mesh.nodes[:, 2]
     low = height < height.min() + 1e-9
-    body = replace(box, held=box.held & ~low[:, None], slide_normal=np.outer(low, [0.0, 0.0, -1.0]))
+    body = replace(box, fixed=box.fixed & ~low[:, None], slide_normal=np.outer(low, [0.0, 0.0, -1.0]))
     effects = (Elasticity(Material("neo-hookean", 1000.0, 0.45)), Held(), Gravity((0.0, 1.0, 0.0)), SkullContact())
     way = np.array([[0.0, 0.0, -1.0], [0.0, 0.5, 1.0], [0.3, 0.0, -1.0], [0.0, 0.0, 1.0]])
     loads = build_posture(way, -1.0)

@@ -47,9 +47,9 @@ def test_overloaded_bonds_release_outside_the_skull(slab, element):
     found = solve_with_debonding(slab, effects(strength), loads, REFERENCE, "cpu", element)
     bonded = slab.slide_normal.any(axis=1)
     gone = np.union1d(found.sliding, found.free)
-    assert found.rested and found.rounds > 1 and 0 < len(gone) < bonded.sum() and bonded[gone].all()
-    assert 0.0 < found.answer.bond[0] <= 1.0
-    moved = found.answer.displacement[0]
+    assert found.converged and found.rounds > 1 and 0 < len(gone) < bonded.sum() and bonded[gone].all()
+    assert 0.0 < found.deformation.bond[0] <= 1.0
+    moved = found.deformation.displacement[0]
     kept = np.setdiff1d(np.flatnonzero(bonded), gone)
     assert not moved[kept].any()  # what holds, holds
     assert np.abs(moved[found.sliding, 2]).max(initial=0.0) < 1e-9 and np.abs(moved[gone]).max() > 1e-5
@@ -74,20 +74,20 @@ def test_without_strength_the_skull_only_presses(slab, load):
     """Signorini's conditions: nothing passes, nothing is pulled, and what is off bears nothing."""
     loads = load(slab)
     found = solve_with_debonding(slab, effects(1e-6), loads, REFERENCE, "cpu", "p1")
-    assert found.rested and found.answer.bond[0] == 0.0 and len(found.sliding) and len(found.free)
-    held = slab.held.copy()
+    assert found.converged and found.deformation.bond[0] == 0.0 and len(found.sliding) and len(found.free)
+    held = slab.fixed.copy()
     held[found.sliding, 2] = True
     byhand = Fem(hold(slab.mesh, held), (Elasticity(TISSUE), Held(), NodalForce()), REFERENCE, "cpu", element="p1")
-    np.testing.assert_allclose(byhand.deform(loads).displacement, found.answer.displacement, atol=1e-9)
-    assert found.answer.displacement[0, found.free, 2].min() > -1e-7 and found.rounds < 20
+    np.testing.assert_allclose(byhand.deform(loads).displacement, found.deformation.displacement, atol=1e-9)
+    assert found.deformation.displacement[0, found.free, 2].min() > -1e-7 and found.rounds < 20
 
 
 def test_a_bond_that_holds_is_solved_once(slab):
     loads = lifted(slab, 0.05)
     found = solve_with_debonding(slab, effects(1e5), loads, REFERENCE, "cpu")
     whole = Fem(slab, effects(1e5), REFERENCE, "cpu").deform(loads)
-    assert found.rounds == 1 and found.rested and not len(found.sliding) and not len(found.free)
-    np.testing.assert_array_equal(found.answer.displacement, whole.displacement)
+    assert found.rounds == 1 and found.converged and not len(found.sliding) and not len(found.free)
+    np.testing.assert_array_equal(found.deformation.displacement, whole.displacement)
 
 
 def test_what_cannot_tear_is_refused(slab):

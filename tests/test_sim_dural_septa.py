@@ -93,8 +93,8 @@ def test_beyond_it_the_brain_moves_less(said, labels, subject):
     walls = read_anatomy(labels.with_name("a.vtu"))
     mesh = walls.mesh
     plain = add_boundary_conditions(mesh, subject.site, PLAN.craniotomy, PLAN.placement)
-    assert said["septa_nodes"] == {"falx": walls.held.all(axis=1).sum() - plain.held.all(axis=1).sum()}
-    assert not walls.slide_normal[walls.held.any(axis=1)].any() and not (walls.held.T & walls.craniotomy).any()
+    assert said["septa_nodes"] == {"falx": walls.fixed.all(axis=1).sum() - plain.fixed.all(axis=1).sum()}
+    assert not walls.slide_normal[walls.fixed.any(axis=1)].any() and not (walls.fixed.T & walls.craniotomy).any()
     place = open_cortex(plain).find_nearest(open_cortex(plain).origin)
     loads = push(place.point, 0.2 * place.inward, footprint=8e-3)
     far, moved = mesh.nodes[:, 0] < 1e-3 * MIDDLE[0] - 8e-3, []
@@ -110,7 +110,7 @@ def test_an_opening_over_it_is_free(said, labels, subject):
     mesh = read_anatomy(labels.with_name("a.vtu")).mesh
     over = replace(subject, site=1e-3 * (MIDDLE + [0.0, 0.0, 42.0]))
     anatomy = add_boundary_conditions(mesh, over.site, PLAN.craniotomy, PLAN.placement, septa=subject.septa)
-    assert anatomy.craniotomy.sum() > 6 and not anatomy.held[anatomy.craniotomy].any()
+    assert anatomy.craniotomy.sum() > 6 and not anatomy.fixed[anatomy.craniotomy].any()
 
 
 def test_it_counts_as_brain(labels, subject, tmp_path, capsys):

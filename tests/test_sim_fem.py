@@ -255,7 +255,7 @@ def stubborn() -> tuple[Anatomy, Loads]:
     """The top is pulled to three times the height and turned aside."""
     top = MESH.nodes[:, 2] > 0.1 - 1e-9
     value = np.where(top[:, None], [0.15, 0.0, 0.2], 0.0)
-    return hold(MESH, ANATOMY.held.all(axis=1) | top), Loads((Prescribed(value[None]),))
+    return hold(MESH, ANATOMY.fixed.all(axis=1) | top), Loads((Prescribed(value[None]),))
 
 
 def test_load_steps_rescue_what_newton_fails_on() -> None:

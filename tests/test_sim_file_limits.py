@@ -41,7 +41,7 @@ def test_a_limit_that_was_set_before_stays_below() -> None:
 
 def test_a_flat_body_is_measured_along_its_longest_side(tmp_path: Path) -> None:
     mesh = TetMesh(BODY.mesh.nodes * [1.0, 1.0, 0.2], BODY.mesh.tets, BODY.mesh.region)
-    fields = {"held": BODY.held * 1, "slide_normal": np.zeros_like(mesh.nodes), "craniotomy": BODY.craniotomy * 1}
+    fields = {"held": BODY.fixed * 1, "slide_normal": np.zeros_like(mesh.nodes), "craniotomy": BODY.craniotomy * 1}
     write_mesh(tmp_path / "a.vtu", mesh, fields)
     assert np.ptp(mesh.nodes, axis=0).min() < 5e-3
     assert read_anatomy(tmp_path / "a.vtu").mesh.digest == mesh.digest

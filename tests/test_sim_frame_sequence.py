@@ -121,7 +121,7 @@ def test_a_start_that_is_not_fit_is_the_ladders(fem):
     torn = fem.deform(pushed(1e-3), guess(good.displacement + rng.normal(0.0, 0.1, good.displacement.shape)))
     assert torn.outcome == (Outcome.CONVERGED_ANEW,)
     loose = good.displacement.copy()
-    loose[0, BODY.held.any(axis=1)] += 1e-4
+    loose[0, BODY.fixed.any(axis=1)] += 1e-4
     assert not isinstance(fem.deform(pushed(1e-3), guess(loose)).warm, Kept)
     assert isinstance(fem.deform(pushed(1e-3), guess(good.displacement)).warm, Kept)
 

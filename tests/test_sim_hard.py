@@ -74,7 +74,7 @@ class Hard:
 
     def residual(self, u: np.ndarray) -> float:
         """Of the whole load at u (V, 3) [m], against the larger of the load and the internal forces."""
-        free = ~self.anatomy.held
+        free = ~self.anatomy.fixed
         inner = internal_forces(
             self.mesh, self.tissues, u, "p2" if self.mesh.middles is not None else self.element or "p1"
         )

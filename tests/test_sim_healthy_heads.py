@@ -142,7 +142,7 @@ def test_tumour_is_drawn_in_mask_with_t1(masked, capsys):
     large, factor = json.loads(text), (1400 / own["brain_ml"]) ** (1 / 3)
     assert code == 0 and large["brain_ml"] == pytest.approx(1400, rel=0.01) and large["septa_nodes"]["falx"] > 10
     walls = read_anatomy(masked / "large.vtu")
-    held = walls.mesh.nodes[walls.held.all(axis=1), 0]
+    held = walls.mesh.nodes[walls.fixed.all(axis=1), 0]
     assert (np.abs(held - 10e-3) < 10e-3).sum() > 0.8 * large["septa_nodes"]["falx"]  # round the mask's middle
     assert large["tumour_ml"] == pytest.approx(own["tumour_ml"], rel=0.02)  # the tumour keeps its size
     grown = np.array(large["opening"]["at_mm"]) - [10.0, 60.0, -40.0]

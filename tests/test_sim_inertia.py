@@ -105,7 +105,7 @@ def test_damping_is_the_exponential_of_a_free_flight() -> None:
     fem = Fem(BLOCK, [soft, Held(), Inertia(DENSITY, 5.0)], replace(TIGHT, limit_strain=False), "cpu", element="p1")
     errors = []
     for steps in (10, 20):
-        velocity = np.where(BLOCK.held, 0.0, 1.0)[None]
+        velocity = np.where(BLOCK.fixed, 0.0, 1.0)[None]
         answer = guess(np.zeros_like(velocity))
         object.__setattr__(answer, "memory", {"inertia": velocity})
         answer = after(fem, answer, steps, 0.2 / steps)

@@ -85,7 +85,7 @@ def test_every_affine_gives_the_same_brain(tmp_path, kind):
     # Opened over the tumour, held lowest.
     opening = mesh.nodes[anatomy.craniotomy].mean(axis=0) - MIDDLE
     assert opening @ (TUMOUR - MIDDLE) > 0.9 * np.linalg.norm(opening) * np.linalg.norm(TUMOUR - MIDDLE)
-    assert mesh.nodes[anatomy.held.all(axis=1), 2].max() < MIDDLE[2] - 0.03
+    assert mesh.nodes[anatomy.fixed.all(axis=1), 2].max() < MIDDLE[2] - 0.03
 
 
 def test_the_skull_is_not_opened_from_below(tmp_path):

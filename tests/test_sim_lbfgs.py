@@ -23,7 +23,7 @@ from sim.runtime.device import Device, find_device
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
 ROWS = MESH.nodes.size
-FREE = ~ANATOMY.held.ravel()
+FREE = ~ANATOMY.fixed.ravel()
 TOTAL = np.array([[0.0, 0.0, -0.1], [0.2, 0.1, -0.4], [0.0, 0.0, 2.0], [0.01, 0.0, 0.0], [0.6, 0.0, -0.9], [0, 0, 0]])
 FINE = 1e-9
 

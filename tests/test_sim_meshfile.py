@@ -50,7 +50,7 @@ def test_anatomy_round_trip_is_exact(tmp_path: Path, mesh: TetMesh) -> None:
     normal = rng.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     whole = hold(mesh, rng.random((count, 3)) < 0.3, normal * (rng.random((count, 1)) < 0.5))
-    anatomy = Anatomy(mesh, whole.held, whole.slide_normal, rng.random(count) < 0.5)
+    anatomy = Anatomy(mesh, whole.fixed, whole.slide_normal, rng.random(count) < 0.5)
     write_anatomy(tmp_path / "a.vtu", anatomy)
     assert read_anatomy(tmp_path / "a.vtu").digest == anatomy.digest
 

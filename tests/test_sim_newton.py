@@ -30,7 +30,7 @@ from sim.runtime.device import Device, find_device
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
 COUNT, ROWS = len(MESH.nodes), MESH.nodes.size
-FREE = ~ANATOMY.held
+FREE = ~ANATOMY.fixed
 CEILING = 0.102
 TIGHT = Accuracy(tolerance=1e-10)
 
@@ -221,7 +221,7 @@ def test_negative_curvature_is_met_and_left(device: Device) -> None:
 
     def least(u: np.ndarray) -> float:
         problem.linearise(device.upload(u), np.zeros(1, bool))
-        free = np.flatnonzero(~fem.anatomy.held.ravel())
+        free = np.flatnonzero(~fem.anatomy.fixed.ravel())
         K = np.zeros((len(free), len(free)))
         for column, row in enumerate(free):
             p, out = device.upload(np.eye(problem.rows)[:, [row]]), device.allocate(problem.rows, 1)

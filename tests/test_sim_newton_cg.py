@@ -86,7 +86,7 @@ def test_memory_leaves_with_its_columns(device: Device) -> None:
 
 def test_a_gap_is_closed_by_the_first_whole_step(device: Device) -> None:
     top = MESH.nodes[:, 2] > 0.1 - 1e-9
-    anatomy = type(ANATOMY)(MESH, ANATOMY.held | top[:, None], ANATOMY.slide_normal, ANATOMY.craniotomy)
+    anatomy = type(ANATOMY)(MESH, ANATOMY.fixed | top[:, None], ANATOMY.slide_normal, ANATOMY.craniotomy)
     value = np.where(top[:, None], [1e-3, 0.0, -2e-3], 0.0)
     problem = compile_problem([Elasticity(), Held()], anatomy, device)
     problem.begin(Cases(Loads((Prescribed(value[None]),)), np.zeros(1)))

@@ -218,7 +218,7 @@ class TestMeshes:
     @staticmethod
     def fields() -> dict[str, np.ndarray]:
         return {
-            "held": BODY.held.astype(np.uint8),
+            "held": BODY.fixed.astype(np.uint8),
             "slide_normal": BODY.slide_normal,
             "craniotomy": BODY.craniotomy.astype(np.uint8),
         }

@@ -20,7 +20,7 @@ from sim.runtime.device import Device
 MESH = box((2, 2, 2), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
 ROWS = MESH.nodes.size
-FREE = np.flatnonzero(~ANATOMY.held.ravel())
+FREE = np.flatnonzero(~ANATOMY.fixed.ravel())
 FORCE = top_forces(MESH, np.array([[0.0, 0.1, -0.2], [0.3, 0.0, 0.1]]))
 CRUSHED = np.repeat((MESH.nodes * [0.15, 0.15, -0.55]).reshape(-1, 1), 2, axis=1)
 REST = np.zeros((ROWS, 2))

@@ -102,7 +102,7 @@ def test_only_what_is_asked_for_is_imported() -> None:
 
 def test_an_effect_that_is_not_asked_for_is_not_launched(launches: list[str]) -> None:
     fem = Fem(ANATOMY, [Elasticity(), Held()], TIGHT, "cpu", element="p1")
-    value = np.where(ANATOMY.held, 1e-3, 0.0)[None]
+    value = np.where(ANATOMY.fixed, 1e-3, 0.0)[None]
     fem.deform(Loads((Prescribed(value),)))
     names = {name.split("__")[0] for name in launches}
     assert "average" not in names  # no footprint is moved

@@ -33,14 +33,14 @@ def test_the_body_stays_and_every_edge_is_halved():
 
 def test_what_holds_the_body_holds_it_still(box):
     fine = refine(box)
-    assert fine.held[: len(box.mesh.nodes)].tolist() == box.held.tolist()
+    assert fine.fixed[: len(box.mesh.nodes)].tolist() == box.fixed.tolist()
     # Of the finer surface, what lies inside the opening's triangles is open and the rest is held.
     assert len(fine.open_surface) == 4 * len(box.open_surface)
     surface = np.unique(fine.mesh.surface)
     opening = np.unique(fine.open_surface)
-    rim = ~fine.held[surface].any(axis=1) & ~fine.craniotomy[surface]
+    rim = ~fine.fixed[surface].any(axis=1) & ~fine.craniotomy[surface]
     assert fine.craniotomy[opening].all()
-    assert not (fine.held.any(axis=1) & fine.craniotomy).any()
+    assert not (fine.fixed.any(axis=1) & fine.craniotomy).any()
     # Free and not to be touched: on edges between an open and a held node.
     near = np.abs(np.linalg.norm(fine.mesh.nodes[surface[rim]], axis=1) - 25e-3)
     assert near.max() < 8e-3
@@ -77,7 +77,7 @@ def test_fine_opening_of_a_mesh_plan_is_refined():
 def test_fixed_or_sliding_surface_is_not_open(box):
     everywhere = np.isin(np.arange(len(box.mesh.nodes)), box.mesh.surface)
     fine = refine(replace(box, craniotomy=everywhere))
-    assert fine.craniotomy.any() and not fine.held[fine.craniotomy].any()
+    assert fine.craniotomy.any() and not fine.fixed[fine.craniotomy].any()
 
 
 def test_a_quadratic_mesh_is_refused():

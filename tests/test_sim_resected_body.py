@@ -30,7 +30,7 @@ def compact(anatomy: Anatomy) -> tuple[Anatomy, np.ndarray]:
     tets = np.searchsorted(used, mesh.tets)
     middles = None if mesh.middles is None else np.searchsorted(used, mesh.middles)
     fresh = TetMesh(mesh.nodes[used], tets, mesh.region, middles)
-    return Anatomy(fresh, anatomy.held[used], anatomy.slide_normal[used], anatomy.craniotomy[used]), used
+    return Anatomy(fresh, anatomy.fixed[used], anatomy.slide_normal[used], anatomy.craniotomy[used]), used
 
 
 def solver(steps: Resection = STEPS, element: str | None = "p1", **values: object) -> OperatedFem:
@@ -217,8 +217,8 @@ class TestHardCases:
         assert isinstance(made, OperatedFem)
         left = made.get_remains(1).anatomy
         gone = left.orphaned
-        assert (gone & BODY.held[:, 0]).any() and (gone & normal.any(axis=1)).any() and (gone & opened).any()
-        assert left.held[gone].all() and not left.slide_normal[gone].any() and not left.craniotomy[gone].any()
+        assert (gone & BODY.fixed[:, 0]).any() and (gone & normal.any(axis=1)).any() and (gone & opened).any()
+        assert left.fixed[gone].all() and not left.slide_normal[gone].any() and not left.craniotomy[gone].any()
         compacted, used = compact(left)
         alone = Fem(compacted, effects, TIGHT, "cpu", element="p1").deform(build_posture(DOWN, 0.03))
         answer = made.deform(build_posture(DOWN, 0.03))
@@ -262,7 +262,7 @@ class TestHardCases:
     def test_what_is_left_on_a_hinge_is_a_sentence(self) -> None:
         """One held edge: the piece turns about it."""
         floor = (MESH.nodes[:, 2] < 1e-9) & (MESH.nodes[:, 0] > 0.06 - 1e-9)
-        edge = replace(BODY, held=np.repeat(((MESH.nodes[:, 2] > 0.06 - 1e-9) | floor)[:, None], 3, axis=1))
+        edge = replace(BODY, fixed=np.repeat(((MESH.nodes[:, 2] > 0.06 - 1e-9) | floor)[:, None], 3, axis=1))
         made = build_fem(edge, (*EFFECTS, Resection((self.MIDDLE_LAYER,))), TIGHT, "cpu", element="p1")
         with pytest.raises(InputError, match="can move rigidly in 1 of 6 ways"):
             made.deform(lying([1]))

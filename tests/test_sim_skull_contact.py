@@ -90,8 +90,9 @@ def test_brain_that_starts_at_rest_may_come_far() -> None:
     """As far as without a start: where nothing acted, nothing says how far away the next equilibrium is."""
     skull, rest = body("p1", SkullContact(GAP)).problem.barriers[0], np.zeros((1, len(MESH.nodes), 3))
 
-    def far(displacement: np.ndarray | None, anew: np.ndarray | None = None) -> float:
-        return float(skull.count_gaps(Cases(lifted(1.0), np.zeros(1), displacement=displacement, anew=anew))[0])
+    def far(displacement: np.ndarray | None, restarted: np.ndarray | None = None) -> float:
+        cases = Cases(lifted(1.0), np.zeros(1), displacement=displacement, restarted=restarted)
+        return float(skull.count_gaps(cases)[0])
 
     assert far(None) == far(rest) == far(rest + 1e-4, np.ones(1, bool)) > 10.0 * far(rest + 1e-4)
 
@@ -154,7 +155,7 @@ def test_contradictions_are_sentences(effects: tuple[Effect, ...], sentence: str
 
 
 def test_a_skull_that_touches_nothing_is_pointless() -> None:
-    bare = Anatomy(MESH, LID.held, np.zeros_like(LID.slide_normal), LID.craniotomy)
+    bare = Anatomy(MESH, LID.fixed, np.zeros_like(LID.slide_normal), LID.craniotomy)
     with pytest.raises(InputError, match="SkullContact finds no node"):
         Fem(bare, [Elasticity(), Held(), SkullContact()], REFERENCE, "cpu", element="p1")
 

@@ -72,12 +72,12 @@ def test_leak_is_positive_flux_through_averaged_facets(egg, tilt):
     """Computed again facet by facet: mean displacement times vector area, averaged over 7 mm of covered facets."""
     slides = egg.slide_normal.any(axis=1)
     tilted = normalise_vectors(egg.slide_normal + tilt * np.random.default_rng(1).normal(size=egg.slide_normal.shape))
-    other = Anatomy(egg.mesh, egg.held, np.where(slides[:, None], tilted, 0.0), egg.craniotomy)
+    other = Anatomy(egg.mesh, egg.fixed, np.where(slides[:, None], tilted, 0.0), egg.craniotomy)
     answer = pressed(other, "p1")
     corners, u = egg.mesh.nodes[egg.mesh.surface], answer.displacement[0][egg.mesh.surface].mean(axis=1)
     vector = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flux, area, middle = np.einsum("si,si->s", vector, u), np.linalg.norm(vector, axis=1), corners.mean(axis=1)
-    covered = (slides | egg.held.all(axis=1))[egg.mesh.surface].all(axis=1)
+    covered = (slides | egg.fixed.all(axis=1))[egg.mesh.surface].all(axis=1)
     passed = 0.0
     for row in np.flatnonzero(covered):
         near = covered & (np.linalg.norm(middle - middle[row], axis=1) <= 7e-3)
@@ -127,7 +127,7 @@ def test_of_a_skull_without_an_opening_there_is_no_share(egg):
     whole = np.unique(egg.mesh.surface)
     normal = np.zeros_like(egg.slide_normal)
     normal[whole, 2] = 1.0
-    closed = Anatomy(egg.mesh, egg.held, normal, np.zeros(len(normal), bool))
+    closed = Anatomy(egg.mesh, egg.fixed, normal, np.zeros(len(normal), bool))
     device, space = find_device("cpu", "float64"), discretise(egg.mesh, "p1")
     grown = device.upload((0.01 * egg.mesh.nodes).reshape(-1, 1))
     leak = Leak(closed, space, device)

@@ -34,7 +34,7 @@ GAP = 1e-4
 def half_open(opened: np.ndarray = OPEN) -> Anatomy:
     """A block held from below, under a flat bone, open where nodes (V,) are `opened`."""
     below = hold(MESH, MESH.nodes[:, 2] < 1e-9, (TOP & ~OPEN)[:, None] * [0.0, 0.0, 1.0])
-    return Anatomy(MESH, below.held, below.slide_normal, opened)
+    return Anatomy(MESH, below.fixed, below.slide_normal, opened)
 
 
 def test_how_far_inside_a_straight_edge() -> None:
@@ -56,7 +56,7 @@ def test_how_far_inside_a_round_opening() -> None:
     away = np.linalg.norm(mesh.nodes[:, :2] - 0.035, axis=1)
     opened = top & (away < 0.018)
     lid = hold(mesh, mesh.nodes[:, 2] < 1e-9, (top & ~opened)[:, None] * [0.0, 0.0, 1.0])
-    body = Anatomy(mesh, lid.held, lid.slide_normal, opened)
+    body = Anatomy(mesh, lid.fixed, lid.slide_normal, opened)
     edge = compute_edge_radius(mesh.nodes, find_opening_edge(body))
     points = mesh.nodes[top]
     inside, way = measure_inside_opening(body, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), edge)

@@ -16,7 +16,7 @@ from sim.loads import Loads, Nodal
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 ANATOMY = base_held(MESH)
-FREE = ~ANATOMY.held
+FREE = ~ANATOMY.fixed
 ACCURACY = Accuracy(tolerance=1e-8)
 # Easy, hopeless in so few steps, easy, nothing, and hard enough for load steps.
 TOTAL = np.array([[0.0, 0.0, -0.1], [0.0, 0.0, -40.0], [0.02, 0.0, 0.0], [0.0, 0.0, 0.0], [0.3, 0.0, 0.9]])

@@ -135,7 +135,7 @@ def closed(anatomy: Anatomy) -> Anatomy:
     a, b, c = np.moveaxis(mesh.nodes[mesh.surface], 1, 0)
     facing = np.zeros_like(mesh.nodes)
     np.add.at(facing, mesh.surface, np.cross(b - a, c - a)[:, None])
-    open_to = (facing != 0.0).any(axis=1) & ~anatomy.held.any(axis=1) & ~anatomy.slide_normal.any(axis=1)
+    open_to = (facing != 0.0).any(axis=1) & ~anatomy.fixed.any(axis=1) & ~anatomy.slide_normal.any(axis=1)
     normal = np.where(open_to[:, None], normalise_vectors(facing), anatomy.slide_normal)
     return replace(anatomy, slide_normal=normal)
 

@@ -118,7 +118,7 @@ def test_the_craniotomy_is_wider_than_the_tumour(subject):
 def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
     mesh = anatomy.mesh
     outer = np.unique(mesh.surface)
-    stem, skull = anatomy.held.all(axis=1), anatomy.slide_normal.any(axis=1)
+    stem, skull = anatomy.fixed.all(axis=1), anatomy.slide_normal.any(axis=1)
     sets = np.stack([stem, skull, anatomy.craniotomy])
     assert (sets.sum(axis=0)[outer] == 1).all() and not np.delete(sets, outer, axis=1).any()
     # 50 mm across, along the cortex, and at least the 90 nodes that the seed's experiment leaves free.

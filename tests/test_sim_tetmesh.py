@@ -154,13 +154,13 @@ class TestAnatomy:
         base = hold(mesh, np.zeros(4, bool))
         held = hold(mesh, np.eye(4, 3, dtype=bool))
         normal = hold(mesh, np.zeros(4, bool), np.eye(4, 3))
-        opened = Anatomy(mesh, base.held, base.slide_normal, np.ones(4, bool))
+        opened = Anatomy(mesh, base.fixed, base.slide_normal, np.ones(4, bool))
         assert len({base.digest, held.digest, normal.digest, opened.digest, mesh.digest}) == 5
 
     @pytest.mark.parametrize(
         ("held", "normal", "opened", "sentence"),
         [
-            (np.zeros((4, 2)), np.zeros((4, 3)), np.zeros(4), r"held has shape \(4, 2\)"),
+            (np.zeros((4, 2)), np.zeros((4, 3)), np.zeros(4), r"fixed has shape \(4, 2\)"),
             (np.zeros((4, 3)), np.zeros((3, 3)), np.zeros(4), r"slide_normal has shape"),
             (np.zeros((4, 3)), np.zeros((4, 3)), np.zeros(5), r"craniotomy has shape"),
             (np.zeros((4, 3)), np.full((4, 3), 0.5), np.zeros(4), "normalise"),
@@ -176,6 +176,6 @@ class TestAnatomy:
     def test_open_surface_has_all_corners_in_the_craniotomy(self) -> None:
         mesh = box((3, 3, 3), 0.1)
         top = mesh.nodes[:, 2] > 0.1 - 1e-9
-        anatomy = Anatomy(mesh, base_held(mesh).held, np.zeros((64, 3)), top)
+        anatomy = Anatomy(mesh, base_held(mesh).fixed, np.zeros((64, 3)), top)
         assert len(anatomy.open_surface) == 18
         assert top[anatomy.open_surface].all()

@@ -225,7 +225,7 @@ def test_the_tool_s_force_is_answered_with_a_bound_of_its_own(data, trained, ele
         assert (answer.reaction_bound[0] < size).mean() > 0.9
     judged = compare_forces(both, fresh, truth[:, 0, :3])
     assert judged.mean_percent == pytest.approx(100.0 * (error / size).mean())
-    assert judged.held is not None and judged.held[0] == pytest.approx((error <= found.reaction_bound[0]).mean())
+    assert judged.shares is not None and judged.shares[0] == pytest.approx((error <= found.reaction_bound[0]).mean())
     assert trained.force["contact-gp"].mean_percent < trained.force["contact"].mean_percent < 9.0
     lifted = compute_poses(
         BALL, np.array([[0.0, 0.0, 0.1]]), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 0.0, -1e-3]])

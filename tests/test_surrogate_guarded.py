@@ -169,7 +169,7 @@ def test_fem_share_matches_held_out_errors(theatre):
     )
     assert (many.limit, many.solved) == (0.1e-3, 1.0)
     (_, model), *_ = theatre.models.items()
-    some = replace(theatre, models={"series-gp": replace(model, left_out=middle)})
+    some = replace(theatre, models={"series-gp": replace(model, held_out=middle)})
     assert some.build_deformer(GUARDED, small()).limit == 0.05e-3
     assert replace(some, limit=1e-3).build_deformer(GUARDED, small()).limit == 1e-3
 
@@ -187,20 +187,20 @@ def test_fem_share_matches_held_out_errors(theatre):
 def test_default_deformer_is_model_alone_where_valid(theatre, mean, bound, who):
     (_, model), *_ = theatre.models.items()
     stated = None if mean is None else LeftOut(mean, 0.001, None, 0.3)
-    some = replace(theatre, models={"series-gp": replace(model, bound=bound, left_out=stated)})
+    some = replace(theatre, models={"series-gp": replace(model, bound=bound, held_out=stated)})
     assert some.select_default(small()) == who and some.select_best(small()) == "series-gp"
     said = describe_error(some.models["series-gp"])
-    assert said.endswith(": scenes play it guarded" if who == GUARDED else ": it may answer alone")
+    assert said.endswith(": scenes play it guarded" if who == GUARDED else ": scenes play it without FEM")
 
 
 def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):
     (name, model), *_ = theatre.models.items()
     stated = LeftOut(0.02, 0.004, 0.3e-3, 0.4)
-    save(tmp_path / "a.npz", {name: replace(model, left_out=stated)})
-    assert load(tmp_path / "a.npz", model.anatomy)[name].left_out == stated
+    save(tmp_path / "a.npz", {name: replace(model, held_out=stated)})
+    assert load(tmp_path / "a.npz", model.anatomy)[name].held_out == stated
     for bad in (replace(stated, mean=float("nan")), replace(stated, solved=1.1), replace(stated, p999="1")):
-        save(tmp_path / "b.npz", {name: replace(model, left_out=bad)})
-        with pytest.raises(InputError, match="left-out"):
+        save(tmp_path / "b.npz", {name: replace(model, held_out=bad)})
+        with pytest.raises(InputError, match="held-out"):
             load(tmp_path / "b.npz", model.anatomy)
 
 

@@ -19,7 +19,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import CALIBRATION_STRIDE
 from surrogate.data.tool_loads import draw
-from surrogate.evaluation.coverage import compute_coverage, measure_covered, measure_held
+from surrogate.evaluation.coverage import compute_coverage, measure_covered, measure_shares
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
@@ -172,7 +172,7 @@ def test_held_out_coverage_is_reported(trained, scored, data):
             error = np.linalg.norm(answer - truth[rows], axis=2).max(axis=1)
             return collect_missed(model, open_patch(data.anatomy), loads.get(Pushed), error)
 
-        near, held, alone, stated = seen(beside), [], [], trained.models[name].left_out
+        near, held, alone, stated = seen(beside), [], [], trained.models[name].held_out
         for disc in range(len(split.centres)):
             here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
             bounds = bound_by(near, TUMOUR_FIT, compute_growth(near, seen(others), TUMOUR_FIT))
@@ -185,7 +185,7 @@ def test_held_out_coverage_is_reported(trained, scored, data):
         assert (stated.mean, stated.solved) == pytest.approx((share.mean(), solved.mean())) and solved.any()
         assert stated.guarded == pytest.approx((share * (1.0 - solved)).mean())
         found, held = trained.left_out[name], np.concatenate(held, axis=1)
-        assert found.loads == held.shape[1] == split.test.sum() and found.held == (held[0].mean(), None)
+        assert found.loads == held.shape[1] == split.test.sum() and found.shares == (held[0].mean(), None)
     assert scored.left_out == {}
 
 
@@ -236,16 +236,16 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
     truth = answer.displacement.copy()
     truth[:, -1, 1] -= miss  # one vertex alone
     found = compute_coverage(model, fresh, truth)
-    assert found.held == (0.25, 0.75) and str(found).startswith("25.0 % at 95 %, 75.0 % at 99 %;")
+    assert found.shares == (0.25, 0.75) and str(found).startswith("25.0 % at 95 %, 75.0 % at 99 %;")
     assert found.bound_mm == pytest.approx(1e3 * np.median(answer.bound[0]))
     assert found.error_mm == pytest.approx(1e3 * np.median(miss), rel=1e-4)
     assert found.extrapolated == answer.outcome.count(Outcome.EXTRAPOLATED) and found.loads == len(fresh)
     weakest = np.argsort(np.linalg.norm(fresh.get(Pushed).force, axis=1))
     assert found.tenths == tuple((weakest[k : k + 6] % 4 == 0).mean() for k in range(0, 60, 6))
     some = measure_covered(np.ones(20), np.full(20, 3e-3), np.array([np.full(20, 4e-3), np.full(20, np.inf)]), 0)
-    assert some.held == (1.0, None) and "100.0 % at 95 %, no guarantee at 99 %;" in str(some)
+    assert some.shares == (1.0, None) and "100.0 % at 95 %, no guarantee at 99 %;" in str(some)
     half = np.where(np.arange(20) < 10, 2e-3, np.inf)  # what promises nothing does not hold, either
-    assert measure_held(np.full(20, 3e-3), half[None]) == (0.0,)
+    assert measure_shares(np.full(20, 3e-3), half[None]) == (0.0,)
 
 
 def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh):
@@ -366,7 +366,7 @@ def test_stored_models_answer_alike(trained, box, fresh, tmp_path):
 def test_a_model_of_another_body_is_refused(trained, box, tmp_path):
     path = tmp_path / "model.npz"
     save(path, {"linear": trained.models["linear"]})
-    other = Anatomy(box.mesh, box.held, box.slide_normal, box.craniotomy & (box.mesh.nodes[:, 0] < 20e-3))
+    other = Anatomy(box.mesh, box.fixed, box.slide_normal, box.craniotomy & (box.mesh.nodes[:, 0] < 20e-3))
     with pytest.raises(InputError, match=f"{box.digest}.*{other.digest}"):
         load(path, other)
     with pytest.raises(InputError, match="one anatomy, not of 2"):

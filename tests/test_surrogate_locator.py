@@ -269,10 +269,10 @@ def test_unsupported_tip_is_left_out(locator, body, truth):
     sure = replace(clean, sigma=np.full(60, 1e-4))
     wrong = replace(sure, tips=clean.now[:1] + [0.0, 0.0, 0.025])
     found, without = locator.locate(wrong), locator.locate(sure)
-    assert found.tips_left_out.tolist() == [0] and not len(found.outliers)
+    assert found.outlier_tips.tolist() == [0] and not len(found.outliers)
     assert found.centroid == pytest.approx(without.centroid, abs=1e-9)
     right = locator.locate(replace(sure, tips=clean.now[:1]))
-    assert not len(right.tips_left_out)
+    assert not len(right.outlier_tips)
 
 
 @pytest.mark.parametrize("rigid", [0.0, 0.8e-3])

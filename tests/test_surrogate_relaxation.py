@@ -202,7 +202,7 @@ def test_it_plays_alone_frame_by_frame(model, box):
     scene = replace(scene, element="p1")
     assert theatre.list_deformers(scene) == ("contact", "fem") and theatre.select_default(scene) == "contact"
     assert describe_error(replace(model, bound=1e-3)).endswith(
-        "1 mm in 95 % of loads (limit 0.2 mm): it plays alone nevertheless, as its tissue relaxes"
+        "1 mm in 95 % of loads (limit 0.2 mm): scenes play it without FEM, as its tissue relaxes"
     )
     with pytest.raises(InputError, match="its tissue relaxes, so that finite elements would have to solve"):
         theatre.build_deformer(GUARDED, scene)

@@ -64,7 +64,7 @@ def test_of_few_loads_no_percentile_of_a_thousand_is_reported(pretender, box, fr
     row = score("few", pretender, fresh, truth, box.tumour_nodes)
     assert row.p999_mm is row.p999_percent is row.worst_p999_mm is None
     said = format_scores([row], 1.0).splitlines()
-    assert said[2].split().count("-") == 3 and "not known from fewer than 1000 loads" in said[3]
+    assert said[2].split().count("-") == 3 and "not estimated from fewer than 1000 loads" in said[3]
     known = format_scores([replace(row, p999_mm=0.25, p999_percent=2.5, worst_p999_mm=0.5)], 1.0).splitlines()
     assert len(known[2]) == len(said[2]) and "0.2500" in known[2] and "fewer" not in known[3]
 
@@ -72,5 +72,5 @@ def test_of_few_loads_no_percentile_of_a_thousand_is_reported(pretender, box, fr
 def test_force_score_leaves_out_tools_that_do_not_press():
     truth = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0], [0.0, 4.0, 0.0]])
     found = score_forces(np.array([9.0, 0.2, 0.2]), truth, np.array([[0.1, 0.3, 0.1], [0.1, 0.5, 0.4]]))
-    assert (found.loads, found.force, found.held) == (2, 3.0, (0.5, 1.0))
+    assert (found.loads, found.force, found.shares) == (2, 3.0, (0.5, 1.0))
     assert (found.mean, found.mean_percent, found.bound) == pytest.approx((0.2, 7.5, 0.2))

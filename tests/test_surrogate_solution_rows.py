@@ -301,7 +301,7 @@ def test_a_data_set_explains_itself(tmp_path):
     top = np.isclose(body.mesh.nodes[:, 2], body.mesh.nodes[:, 2].max())
     inside = np.linalg.norm(body.mesh.nodes[body.mesh.tets].mean(axis=1) - [0.04, 0.04, 0.03], axis=1) < 0.015
     mesh = TetMesh(body.mesh.nodes, body.mesh.tets, np.where(inside, 2, 1))
-    write_anatomy(tmp_path / "box.vtu", Anatomy(mesh, body.held, body.slide_normal, top))
+    write_anatomy(tmp_path / "box.vtu", Anatomy(mesh, body.fixed, body.slide_normal, top))
     words = ["simulate", str(tmp_path / "box.vtu"), "--out", str(tmp_path / "a.h5"), "--count", "2", "--device", "cpu"]
     assert main([*words, "--element", "smoothed", "--young", "2000", "--json"]) == 0
     with h5py.File(tmp_path / "a.h5") as file:

@@ -80,7 +80,7 @@ def test_what_it_needs_it_asks_for(box, gauge, fresh):
 def test_the_bound_holds_as_often_as_it_says(model, fresh):
     found = measure_distance_coverage(model, *fresh)
     # Of 200 loads that calibrate and 300 that judge the share scatters by 0.02.
-    assert 0.89 <= found.held[0] <= 0.99 and found.held[1] >= found.held[0]
+    assert 0.89 <= found.shares[0] <= 0.99 and found.shares[1] >= found.shares[0]
     # It follows the load: bounds of one size would be the 95th percentile for all.
     predicted = model.predict_distance(fresh[0])
     error = np.abs(predicted.value - fresh[1])
@@ -101,7 +101,7 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
     kept, later = known(1500, 21), known(1000, 22)
     bounded = replace(model, tip=replace(model.tip, bound=bound_by(seen(kept), TIP_FIT, 0.0)))
     found = measure_distance_coverage(bounded, later.loads, later.distance)
-    assert 0.93 <= found.held[0] <= 0.97 and min(found.tenths) > 0.85 and found.held[1] > 0.975
+    assert 0.93 <= found.shares[0] <= 0.97 and min(found.tenths) > 0.85 and found.shares[1] > 0.975
 
 
 def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
@@ -125,7 +125,7 @@ def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
         held.append(seen(here).error <= bounded.predict_distance(good.select(here)).bound)
     found = trained.distance_left_out["linear"]
     held = np.concatenate(held, axis=1)
-    assert found.loads == held.shape[1] == split.test.sum() and found.held == (held[0].mean(), None)
+    assert found.loads == held.shape[1] == split.test.sum() and found.shares == (held[0].mean(), None)
 
 
 def test_the_correction_brings_distances_nearer(model, fresh):

@@ -94,7 +94,7 @@ def make_small_opening(box):
     from sim.anatomy import Anatomy
 
     near = box.craniotomy & (np.linalg.norm(box.mesh.nodes, axis=1) < 9e-3)
-    return Anatomy(box.mesh, box.held | ~near[:, None], box.slide_normal, near)
+    return Anatomy(box.mesh, box.fixed | ~near[:, None], box.slide_normal, near)
 
 
 def test_spread_points_are_far_from_each_other():

@@ -64,7 +64,7 @@ def slippery(anatomy: Anatomy) -> Anatomy:
     """The same, its lower side a skull that it slides on."""
     height = anatomy.mesh.nodes[:, 2]
     low = height < height.min() + 1e-9
-    return replace(anatomy, held=anatomy.held & ~low[:, None], slide_normal=np.outer(low, [0.0, 0.0, -1.0]))
+    return replace(anatomy, fixed=anatomy.fixed & ~low[:, None], slide_normal=np.outer(low, [0.0, 0.0, -1.0]))
 
 
 def played(scene: Scene) -> dict[str, list[str]]:

@@ -163,7 +163,7 @@ def case_of(anatomy: Anatomy, loads: int, seed: int) -> Case:
     InputError
         An anatomy without open cortex, or fewer loads than one.
     """
-    held = np.asarray((anatomy.held | (anatomy.slide_normal != 0.0)).any(axis=1))
+    held = np.asarray((anatomy.fixed | (anatomy.slide_normal != 0.0)).any(axis=1))
     (pushed,) = draw("palpation", anatomy, loads, seed).get_all(Pushed)
     mesh = anatomy.mesh
     weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()

@@ -131,7 +131,7 @@ def springs(anatomy: Anatomy, skull: float = SKULL, point: float = POINT) -> Spr
     stiff = [Material("linear", YOUNG * times, POISSON) for times in (1.0, STIFFER)]
     tissue = Elasticity(stiff[0], {TUMOUR_LABEL: stiff[1]})
     stiffness = compile_problem((tissue, Held()), anatomy, find_device("cpu", REFERENCE.precision)).rest_curvature()
-    covered = anatomy.slide_normal.any(axis=1) | anatomy.held.any(axis=1)
+    covered = anatomy.slide_normal.any(axis=1) | anatomy.fixed.any(axis=1)
     area = np.zeros(len(mesh.nodes))
     np.add.at(area, mesh.surface, np.repeat(compute_areas(mesh.nodes[mesh.surface])[:, None] / 3.0, 3, axis=1))
     spring = np.repeat(np.where(covered, skull * area, 0.0), 3)

@@ -91,9 +91,9 @@ def _answered(
             time_work(solve_with_debonding, anatomy, effects, load, NO_STRAIN_LIMIT, device, tearing=tearing)
             for load in each
         ]
-        good = np.array([one.rested and one.answer.outcome[0].good for one, _ in found])
+        good = np.array([one.converged and one.deformation.outcome[0].good for one, _ in found])
         return (
-            join_deformations([one.answer for one, _ in found]),
+            join_deformations([one.deformation for one, _ in found]),
             good,
             float(np.mean([seconds for _, seconds in found])),
         )

@@ -182,8 +182,8 @@ def _generate_samples(
             if readout:
                 at = partial(_build_delayed_camera, filmed, time - late)
                 found = project_by_rows(found, at, readout, filmed.T_scan_patient)
-            known = then.T_camera_world @ filmed.T_scan_patient
-            _, pose = find_pose(believed, target, found, known)
+            initial = then.T_camera_world @ filmed.T_scan_patient
+            _, pose = find_pose(believed, target, found, initial)
             if pose is None:
                 raise InputError("the camera does not see the patient's reference: take a path that keeps it in sight.")
             believed = taken.build_camera(pose.T_camera_target @ np.linalg.inv(filmed.T_scan_patient))
@@ -266,9 +266,9 @@ class ErrorBudget:
         """95th percentile of the maximum surface error [m]."""
         return float(np.quantile(self.clinical.worst, LEVEL))
 
-    def find_largest(self, what: Literal["middle", "worst"]) -> str:
+    def find_largest(self, error: Literal["middle", "worst"]) -> str:
         """Return the contributor with the largest 95th percentile of the error of the centre, or of the worst point."""
-        return max(self.alone, key=lambda name: float(np.quantile(getattr(self.alone[name], what), LEVEL)))
+        return max(self.alone, key=lambda name: float(np.quantile(getattr(self.alone[name], error), LEVEL)))
 
 
 def compute_budget(

@@ -78,13 +78,13 @@ def _compute_mean_motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
     return 1e3 * float(np.linalg.norm(result.displacement, axis=2).mean())
 
 
-def compute_variance_shares(found: Sequence[Cell], what: str = "force") -> dict[str, float]:
+def compute_variance_shares(found: Sequence[Cell], response: str = "force") -> dict[str, float]:
     """Return the share of variance of the logarithmic motion explained by each factor, and by each pair beyond its two.
 
     The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. What
     three and more do together is the rest to 1.
     """
-    values = np.log([getattr(cell, what) for cell in found])
+    values = np.log([getattr(cell, response) for cell in found])
     good = np.isfinite(values)
     values = values[good] - values[good].mean()
     kept = [cell.levels for cell, one in zip(found, good, strict=True) if one]

@@ -50,7 +50,7 @@ class Aim:
 class Variant:
     """Variant with one changed factor: its name, default and changed value, and the resulting body and aim."""
 
-    what: str
+    factor: str
     default: str
     now: str
     body: BodyVariant
@@ -181,8 +181,8 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
         raise InputError("the anatomy has no tumour whose motion could change: make one with `sulcus anatomy`.")
     body, fem = study.body, study.build_fem(study.body)
     pushed = fem.deform(study.loads)
-    known = match_motion(study.anatomy, study.loads, pushed)
-    defaults = ((study.loads, pushed), (known, fem.deform(known, guess(pushed.displacement))))
+    matched = match_motion(study.anatomy, study.loads, pushed)
+    defaults = ((study.loads, pushed), (matched, fem.deform(matched, guess(pushed.displacement))))
     rest = np.zeros((len(study.loads), len(nodes), 3))
     whole = [change(default.restrict(nodes), default.restrict(nodes), rest) for _, default in defaults]
     yield SensitivityRow(Variant("motion itself", "", "", body), *whole)

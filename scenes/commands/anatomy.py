@@ -104,8 +104,8 @@ def run(args: argparse.Namespace) -> int:
     tumour = anatomy.mesh.tets[anatomy.in_tumour]
     lost = find_lost_pieces(subject.pieces, anatomy.mesh.nodes, tumour)
     if any(lost):
-        said = describe_lost_pieces(subject.pieces, lost)
-        print(f"{args.out}: does not hold {said}: where they matter, ask for more nodes.", file=sys.stderr)
+        pieces = describe_lost_pieces(subject.pieces, lost)
+        print(f"{args.out}: does not hold {pieces}: where they matter, ask for more nodes.", file=sys.stderr)
     figures = _summarise_anatomy(args, anatomy, subject, lost)
     missed = figures["tumour_volume_error_percent"]
     if abs(missed) > MIN_REPORTED_LOSS:
@@ -116,8 +116,8 @@ def run(args: argparse.Namespace) -> int:
         )
     for part in subject.parts:
         if not anatomy.mesh.mark_elements(part.label).any():
-            said = f"has no {name_region(part.label)}, of which the labels mark {1e6 * part.volume:.2g} ml"
-            print(f"{args.out}: {said}: where it matters, ask for more nodes.", file=sys.stderr)
+            message = f"has no {name_region(part.label)}, of which the labels mark {1e6 * part.volume:.2g} ml"
+            print(f"{args.out}: {message}: where it matters, ask for more nodes.", file=sys.stderr)
     files = {"mesh": str(args.out), "t1": None if intensity is None else str(beside)}
     summary = {**files, **figures, "seconds": round(time.perf_counter() - began, 2)}
     print(json.dumps(summary) if args.json else _format_report(summary))
@@ -139,7 +139,7 @@ def _summarise_anatomy(
     mesh = anatomy.mesh
     volume = mesh.volumes[anatomy.in_tumour].sum()
     error, weight = compute_surface_errors(mesh.nodes, mesh.surface, subject.brain)
-    septa = [int((find_held_vertices(mesh, one) & anatomy.held.all(axis=1)).sum()) for one in subject.septa]
+    septa = [int((find_held_vertices(mesh, one) & anatomy.fixed.all(axis=1)).sum()) for one in subject.septa]
     regions = {
         name_region(part.label): (float(mesh.volumes[mesh.mark_elements(part.label)].sum()), part)
         for part in subject.parts
@@ -149,7 +149,7 @@ def _summarise_anatomy(
         "tets": len(mesh.tets),
         "tumour_nodes": len(anatomy.tumour_nodes),
         "craniotomy_nodes": int(anatomy.craniotomy.sum()),
-        "held_nodes": int(anatomy.held.any(axis=1).sum()),
+        "held_nodes": int(anatomy.fixed.any(axis=1).sum()),
         "septa_nodes": {septum.name: held for septum, held in zip(subject.septa, septa, strict=True)},
         "sliding_nodes": int(anatomy.slide_normal.any(axis=1).sum()),
         "worst_dihedral_deg": round(float(compute_dihedral_angles(mesh.nodes, mesh.tets).min()), 2),
@@ -209,7 +209,7 @@ def _format_report(figures: dict) -> str:
         *(f"{name} {held} nodes that do not move" for name, held in figures["septa_nodes"].items()),
         *_format_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
         f"opening: {_format_place(figures['opening'])}",
-        "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} at the skull, {held_nodes} held",
+        "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} at the skull, {held_nodes} fixed",
         "written to {mesh}" + (", intensities to {t1}" if figures["t1"] else "") + " in {seconds} s",
     ]
     return "\n".join(lines).format(**figures)

@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     scene = _build_filmed_scene(args, theatre)
     calibration, site = scene.viewpoint.calibration, theatre.site
     assert calibration is not None
-    known = _read_intrinsic_covariance(args, calibration)
+    covariance = _read_intrinsic_covariance(args, calibration)
     registration = None
     if args.registration is not None:
         registration = read_registration(args.registration)
@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
     time = still.times[number]
     own_bodies, meshes, own_mesh = _extract_motions_at(scene, bodies, number)
     filmed = Filmed(
-        site=site, viewpoint=scene.viewpoint, duration=scene.duration, covariance=known, time=time,
+        site=site, viewpoint=scene.viewpoint, duration=scene.duration, covariance=covariance, time=time,
         T_scan_patient=place_reference(site, scene.viewpoint.build_camera(site)),
         rest=Stage(scene, site).select_stage(scene.build_loads(site, scene.path(time), time)).tumour_at_rest.vertices,
         field=still.fields[number], normals=still.normals[number], velocity=compute_velocity(still, number),

@@ -47,6 +47,6 @@ def run(args: argparse.Namespace) -> int:
             bar.set_description("finite elements")
 
         report = collect(out, theatre, player, name, drawn, bar.update)
-    said = f"{report['frames']} frames by {name}, written to {out}; FEM: {report['fem']}"
-    print(json.dumps(report) if args.json else said)
+    summary = f"{report['frames']} frames by {name}, written to {out}; FEM: {report['fem']}"
+    print(json.dumps(report) if args.json else summary)
     return 0

@@ -48,12 +48,12 @@ def run(args: argparse.Namespace) -> int:
     write = build_episode_writer(args)
     contents = [read_contents(path) for path in list_episode_paths(args.episodes)]
     report = write(contents, progress=partial(tqdm, unit="episode", file=sys.stderr))
-    said = f"{len(contents)} episodes written to {report['out']}"
+    summary = f"{len(contents)} episodes written to {report['out']}"
     if args.to == "card":
-        said = f"card of {len(contents)} episodes written to {report['out']}: {', '.join(report['files'])}"
+        summary = f"card of {len(contents)} episodes written to {report['out']}: {', '.join(report['files'])}"
     if report.get("points_only"):
-        said += f"; the surfaces of {report['points_only']} are not known, so that they hold points alone"
-    print(to_json_line(report) if args.json else said)
+        summary += f"; the surfaces of {report['points_only']} are not known, so that they hold points alone"
+    print(to_json_line(report) if args.json else summary)
     return 0
 
 

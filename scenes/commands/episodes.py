@@ -208,7 +208,7 @@ def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: 
 
     count, models = tally.failed + tally.lost, list_model_errors(out)
     if args.json:
-        said = {
+        report = {
             "out": str(out),
             "asked": args.count,
             "there": tally.made + tally.skipped,
@@ -223,7 +223,7 @@ def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: 
             "bodies_with_a_model": len(models),
             "weak_bodies": to_weak_json(models),
         }
-        print(to_json_line(said))
+        print(to_json_line(report))
         return
     print(f"{out}: {tally.made + tally.skipped} of {args.count} episodes are there; {tally.made} were made now.")
     if tally.made:

@@ -103,6 +103,6 @@ def _write_page(args: argparse.Namespace) -> int:
         raise InputError("--cortex is for ONNX: a page contains the cortex anyway. Leave it out.")
     mesh = args.anatomy if args.model is None else _find_mesh(args)
     found = write_html(out, open_theatre(mesh, args.model, "cpu"), find_scene("press"), args.learner)
-    what = "the tumour and the open cortex" if found.cortex else "the tumour (with the open cortex it is too large)"
-    print(f"{found.name}, {what}, written: {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    content = "the tumour and the open cortex" if found.cortex else "the tumour (with the open cortex it is too large)"
+    print(f"{found.name}, {content}, written: {out} ({out.stat().st_size / 1e6:.1f} MB)")
     return 0

@@ -129,8 +129,8 @@ def run(args: argparse.Namespace) -> int:
     write_table(paths["truth.csv"], truth, player.stage.tumour_at_rest.vertices)
     moved = 1e3 * float(np.linalg.norm(truth.displacement, axis=2).mean(axis=1).max())
     report = {"scene": scene.name, "frames": len(shots), "film": str(film), "tumour_moves_mm": moved}
-    said = f"{len(shots)} images of {scene.name}; maximum tumour displacement {moved:.2f} mm: {film}"
-    print(to_json_line(report) if args.json else said)
+    summary = f"{len(shots)} images of {scene.name}; maximum tumour displacement {moved:.2f} mm: {film}"
+    print(to_json_line(report) if args.json else summary)
     return 0
 
 

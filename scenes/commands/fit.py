@@ -89,8 +89,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(to_json_line({**_summarise_tissue(tissue, out), "outliers": [each.tolist() for each in excluded]}))
     else:
-        said = [f"Frame {n}: {describe_left_out(each)}" for n, each in enumerate(excluded, start=1) if len(each)]
-        print("\n".join([*said, *format_fit(tissue, out)]))
+        notes = [f"Frame {n}: {describe_left_out(each)}" for n, each in enumerate(excluded, start=1) if len(each)]
+        print("\n".join([*notes, *format_fit(tissue, out)]))
     return 0
 
 

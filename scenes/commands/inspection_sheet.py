@@ -260,10 +260,10 @@ def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> Non
             _blend_colour(grounds, COLOURS["tumour"], SHADOW_OPACITY).tolist(),
         )
     )
-    for number, (said, colours) in enumerate(reversed(legend)):
+    for number, (label, colours) in enumerate(reversed(legend)):
         row = 2 * SIDE - PAD - LINE_SPACING * (number + 1)
         for part, colour in enumerate(colours):
             wide = 16 // len(colours)
             at = left + wide * part
             ink.rectangle([at, row + 3, at + wide - 1, row + 18], fill=tuple(int(value) for value in colour))
-        ink.text((left + 24, row), said, TEXT_COLOUR, ImageFont.load_default(FONT_SIZE))
+        ink.text((left + 24, row), label, TEXT_COLOUR, ImageFont.load_default(FONT_SIZE))

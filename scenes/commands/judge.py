@@ -45,11 +45,11 @@ def run(args: argparse.Namespace) -> int:
     truth = data.read_displacement(nodes)[data.good]
     for name, model in models.items():
         trained, here = _get_physics(model.training), _get_physics(data.provenance)
-        for what in here:
-            if trained[what] != here[what]:
+        for setting in here:
+            if trained[setting] != here[setting]:
                 raise InputError(
-                    f"{args.data}: its {what} is {here[what]}, but {name} was trained on {trained[what]}: that would "
-                    "judge the difference of two bodies. Simulate with the model's own."
+                    f"{args.data}: its {setting} is {here[setting]}, but {name} was trained on {trained[setting]}: "
+                    "the error would include this difference. Simulate with that of the model."
                 )
     for name, model in models.items():
         if model.envelope.is_training_point(model.to_input(loads).point, data.anatomy.mesh.nodes):
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())
     preset = "" if data.tool is not None else data.provenance.get("preset", "")
     if args.json:
-        covered, of_tip = ({name: asdict(found) for name, found in held.items()} for held in (promised, ranged))
+        covered, of_tip = ({name: asdict(found) for name, found in each.items()} for each in (promised, ranged))
         figures = {"scores": [asdict(row) for row in scores], "coverage": covered, "distance_coverage": of_tip}
         figures["force"] = {name: asdict(found) for name, found in forces.items()}
         print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": compute_rejected_share(preset)}))
@@ -85,8 +85,8 @@ def run(args: argparse.Namespace) -> int:
         if describe_rejected(preset):
             print(describe_rejected(preset))
         for name in models:
-            for what, held in (("bounds", promised), ("bounds of the distance from tip to tumour", ranged)):
-                print(f"{name}: {what} held for {held[name]}" if name in held else f"{name}: states no {what}")
+            for bound, coverage in (("bounds", promised), ("bounds of the distance from tip to tumour", ranged)):
+                print(f"{name}: {bound} cover {coverage[name]}" if name in coverage else f"{name}: has no {bound}")
             if name in forces:
                 print(f"{name}: the tool's force: {forces[name]}")
     return 0

@@ -63,8 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "write an IPv6 address in brackets",
     )
     parser.add_argument("--clients", type=int, default=16, help="maximum number of clients")
-    what = "received transforms [mm]; AToB maps coordinates in frame A to frame B; the scan's space is RAS"
-    names = parser.add_argument_group(what)
+    title = "received transforms [mm]; AToB maps coordinates in frame A to frame B; the scan's space is RAS"
+    names = parser.add_argument_group(title)
     names.add_argument("--tool-name", default="StylusTipToReference", help="name of the incoming tool transform")
     names.add_argument(
         "--reference-name", default="ReferenceToTracker", help="name of the incoming reference transform, AToTracker"
@@ -125,8 +125,8 @@ def run(args: argparse.Namespace) -> int:
     if len(names.by_wire) < len(NAME_OPTIONS):
         raise InputError(f"{', '.join(NAME_OPTIONS)}: must differ in their first 20 characters, which messages carry.")
     if args.host not in ("127.0.0.1", "localhost", "::1"):
-        said = "OpenIGTLink has no password: every program that can reach this address can move the displayed tumour"
-        print(f"sulcus link: {said}", file=sys.stderr)
+        warning = "OpenIGTLink has no password: every program that can reach this address can move the displayed tumour"
+        print(f"sulcus link: {warning}", file=sys.stderr)
     source = None if args.client is None else parse_address(args.client)
     if source is not None and source[1] == args.port and is_here(source[0], args.host):
         raise InputError(
@@ -244,15 +244,15 @@ def open_link(args: argparse.Namespace) -> LinkSession:
     registration = None if args.registration is None else read_registration(args.registration)
     tool = None if args.tool is None else read_tool(args.tool)
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    said = (
+    warning = (
         f"a {args.registration_name} that is sent does not say whose registration it is"
         if registration is None
         else describe_other_mesh(registration, theatre.anatomy, str(args.registration))
     )
     if registration is None or registration.scanned is None:
-        said += ". All results are unreliable: give --registration with a file of `sulcus register --anatomy`"
-    if said:
-        print(f"sulcus link: {said}", file=sys.stderr)
+        warning += ". All results are unreliable: give --registration with a file of `sulcus register --anatomy`"
+    if warning:
+        print(f"sulcus link: {warning}", file=sys.stderr)
     tool = tool or _choose_tool(theatre, args.anatomy)
     scene = apply_tissue_options(args, build_tracked_scene(args, tool.shape), theatre)
     deformer, who = build_mover(args, theatre, scene, True)

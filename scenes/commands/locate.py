@@ -105,7 +105,7 @@ def _summarise_result(found: Location, points: int, regions: tuple[Region, ...],
         "bias_degrees": np.degrees(found.rotation).tolist(),
         "points": points,
         "outliers": found.outliers.tolist(),
-        "tips_left_out": found.tips_left_out.tolist(),
+        "tips_left_out": found.outlier_tips.tolist(),
         "slipped": found.slipped,
         "calibrated": found.calibrated,
         "warnings": _list_warnings(found),
@@ -131,12 +131,12 @@ def _format_result(found: Location, out: Path | None) -> str:
 
 def _list_warnings(found: Location) -> list[str]:
     """List remarks that a reader of the result needs, in sentences."""
-    said = list(found.warnings)
+    warnings = list(found.warnings)
     if found.slipped:
-        said.append("If it was checked, say so by --registration-checked.")
+        warnings.append("If it was checked, say so by --registration-checked.")
     if len(found.outliers):
-        said.append(describe_left_out(found.outliers))
-    return said + [f"Left out, as the points do not support it: tip {number + 1}." for number in found.tips_left_out]
+        warnings.append(describe_left_out(found.outliers))
+    return warnings + [f"Left out, as the points do not support it: tip {number + 1}." for number in found.outlier_tips]
 
 
 def describe_left_out(numbers: np.ndarray) -> str:

@@ -104,8 +104,7 @@ def find_locator(args: argparse.Namespace, anatomy: Anatomy, small: bool = False
         if args.region and locator.regions != list_regions_known(args, anatomy):
             raise InputError(
                 f"{path}: knows other regions than --region says ({describe_regions(locator.regions) or 'none'}). "
-                "Leave "
-                "--region out, or name another file by --locator: one that knows them is made there."
+                "Leave --region out, or name another file by --locator: one that knows them is made there."
             )
         if locator.prior.nodes is not None and not small:
             raise InputError(

@@ -254,9 +254,9 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
     tool = None if args.tool is None else read_tool(args.tool)
     elsewhere = open_external_tracker(args, calibration)
     theatre = open_theatre(args.anatomy, args.model, args.device)
-    said = describe_other_mesh(registration, theatre.anatomy, args.registration)
-    if said:
-        print(f"sulcus overlay: {said}", file=sys.stderr)
+    warning = describe_other_mesh(registration, theatre.anatomy, args.registration)
+    if warning:
+        print(f"sulcus overlay: {warning}", file=sys.stderr)
     scene = apply_tissue_options(args, build_tracked_scene(args, None if tool is None else tool.shape), theatre)
     stage = theatre.build_stage(scene)
     deformer, who = build_mover(args, theatre, scene, tool is not None)

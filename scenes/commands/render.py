@@ -69,6 +69,6 @@ def run(args: argparse.Namespace) -> int:
     report |= {"out": str(args.out), "film": film}
     beside = "" if film is None else f", video {film}"
     unanswered = f"; solutions that did not converge or are extrapolated: {bad}" if bad else ""
-    said = f"{len(written)} frame{'s' * (len(written) != 1)} by {who}, written to {args.out}{beside}{unanswered}"
-    print(json.dumps(report) if args.json else said)
+    summary = f"{len(written)} frame{'s' * (len(written) != 1)} by {who}, written to {args.out}{beside}{unanswered}"
+    print(json.dumps(report) if args.json else summary)
     return 1 if bad else 0

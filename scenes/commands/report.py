@@ -144,11 +144,11 @@ def _describe_study(study: ReportStudy) -> tuple[str, ...]:
     from ..report.reference import get_reference
     from ..report.study import KINDS
 
-    truth, said = get_reference(study), study.dataset.provenance
+    truth, preset = get_reference(study), study.dataset.provenance.get("preset", "")
     mesh = "the same mesh with every edge halved" if study.fine else "the same mesh"
     good = int(truth.good.sum())
     return (
-        f"Data: {len(study.converged)} {said.get('preset', '')} loads on {len(study.anatomy.mesh.nodes)} vertices, "
+        f"Data: {len(study.converged)} {preset} loads on {len(study.anatomy.mesh.nodes)} vertices, "
         f"{study.element} elements, {study.tissue}; {study.discs.summarise()}.",
         f"Reference: quadratic tetrahedra (p2) on {mesh}, the data's tissue, to 1e-8 in double precision, read at the "
         f"same material points. {good} of {len(truth.good)} loads of the left-out discs converged, "

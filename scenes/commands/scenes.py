@@ -50,24 +50,24 @@ def run(args: argparse.Namespace) -> int:
     with drawing as bar:
         for name, scene in scenes.items():
             names = [type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy)]
-            known = {
+            row = {
                 "scene": name,
                 "title": scene.title,
                 "effects": names,
                 "deformers": list(theatre.list_deformers(scene)),
             }
             players = ", ".join(theatre.list_deformers(scene))
-            known["solver"] = solver = theatre.describe_deformer("fem", scene)
+            row["solver"] = solver = theatre.describe_deformer("fem", scene)
             bar.write(f"{name}: {scene.title}\n  acting: {', '.join(names)}", file=lines)
             bar.write(f"  can be played by: {players}\n  fem: {solver}", file=lines)
             if name in drawn:
                 usual = theatre.select_default(scene)
                 found = render_thumbnail(theatre.build_player(usual, scene), usual)
                 pictures[name] = found.colour
-                known |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": usual}
+                row |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": usual}
                 cost = f"{found.total:.0f} ms a frame by {usual}"
                 bar.write(f"  {cost}; the tumour moves by up to {found.moved_mm:.2f} mm", file=lines)
-            rows.append(known)
+            rows.append(row)
             bar.update()
     if args.out is not None:
         try:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..analysis.sensitivity import Change, SensitivityRow, SensitivityStudy
 
 # Column titles of the table.
-COLUMN_TITLES = ("what", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
+COLUMN_TITLES = ("factor", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
 COLUMN_WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
 """Widths of the table's columns [characters]: a line fits into 120."""
 # Explanation under the table.
@@ -103,8 +103,8 @@ def run(args: argparse.Namespace) -> int:
     with tqdm(total=1 + len(changed), unit="row", file=sys.stderr) as bar:
         for row in measure_variants(study, changed):
             found.append(row)
-            what = (row.variant.what, row.variant.default, row.variant.now)
-            bar.write(_format_row((*what, *_format_cells(row.force), *_format_cells(row.motion))), file=lines)
+            names = (row.variant.factor, row.variant.default, row.variant.now)
+            bar.write(_format_row((*names, *_format_cells(row.force), *_format_cells(row.motion))), file=lines)
             bar.update()
     table = [_flatten_row(row) for row in found]
     if args.out:
@@ -137,7 +137,7 @@ def _run_factorial(args: argparse.Namespace) -> int:
     found = list(tqdm(solve_cells(nodes=args.nodes, device=args.device), total=total, unit="cell", file=sys.stderr))
     table = [{**cell.levels, "force_mm": cell.force, "motion_mm": cell.motion} for cell in found]
     failed = sum(not np.isfinite(value) for cell in found for value in (cell.force, cell.motion))
-    parts = {what: compute_variance_shares(found, what) for what in ("force", "motion")}
+    parts = {response: compute_variance_shares(found, response) for response in ("force", "motion")}
     if args.out:
         write_table(args.out, table)
         write_png(picture, draw_panels(build_panels(found)))
@@ -147,9 +147,9 @@ def _run_factorial(args: argparse.Namespace) -> int:
     print("Of the variance of the motion's logarithm, known force and known motion of the tool:")
     for name, share in parts["force"].items():
         print(f"| {name:<36} | {share:6.1%} | {parts['motion'][name]:6.1%} |")
-    for what in parts:
-        values = [row[f"{what}_mm"] for row in table]
-        print(f"Known {what}: the tumour moves by {np.nanmin(values):.2f} to {np.nanmax(values):.2f} mm.")
+    for response in parts:
+        values = [row[f"{response}_mm"] for row in table]
+        print(f"Known {response}: the tumour moves by {np.nanmin(values):.2f} to {np.nanmax(values):.2f} mm.")
     if failed:
         print(f"{failed} solves did not converge: they are in no figure.")
     return 1 if failed else 0
@@ -185,23 +185,23 @@ def _format_row(cells: Sequence[str]) -> str:
 
 def _list_remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
     """List remarks that a reader of the table needs, in sentences."""
-    said = []
+    remarks = []
     if failed:
-        said.append(f"{failed} solves did not converge: they and their comparisons are excluded.")
+        remarks.append(f"{failed} solves did not converge: they and their comparisons are excluded.")
     if model is not None and _bound(model):
         stated = _get_reported_error(model)
-        said.append(
+        remarks.append(
             f"Surrogate error: reported bound on held-out {stated['preset']} loads relative to its own "
             f"FEM with element {stated['element']}. Use --compare for the error of that element."
         )
     else:
-        said.append("No surrogate error is given: there is no model with a bound next to this anatomy (--model).")
-    said.append(LOCKING_NOTES[study.body.element])
+        remarks.append("No surrogate error is given: there is no model with a bound next to this anatomy (--model).")
+    remarks.append(LOCKING_NOTES[study.body.element])
     if not beside:
-        said.append("The discretisation error is not available: --compare p2 compares quadratic elements on this mesh.")
+        remarks.append("No discretisation error is given: --compare p2 compares quadratic elements on this mesh.")
     if not study.anatomy.slide_normal.any():
-        said.append("This anatomy has no skull: there is no row for the skull.")
-    return said
+        remarks.append("This anatomy has no skull: there is no row for the skull.")
+    return remarks
 
 
 def _get_reported_error(model: Learned) -> dict[str, Any]:
@@ -215,4 +215,4 @@ def _flatten_row(row: SensitivityRow) -> dict[str, Any]:
     variant = row.variant
     sides = {"force": row.force, "motion": row.motion}
     figures = {f"{side} {name}": value for side, change in sides.items() for name, value in asdict(change).items()}
-    return {"what": variant.what, "default": variant.default, "now": variant.now, **figures}
+    return {"what": variant.factor, "default": variant.default, "now": variant.now, **figures}

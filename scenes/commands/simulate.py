@@ -206,7 +206,7 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
     failed = int(np.sum([not outcome.good for outcome in outcomes]))
     rate = solved.loads / solved.load_seconds if solved.loads else None
     if args.json:
-        said = {
+        report = {
             "out": args.out,
             "solver": solver,
             "loads": len(outcomes),
@@ -217,7 +217,7 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
             "loads_per_second": rate,
             "nominal_refused": 0.0 if args.pose_control else compute_rejected_share(args.tool_preset),
         }
-        print(json.dumps(said))
+        print(json.dumps(report))
         return
     if asked < args.count:
         print(f"the preset {args.tool_preset} has {asked} loads: all of them were taken.")

@@ -85,8 +85,8 @@ def run(args: argparse.Namespace) -> int:
     moved, bond = float(np.linalg.norm(deformation.displacement[0], axis=1).max()), float(deformation.bond[0])
     notes: list[str] = []
     if reached < 1.0:
-        what = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
-        notes.append(f"{outcome.value}; what is written is {what}")
+        state = f"in equilibrium under {reached:.1%} of the load" if reached else "the last state, in no equilibrium"
+        notes.append(f"{outcome.value}; the file has {state}")
     least, most = deformation.stretch[:, 0]
     if inverted:
         notes.append(f"{inverted} tetrahedra are inverted: the load is too strong for this mesh. Give a weaker one")

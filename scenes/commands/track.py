@@ -77,8 +77,9 @@ def run(args: argparse.Namespace) -> int:
     good = sum(row.pose is not None for row in rows)
     middle = 1e3 * float(np.median([row.seconds for row in rows]))
     if args.json:
-        said = {verdict.name.lower(): count for verdict, count in Counter(row.verdict for row in rows).items()}
-        print(to_json_line({"out": str(out), "pictures": len(rows), "states": said, "ms": middle, "seconds": seconds}))
+        states = Counter(row.verdict.name.lower() for row in rows)
+        report = {"out": str(out), "pictures": len(rows), "states": states, "ms": middle, "seconds": seconds}
+        print(to_json_line(report))
     else:
         print(f"{len(rows)} images of the {args.body}, {middle:.1f} ms each (median):")
         for (lacks, verdict), count in Counter((row.lacks, row.verdict) for row in rows).most_common():

@@ -1,4 +1,4 @@
-"""`sulcus train`: fit the learners to a data set, score them on left-out discs, and say who wins."""
+"""`sulcus train`: fit the learners to a data set, and compare their errors on held-out discs."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--learners",
         help=f"model types: {', '.join(LEARNERS)}, or for poses {', '.join(POSE_LEARNERS)}, separated by commas "
-        "(default: "
-        "all that the data can train)",
+        "(default: all that the data can train)",
     )
     parser.add_argument("--most", type=int, metavar="LOADS", help="maximum number of training loads (default: all)")
     add_devices(parser, "; the power series is computed by FEM on the first")
@@ -97,15 +96,14 @@ def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
     if good // CALIBRATION_STRIDE < MIN_CALIBRATION_LOADS:
         notes.append(
             f"of {good} loads {good // CALIBRATION_STRIDE} calibrate error bounds; at least {MIN_CALIBRATION_LOADS} "
-            "are needed: the "
-            "models will have one bound for all loads instead of one for each. "
+            "are needed: the models will have one bound for all loads instead of one for each. "
             f"`sulcus simulate --count {CALIBRATION_STRIDE * MIN_CALIBRATION_LOADS}` gives enough."
         )
     return notes
 
 
 def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
-    notes = [f"{failed} cases that did not converge were excluded."] if failed else []
+    notes = [f"{failed} unreliable solutions were excluded."] if failed else []
     notes += [words for words in [describe_rejected(preset)] if words]
     bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
     return "\n".join(
@@ -115,10 +113,10 @@ def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
             "error at the tumour's vertices on the held-out loads, relative to FEM on the same mesh:",
             format_scores(trained.scores, 1e3 * trained.motion),
             f"95th percentile of the maximum vertex error on held-out loads [mm]: {bounds}; scenes use the smallest",
-            *(f"on those discs {name} is {describe_error(model)}" for name, model in trained.models.items()),
-            *(f"on those discs bounds of {name} held for {found}" for name, found in trained.left_out.items()),
+            *(f"on those discs, {name}: {describe_error(model)}" for name, model in trained.models.items()),
+            *(f"on those discs, bounds of {name} cover {found}" for name, found in trained.left_out.items()),
             *(
-                f"on those discs, bounds of the distance from tip to tumour by {name} held for {found}"
+                f"on those discs, bounds of the distance from tip to tumour by {name} cover {found}"
                 for name, found in trained.distance_left_out.items()
             ),
             *(f"on those discs, the tool's force by {name}: {found}" for name, found in trained.force.items()),
@@ -137,9 +135,9 @@ def _describe_calibration(trained: Trained) -> str:
 
 def _describe_error(model: Learned) -> dict[str, object]:
     """Describe the model's own reported errors, next to its score."""
-    known = get_held_out_error(model)
-    discs = None if known.left_out is None else asdict(known.left_out)
-    return {"bound_mm": 1e3 * known.bound, "discs": discs, "weak": known.weak}
+    reported = get_held_out_error(model)
+    discs = None if reported.held_out is None else asdict(reported.held_out)
+    return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.weak}
 
 
 def _format_json(trained: Trained, out: str, failed: int, preset: str) -> str:

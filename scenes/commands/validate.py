@@ -68,10 +68,10 @@ def run(args: argparse.Namespace) -> int:
         weak = {str(place): to_weak_json(models) for place, models in trained.items()}
         print(to_json_line({"episodes": len(reports), "broken": len(broken), "files": files, "weak_bodies": weak}))
     else:
-        said = format_reports(reports, broken)
+        lines = format_reports(reports, broken)
         for place, models in trained.items():
-            said += [line if line.startswith("-") else f"{place}: {line}" for line in describe_weak(models)]
-        print("\n".join(said))
+            lines += [line if line.startswith("-") else f"{place}: {line}" for line in describe_weak(models)]
+        print("\n".join(lines))
     return 1 if broken else 0
 
 
@@ -86,31 +86,31 @@ def list_lost_episodes(folder: Path) -> list[Report]:
 
 def format_reports(reports: list[Report], broken: list[Report]) -> list[str]:
     """Format the faults of each file, the files that could not be checked, and statistics of all complete ones."""
-    said = [f"{report.path}: {problem}" for report in broken for problem in report.problems]
-    said = [
-        *said[:MAX_LISTED_FILES],
-        *([f"and {len(said) - MAX_LISTED_FILES} more: --json has all"] if len(said) > MAX_LISTED_FILES else []),
+    lines = [f"{report.path}: {problem}" for report in broken for problem in report.problems]
+    lines = [
+        *lines[:MAX_LISTED_FILES],
+        *([f"and {len(lines) - MAX_LISTED_FILES} more: --json has all"] if len(lines) > MAX_LISTED_FILES else []),
     ]
     skipped: dict[str, int] = {}
     for report in reports:
         for one in report.skipped:
             skipped[one] = skipped.get(one, 0) + 1
-    said += [f"not looked at in {count} of {len(reports)} episodes: {one}" for one, count in skipped.items()]
+    lines += [f"not looked at in {count} of {len(reports)} episodes: {one}" for one, count in skipped.items()]
     whole = [report for report in reports if not report.problems]
     counts = ("frames", "solved", "unsolved")
     frames, solved, unsolved = (sum(getattr(report, name) for report in whole) for name in counts)
-    said.append(
+    lines.append(
         f"{len(whole)} of {len(reports)} episodes are whole: {frames} frames, {solved} of them solved "
         f"by finite elements, {unsolved} without convergence"
     )
     errors = [one.error_mm for one in whole if one.error_mm is not None]
     if errors:
         mean, worst = sum(one[0] for one in errors) / len(errors), max(one[1] for one in errors)
-        said.append(f"tumour as predicted, against finite elements: {mean:#.3g} mm on average, {worst:#.3g} mm at most")
+        lines.append(f"predicted tumour, relative to finite elements: mean {mean:#.3g} mm, maximum {worst:#.3g} mm")
     again = [one for one in reports if one.again_mm is not None]
     if again:
-        said.append(
+        lines.append(
             f"{sum(one.again for one in again)} frames solved again lie at most "
             f"{max(one.again_mm or 0.0 for one in again):.4f} mm from where the files have them"
         )
-    return said
+    return lines

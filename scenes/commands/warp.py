@@ -188,8 +188,7 @@ def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float,
         middle = ", ".join(f"{1e3 * value:.0f}" for value in site.origin)
         raise InputError(
             f"--load: the place is {apart:.0f} mm from the open cortex; {MAX_DISTANCE:g} mm is the most. The middle "
-            "of the "
-            f"open cortex is at {middle} mm (RAS)."
+            f"of the open cortex is at {middle} mm (RAS)."
         )
     arm = nearest - site.origin
     touch = Touch(float(arm @ site.right), float(arm @ site.up), newton)
@@ -234,6 +233,6 @@ def format_warp(report: dict, out: Path) -> str:
         else f"Tumour position error in the patient (95 %): maximum surface error {bound:.1f} mm.",
     ]
     for image in report["images"]:
-        lost = image["outside"] + image["gone"]
+        lost = image["outside"] + image["resected"]
         lines.append(f"{image['name']}: {image['moved']:,} voxels moved, {lost:,} without source data are set to 0.")
     return "\n".join([*lines, f"Written to {out}; README.txt there says how to open it."])

@@ -272,7 +272,7 @@ def to_weak_json(models: Mapping[int, HeldOutError]) -> list[dict[str, float | i
         {
             "body": number,
             "bound_mm": 1e3 * one.bound,
-            "mean_share_of_motion": None if one.left_out is None else one.left_out.mean,
+            "mean_share_of_motion": None if one.held_out is None else one.held_out.mean,
         }
         for number, one in find_weak(models).items()
     ]

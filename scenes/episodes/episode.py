@@ -72,8 +72,7 @@ MEANINGS = {
     "tumour_rest": "positions in the scan",
     "reaction_fem": "(frames, tools, 6): force that each tool exerts, and its moment about the tool's lowest point",
     "reaction_predicted": "(frames, tools, 6): the same by the deformer, if available",
-    "reaction_bound": "(frames, 2): 95 % and 99 % bounds of the model's error of that force; NaN: "
-    "not available",
+    "reaction_bound": "(frames, 2): 95 % and 99 % bounds of the model's error of that force; NaN: not available",
     "time": "time since the start of the scene", "seconds": "duration of each stage of the image",
     "T_camera_world": "(frames, 4, 4): takes points of the world to the camera's frame: x_camera = T x_world",
     "T_world_tool": "(frames, 4, 4): takes points of the tool's own frame to the world: x_world = T x_tool",
@@ -86,8 +85,7 @@ MEANINGS = {
     "NaN: not available",
     "model_error": "95 % bound of the maximum tumour vertex error relative to the model's FEM; "
     "NaN for FEM itself, or if not available",
-    "tumour_error": "95 % bound of the maximum tumour surface error relative to the patient. NaN: "
-    "not available",
+    "tumour_error": "95 % bound of the maximum tumour surface error relative to the patient. NaN: not available",
     "tumour_error_unobserved": "the same bound without observations",
 }  # fmt: skip
 # Units of the arrays of an episode.

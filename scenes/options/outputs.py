@@ -48,8 +48,8 @@ def check_output_path(
     return path
 
 
-def check_output_folder(folder: Path, what: str) -> Path:
-    """Check that images can be written into a folder; return it and leave nothing behind. `what` is their plural name.
+def check_output_folder(folder: Path, content: str) -> Path:
+    """Check that images can be written into a folder; return it and leave nothing behind. `content`: their plural name.
 
     Raises
     ------
@@ -57,12 +57,12 @@ def check_output_folder(folder: Path, what: str) -> Path:
         A file of that name, or a place where nothing can be written.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file, but the {what} need a folder. Choose another name.")
+        raise InputError(f"{folder}: is a file, but the {content} need a folder. Choose another name.")
     try:
         with remove_empty_parents(folder / "any.png"):
             check_output(folder / "any.png", ".png")
     except InputError as error:
-        raise InputError(f"{folder}: the {what} cannot be written there. Choose another folder.") from error
+        raise InputError(f"{folder}: the {content} cannot be written there. Choose another folder.") from error
     return folder
 
 

@@ -147,15 +147,14 @@ def _check_kind(markup: Markup, option: str, **kinds: int | None) -> None:
     words = {"Fiducial": "one point", "Line": "a line of two points", "ClosedCurve": "a closed curve"}
     raise InputError(
         f"{markup.path}: holds {_describe_markup(markup)}; {option} takes "
-        f"{' or '.join(words[kind] for kind in kinds)}. "
-        "Save that from 3D Slicer."
+        f"{' or '.join(words[kind] for kind in kinds)}. Save that from 3D Slicer."
     )
 
 
 def _describe_markup(markup: Markup) -> str:
     """Describe the content of a file."""
     count = "1 point" if len(markup.points) == 1 else f"{len(markup.points)} points"
-    known = {
+    descriptions = {
         "Fiducial": f"a list of {count}",
         "Line": f"a line of {count}",
         "Curve": "an open curve",
@@ -164,4 +163,4 @@ def _describe_markup(markup: Markup) -> str:
         "Angle": "an angle",
         "ROI": "a box (ROI)",
     }
-    return known.get(markup.kind, f"markups of the kind {markup.kind}")
+    return descriptions.get(markup.kind, f"markups of the kind {markup.kind}")

@@ -113,8 +113,8 @@ def _report_mismatch(args: argparse.Namespace, elsewhere: ExternalTracker) -> No
         for name, each in elsewhere.streams.items()
     ]
     clock = f"; --clock is {elsewhere.clock.offset:g} s" if elsewhere.clock.offset else ""
-    said = f"{outside}. It is of {first:.2f} s, {', '.join(when)}{clock}. Give --clock S, or {AUTO}"
-    print(f"sulcus overlay: {said}", file=sys.stderr)
+    message = f"{outside}. It is of {first:.2f} s, {', '.join(when)}{clock}. Give --clock S, or {AUTO}"
+    print(f"sulcus overlay: {message}", file=sys.stderr)
 
 
 def _choose_clock(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
@@ -132,6 +132,6 @@ def _choose_clock(args: argparse.Namespace, calibration: Calibration, tool: Pose
         found = estimate_video_clock(film, calibration, tool, patient)
     except ValueError as error:
         raise InputError(f"--clock {AUTO}: {error}") from error
-    said = f"the tracker's clock runs {found.offset:.4f} s ahead of the video's, +- {found.error:.4f} s"
-    print(f"sulcus overlay: {said}", file=sys.stderr)
+    message = f"the tracker's clock runs {found.offset:.4f} s ahead of the video's, +- {found.error:.4f} s"
+    print(f"sulcus overlay: {message}", file=sys.stderr)
     return found

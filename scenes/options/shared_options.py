@@ -68,8 +68,8 @@ def add_style(parser: argparse.ArgumentParser, without: tuple[Style, ...] = ()) 
     from ar.overlay.styles import STYLES
 
     styles: list[Style] = [style for style in STYLES if style not in without]
-    said = "; ".join(f"{style}: {STYLES[style]}" for style in styles if style != "none")
-    parser.add_argument("--style", choices=styles, default="window", help=f"overlay style; {said}")
+    descriptions = "; ".join(f"{style}: {STYLES[style]}" for style in styles if style != "none")
+    parser.add_argument("--style", choices=styles, default="window", help=f"overlay style; {descriptions}")
 
 
 def add_address(parser: argparse.ArgumentParser) -> None:

@@ -26,10 +26,10 @@ def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None
     parser.add_argument(
         "--tumour", type=parse_labels, metavar="3,4", help="labels of tumour, by number or segment name"
     )
-    said = ". ".join(f"{name}: {one.source}" for name, one in CONVENTIONS.items())
+    sources = ". ".join(f"{name}: {one.source}" for name, one in CONVENTIONS.items())
     parser.add_argument(
         *names, dest="convention", choices=tuple(CONVENTIONS),
-        help=f"label convention, instead of label numbers. {said}",
+        help=f"label convention, instead of label numbers. {sources}",
     )  # fmt: skip
     parser.add_argument(
         "--mask", type=Path, metavar="BRAIN.nii.gz",

@@ -129,8 +129,8 @@ def list_playable(args: argparse.Namespace, theatre: PatientSetup, scenes: Seque
     left = [] if args.scenes else [scene for scene in scenes if theatre.is_without_locator(scene)]
     if left:
         names = ", ".join(scene.name for scene in left)
-        said = f"no {names}: this anatomy has no locator, which `sulcus locator` makes"
-        print(f"{args.program}: {said}", file=sys.stderr)
+        message = f"no {names}: this anatomy has no locator. Make one with `sulcus locator`"
+        print(f"{args.program}: {message}", file=sys.stderr)
     return [scene for scene in scenes if scene not in left]
 
 
@@ -150,15 +150,15 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
             none = (
                 "no model exists next to this anatomy; `sulcus train` trains one" if scene.sight is None else TRUTH_TEXT
             )
-            why = next(iter(theatre.list_rejections(scene).values()), none)
-            print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {why}", file=sys.stderr)
+            reason = next(iter(theatre.list_rejections(scene).values()), none)
+            print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {reason}", file=sys.stderr)
         default, best = theatre.select_default(scene), theatre.select_best(scene)
         if args.deformer is None and best in theatre.models and default != scene.deformer:
             from surrogate.model.guarded import describe_error, get_held_out_error
 
             model = theatre.models[best]
             if get_held_out_error(model).weak:
-                print(f"{args.program}: on left-out cortex {best} is {describe_error(model)}", file=sys.stderr)
+                print(f"{args.program}: on held-out cortex, {best}: {describe_error(model)}", file=sys.stderr)
         return args.deformer or default
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")

@@ -39,7 +39,7 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, d
     """
     sets = f"{', '.join(MATERIALS)}; see docs/concepts/physics.md"
     if whole:
-        each = (f"{name} holds for {known.time_scale}. Source: {known.source}" for name, known in MATERIALS.items())
+        each = (f"{name} holds for {preset.time_scale}. Source: {preset.source}" for name, preset in MATERIALS.items())
         sets = ". ".join(each)
     parser.add_argument(
         "--material", default="default", choices=(*MATERIALS, *LAWS, Ogden.law), metavar="TISSUE",
@@ -71,8 +71,7 @@ def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN
         "--region", action="append", default=[], metavar="REGION:YOUNG[,POISSON]",
         help=f"Young's modulus [Pa] and, optionally, Poisson's ratio of a region, by number or name "
         f"({', '.join(NON_BRAIN_REGIONS)}), such as oedema:2000 or 3:2000,0.45; for Ogden's law "
-        "REGION:C1,M1;C2,M2;K; repeatable "
-        f"(default: {default}; necrosis as the tumour)",
+        f"REGION:C1,M1;C2,M2;K; repeatable (default: {default}; necrosis as the tumour)",
     )  # fmt: skip
 
 
@@ -83,8 +82,8 @@ def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] =
         "slide": "frictionless sliding without separation",
         "contact": "frictionless sliding with separation",
     }
-    said = "; ".join(f"{name}: {words[name]}" for name in choices)
-    parser.add_argument("--skull", choices=choices, default=choices[0], help=f"boundary condition at the skull; {said}")
+    meanings = "; ".join(f"{name}: {words[name]}" for name in choices)
+    parser.add_argument("--skull", choices=choices, default=choices[0], help=f"boundary condition at skull; {meanings}")
 
 
 def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMENDED) -> None:
@@ -120,9 +119,9 @@ def parse_tissue(args: argparse.Namespace) -> Tissue:
 
 def _parse_tissue(args: argparse.Namespace) -> Material | Ogden:
     """Return the requested elastic tissue, with the Prony series of its preset."""
-    known = MATERIALS[args.material].tissue if args.material in MATERIALS else None
+    preset = MATERIALS[args.material].tissue if args.material in MATERIALS else None
     ours = {"--ogden": args.ogden, "--bulk": args.bulk}
-    if args.material == Ogden.law or isinstance(known, Ogden):
+    if args.material == Ogden.law or isinstance(preset, Ogden):
         reject_option({"--young": args.young, "--poisson": args.poisson}, args.material, f"the laws {', '.join(LAWS)}")
     if args.material == Ogden.law:
         missing = [name for name, value in ours.items() if value is None]
@@ -136,11 +135,11 @@ def _parse_tissue(args: argparse.Namespace) -> Material | Ogden:
             ) from error
         return Ogden(terms, args.bulk)
     reject_option(ours, args.material, "--material ogden")
-    if isinstance(known, Ogden):
-        return known
-    base = known or BRAIN
+    if isinstance(preset, Ogden):
+        return preset
+    base = preset or BRAIN
     return Material(
-        args.material if known is None else base.law,
+        args.material if preset is None else base.law,
         base.young if args.young is None else args.young,
         base.poisson if args.poisson is None else args.poisson,
     )

@@ -210,9 +210,9 @@ def list_objections(frames: Sequence[Frame]) -> list[str]:
     refused = [estimate.refusal for estimate in estimates if estimate.location is None]
     slipped = [estimate.location.doubt for estimate in estimates if estimate.location and estimate.location.slipped]
     found = [
-        f"the locator {does} in {len(why)} of {len(estimates)} frames: {why[0]}"
-        for does, why in {"rejects the observation": refused, "doubts its result": slipped}.items()
-        if why
+        f"the locator {does} in {len(reasons)} of {len(estimates)} frames: {reasons[0]}"
+        for does, reasons in {"rejects the observation": refused, "doubts its result": slipped}.items()
+        if reasons
     ]
     motion = np.linalg.norm([estimate.true for estimate in estimates], axis=1) if estimates else np.zeros(0)
     moving = np.count_nonzero(motion > STILL_SHARE * motion.max(initial=0.0))

@@ -146,7 +146,7 @@ class PatientSetup:
 
     def select_models(self, scene: Scene) -> dict[str, Learned]:
         """Select the trained models that support a scene, by name."""
-        return {name: self.models[name] for name, why in self.list_rejections(scene).items() if why is None}
+        return {name: self.models[name] for name, reason in self.list_rejections(scene).items() if reason is None}
 
     def list_deformers(self, scene: Scene) -> tuple[str, ...]:
         """List all deformers available for a scene: trained models that support it, the best one guarded, FEM."""
@@ -164,7 +164,7 @@ class PatientSetup:
 
     def limit_of(self, scene: Scene) -> float:
         """Return the predicted error [m] above which FEM replaces the best model of a scene."""
-        stated = self.models[self.select_best(scene)].left_out
+        stated = self.models[self.select_best(scene)].held_out
         if self.limit is not None:
             return self.limit
         return MAX_VERTEX_ERROR if stated is None else stated.limit
@@ -224,17 +224,17 @@ class PatientSetup:
             model, limit = self.models[self.select_best(scene)], self.limit_of(scene)
             return Guarded(model, self.build_fem(scene, scene.accuracy, live=True), limit)
         if name == GUARDED and self.models:
-            why = next(iter(self.list_rejections(scene).values()))
+            reason = next(iter(self.list_rejections(scene).values()))
             raise InputError(
-                f"no model that {GUARDED} could ask knows the scene {scene.name}: {why}. Choose {allowed}."
+                f"no model that {GUARDED} could ask knows the scene {scene.name}: {reason}. Choose {allowed}."
             )
         if name not in self.models:
             raise InputError(
                 f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the trained ones."
             )
-        why = self.list_rejections(scene)[name]
-        if why is not None:
-            raise InputError(f"{name} does not know the scene {scene.name}: {why}. Choose one of {allowed}.")
+        reason = self.list_rejections(scene)[name]
+        if reason is not None:
+            raise InputError(f"{name} does not know the scene {scene.name}: {reason}. Choose one of {allowed}.")
         return self.models[name]
 
     def build_player(self, name: str, scene: Scene) -> Player:

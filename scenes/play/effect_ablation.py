@@ -96,8 +96,8 @@ def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
     times = scene.times[::every].tolist()
     found, seconds = _solve_frames(fem, scene, theatre.site, times)
     wp.synchronize()
-    known = {id(array) for array in before}
-    held = sum(array.capacity for array in list_device_arrays() if id(array) not in known)
+    earlier = {id(array) for array in before}
+    held = sum(array.capacity for array in list_device_arrays() if id(array) not in earlier)
     return AblationRun(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
 
 

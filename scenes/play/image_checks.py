@@ -103,7 +103,7 @@ def _is_ground_labelled(frame: Frame, mask: np.ndarray) -> bool:
     allowed = [words] * (share > WHOLE_SHARE - MASK_TOLERANCE) + [f"partly {words}"] * (
         share < WHOLE_SHARE + MASK_TOLERANCE
     )
-    return any(all(has_text(frame.shown, line, TEXT_SCALE) for line in format_ground(said)) for said in allowed)
+    return any(all(has_text(frame.shown, line, TEXT_SCALE) for line in format_ground(text)) for text in allowed)
 
 
 def has_printed_numbers(player: Player, frame: Frame) -> bool:
@@ -151,13 +151,13 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
         anatomy, np.stack([player.compute_positions(frame.deformation) - rest, player.estimate_positions(frame) - rest])
     )
     off, length = float(np.linalg.norm(moved - true)), float(np.linalg.norm(moved))
-    said = [
+    lines = [
         line
         for text in (f"{ESTIMATED_LINES.motion} {format_millimetres(length, found.location.p95)}", frame.remark)
         for line in wrap_line(text, MAX_BOTTOM_WIDTH * frame.shown.shape[1])
     ]
     return frame.remark.endswith(f"error {1e3 * off:.1f} mm") and all(
-        has_text(frame.shown, text, TEXT_SCALE) for text in said
+        has_text(frame.shown, text, TEXT_SCALE) for text in lines
     )
 
 

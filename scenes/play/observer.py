@@ -234,10 +234,10 @@ class RigidError:
         return middle + Rotation.from_rotvec(self.turn).apply(points - middle) + self.shift
 
 
-def sample_rigid_error(sight: PointObservation | StereoObservation, number: int) -> RigidError:
-    """One of the rigid errors of a sight, by number."""
-    turn, shift = np.random.default_rng([sight.seed, 0, number]).standard_normal((2, 3))
-    return RigidError(sight.turn * turn / np.linalg.norm(turn), sight.shift * shift / np.linalg.norm(shift))
+def sample_rigid_error(model: PointObservation | StereoObservation, number: int) -> RigidError:
+    """Sample the `number`-th rigid registration error of an observation model."""
+    turn, shift = np.random.default_rng([model.seed, 0, number]).standard_normal((2, 3))
+    return RigidError(model.turn * turn / np.linalg.norm(turn), model.shift * shift / np.linalg.norm(shift))
 
 
 def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:

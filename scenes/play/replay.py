@@ -65,16 +65,16 @@ class FrameCache(Generic[T]):
 
     def approach_frame(self, number: int) -> tuple[int, T]:
         """Return the frame, or one nearer to it, and its number: a call takes one step at most."""
-        known = self.kept | self._last
-        starts = known if self._course.back else [other for other in known if other <= number]
+        computed = self.kept | self._last
+        starts = computed if self._course.back else [other for other in computed if other <= number]
         reached = min(starts, key=lambda other: abs(number - other), default=-1)
         if reached != number:
-            before, reached = known.get(reached), self._stop(reached, number)
-            known = {reached: self._step(reached, before)}
+            before, reached = computed.get(reached), self._stop(reached, number)
+            computed = {reached: self._step(reached, before)}
             if reached % self._every == 0:
-                self.kept |= known
-        self._last = {reached: known[reached]}
-        return reached, known[reached]
+                self.kept |= computed
+        self._last = {reached: computed[reached]}
+        return reached, computed[reached]
 
     def _stop(self, start: int, number: int) -> int:
         """Return the frame at which a step from `start` towards a frame ends."""

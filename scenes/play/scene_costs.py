@@ -71,9 +71,9 @@ def render_thumbnail(player: Player, name: str) -> Thumbnail:
     every = max(1, (len(player.scene.times) - 1) // (RENDERED_FRAMES - 1))
     frames = list(player.play_frames(every))
     best = max(frames, key=lambda frame: (_count_cuts(player, frame), frame.moved))
-    said = add_cost_label(best, name)
-    taken = best.taken | (said != best.shown).any(axis=2).view(np.uint8)
-    picture = draw_text_panel(said, [player.scene.name], "top right", 0.9, sights=[taken])
+    labelled = add_cost_label(best, name)
+    taken = best.taken | (labelled != best.shown).any(axis=2).view(np.uint8)
+    picture = draw_text_panel(labelled, [player.scene.name], "top right", 0.9, sights=[taken])
     return Thumbnail(
         shrink_image(picture, *IMAGE_SIZE),
         _compute_medians(frames[1:] or frames),

@@ -24,10 +24,10 @@ class Busy:
         self._thread = threading.Thread(target=self._watch, name="busy", daemon=True)
         self._thread.start()
 
-    def begin_work(self, what: str) -> None:
-        """Mark the start or continuation of work on `what`."""
+    def begin_work(self, task: str) -> None:
+        """Mark the start or continuation of work on `task`."""
         with self._lock:
-            self._what = what
+            self._what = task
             self._since = clock.perf_counter() if self._since is None else self._since
 
     def end_work(self) -> None:

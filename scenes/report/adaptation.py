@@ -37,7 +37,7 @@ def debulk_tumour(anatomy: Anatomy) -> Anatomy:
     used, table = np.unique(mesh.table[left], return_inverse=True)
     middles = None if mesh.middles is None else table[:, 4:]
     body = TetMesh(mesh.nodes[used], table[:, :4], mesh.region[left], middles)
-    return Anatomy(body, anatomy.held[used], anatomy.slide_normal[used], anatomy.craniotomy[used])
+    return Anatomy(body, anatomy.fixed[used], anatomy.slide_normal[used], anatomy.craniotomy[used])
 
 
 def build_debulked_study(study: ReportStudy) -> ReportStudy:

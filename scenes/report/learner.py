@@ -98,10 +98,10 @@ def compute_coverage_beyond(
     """Return the coverage of the 95 % bounds outside their guarantee; `truth` (B, n, 3) [m] of the loads `outside`."""
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.left_out.get(spec.name)
-    held = {} if found is None else {"discs": found.held[0]}
+    shares = {} if found is None else {"discs": found.shares[0]}
     if model.bounds is not None and len(outside) >= FORCE_CLASSES:
-        held["beyond"] = compute_coverage(model, outside, truth).held[0]
-    return {name: share for name, share in held.items() if share is not None}
+        shares["beyond"] = compute_coverage(model, outside, truth).shares[0]
+    return {name: share for name, share in shares.items() if share is not None}
 
 
 def _measure_adaptation(study: ReportStudy, spec: LearnerSpec) -> tuple[float | None, ErrorFigures | None]:

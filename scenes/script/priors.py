@@ -36,7 +36,7 @@ class ParameterPrior:
         "normal" has mean 0 here.
     range
         Lower and upper limit; for "normal" the standard deviation, twice.
-    what
+    meaning
         Meaning of the number, with its unit.
     source
         Source of the values.
@@ -45,7 +45,7 @@ class ParameterPrior:
     name: str
     law: Law
     range: tuple[float, float]
-    what: str
+    meaning: str
     source: str
 
     def compute_quantiles(self, share: np.ndarray) -> np.ndarray:

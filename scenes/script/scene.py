@@ -132,10 +132,10 @@ class Scene:
     frames_per_second: float = 30.0
 
     def __post_init__(self) -> None:
-        for what in ("duration", "frames_per_second"):
-            number = getattr(self, what)
+        for name in ("duration", "frames_per_second"):
+            number = getattr(self, name)
             if not isinstance(number, Real) or not 0.0 < float(number) < np.inf:
-                raise InputError(f"the scene {self.name} has {what} {number!r}: give a number above 0.")
+                raise InputError(f"the scene {self.name} has {name} {number!r}: give a number above 0.")
         if float(self.duration) * float(self.frames_per_second) > MAX_FRAMES:
             raise InputError(
                 f"the scene {self.name} lasts {self.duration:g} s at {self.frames_per_second:g} frames a second: "
@@ -320,8 +320,8 @@ def _read_own_scene(path: str) -> Scene:
         except Exception as error:
             raise InputError(format_script_error(FilePath(path).absolute(), error)) from error
         if not isinstance(touch, Touch):
-            what = type(touch).__name__
-            raise InputError(f"{path}: at {time:g} s its path gives a {what}. Make it a scenes.Touch.")
+            kind = type(touch).__name__
+            raise InputError(f"{path}: at {time:g} s its path gives a {kind}. Make it a scenes.Touch.")
     for effect in found.effects:
         if isinstance(effect, Elasticity):
             for tissue in (effect.default, *effect.regions.values()):

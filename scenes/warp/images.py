@@ -150,12 +150,12 @@ class PatientImage:
 
 @dataclass(frozen=True)
 class Warped:
-    """Name of a warped image, and its numbers of voxels that moved, came from outside, and were cut away."""
+    """Name of a warped image, and its numbers of voxels that moved, came from outside, and were resected."""
 
     name: str
     moved: int
     outside: int
-    gone: int
+    resected: int
 
 
 def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> PatientImage:
@@ -224,19 +224,19 @@ def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order:
         out.header.set_slope_inter(slope, shift)
     name = to_warped_name(picture.path)
     nibabel.save(out, folder / name)
-    return Warped(name, counts.moved, counts.outside, counts.gone)
+    return Warped(name, counts.moved, counts.outside, counts.resected)
 
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Count the voxels that moved, came from outside the image, or from removed tissue.
+    """Count the voxels that moved, came from outside the image, or from resected tissue.
 
     Also return the blank ones (I, J, K).
     """
 
     moved: int
     outside: int
-    gone: int
+    resected: int
     blank: np.ndarray
 
 
@@ -249,7 +249,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
     if order > 1:
         source = ndimage.spline_filter(source.astype(np.float64), order, mode="nearest")
     out, blank = values.copy(), np.zeros(values.shape, bool)
-    moved = outside = gone = 0
+    moved = outside = resected = 0
     last = np.array(values.shape) - 1
     sides = values.shape[1:]
     for first in range(0, len(values), BATCH_SLICES):
@@ -273,8 +273,8 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
         numbers = np.ravel_multi_index(index[rows].T - np.array([[first], [0], [0]]), (len(slab), *sides))
         slab.reshape(-1)[numbers] = np.where(off | cut, 0, _as(read, values.dtype))
         blank[first : first + BATCH_SLICES].reshape(-1)[numbers] = off | cut
-        outside, gone = outside + int(off.sum()), gone + int(cut.sum())
-    return out, Counts(moved, outside, gone, blank)
+        outside, resected = outside + int(off.sum()), resected + int(cut.sum())
+    return out, Counts(moved, outside, resected, blank)
 
 
 def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

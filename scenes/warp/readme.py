@@ -65,7 +65,7 @@ def write_readme(report: dict, images: Sequence[Warped]) -> str:
     lines = ""
     for one in images:
         lines += f"{one.name}\n    your image now, on its own grid: {one.moved:,} voxels moved.\n"
-        lines += f"    0 as their source lies outside: {one.outside:,}; as it was cut away: {one.gone:,}.\n"
+        lines += f"    0 as their source lies outside: {one.outside:,}; as it was resected: {one.resected:,}.\n"
     named = [*report["landmarks"], *([CENTROID] if {TUMOUR, NEAREST} & {*report["landmarks"]} else [])]
     points = "".join(f"    {name}: {DESCRIPTIONS[name]}\n" for name in named)
     surfaces = (

@@ -216,8 +216,7 @@ def _note_cavity(
     ml = 1e6 * int(whole.mask(fluid).sum()) * abs(float(np.linalg.det(whole.affine[:3, :3])))
     return (
         f"{ml:.2g} ml are a cavity, label {format_labels(fluid)}: where the mask holds it, it becomes brain. "
-        "For a region "
-        f"with a stiffness of its own add --ventricles {','.join(map(str, fluid))}",
+        f"For a region with a stiffness of its own add --ventricles {','.join(map(str, fluid))}",
     )
 
 

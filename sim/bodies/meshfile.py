@@ -256,7 +256,7 @@ def write_anatomy(path: str | Path, anatomy: Anatomy) -> None:
         path,
         anatomy.mesh,
         {
-            "held": anatomy.held.astype(np.uint8),
+            "held": anatomy.fixed.astype(np.uint8),
             "slide_normal": anatomy.slide_normal,
             "craniotomy": anatomy.craniotomy.astype(np.uint8),
         },

@@ -75,7 +75,7 @@ def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
         halved[count:] = KDTree(nodes[np.unique(opening)]).query(nodes[count:])[0] <= reach
     halved = _make_conforming(table, halved)
     tets, parent = _build_children(nodes, table, halved[table[:, 4:]])
-    held, normal = space.extend_held(anatomy.held), space.extend_normals(anatomy.slide_normal, anatomy.held)
+    held, normal = space.extend_held(anatomy.fixed), space.extend_normals(anatomy.slide_normal, anatomy.fixed)
     craniotomy = np.zeros(space.count, bool)
     craniotomy[opening] = True
     craniotomy[:count] = anatomy.craniotomy

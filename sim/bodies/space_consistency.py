@@ -34,14 +34,12 @@ def has_one_space(brain: Mask, tumour: Mask) -> bool:
     if within < MIN_INSIDE_FRACTION and turned > MIN_MIRRORED_FRACTION:
         raise InputError(
             f"{tumour.path}: its tumour lies at {_format_box(boxes[1])}, and the brain of {brain.path} at "
-            f"{_format_box(boxes[0])}. "
-            f"With x and y negated it would lie in the brain: {EXPORT_REMEDY}"
+            f"{_format_box(boxes[0])}. With x and y negated it would lie in the brain: {EXPORT_REMEDY}"
         )
     if apart:
         raise InputError(
             f"{tumour.path}: its tumour lies at {_format_box(boxes[1])} and does not overlap the brain of "
-            f"{brain.path}, at "
-            f"{_format_box(boxes[0])}. Give volumes of one space, or resample one into the other's."
+            f"{brain.path}, at {_format_box(boxes[0])}. Give volumes of one space, or resample one into the other's."
         )
     return turned > MIN_MIRRORED_FRACTION and not _is_same_grid(brain.grid, tumour.grid)
 

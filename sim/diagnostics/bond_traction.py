@@ -61,14 +61,14 @@ class Bond:
         self._effect, self._device = effect, device
         covered = (anatomy.slide_normal != 0.0).any(axis=1)
         corners = space.mesh.surface
-        wall = (covered | anatomy.held.all(axis=1))[corners].all(axis=1) & covered[corners].any(axis=1)
+        wall = (covered | anatomy.fixed.all(axis=1))[corners].all(axis=1) & covered[corners].any(axis=1)
         triangles = space.surface[wall]
         share = np.repeat(compute_areas(space.nodes[triangles[:, :3]])[:, None] / 3.0, 3, axis=1)
         # For quadratic triangles, the integrals of the corners' shape functions are zero.
         area = np.bincount(triangles[:, -3:].ravel(), share.ravel(), space.count)
         nodes = np.unique(triangles)
         near = KDTree(space.nodes[nodes]).query_ball_point(space.nodes[nodes], around)
-        normal = space.extend_normals(anatomy.slide_normal, anatomy.held)[nodes]
+        normal = space.extend_normals(anatomy.slide_normal, anatomy.fixed)[nodes]
         kept = np.flatnonzero(normal.any(axis=1) & np.array([area[nodes[patch]].any() for patch in near], bool))
         patches = [nodes[near[patch]] for patch in kept]
         self.nodes = nodes[kept]

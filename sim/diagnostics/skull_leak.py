@@ -86,7 +86,7 @@ class Leak:
     """
 
     def __init__(self, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 7e-3):
-        solid = (anatomy.slide_normal != 0.0).any(axis=1) | anatomy.held.all(axis=1)
+        solid = (anatomy.slide_normal != 0.0).any(axis=1) | anatomy.fixed.all(axis=1)
         covered = solid[space.mesh.surface].all(axis=1)
         vectors = integrate_facet_normals(space.nodes, space.surface)
         corners = space.nodes[space.surface[:, :3]]

@@ -40,7 +40,7 @@ class RemainingBody:
 
 
 def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
-    """Return the remaining bodies under effects with a `Resection`; `Anatomy.held` counts only if they include `Held`.
+    """Return the remaining bodies under effects with a `Resection`; `Anatomy.fixed` counts only if they include `Held`.
 
     Raises
     ------
@@ -50,8 +50,8 @@ def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[
     effects = tuple(effects)
     cut = next(effect for effect in effects if isinstance(effect, Resection))
     kinds = {type(effect) for effect in effects}
-    held = Held in kinds or not anatomy.held.any()
-    whole = anatomy if held else replace(anatomy, held=np.zeros_like(anatomy.held))
+    held = Held in kinds or not anatomy.fixed.any()
+    whole = anatomy if held else replace(anatomy, fixed=np.zeros_like(anatomy.fixed))
     return compute_remains(whole, cut, bool(kinds & {Bonded, Slide}))
 
 
@@ -68,7 +68,7 @@ def compute_remains(anatomy: Anatomy, effect: Resection, slides: bool = True) ->
 
 def _iterate_bodies(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[RemainingBody]:
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
-    check_held(anatomy.mesh, anatomy.held, normal)  # else all of it would count as disconnected
+    check_held(anatomy.mesh, anatomy.fixed, normal)  # else all of it would count as disconnected
     yield RemainingBody(0, anatomy, np.zeros(0, np.int64))
     taken: set[int] = set()
     for done, step in enumerate(effect.steps, start=1):

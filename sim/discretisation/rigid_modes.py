@@ -59,9 +59,9 @@ def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, tolerance: floa
     for number in np.unique(cluster):
         mine = np.flatnonzero(cluster == number)
         node = np.unique(anatomy.mesh.table[mine])
-        if not anatomy.held[node].any():
+        if not anatomy.fixed[node].any():
             one = np.zeros(len(node), np.int64)
-            if _count_free_motions(nodes, anatomy.held, normal, one, node, tolerance)[0]:
+            if _count_free_motions(nodes, anatomy.fixed, normal, one, node, tolerance)[0]:
                 loose.append(mine)
     return np.concatenate(loose) if loose else np.zeros(0, np.int64)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -21,8 +22,8 @@ class Cases:
 
     loads have B rows; start_time is (B,) [s]. memory: by term name, arrays with B rows, as `Term.end` returned them.
     displacement (B, N, 3) [m] of the nodes at the start; None: undeformed. share (B,): path fraction that tools have
-    covered, 1 if None. `anew` (B,) bool: descents that start undeformed and without
-    contact; none if None. warm: data of an earlier solution that speed up this one, rows (B, ...).
+    covered, 1 if None. `restarted` (B,) bool: descents that start undeformed and without contact; none if None.
+    warm: data of an earlier solution that speed up this one, rows (B, ...).
     """
 
     loads: Loads
@@ -30,11 +31,11 @@ class Cases:
     memory: Mapping[str, Any] = field(default_factory=dict)
     displacement: np.ndarray | None = None
     share: np.ndarray | None = None
-    anew: np.ndarray | None = None
+    restarted: np.ndarray | None = None
     warm: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def gone(self) -> np.ndarray:
+    def path_fraction(self) -> np.ndarray:
         """Path fractions (B,) that tools have covered."""
         return np.ones(len(self.loads)) if self.share is None else self.share
 
@@ -61,9 +62,9 @@ class Cases:
         memory = {name: value[index] for name, value in self.memory.items()}
         displacement = None if self.displacement is None else self.displacement[index]
         share = None if self.share is None else self.share[index]
-        anew = None if self.anew is None else self.anew[index]
+        restarted = None if self.restarted is None else self.restarted[index]
         warm = {name: value[index] for name, value in self.warm.items()}
-        return Cases(self.loads.select(index), self.start_time[index], memory, displacement, share, anew, warm)
+        return Cases(self.loads.select(index), self.start_time[index], memory, displacement, share, restarted, warm)
 
     def get_past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Return the memory of the term `name`, (B, *shape) float64; zeros without one.
@@ -82,7 +83,8 @@ class Cases:
             )
         return np.zeros(whole) if found is None else np.asarray(found, np.float64)
 
-    rows, past = select, get_past  # Former names, for one release.
+    # Former names, for one release.
+    rows, past, gone, anew = select, get_past, path_fraction, property(attrgetter("restarted"))
 
 
 @runtime_checkable

@@ -128,8 +128,7 @@ def parse_device_names(words: str) -> tuple[str, ...]:
         if not cards:
             raise InputError(
                 f"'all' means every GPU, and there is none here{_explain_no_gpu()}: choose auto, or name devices "
-                "separated by "
-                "commas, as in cpu,cpu."
+                "separated by commas, as in cpu,cpu."
             )
         return cards
     asked = [name.strip() for name in words.split(",")]

@@ -147,14 +147,14 @@ class Strategy:
             started = guess.any(axis=0)
             history = EMPTY_HISTORY if astray.any() else restore_history(cases, problem.rows)
             if problem.barriers and astray.any():
-                cases = replace(cases, anew=astray.copy())
+                cases = replace(cases, restarted=astray.copy())
                 problem.begin(cases)
             result = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), history)
             lost = np.where(result.good, self.inversion.find_doubtful(result.inverted), self._find_unsolved(result))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
-                some = replace(cases.select(again), anew=np.ones(len(again), bool))
+                some = replace(cases.select(again), restarted=np.ones(len(again), bool))
                 problem.begin(some)
                 result.put(again, self._solve_whole_load(some), device)
         result.outcome[astray & result.good] = Outcome.CONVERGED_ANEW
@@ -306,7 +306,7 @@ class Strategy:
         The cases are the rows `index` (k,) of `failed`, whose result stays where no larger fraction is found.
         """
         problem, device = self.problem, self.problem.device
-        cases = replace(cases, anew=np.ones(len(index), bool))
+        cases = replace(cases, restarted=np.ones(len(index), bool))
 
         def raised(part: Cases, share: np.ndarray) -> Cases:
             return replace(part, loads=part.loads.scale(share), share=share)

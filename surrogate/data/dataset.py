@@ -36,6 +36,7 @@ CAUSES: dict[str, type[Cause]] = {  # Types of loads that a data set may contain
 FORMAT = "sulcus data 2"  # Name and version of the file format.
 OLD_FORMAT = "sulcus data 1"  # Format without checksums, with flags of the finished rows: can be read, but not resumed.
 MESH = ("nodes", "tets", "region", "middles")  # Names of a mesh's arrays; linear meshes have no `middles`.
+CONDITIONS = ("held", "slide_normal", "craniotomy")  # Names of the boundary conditions; `held`: `Anatomy.fixed`.
 SEAL_ATTRIBUTE = "digest of these attributes"  # Attribute that contains the hash of all other texts.
 CHUNK_ROWS = 256  # Number of rows read at once.
 MAX_DISPLACEMENT = 1.0  # Largest valid displacement [body lengths].
@@ -191,8 +192,7 @@ class Dataset:
 def _format_damaged(path: Path, lost: np.ndarray, group: str) -> str:
     return (
         f"{path}: {format_row_numbers(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: "
-        "it solves those alone; "
-        "simulate data of an earlier version again."
+        "it solves those alone; simulate data of an earlier version again."
     )
 
 
@@ -286,8 +286,8 @@ def write_embedded(file: h5py.File, anatomy: Anatomy) -> None:
     group = file.create_group("anatomy")  # groups that HDF5 creates implicitly have a date
     for name, array in zip(MESH, anatomy.mesh.arrays, strict=False):
         group[name] = array
-    for name in ("held", "slide_normal", "craniotomy"):
-        group[name] = getattr(anatomy, name)
+    for name, array in zip(CONDITIONS, (anatomy.fixed, anatomy.slide_normal, anatomy.craniotomy), strict=True):
+        group[name] = array
     group.attrs["digest"] = anatomy.digest
 
 
@@ -300,8 +300,7 @@ def read_embedded(file: h5py.File) -> Anatomy:
         Arrays that do not match the stored digest.
     """
     array = {name: read_stored(file, f"anatomy/{name}", "fiu")[:] for name in MESH if f"anatomy/{name}" in file}
-    sets = {name: read_stored(file, f"anatomy/{name}", "fb")[:] for name in ("held", "slide_normal", "craniotomy")}
-    anatomy = Anatomy(TetMesh(**array), **sets)
+    anatomy = Anatomy(TetMesh(**array), *(read_stored(file, f"anatomy/{name}", "fb")[:] for name in CONDITIONS))
     if anatomy.digest != file["anatomy"].attrs["digest"]:
         raise InputError(f"{file.filename}: the anatomy inside was changed after it was written: simulate again.")
     return anatomy

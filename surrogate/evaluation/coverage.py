@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ..model.conformal import LEVELS
 from ..model.learned import Learned
 
 FORCE_CLASSES = 10  # Number of classes of force for which coverage is reported.
-Held = tuple[float | None, ...]
+Shares = tuple[float | None, ...]
 """Share of loads within their bounds for each of `conformal.LEVELS`; None where bounds give no guarantee."""
 
 
@@ -27,7 +28,7 @@ class Coverage:
     ----------
     loads
         n.
-    held
+    shares
         Empirical coverage for `conformal.LEVELS`; None if there were too few calibration loads for a guarantee. The
         error is the maximum over the tumour, or that of the distance from tip to tumour.
     tenths
@@ -39,17 +40,19 @@ class Coverage:
     """
 
     loads: int
-    held: Held
+    shares: Shares
     tenths: tuple[float, ...]
     bound_mm: float
     error_mm: float
     extrapolated: int
 
+    held = property(attrgetter("shares"))  # Former name, for one release.
+
     def __str__(self) -> str:
         tenths = " ".join(f"{100 * share:.0f}" for share in self.tenths)
         return (
-            f"{format_held(self.held)}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median error "
-            f"{self.error_mm:.4f} mm; {self.extrapolated} loads outside the training range"
+            f"{format_shares(self.shares)}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median "
+            f"error {self.error_mm:.4f} mm; {self.extrapolated} loads outside the training range"
         )
 
 
@@ -90,7 +93,7 @@ def _check_load_count(loads: Loads) -> None:
         raise InputError(f"{len(loads)} loads have no tenths: simulate at least {FORCE_CLASSES}.")
 
 
-def measure_held(error: np.ndarray, bound: np.ndarray) -> Held:
+def measure_shares(error: np.ndarray, bound: np.ndarray) -> Shares:
     """Compute shares of errors (B,) within bounds (levels, B) of the same unit; None if all bounds are infinite."""
     promised = ~np.isposinf(bound)
     return tuple(
@@ -98,9 +101,9 @@ def measure_held(error: np.ndarray, bound: np.ndarray) -> Held:
     )
 
 
-def format_held(held: Held) -> str:
+def format_shares(covered: Shares) -> str:
     """Describe the coverage at each level."""
-    shares = zip(held, LEVELS, strict=True)
+    shares = zip(covered, LEVELS, strict=True)
     return ", ".join(
         f"no guarantee at {100 * level:g} %" if share is None else f"{100 * share:.1f} % at {100 * level:g} %"
         for share, level in shares
@@ -109,12 +112,12 @@ def format_held(held: Held) -> str:
 
 def measure_covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
     """Compute the coverage of errors (B,) [m] by bounds (2, B) [m], overall and by deciles of force (B,) [N]."""
-    held = error <= bound[0]
+    covered = error <= bound[0]
     by_force = np.array_split(np.argsort(force, kind="stable"), FORCE_CLASSES)
     return Coverage(
         len(error),
-        measure_held(error, bound),
-        tuple(float(held[rows].mean()) for rows in by_force),
+        measure_shares(error, bound),
+        tuple(float(covered[rows].mean()) for rows in by_force),
         1e3 * float(np.median(bound[0])),
         1e3 * float(np.median(error)),
         extrapolated,

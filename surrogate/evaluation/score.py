@@ -16,7 +16,7 @@ from sim.runtime.threads import limit_to_one_thread
 
 from ..model.held_out import MIN_LOADS_FOR_P999
 from ..model.learned import Learned
-from .coverage import Held, format_held, measure_held
+from .coverage import Shares, format_shares, measure_shares
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ForceScore:
         Mean error [N].
     mean_percent, p95_percent
         Mean and 95th percentile of the errors divided by the load's force [%].
-    held
+    shares
         Empirical coverage of the bound, see `Coverage`; None without a bound.
     bound
         Median of the bound at the first level [N]; None without a bound.
@@ -80,13 +80,13 @@ class ForceScore:
     mean: float
     mean_percent: float
     p95_percent: float
-    held: Held | None = None
+    shares: Shares | None = None
     bound: float | None = None
 
     def __str__(self) -> str:
         promised = "no bounds"
-        if self.held is not None and self.bound is not None:
-            promised = f"bounds held for {format_held(self.held)}; median bound {self.bound:.4f} N"
+        if self.shares is not None and self.bound is not None:
+            promised = f"bounds cover {format_shares(self.shares)}; median bound {self.bound:.4f} N"
         return (
             f"mean error {self.mean:.4f} N of {self.force:.3f} N, {self.mean_percent:.2f} % of each load's force, "
             f"p95 {self.p95_percent:.2f} %; {promised}"
@@ -121,7 +121,7 @@ def score_forces(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None 
         float(error[some].mean()),
         float(share.mean()),
         float(np.percentile(share, 95.0)),
-        measure_held(error[some], bound[:, some]) if bound is not None else None,
+        measure_shares(error[some], bound[:, some]) if bound is not None else None,
         float(np.median(bound[0, some])) if bound is not None else None,
     )
 
@@ -247,7 +247,7 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
     fastest = min(scores, key=lambda row: row.microseconds)
     verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
     wins = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
-    few = [f"p99.9: not known from fewer than {MIN_LOADS_FOR_P999} loads"] if scores[0].p999_mm is None else []
+    few = [f"p99.9: not estimated from fewer than {MIN_LOADS_FOR_P999} loads"] if scores[0].p999_mm is None else []
     return "\n".join([head, *rows, *few, wins if len(scores) > 1 else f"{best.name}: {verdict}", *_solve_lines(scores)])
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from operator import attrgetter
 
 import numpy as np
 
@@ -77,7 +78,7 @@ class Location:
         Posterior of the shapes' weights and of the rigid error, with calibrated covariances.
     p95
         [m]: with probability 0.95 the centroid of the tumour is within this distance of `centroid`.
-    outliers, tips_left_out
+    outliers, outlier_tips
         Numbers of points, and of tips, from 0. They are away from the open cortex, or no other point supports them.
     slipped
         True if the registration may have slipped, by far more than reported. Then the posterior includes a slip.
@@ -94,7 +95,7 @@ class Location:
     posterior: Posterior
     p95: float
     outliers: np.ndarray
-    tips_left_out: np.ndarray
+    outlier_tips: np.ndarray
     slipped: bool
     checked: bool
     calibrated: bool
@@ -225,7 +226,8 @@ class Location:
             return "none, as what was seen is within its errors"
         return ", ".join(map(str, self.cause_shares))
 
-    at, covariance = compute_motion, compute_covariance  # Former names, for one release.
+    # Former names, for one release.
+    at, covariance, tips_left_out = compute_motion, compute_covariance, property(attrgetter("outlier_tips"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +288,7 @@ class Locator:
             posterior=found,
             p95=compute_radius(found.compute_covariance(prior.middle[:, None])[0]),
             outliers=outliers,
-            tips_left_out=found.outliers[found.outliers >= count] - count,
+            outlier_tips=found.outliers[found.outliers >= count] - count,
             slipped=slipped,
             checked=observation.checked,
             calibrated=not slipped and is_within_trials(self.tried, found.evidence),

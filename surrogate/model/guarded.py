@@ -90,14 +90,14 @@ class Guarded:
 
 def get_held_out_error(model: Learned) -> HeldOutError:
     """Return a model's reported errors on held-out cortex."""
-    return HeldOutError(model.bound, model.left_out)
+    return HeldOutError(model.bound, model.held_out)
 
 
 def describe_error(model: Learned) -> str:
     """Describe a model's reported errors, and the deformer used in scenes: see `Guarded`."""
     stated = get_held_out_error(model)
-    guarded = "it plays alone nevertheless, as its tissue relaxes" if model.series else "scenes play it guarded"
-    return f"{model.left_out or stated}: {guarded if stated.weak else 'it may answer alone'}"
+    guarded = "scenes play it without FEM, as its tissue relaxes" if model.series else "scenes play it guarded"
+    return f"{model.held_out or stated}: {guarded if stated.weak else 'scenes play it without FEM'}"
 
 
 def find_model(deformer: Deformer) -> Learned | None:

@@ -59,26 +59,26 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class HeldOutError:
-    """Reported errors of a model on held-out cortex: `bound` and `left_out` as in `Learned`."""
+    """Reported errors of a model on held-out cortex: `bound` and `held_out` as in `Learned`."""
 
     bound: float
-    left_out: LeftOut | None
+    held_out: LeftOut | None
 
     @property
     def weak(self) -> bool:
         """True if the model needs FEM fallback: by mean error, or by maximum vertex error if that is missing."""
-        return not (self.bound <= MAX_VERTEX_ERROR if self.left_out is None else self.left_out.enough)
+        return not (self.bound <= MAX_VERTEX_ERROR if self.held_out is None else self.held_out.enough)
 
     def __str__(self) -> str:
         """Return a description of the errors and their limits."""
-        if self.left_out is None:
+        if self.held_out is None:
             return (
                 f"maximum error up to {1e3 * self.bound:.2g} mm in 95 % of loads (limit {1e3 * MAX_VERTEX_ERROR:g} mm)"
             )
-        mean = f"mean error {100 * self.left_out.mean:.2g} % of the motion (limit {100 * MAX_MEAN_ERROR:g} %)"
-        if self.left_out.p999 is None:
+        mean = f"mean error {100 * self.held_out.mean:.2g} % of the motion (limit {100 * MAX_MEAN_ERROR:g} %)"
+        if self.held_out.p999 is None:
             return mean
-        return f"{mean}; 99.9th percentile {1e3 * self.left_out.p999:.2g} mm (limit {1e3 * MAX_P999_ERROR:g} mm)"
+        return f"{mean}; 99.9th percentile {1e3 * self.held_out.p999:.2g} mm (limit {1e3 * MAX_P999_ERROR:g} mm)"
 
 
 def find_handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndarray:

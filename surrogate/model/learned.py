@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, reduce
-from operator import add
+from operator import add, attrgetter
 
 import numpy as np
 
@@ -88,7 +88,7 @@ class Learned:
         Tool of the poses that it supports; None: it supports pushes. Depth [m] then replaces force.
     tip
         Model of the distance from tip to tumour, if trained.
-    left_out
+    held_out
         Errors on held-out cortex; None if none was held out, or for older files.
     force
         Model of the tool's force, if trained.
@@ -112,7 +112,7 @@ class Learned:
     training: Mapping[str, str] = field(default_factory=dict)
     tool: BuiltIn | None = None
     tip: TipModel | None = None
-    left_out: LeftOut | None = None
+    held_out: LeftOut | None = None
     force: ForceModel | None = None
 
     @cached_property
@@ -186,8 +186,7 @@ class Learned:
                 raise InputError(
                     f"load {far[0]} has {name} of {unit * size[far[0]]:.3g} {symbol}, but this model was trained on "
                     f"{unit * most:.3g} {symbol} at most: give up to {MAX_TRAINING_RATIO:g} times that, or ask the "
-                    "finite "
-                    "elements."
+                    "finite elements."
                 )
         away = find_nearest(pushed.point[doubtful], self._patch.points)[1]
         if (away > pushed.footprint[doubtful]).any():  # away from nodes, but perhaps not from triangles
@@ -363,7 +362,7 @@ class Learned:
 
     # Former names, for one release.
     motion, within, exerted, promised = predict_motion, clip_to_range, predict_force, compute_bounds
-    distance, asked = predict_distance, to_input
+    distance, asked, left_out = predict_distance, to_input, property(attrgetter("held_out"))
 
 
 def build_prediction(

@@ -39,7 +39,7 @@ def check_model_state(name: str, model: Learned) -> None:
         _check_envelope(model.envelope)
         _require_good(isinstance(model.bound, float) and not model.bound < 0.0, "its bound is no distance")
         _require_good(
-            model.left_out is None or _is_valid_error(model.left_out), "its errors on left-out cortex are no errors"
+            model.held_out is None or _is_valid_error(model.held_out), "its errors on held-out cortex are no errors"
         )
         texts = (*model.training, *model.training.values())
         _require_good(all(isinstance(text, str) for text in texts), "what it states of its training is no text")

@@ -132,7 +132,7 @@ def read_reported_errors(path: str | Path) -> dict[str, HeldOutError]:
         A file that is missing, or not a model file of this project.
     """
     with _open_header(path) as header:
-        return {name: HeldOutError(about["bound"], _read_left_out(about)) for name, about in header["models"].items()}
+        return {name: HeldOutError(about["bound"], _read_held_out(about)) for name, about in header["models"].items()}
 
 
 def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
@@ -167,7 +167,7 @@ def _read_header(archive: Archive) -> dict[str, Any]:
     return header
 
 
-def _read_left_out(description: dict[str, Any]) -> LeftOut | None:
+def _read_held_out(description: dict[str, Any]) -> LeftOut | None:
     """Read the errors on held-out cortex; None for older files."""
     stated = description.get("left_out")
     return None if stated is None else LeftOut(**stated)
@@ -224,7 +224,7 @@ def _describe_model(model: Learned, put: Any) -> dict[str, Any]:
         "training": dict(model.training),
         "tool": None if model.tool is None else repr(model.tool),
         "tip": None if model.tip is None else _describe_tip(model.tip, put),
-        "left_out": None if model.left_out is None else asdict(model.left_out),
+        "left_out": None if model.held_out is None else asdict(model.held_out),
         "force": None if model.force is None else _describe_force(model.force, put),
     }
 
@@ -306,6 +306,6 @@ def _rebuild_model(description: dict[str, Any], arrays: Mapping[str, np.ndarray]
         # Missing in older files.
         tool=read_tool_statement(description.get("tool"), description.get("ball")),
         tip=_rebuild_tip(description.get("tip"), arrays, envelope["reach"]),
-        left_out=_read_left_out(description),
+        held_out=_read_held_out(description),
         force=_rebuild_force(description.get("force"), arrays, envelope["reach"]),
     )

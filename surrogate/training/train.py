@@ -227,7 +227,7 @@ def _train_and_score(
             )
             motion = _compute_motion(answers, split.test)
             model = replace(
-                model, left_out=measure_held_out(distance, motion, bound["tumour"][0], far.tumour.extrapolated)
+                model, held_out=measure_held_out(distance, motion, bound["tumour"][0], far.tumour.extrapolated)
             )
             promised = bound.get("force")
     forces = None

@@ -284,8 +284,8 @@ class Skull:
         known = np.zeros(len(cases.loads), bool)
         if cases.displacement is not None:
             known |= cases.displacement.any(axis=(1, 2))
-        if cases.anew is not None:
-            known &= ~cases.anew
+        if cases.restarted is not None:
+            known &= ~cases.restarted
         return np.where(known, self._settings.next_width, self._settings.first_width) / self._bone.activation.min()
 
     def find_buried(self, u: wp.array) -> np.ndarray:

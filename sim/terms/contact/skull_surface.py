@@ -98,8 +98,8 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
     InputError
         An anatomy without nodes that can touch the skull.
     """
-    held = space.extend_held(anatomy.held).all(axis=1)
-    normal = space.extend_normals(anatomy.slide_normal, anatomy.held)
+    held = space.extend_held(anatomy.fixed).all(axis=1)
+    normal = space.extend_normals(anatomy.slide_normal, anatomy.fixed)
     slides = (normal != 0.0).any(axis=1) & ~held
     if not slides.any():
         raise InputError("SkullContact finds no node that can touch: all slide normals are zero, or their nodes fixed.")
@@ -206,5 +206,5 @@ def measure_inside_opening(
 
 def find_triangles_about_opening(anatomy: Anatomy) -> np.ndarray:
     """Return a mask (S,) of surface triangles whose corners all lie in the craniotomy or under bone."""
-    covered = np.logical_or(anatomy.slide_normal.any(axis=1), anatomy.held.all(axis=1))
+    covered = np.logical_or(anatomy.slide_normal.any(axis=1), anatomy.fixed.all(axis=1))
     return np.all(np.logical_or(anatomy.craniotomy, covered)[anatomy.mesh.surface], axis=1)

@@ -100,7 +100,7 @@ class ToolContactTerm:
         if way is None:
             return np.ones(len(cases.loads))
         clear = wp.full((len(self._owner), u.shape[1]), np.inf, dtype=wp.float64, device=self._device.name)
-        inputs = [u, self._surface, self._get_tools(way.interpolate(cases.gone))]
+        inputs = [u, self._surface, self._get_tools(way.interpolate(cases.path_fraction))]
         self._device.launch(self._kernels.clearance, (len(self._triangles), u.shape[1]), inputs, [clear])
         of_tools = np.minimum.reduceat(clear.numpy(), self._first, axis=0).T + self._sag
         return way.compute_stride(self._shapes, of_tools.clip(0.0), self._touch)
@@ -140,7 +140,7 @@ class ToolContactTerm:
     def begin(self, cases: Cases) -> None:
         """Place the tools at their fraction of the path, and reset the gap."""
         way = self._way(cases)
-        self._set_pose(None if way is None else way.interpolate(cases.gone))
+        self._set_pose(None if way is None else way.interpolate(cases.path_fraction))
         self.widen(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
@@ -314,17 +314,17 @@ def build_tool_contact(
                 raise InputError(
                     f"Touching has poses of {cause.pose.shape[1]} tools, but ToolContact has {len(tools)}."
                 )
-            return ToolPath(_find_path_starts(last, cases.anew, clear, cause.pose), cause.pose)
+            return ToolPath(_find_path_starts(last, cases.restarted, clear, cause.pose), cause.pose)
         cause = cases.loads.get(Retracted)
         if cause is None:
             return None
         laid = cause.pose[:, None]
         held = laid.copy()
         held[:, 0, :3, 3] += cause.displacement
-        return ToolPath(_find_path_starts(last, cases.anew, lambda pose: pose, laid), held)
+        return ToolPath(_find_path_starts(last, cases.restarted, lambda pose: pose, laid), held)
 
     whole = space.surface[:, :3]
-    solid = np.logical_or(anatomy.held.all(axis=1), anatomy.slide_normal.any(axis=1))
+    solid = np.logical_or(anatomy.fixed.all(axis=1), anatomy.slide_normal.any(axis=1))
     bone = space.surface[solid[whole].all(axis=1)]
     return ToolContactTerm(
         name, tools, way, nodes=space.nodes, triangles=triangles, whole=whole, bone=bone,
@@ -345,11 +345,11 @@ def _build_surface(nodes: np.ndarray, triangles: np.ndarray, fine: float, device
 
 
 def _find_path_starts(
-    last: np.ndarray | None, anew: np.ndarray | None, clear: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
+    last: np.ndarray | None, restarted: np.ndarray | None, clear: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
 ) -> np.ndarray:
-    """Return path starts for poses (B, tools, 4, 4): the last poses; contact-free ones without history or if `anew`."""
+    """Return path starts for poses (B, tools, 4, 4): the last; without history or if `restarted`, contact-free ones."""
     begin = pose.copy() if last is None else last.copy()
-    new = np.ones(len(pose), bool) if last is None else np.zeros(len(pose), bool) if anew is None else anew
+    new = np.ones(len(pose), bool) if last is None else np.zeros(len(pose), bool) if restarted is None else restarted
     begin[new] = clear(pose[new])
     return begin
 
