@@ -24,6 +24,7 @@ from ..script.framing import DRAPE_HEIGHT
 from ..script.observation_models import StereoObservation
 from ..script.scene import Scene
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
+from .fine_cortex import FineCortex, build_fine_cortex
 from .observer import Sees
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
@@ -131,12 +132,17 @@ class Stage:
         If the brain separates from the skull, the surface beyond the drape's hole is rendered below it. The drape
         follows the scan's surface, and a sliding gyrus would penetrate it.
         """
-        layer = self._visible.build_layer(positions)
+        layer = self._build_fine(positions) if self.scene.look.gyri else self._visible.build_layer(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
             return layer
         beyond = self.site.compute_axis_distance(layer.vertices) - HOLE_RATIO * self.site.clearance
         below = np.minimum(DRAPE_SLOPE * beyond.clip(0.0), DRAPE_DEPTH)
         return replace(layer, vertices=layer.vertices + below[:, None] * self.site.axis)
+
+    def _build_fine(self, positions: np.ndarray) -> Layer:
+        fine, tint = self.fine, self.scene.look.tint
+        at = fine.surface.place(positions[fine.vertices])
+        return Layer("cortex", CORTEX, at, fine.surface.triangles, fine.colour * tint, gloss=0.7, shininess=110.0)
 
     @cached_property
     def brain(self) -> Layer:
@@ -224,9 +230,18 @@ class Stage:
 
     @cached_property
     def _visible(self) -> Cortex:
+        return self._build_cortex(self._list_visible())
+
+    def _list_visible(self) -> np.ndarray:
+        """List the surface triangles (S, 3) of open cortex and edge."""
         mesh = self.anatomy.mesh
         away = np.linalg.norm(mesh.nodes[mesh.surface] - self.site.origin, axis=2).min(axis=1)
-        return self._build_cortex(mesh.surface[away < self.site.radius + RIM_DISTANCE])
+        return mesh.surface[away < self.site.radius + RIM_DISTANCE]
+
+    @cached_property
+    def fine(self) -> FineCortex:
+        """Fine surface that embeds gyri and vessels in the visible FEM surface."""
+        return build_fine_cortex(self.site, self.anatomy.mesh, self._list_visible(), self.intensity)
 
     def _build_cortex(self, surface: np.ndarray) -> Cortex:
         """Triangles (S, 3) of the mesh's surface that wear the scan."""

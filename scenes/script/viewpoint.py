@@ -63,9 +63,12 @@ class Appearance:
     vessels: int | None = None
     cottonoids: tuple[Cottonoid, ...] = ()
     finger: float | None = None
+    gyri: bool = False
 
 
 PLAIN_APPEARANCE = Appearance()
+"""Look of data sets: the FEM surface, with the scan as its texture."""
+NATURAL_APPEARANCE = Appearance(gyri=True)
 """Default look of scenes."""
 
 
