@@ -107,9 +107,7 @@ class GymTask:
                 look=PLAIN_APPEARANCE, element="p1",
             )  # fmt: skip
         effects = Elasticity(), Held(), Bonded(), ToolContact((self.tool.shape,))
-        return Scene(
-            self.name, self.title, effects=effects, tool=self.tool, viewpoint=view, look=PLAIN_APPEARANCE
-        )
+        return Scene(self.name, self.title, effects=effects, tool=self.tool, viewpoint=view, look=PLAIN_APPEARANCE)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from sim.geometry.tetmesh import TetMesh
 from ..script.craniotomy_frame import CraniotomyFrame
 from .gyri import build_cortex_maps
 
-EDGE_LENGTH = 0.3e-3  # Largest edge of a triangle in the craniotomy [m].
-EDGE_GROWTH = 0.3  # Growth of the largest edge with the distance from the craniotomy.
+EDGE_LENGTH = 0.33e-3  # Largest edge of a triangle in the craniotomy [m].
+EDGE_GROWTH = 0.6  # Growth of the largest edge with the distance from the craniotomy.
 MAX_EDGE_LENGTH = 1.8e-3  # Largest edge of a triangle beyond the craniotomy [m].
 CROWN_DEPTH = 0.25e-3  # Depth of crowns below the rounded FEM surface [m]: its facets limit the fine surface.
 CUT_COLOUR = (0.80, 0.58, 0.46)  # Colour of the walls of a cavity (RGB, 0 to 1).

@@ -137,8 +137,7 @@ def _find_sulci(field: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.nd
     """
     k, width = 2.0 * np.pi / wavelength, 0.06 * wavelength
     x, y, xx, xy, yy = (
-        gaussian_filter(field, width, order=order, mode="wrap")
-        for order in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+        gaussian_filter(field, width, order=order, mode="wrap") for order in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     )
     curvature = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
     turn = 0.5 * np.arctan2(2.0 * xy, xx - yy)

@@ -253,9 +253,11 @@ class Player:
         remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
-            marks = Marks(band, shown, rest, traces)
-            words = Words(doubt, head, get_legend_names(estimate), moved, error.bound)
-            over = composite(picture, camera, tumour, self.style, Cover(OCCLUDER_LABELS, OPENING), marks, words)
+            marks = Marks(band, shown, stage.smooth_tumour_at_rest, traces)
+            words = Words(doubt, head, get_legend_names(estimate), moved or (motion, None), error.bound)
+            over = composite(
+                picture, camera, stage.smooth_tumour(tumour), self.style, Cover(OCCLUDER_LABELS, OPENING), marks, words
+            )
             if estimate is not None and self.style != "none":
                 draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
             annotate(over, number, remark)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from ar.optics.camera import Camera
 from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
+from ar.rendering.embedding import EmbeddedSurface, subdivide
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.renderer import Lamp, Picture, Renderer, build_lamp
 from sim.anatomy import Anatomy
@@ -54,6 +55,8 @@ ESTIMATED_LINES = LegendNames(
 READING_DEPTH = 2.0e-3
 # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
 RIM_DISTANCE = 10e-3
+TUMOUR_DEPTH = 0.12e-3  # Depth of that outline below the rounded facets [m]: it cuts corners of the mesh off.
+TUMOUR_EDGE = 1.2e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
 DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
 DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 
@@ -201,6 +204,13 @@ class Stage:
         vertices, triangles = self._tumour
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
+    def smooth_tumour(self, tumour: Layer) -> Layer:
+        """Return a layer of the tumour's surface with rounded facets: for its outline, not for numbers."""
+        surface = self._round_tumour
+        return replace(
+            tumour, vertices=surface.place(tumour.vertices), triangles=surface.triangles, colour=tumour.colour[0]
+        )
+
     def build_reference(self, positions: np.ndarray) -> Layer:
         """Return the tumour surface computed by FEM, drawn for comparison with an estimate."""
         return replace(self.build_tumour(positions), name="truth", colour=np.array(TRUTH_COLOUR))
@@ -209,6 +219,11 @@ class Stage:
     def tumour_at_rest(self) -> Layer:
         """The tumour's surface in the scan."""
         return self.build_tumour(self.site.anatomy.mesh.nodes)
+
+    @cached_property
+    def smooth_tumour_at_rest(self) -> Layer:
+        """The tumour's surface in the scan, with rounded facets."""
+        return self.smooth_tumour(self.tumour_at_rest)
 
     @property
     def tumour_vertices(self) -> np.ndarray:
@@ -223,6 +238,12 @@ class Stage:
     @cached_property
     def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
         return np.unique(self.anatomy.tumour_surface, return_inverse=True)
+
+    @cached_property
+    def _round_tumour(self) -> EmbeddedSurface:
+        at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
+        fine = subdivide(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
+        return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=np.inf)
 
     @cached_property
     def _cortex(self) -> Cortex:

@@ -54,6 +54,9 @@ class Appearance:
         Cottonoids on the cortex.
     finger
         Direction in the tangent plane of a gloved finger that reaches over the opening's edge [rad]; None: no finger.
+    gyri
+        True: gyri, sulci and vessels on a fine surface just below the FEM surface, instead of scan and `vessels`.
+        False: the FEM surface itself, as in data sets.
     """
 
     lamp: float = 1.0
