@@ -102,7 +102,7 @@ def subdivide(points: np.ndarray, triangles: np.ndarray, target: Callable[[np.nd
     The fine surface has no depth. Triangles that share an edge share its vertices.
     """
     coarse, at = triangles, points
-    shares = sparse.identity(len(points), format="csr")
+    shares = sparse.csr_matrix(sparse.identity(len(points)))
     while True:
         ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
         keys, number = np.unique(ends @ [len(at), 1], return_inverse=True)
@@ -112,7 +112,7 @@ def subdivide(points: np.ndarray, triangles: np.ndarray, target: Callable[[np.nd
             break
         new = np.where(long, len(at) + np.cumsum(long) - 1, -1)
         triangles = _split(triangles, new[number].reshape(-1, 3))
-        shares = sparse.vstack([shares, 0.5 * (shares[a[long]] + shares[b[long]])]).tocsr()
+        shares = sparse.csr_matrix(sparse.vstack([shares, 0.5 * (shares[a[long]] + shares[b[long]])]))
         at = shares @ points
     row = np.repeat(np.arange(len(at)), np.diff(shares.indptr))
     place = row, np.arange(len(row)) - shares.indptr[row]

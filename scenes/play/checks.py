@@ -56,8 +56,8 @@ class SceneFigures:
     honest
         True if occluded parts are drawn as a broken outline without shading, and the image names the occluder.
     finite, answered
-        True if every number and image is finite and the visible cortex moves as the FEM surface; true if every solution,
-        drawn or by FEM, has a good outcome.
+        True if every number and image is finite and the visible cortex moves as the FEM surface; true if every
+        solution, drawn or by FEM, has a good outcome.
     doubt
         The first solution that has not: frame, source and outcome; number of others.
     in_step

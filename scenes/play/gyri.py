@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any, cast
 
 import numpy as np
 from scipy.interpolate import griddata
@@ -97,7 +98,7 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
 
     fluid = _read_fluid(site, intensity, half, count // COARSE_STEP)
     field = _solve_swift_hohenberg(random, fluid, GYRI.wavelength / MAP_SPACING / COARSE_STEP)
-    field = warp(zoom(field, COARSE_STEP, order=3, mode="grid-wrap", grid_mode=True), 2.5e-3, GYRI.wander)
+    field = warp(np.asarray(zoom(field, COARSE_STEP, order=3, mode="grid-wrap", grid_mode=True)), 2.5e-3, GYRI.wander)
     field /= np.sqrt(2.0 * gaussian_filter(field**2, 0.5 * GYRI.wavelength / MAP_SPACING, mode="wrap"))
     away, strength = _find_sulci(field, GYRI.wavelength / MAP_SPACING)
     across = np.arccos(np.clip(-field, -1.0, 1.0)) / np.pi  # 0 in a sulcus, 1 on a crown
@@ -111,7 +112,8 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
 
     # Veins lie in some of the sulci.
     radius = GYRI.vein_radius * np.clip(0.25 + 0.6 * smooth(9e-3), 0.0, 1.0) * np.clip(3.0 * strength - 0.6, 0.0, 1.0)
-    parts, _ = label(away < radius)
+    parts = np.zeros((count, count), np.int32)
+    label(away < radius, output=parts)
     least = 2.0 * GYRI.vein_radius * GYRI.vein_length / MAP_SPACING**2
     radius[(np.bincount(parts.ravel()) < least)[parts]] = 0.0
     vein = np.clip((radius - away) / (1.5 * MAP_SPACING) + 0.5, 0.0, 1.0) * (radius > 0.15e-3)
@@ -137,7 +139,8 @@ def _find_sulci(field: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.nd
     """
     k, width = 2.0 * np.pi / wavelength, 0.06 * wavelength
     x, y, xx, xy, yy = (
-        gaussian_filter(field, width, order=order, mode="wrap") for order in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+        gaussian_filter(field, width, order=cast(Any, order), mode="wrap")
+        for order in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     )
     curvature = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
     turn = 0.5 * np.arctan2(2.0 * xy, xx - yy)
