@@ -225,8 +225,8 @@ class Player:
         positions = self.compute_positions(deformation)
         held = None if self.scene.tool is None else self.place_tool(self.scene.tool, touch, positions)
         stage, camera = self.stage.select_stage(loads), self.get_camera(float(loads.times[0]))
-        picture = stage.render(camera, positions, None if held is None else held.pose)
-        field = self.scene.viewpoint.field
+        drawn = stage.plain if self.style == "rings" else stage  # rings lie on the FEM surface
+        picture, field = drawn.render(camera, positions, held and held.pose), self.scene.viewpoint.field
         picture = picture if field is None else add_vignette(picture, field)
         corners = stage.compute_corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
@@ -255,9 +255,8 @@ class Player:
         if self.composed:
             marks = Marks(band, shown, stage.smooth_tumour_at_rest, traces)
             words = Words(doubt, head, get_legend_names(estimate), moved or (motion, None), error.bound)
-            over = composite(
-                picture, camera, stage.smooth_tumour(tumour), self.style, Cover(OCCLUDER_LABELS, OPENING), marks, words
-            )
+            outline, cover = stage.smooth_tumour(tumour), Cover(OCCLUDER_LABELS, OPENING)
+            over = composite(picture, camera, outline, self.style, cover, marks, words)
             if estimate is not None and self.style != "none":
                 draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
             annotate(over, number, remark)

@@ -112,6 +112,11 @@ class Stage:
         )
 
     @cached_property
+    def plain(self) -> Stage:
+        """The stage with the FEM surface as its cortex."""
+        return replace(self, scene=replace(self.scene, look=replace(self.scene.look, gyri=False)))
+
+    @cached_property
     def nodes(self) -> np.ndarray:
         """Sorted mesh vertices (n,) whose motion is rendered: open cortex and tumour."""
         anatomy = self.anatomy
