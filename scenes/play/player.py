@@ -230,8 +230,7 @@ class Player:
         picture = picture if field is None else add_vignette(picture, field)
         corners = stage.compute_corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
-        # # The observer's rendering time is not part of the estimate.
-        seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds
+        seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds  # without its rendering
         tumour, rest = stage.build_tumour(_estimate_positions(positions, estimate)), stage.tumour_at_rest
         doubt = describe_outcome(deformation.outcome[0]) or (
             BONE_WARNING if held is not None and held.beyond > BLOCKED_DEPTH else ""
