@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ar.rendering.embedding import subdivide
+from ar.rendering.embedding import build_embedded_surface
 from scenes.script.tool import build_sphere
 
 POINTS, TRIANGLES = build_sphere(1)
@@ -14,7 +14,7 @@ POINTS, TRIANGLES = build_sphere(1)
 
 @pytest.fixture(scope="module")
 def fine():
-    found = subdivide(POINTS, TRIANGLES, lambda at: np.where(at[:, 2] > 0.0, 0.1, 0.25))
+    found = build_embedded_surface(POINTS, TRIANGLES, lambda at: np.where(at[:, 2] > 0.0, 0.1, 0.25))
     depth = 0.02 * np.random.default_rng(0).random(len(found.depth))
     return replace(found, depth=depth)
 

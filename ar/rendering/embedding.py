@@ -96,7 +96,9 @@ class EmbeddedSurface:
         return fine.numpy()
 
 
-def subdivide(points: np.ndarray, triangles: np.ndarray, target: Callable[[np.ndarray], np.ndarray]) -> EmbeddedSurface:
+def build_embedded_surface(
+    points: np.ndarray, triangles: np.ndarray, target: Callable[[np.ndarray], np.ndarray]
+) -> EmbeddedSurface:
     """Subdivide triangles (S, 3) of points (n, 3) [m] until each edge is as short as `target` [m] at its centre (e, 3).
 
     The fine surface has no depth. Triangles that share an edge share its vertices.

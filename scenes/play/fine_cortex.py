@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ar.rendering.embedding import EmbeddedSurface, subdivide
+from ar.rendering.embedding import EmbeddedSurface, build_embedded_surface
 from sim.bodies.intensity import Intensity
 from sim.geometry.tetmesh import TetMesh
 
@@ -39,7 +39,7 @@ def build_fine_cortex(
         beyond = site.compute_axis_distance(points) - site.clearance
         return np.clip(EDGE_LENGTH + EDGE_GROWTH * beyond, EDGE_LENGTH, MAX_EDGE_LENGTH)
 
-    fine = subdivide(mesh.nodes[vertices], triangles, target)
+    fine = build_embedded_surface(mesh.nodes[vertices], triangles, target)
     maps = build_cortex_maps(site, intensity).sample(site, fine.interpolate(mesh.nodes[vertices]))
     cut = fine.interpolate((~np.isin(vertices, site.anatomy.mesh.surface))[:, None].astype(float))
     depth = CROWN_DEPTH + (1.0 - cut[:, 0]) * maps[:, 0]

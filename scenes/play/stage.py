@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ar.optics.camera import Camera
 from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
-from ar.rendering.embedding import EmbeddedSurface, subdivide
+from ar.rendering.embedding import EmbeddedSurface, build_embedded_surface
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.renderer import Lamp, Picture, Renderer, build_lamp
 from sim.anatomy import Anatomy
@@ -247,7 +247,7 @@ class Stage:
     @cached_property
     def _round_tumour(self) -> EmbeddedSurface:
         at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
-        fine = subdivide(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
+        fine = build_embedded_surface(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
         return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=np.inf)
 
     @cached_property
