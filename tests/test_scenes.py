@@ -153,14 +153,15 @@ class TestCamera:
         frame = play.draw(40, 1.3, play.scene.path(1.3))
         share = np.bincount(frame.picture.segmentation.ravel(), minlength=5) / frame.picture.segmentation.size
         assert share[CORTEX] > 0.08 and share[TOOL] > 0.03 and share[DRAPE] > 0.2 and share[4] == 0.0
-        # What is called cortex lies on the deformed surface, under the edge of the bone too.
+        # What is called cortex lies on the deformed surface or in its sulci, under the edge of the bone too.
         pixels = np.argwhere(frame.picture.segmentation == CORTEX)[::97]
         depth = frame.picture.depth[tuple(pixels.T)]
         seen = frame.camera.unproject(pixels[:, ::-1].astype(float), depth)
         surface = trimesh.Trimesh(
             play.compute_positions(frame.deformation), template.anatomy.mesh.surface, process=False, validate=False
         )
-        assert trimesh.proximity.closest_point_naive(surface, seen)[1].max() < 2e-5
+        away = trimesh.proximity.closest_point_naive(surface, seen)[1]
+        assert away.max() < 5e-3 and np.percentile(away, 75) < 2e-3
 
 
 def test_the_cortex_wears_the_scan(template):

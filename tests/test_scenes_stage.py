@@ -8,13 +8,14 @@ from theatres import small, template_theatre
 
 from scenes.play.player import Player
 from scenes.play.stage import CORTEX, Stage
+from scenes.script.viewpoint import PLAIN_APPEARANCE
 from sim.bodies.intensity import Intensity
 from sim.deformation import Deformer, guess
 
 
 def seen(values, scene=None):
     """The picture and its segmentation of the template with other grey values."""
-    theatre, scene = template_theatre(), scene or small()
+    theatre, scene = template_theatre(), replace(scene or small(), look=PLAIN_APPEARANCE)
     stage = Stage(scene, theatre.site, Intensity(values, theatre.intensity.affine))
     picture = stage.render(scene.viewpoint.build_camera(theatre.site), theatre.anatomy.mesh.nodes, None)
     return picture

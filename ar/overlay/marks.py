@@ -162,7 +162,7 @@ class Words:
     doubt: str = ""
     head: Sequence[str] = ()
     names: LegendNames = DEFAULT_NAMES
-    moved: tuple[float, float] | None = None
+    moved: tuple[float, float | None] | None = None
     error: float | None = None
 
 

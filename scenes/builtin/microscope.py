@@ -9,7 +9,7 @@ from ..script.observation_models import StereoObservation
 from ..script.scene import Bounds, Scene
 from ..script.tool import Probe
 from ..script.tool_paths import Touch, press
-from ..script.viewpoint import Viewpoint
+from ..script.viewpoint import PLAIN_APPEARANCE, Viewpoint
 
 BRAIN = Material("neo-hookean", young=1800.0, poisson=0.45)  # Softer than the default, unknown to the estimate.
 TUMOUR = Material("neo-hookean", young=3200.0, poisson=0.45)  # Stiffer than the brain, unknown to the estimate.
@@ -33,5 +33,6 @@ SCENE = Scene(
     lying=build_drainage(2.0, to=0.2),
     sight=StereoObservation(),
     viewpoint=Viewpoint(width=800, height=600, eye="left", field=1.0),
+    look=PLAIN_APPEARANCE,  # the stereo images of the FEM surface itself
     bounds=Bounds(overlap=0.7, error=3e-3, drawn=2.5, removed=0.5),
 )

@@ -5,7 +5,7 @@ from sim.effects import Bonded, Elasticity, Held, Retraction
 from ..script.scene import Scene
 from ..script.tool import Blade
 from ..script.tool_paths import lay
-from ..script.viewpoint import Appearance, Viewpoint
+from ..script.viewpoint import Viewpoint
 
 BLADE = Blade(width=16e-3, length=28e-3, edge=2e-3)
 
@@ -17,6 +17,5 @@ SCENE = Scene(
     effects=(Elasticity(), Held(), Bonded(), Retraction(BLADE.shape)),
     tool=BLADE,
     viewpoint=Viewpoint(width=800, height=600, field=1.0),
-    look=Appearance(vessels=4),
     deformer="gp-spatula",
 )

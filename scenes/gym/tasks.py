@@ -13,7 +13,7 @@ from sim.material import MATERIALS
 from ..script.debulking import Debulking
 from ..script.scene import Scene
 from ..script.tool import Blade, Instrument, Probe
-from ..script.viewpoint import OBLIQUE_VIEWPOINT
+from ..script.viewpoint import OBLIQUE_VIEWPOINT, PLAIN_APPEARANCE
 
 STEP_SECONDS = 0.05
 """Duration of a step [s]."""
@@ -104,10 +104,10 @@ class GymTask:
             effects = Elasticity(MATERIALS["drained"].tissue), Held(), SkullContact(), Gravity()
             return Scene(
                 self.name, self.title, effects=effects, tool=self.tool, surgery=self.surgery, viewpoint=view,
-                element="p1",
+                look=PLAIN_APPEARANCE, element="p1",
             )  # fmt: skip
         effects = Elasticity(), Held(), Bonded(), ToolContact((self.tool.shape,))
-        return Scene(self.name, self.title, effects=effects, tool=self.tool, viewpoint=view)
+        return Scene(self.name, self.title, effects=effects, tool=self.tool, viewpoint=view, look=PLAIN_APPEARANCE)
 
 
 @dataclass(frozen=True)

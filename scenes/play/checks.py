@@ -9,7 +9,7 @@ import numpy as np
 
 from ar.optics.camera import Camera, project_cv2
 from ar.overlay.outlines import compute_iou, compute_silhouette
-from ar.rendering.layer import Layer
+from ar.rendering.layer import Layer, compute_vertex_normals
 from sim.deformation import Deformation
 from surrogate.locating.prior import compute_middle
 
@@ -25,6 +25,8 @@ from .image_checks import (
 from .player import Frame, Player
 from .stage import DRAPE
 
+# Largest distance of the visible cortex from the normal below the FEM surface, and above that surface [m].
+MAX_ASIDE = 1e-9
 STILL_SHARE = 0.25  # Share of its largest motion below which the tumour counts as still.
 WORST_MISS = 0.0, np.inf, np.inf, np.inf, 1.0, False
 """Metrics of a tumour at an invalid position: overlap, distance [m], two image distances [pixel], occlusion drawn."""
@@ -54,7 +56,8 @@ class SceneFigures:
     honest
         True if occluded parts are drawn as a broken outline without shading, and the image names the occluder.
     finite, answered
-        True if every number and image is finite; true if every solution, drawn or by FEM, has a good outcome.
+        True if every number and image is finite and the visible cortex moves as the FEM surface; true if every
+        solution, drawn or by FEM, has a good outcome.
     doubt
         The first solution that has not: frame, source and outcome; number of others.
     in_step
@@ -101,7 +104,7 @@ class SceneFigures:
             "choose another --tilt": not self.visible < bounds.visible,
             "what the drape or bone covers is drawn as if it were visible, or the image does not say so": self.honest,
             "the tumour never moves: nothing was shown": self.motion_mm > 0.0,
-            "a number is not finite": self.finite,
+            "a number is not finite, or the visible cortex does not move as the FEM surface": self.finite,
             f"a solution is not good: {self.doubt}": self.answered,
             "an image shows the solution at another time": self.in_step,
             f"the ellipsoid holds the tumour's middle in {self.covered:.0%} of the frames, less than "
@@ -132,7 +135,7 @@ def measure(
         ).mean()
         for row, frame in enumerate(frames)
     ]
-    finite = [_is_finite(frame) for frame in frames]
+    finite = [_is_finite(frame) and _is_carried(player, frame) for frame in frames]
     misses = [
         _measure_miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else WORST_MISS
         for row, frame in enumerate(frames)
@@ -226,6 +229,18 @@ def list_objections(frames: Sequence[Frame]) -> list[str]:
 
 def _is_finite(frame: Frame) -> bool:
     return bool(np.isfinite(frame.picture.depth).all() and np.isfinite(frame.deformation.displacement).all())
+
+
+def _is_carried(player: Player, frame: Frame) -> bool:
+    """Return True if the visible cortex moves as the FEM surface in which it is embedded."""
+    stage = player.stage.select_stage(frame.loads)
+    if not stage.scene.look.gyri:
+        return True
+    surface, at = stage.fine.surface, player.compute_positions(frame.deformation)[stage.fine.vertices]
+    away = surface.place(at) - surface.interpolate(at)
+    normal = surface.interpolate(compute_vertex_normals(at, surface.coarse))
+    aside = away - np.einsum("mi,mi->m", away, normal)[:, None] * normal / np.square(normal).sum(axis=1, keepdims=True)
+    return float(np.abs(aside).max()) < MAX_ASIDE and float(np.einsum("mi,mi->m", away, normal).max()) < MAX_ASIDE
 
 
 def _measure_miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:

@@ -67,34 +67,38 @@ def add_vessels(
     return Solid(scan * light[:, :, None], np.linalg.inv(T), dark, relief, height=scan)
 
 
-def compute_vessel_absorption(across: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def compute_vessel_absorption(
+    across: np.ndarray, random: np.random.Generator, settings: VesselSettings = VESSELS
+) -> np.ndarray:
     """Share of the light that vessels take, (n, n), at places `across` (n,) [m] from the middle, both ways."""
-    points, widths = sample_vessel_paths(float(np.abs(across).max()), random)
+    points, widths = sample_vessel_paths(float(np.abs(across).max()), random, settings)
     here = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1)
-    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * VESSELS.max_width)
-    width = np.append(widths, VESSELS.max_width)[nearest]
-    vessels = VESSELS.max_absorption * np.exp(-2.0 * (away / width) ** 2)
-    mottle = gaussian_filter(random.standard_normal(away.shape), VESSELS.mottle_length / VESSELS.voxel_across)
-    return np.clip(vessels + (1.0 - vessels) * VESSELS.mottle_contrast * mottle / mottle.std(), 0.0, 0.95)
+    away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * settings.max_width)
+    width = np.append(widths, settings.max_width)[nearest]
+    vessels = settings.max_absorption * np.exp(-2.0 * (away / width) ** 2)
+    mottle = gaussian_filter(random.standard_normal(away.shape), settings.mottle_length / settings.voxel_across)
+    return np.clip(vessels + (1.0 - vessels) * settings.mottle_contrast * mottle / mottle.std(), 0.0, 0.95)
 
 
-def sample_vessel_paths(half: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def sample_vessel_paths(
+    half: float, random: np.random.Generator, settings: VesselSettings
+) -> tuple[np.ndarray, np.ndarray]:
     """Points (k, 2) [m] of vessels that come in at the border of a square, wander and branch; their widths (k,) [m]."""
-    count = VESSELS.trunk_count
+    count = settings.trunk_count
     angles = 2.0 * np.pi * (np.arange(count) + random.uniform(0.0, 0.7, count)) / count
     rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
-    ends = list(zip(rim, angles + np.pi, VESSELS.max_width * random.uniform(0.5, 1.0, count), strict=True))
+    ends = list(zip(rim, angles + np.pi, settings.max_width * random.uniform(0.5, 1.0, count), strict=True))
     points, widths = [], []
     while ends:
         at, way, width = ends.pop()
-        while width > VESSELS.min_width and np.abs(at).max() <= half:
+        while width > settings.min_width and np.abs(at).max() <= half:
             points.append(at)
             widths.append(width)
-            way = way + VESSELS.turn_deviation * random.standard_normal()
-            at, width = at + VESSELS.step * np.array([np.cos(way), np.sin(way)]), VESSELS.width_factor * width
-            if random.uniform() < VESSELS.branch_probability:
+            way = way + settings.turn_deviation * random.standard_normal()
+            at, width = at + settings.step * np.array([np.cos(way), np.sin(way)]), settings.width_factor * width
+            if random.uniform() < settings.branch_probability:
                 side = random.choice([-1.0, 1.0])
-                ends.append((at, way + side * random.uniform(0.5, 1.2), VESSELS.branch_width_ratio * width))
+                ends.append((at, way + side * random.uniform(0.5, 1.2), settings.branch_width_ratio * width))
                 way, width = way - 0.2 * side, 0.95 * width
     return np.array(points), np.array(widths)
 

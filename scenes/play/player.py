@@ -225,7 +225,8 @@ class Player:
         positions = self.compute_positions(deformation)
         held = None if self.scene.tool is None else self.place_tool(self.scene.tool, touch, positions)
         stage, camera = self.stage.select_stage(loads), self.get_camera(float(loads.times[0]))
-        picture = stage.render_view(camera, positions, None if held is None else held.pose, self.coarse)
+        drawn = stage.plain if self.style == "rings" else stage  # rings lie on the FEM surface
+        picture = drawn.render_view(camera, positions, held and held.pose, self.coarse)
         corners = stage.compute_corners(None if held is None else held.pose)
         estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
         seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds  # without rendering
@@ -250,9 +251,10 @@ class Player:
         remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
-            marks = Marks(band, shown, rest, traces)
-            words = Words(doubt, head, get_legend_names(estimate), moved, error.bound)
-            over = composite(picture, camera, tumour, self.style, Cover(OCCLUDER_LABELS, OPENING), marks, words)
+            marks = Marks(band, shown, stage.smooth_tumour_at_rest, traces)
+            words = Words(doubt, head, get_legend_names(estimate), moved or (motion, None), error.bound)
+            outline, cover = stage.smooth_tumour(tumour), Cover(OCCLUDER_LABELS, OPENING)
+            over = composite(picture, camera, outline, self.style, cover, marks, words)
             if estimate is not None and self.style != "none":
                 draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
             annotate(over, number, remark)

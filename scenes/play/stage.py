@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from ar.optics.camera import Camera
 from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
+from ar.rendering.embedding import EmbeddedSurface, build_embedded_surface
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.real_image import add_vignette, enlarge_picture
 from ar.rendering.renderer import Lamp, Picture, Renderer, build_lamp
@@ -25,6 +26,7 @@ from ..script.framing import DRAPE_HEIGHT
 from ..script.observation_models import StereoObservation
 from ..script.scene import Scene
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
+from .fine_cortex import FineCortex, build_fine_cortex
 from .observer import Sees
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
@@ -54,6 +56,8 @@ ESTIMATED_LINES = LegendNames(
 READING_DEPTH = 2.0e-3
 # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
 RIM_DISTANCE = 10e-3
+TUMOUR_DEPTH = 0.12e-3  # Depth of that outline below the rounded facets [m]: it cuts corners of the mesh off.
+TUMOUR_EDGE = 1.2e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
 DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
 DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 
@@ -109,6 +113,11 @@ class Stage:
         )
 
     @cached_property
+    def plain(self) -> Stage:
+        """The stage with the FEM surface as its cortex."""
+        return replace(self, scene=replace(self.scene, look=replace(self.scene.look, gyri=False)))
+
+    @cached_property
     def nodes(self) -> np.ndarray:
         """Sorted mesh vertices (n,) whose motion is rendered: open cortex and tumour."""
         anatomy = self.anatomy
@@ -137,12 +146,17 @@ class Stage:
         If the brain separates from the skull, the surface beyond the drape's hole is rendered below it. The drape
         follows the scan's surface, and a sliding gyrus would penetrate it.
         """
-        layer = self._visible.build_layer(positions)
+        layer = self._build_fine(positions) if self.scene.look.gyri else self._visible.build_layer(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
             return layer
         beyond = self.site.compute_axis_distance(layer.vertices) - HOLE_RATIO * self.site.clearance
         below = np.minimum(DRAPE_SLOPE * beyond.clip(0.0), DRAPE_DEPTH)
         return replace(layer, vertices=layer.vertices + below[:, None] * self.site.axis)
+
+    def _build_fine(self, positions: np.ndarray) -> Layer:
+        fine, tint = self.fine, self.scene.look.tint
+        at = fine.surface.place(positions[fine.vertices])
+        return Layer("cortex", CORTEX, at, fine.surface.triangles, fine.colour * tint, gloss=0.7, shininess=110.0)
 
     @cached_property
     def brain(self) -> Layer:
@@ -208,6 +222,13 @@ class Stage:
         vertices, triangles = self._tumour
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
+    def smooth_tumour(self, tumour: Layer) -> Layer:
+        """Return a layer of the tumour's surface with rounded facets: for its outline, not for numbers."""
+        surface = self._round_tumour
+        return replace(
+            tumour, vertices=surface.place(tumour.vertices), triangles=surface.triangles, colour=tumour.colour[0]
+        )
+
     def build_reference(self, positions: np.ndarray) -> Layer:
         """Return the tumour surface computed by FEM, drawn for comparison with an estimate."""
         return replace(self.build_tumour(positions), name="truth", colour=np.array(TRUTH_COLOUR))
@@ -216,6 +237,11 @@ class Stage:
     def tumour_at_rest(self) -> Layer:
         """The tumour's surface in the scan."""
         return self.build_tumour(self.site.anatomy.mesh.nodes)
+
+    @cached_property
+    def smooth_tumour_at_rest(self) -> Layer:
+        """The tumour's surface in the scan, with rounded facets."""
+        return self.smooth_tumour(self.tumour_at_rest)
 
     @property
     def tumour_vertices(self) -> np.ndarray:
@@ -232,14 +258,29 @@ class Stage:
         return np.unique(self.anatomy.tumour_surface, return_inverse=True)
 
     @cached_property
+    def _round_tumour(self) -> EmbeddedSurface:
+        at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
+        fine = build_embedded_surface(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
+        return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=np.inf)
+
+    @cached_property
     def _cortex(self) -> Cortex:
         return self._build_cortex(self.anatomy.open_surface)
 
     @cached_property
     def _visible(self) -> Cortex:
+        return self._build_cortex(self._list_visible())
+
+    def _list_visible(self) -> np.ndarray:
+        """List the surface triangles (S, 3) of open cortex and edge."""
         mesh = self.anatomy.mesh
         away = np.linalg.norm(mesh.nodes[mesh.surface] - self.site.origin, axis=2).min(axis=1)
-        return self._build_cortex(mesh.surface[away < self.site.radius + RIM_DISTANCE])
+        return mesh.surface[away < self.site.radius + RIM_DISTANCE]
+
+    @cached_property
+    def fine(self) -> FineCortex:
+        """Fine surface that embeds gyri and vessels in the visible FEM surface."""
+        return build_fine_cortex(self.site, self.anatomy.mesh, self._list_visible(), self.intensity)
 
     def _build_cortex(self, surface: np.ndarray) -> Cortex:
         """Triangles (S, 3) of the mesh's surface that wear the scan."""

@@ -39,7 +39,7 @@ from .observation_models import PointObservation, StereoObservation
 from .registration import Registration
 from .tool import Instrument, Probe
 from .tool_paths import IDLE_HEIGHT, Path, Touch, keep_idle
-from .viewpoint import PLAIN_APPEARANCE, USUAL_VIEWPOINT, Appearance, Viewpoint
+from .viewpoint import NATURAL_APPEARANCE, USUAL_VIEWPOINT, Appearance, Viewpoint
 
 MAX_FRAMES = 108_000  # Maximum number of frames of a scene: one hour at 30 frames/s.
 
@@ -123,7 +123,7 @@ class Scene:
     surgery: Debulking | None = None
     sight: PointObservation | StereoObservation | None = None
     viewpoint: Viewpoint = USUAL_VIEWPOINT
-    look: Appearance = PLAIN_APPEARANCE
+    look: Appearance = NATURAL_APPEARANCE
     registration: Registration = "perfect"
     deformer: str | None = None
     element: str | None = None

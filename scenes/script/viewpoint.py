@@ -54,6 +54,9 @@ class Appearance:
         Cottonoids on the cortex.
     finger
         Direction in the tangent plane of a gloved finger that reaches over the opening's edge [rad]; None: no finger.
+    gyri
+        True: gyri, sulci and vessels on a fine surface just below the FEM surface, instead of scan and `vessels`.
+        False: the FEM surface itself, as in data sets.
     """
 
     lamp: float = 1.0
@@ -63,9 +66,12 @@ class Appearance:
     vessels: int | None = None
     cottonoids: tuple[Cottonoid, ...] = ()
     finger: float | None = None
+    gyri: bool = False
 
 
 PLAIN_APPEARANCE = Appearance()
+"""Look of data sets: the FEM surface, with the scan as its texture."""
+NATURAL_APPEARANCE = Appearance(gyri=True)
 """Default look of scenes."""
 
 

@@ -20,6 +20,7 @@ from ..play.stage import Stage
 from ..script.camera_paths import HandHeld
 from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import find_scene
+from ..script.viewpoint import PLAIN_APPEARANCE
 from .filming import (
     USUAL_CALIBRATION,
     VIEW,
@@ -107,7 +108,7 @@ def build_synthetic_video(theatre: PatientSetup) -> DrawnFilm:
     whole = find_scene(SCENE)
     scene = replace(
         whole, path=lambda time: whole.path(time + START_TIME), viewpoint=from_where_it_sees_all(view),
-        frames_per_second=FRAME_RATE, duration=DURATION,
+        frames_per_second=FRAME_RATE, duration=DURATION, look=PLAIN_APPEARANCE,
     )  # fmt: skip
     stage = theatre.build_stage(scene)
     deformer = Dent(theatre.anatomy, stage.site)

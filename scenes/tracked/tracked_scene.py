@@ -24,10 +24,11 @@ def build_tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scen
     from sim.effects import SKULLS, Elasticity, Held, ToolContact
 
     from ..script.scene import Scene
+    from ..script.viewpoint import PLAIN_APPEARANCE
 
     touched = () if shape is None else (ToolContact((shape,)),)
     effects = (Elasticity(), Held(), SKULLS[args.skull], *touched)
-    return Scene(args.command, "A tracked tool.", effects=effects)
+    return Scene(args.command, "A tracked tool.", effects=effects, look=PLAIN_APPEARANCE)
 
 
 def build_mover(

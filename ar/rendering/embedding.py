@@ -1,0 +1,143 @@
+"""Fine surface embedded in a coarse one: constant barycentric weights, and depths below it along its normals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+from scipy import sparse
+
+from .layer import compute_vertex_normals
+from .parallel import forward_kernel, launch_in_bands, load
+
+
+@forward_kernel
+def embed(
+    begin: wp.int32,
+    end: wp.int32,
+    run: wp.int32,
+    corners: wp.array(dtype=wp.vec3i),
+    weights: wp.array(dtype=wp.vec3d),
+    depth: wp.array(dtype=wp.float64),
+    coarse: wp.array(dtype=wp.vec3d),
+    normals: wp.array(dtype=wp.vec3d),
+    rounding: wp.float64,
+    highest: wp.float64,
+    # output
+    fine: wp.array(dtype=wp.vec3d),
+):
+    """Place fine vertices above the facets of a coarse surface by the height of its rounded facets minus a depth."""
+    start = begin + wp.tid() * run
+    for index in range(start, wp.min(start + run, end)):
+        c, w = corners[index], weights[index]
+        p = w[0] * coarse[c[0]] + w[1] * coarse[c[1]] + w[2] * coarse[c[2]]
+        normal = wp.vec3d(wp.float64(0.0))
+        away = wp.vec3d(wp.float64(0.0))
+        for k in range(3):
+            n = normals[c[k]]
+            normal += w[k] * n
+            away -= w[k] * wp.dot(p - coarse[c[k]], n) * n
+        normal = wp.normalize(normal)
+        height = rounding * wp.dot(away, normal) - depth[index]
+        fine[index] = p + wp.min(height, highest) * normal
+
+
+@dataclass(frozen=True, eq=False)
+class EmbeddedSurface:
+    """Fine surface that follows a coarse one, and by default never lies outside its facets.
+
+    A fine vertex is the interpolated coarse point, moved along the interpolated normal by the height of the rounded
+    facet minus a depth.
+
+    Parameters
+    ----------
+    coarse
+        Triangles (S, 3) of the coarse surface.
+    corners, weights
+        Coarse vertices (m, 3) of each fine vertex, and their barycentric weights (m, 3).
+    triangles
+        Triangles (F, 3) of the fine surface.
+    depth
+        Depths (m,) [m] below the rounded coarse surface.
+    rounding
+        Share of Phong tessellation (Boubekeur, Alexa 2008) that rounds the coarse facets: 0.5 makes a circle round.
+    highest
+        Largest height above the coarse facets [m].
+    """
+
+    coarse: np.ndarray
+    corners: np.ndarray
+    weights: np.ndarray
+    triangles: np.ndarray
+    depth: np.ndarray
+    rounding: float = 0.75
+    highest: float = 0.0
+
+    @cached_property
+    def _inputs(self) -> list[wp.array]:
+        kinds = wp.vec3i, wp.vec3d, wp.float64
+        arrays = self.corners.astype(np.int32), self.weights, self.depth
+        load("cpu", embed.module)
+        return [wp.array(array, dtype=kind, device="cpu") for array, kind in zip(arrays, kinds, strict=True)]
+
+    def interpolate(self, values: np.ndarray) -> np.ndarray:
+        """Return values (m, ...) at the fine vertices of values (n, ...) at the coarse ones."""
+        return np.einsum("mk,mk...->m...", self.weights, values[self.corners])
+
+    def place(self, positions: np.ndarray) -> np.ndarray:
+        """Return fine vertices (m, 3) [m] for coarse vertices at positions (n, 3) [m]."""
+        both = positions, compute_vertex_normals(positions, self.coarse)
+        coarse = [wp.array(np.ascontiguousarray(each), dtype=wp.vec3d, device="cpu") for each in both]
+        fine = wp.empty(len(self.depth), dtype=wp.vec3d, device="cpu")
+        launch_in_bands(embed, [*self._inputs, *coarse, self.rounding, self.highest], [fine], len(self.depth), "cpu")
+        return fine.numpy()
+
+
+def build_embedded_surface(
+    points: np.ndarray, triangles: np.ndarray, target: Callable[[np.ndarray], np.ndarray]
+) -> EmbeddedSurface:
+    """Subdivide triangles (S, 3) of points (n, 3) [m] until each edge is as short as `target` [m] at its centre (e, 3).
+
+    The fine surface has no depth. Triangles that share an edge share its vertices.
+    """
+    coarse, at = triangles, points
+    shares = sparse.csr_matrix(sparse.identity(len(points)))
+    while True:
+        ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+        keys, number = np.unique(ends @ [len(at), 1], return_inverse=True)
+        a, b = np.divmod(keys, len(at))
+        long = np.linalg.norm(at[a] - at[b], axis=1) > target(0.5 * (at[a] + at[b]))
+        if not long.any():
+            break
+        new = np.where(long, len(at) + np.cumsum(long) - 1, -1)
+        triangles = _split(triangles, new[number].reshape(-1, 3))
+        shares = sparse.csr_matrix(sparse.vstack([shares, 0.5 * (shares[a[long]] + shares[b[long]])]))
+        at = shares @ points
+    row = np.repeat(np.arange(len(at)), np.diff(shares.indptr))
+    place = row, np.arange(len(row)) - shares.indptr[row]
+    corners, weights = np.zeros((len(at), 3), np.int64), np.zeros((len(at), 3))
+    corners[place], weights[place] = shares.indices, shares.data
+    # Neighbours lie next to each other in memory: drawing takes less time.
+    order = np.lexsort([*weights.T, *np.sort(corners, axis=1).T])
+    triangles = np.argsort(order)[triangles]
+    triangles = triangles[np.argsort(triangles.min(axis=1))]
+    return EmbeddedSurface(coarse, corners[order], weights[order], triangles, np.zeros(len(at)))
+
+
+def _split(triangles: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Split triangles (F, 3) at the vertices `middle` (F, 3) of their edges ab, bc, ca; -1 where an edge is whole."""
+    count = (middle >= 0).sum(axis=1)
+    # One divided edge comes first, one whole edge last.
+    first = np.select([count == 1, count == 2], [np.argmax(middle, axis=1), np.argmin(middle, axis=1) + 1], 0)
+    turn = (first[:, None] + np.arange(3)) % 3
+    (a, b, c), (m, n, o) = (np.take_along_axis(each, turn, axis=1).T for each in (triangles, middle))
+    pieces = {
+        0: [(a, b, c)],
+        1: [(a, m, c), (m, b, c)],
+        2: [(m, b, n), (a, m, n), (a, n, c)],
+        3: [(a, m, o), (m, b, n), (o, n, c), (m, n, o)],
+    }
+    return np.concatenate([np.stack(each, axis=1)[count == of] for of, some in pieces.items() for each in some])
