@@ -219,10 +219,8 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
         assert (moment.picture != before).any() == moves and asked == []
 
 
-def test_images_in_motion_are_coarse_and_get_sharp_at_rest(demo, monkeypatch):
-    monkeypatch.setattr("scenes.page.comparison.MAX_RENDER_TIME", 0.0)  # every renderer is slow
-    monkeypatch.setattr("scenes.page.comparison.STILL_TIME", 1.0)
-    now = PageState()
+def test_images_in_motion_are_coarse_and_get_sharp_at_rest(demo):
+    now = PageState(max_render_time=0.0, still_time=1.0)  # every renderer is slow
     demo.wish.set(plays=False, number=29)
     demo.update_page(now)
     assert not now.coarse  # nothing has moved yet
@@ -239,7 +237,7 @@ def test_images_in_motion_are_coarse_and_get_sharp_at_rest(demo, monkeypatch):
     np.testing.assert_array_equal(still.tumour_error.bound, moving.tumour_error.bound)
     assert np.abs(still.shown.astype(int) - moving.shown).mean() < 4.0
     # A fast renderer always draws sharp images.
-    monkeypatch.setattr("scenes.page.comparison.MAX_RENDER_TIME", 1e9)
+    now.max_render_time = 1e9
     demo.wish.set(number=31)
     demo.update_page(now)
     assert not now.coarse

@@ -99,6 +99,6 @@ def test_data_sets_keep_the_plain_look(stage):
 def test_smooth_outline_stays_close_to_the_fem_tumour(stage):
     rough = stage.tumour_at_rest
     smooth = stage.smooth_tumour(rough)
-    surface = stage._round_tumour
+    surface = stage.round_tumour
     away = np.linalg.norm(smooth.vertices - surface.interpolate(rough.vertices), axis=1)
     assert np.median(away) < 0.15e-3 and away.max() < 0.4e-3 and len(smooth.triangles) > 4 * len(rough.triangles)

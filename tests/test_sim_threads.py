@@ -67,8 +67,7 @@ def test_one_core_at_least_and_one_for_little() -> None:
     assert choose_threads(10**6, Sharing(max_threads=1)) == 1
 
 
-def test_background_waits_for_the_foreground(monkeypatch) -> None:
-    monkeypatch.setattr("sim.runtime.threads.MAX_PAUSE", 30.0)
+def test_background_waits_for_the_foreground() -> None:
     passed = threading.Event()
 
     def work():
@@ -80,7 +79,7 @@ def test_background_waits_for_the_foreground(monkeypatch) -> None:
     with run_in_foreground():
         wait_for_foreground()  # this thread is not in the background
         thread.start()
-        assert not passed.wait(0.1)
+        assert not passed.wait(0.03)
     assert passed.wait(5.0)
     thread.join()
 

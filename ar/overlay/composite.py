@@ -240,8 +240,7 @@ def _draw_sketch(
 def _describe_motion(hidden: Layer, before: Layer, words: Words) -> str:
     """Describe the surface's mean motion, or the given motion."""
     mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-    length, error = (mean, None) if words.moved is None else words.moved
-    return f"{words.names.motion} {format_millimetres(length, error)}"
+    return f"{words.names.motion} {format_millimetres(*((mean, None) if words.moved is None else words.moved))}"
 
 
 def _write_lines(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overlaid:

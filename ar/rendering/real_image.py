@@ -100,7 +100,7 @@ def build_real_image(
     return _upload_picture(colour.copy(), depth, segmentation, device)
 
 
-def enlarge_picture(picture: Picture, width: int, height: int) -> Picture:
+def scale_picture(picture: Picture, width: int, height: int) -> Picture:
     """Return an image on more pixels: colours interpolated, depths and ids of the nearest pixel."""
     size, device = (width, height), str(picture.drawn.colour.device)
     depth, segmentation = (

@@ -99,7 +99,8 @@ class PageState:
     """State of the page: the request, its solution, the frame, and the FEM comparison.
 
     `goal` is the request that the frame is on the way to, `asked` the one that it fulfils, `look` the display style.
-    If nothing changes, the page is still from `still_at` on [s]. `render_time` [s] is that of a sharp image.
+    If nothing changes for `still_time` [s], the page is still, from `still_at` on [s]. Images in motion are coarse if
+    the `render_time` of a sharp one is above `max_render_time` [s].
     """
 
     goal: tuple | None = None
@@ -119,12 +120,14 @@ class PageState:
     judged: Comparison | None = None
     stale: bool | None = None
     plan: tuple[str, ...] | None = None
+    still_time: float = 0.5
+    max_render_time: float = 0.015
 
     def choose_resolution(self) -> bool:
-        """Return whether the next image is coarse: in motion, if rendering a sharp one takes long."""
+        """Return whether the next image, drawn now, is coarse."""
         time = clock.perf_counter()
-        self.coarse = self.render_time > MAX_RENDER_TIME and time < self.still_at
-        self.still_at = time + STILL_TIME
+        self.coarse = self.render_time > self.max_render_time and time < self.still_at
+        self.still_at = time + self.still_time
         return self.coarse
 
     def record_rendering(self, seconds: float) -> None:
@@ -137,8 +140,6 @@ class PageState:
         return clock.perf_counter() >= self.still_at
 
 
-STILL_TIME = 0.5  # Time after a change from which the page is still [s].
-MAX_RENDER_TIME = 0.015  # Duration of rendering above which images in motion are coarse [s].
 COARSE_SAVING = 5.0  # Duration of rendering a sharp image relative to a coarse one, at most.
 MIN_COMPARED_MOTION = 0.1e-3  # Smallest mean motion of the tumour of a load that is compared [m].
 MAX_RECENT_LOADS = 120  # Number of last loads that are kept for each deformer.

@@ -55,7 +55,7 @@ from .view import (
 
 WAITING_TEXT = "The finite elements are working on this load."  # Text while FEM solves.
 UNDEFORMED_TEXT = '<p class="stale">The undeformed body, as in the scan. The first result is being computed.</p>'
-MIN_REST = 0.007  # Shortest pause after an image, in which FEM in the background goes on [s].
+MIN_REST = 0.007  # Shortest pause after an image, for FEM in the background [s].
 MESSAGE_TIME = 2.0  # Time for which a playing page shows why a frame is skipped [s].
 
 

@@ -26,6 +26,7 @@ COARSE_STEP = 4  # Grid spacing of the pattern's field [grid spacings of the map
 GROWTH = 0.6  # Growth rate of the Swift-Hohenberg equation.
 TIME_STEP = 0.5  # Time step of the Swift-Hohenberg equation.
 STEPS = 300  # Number of its time steps.
+LINE_WIDTH = 1.3e-3  # Width of sulci and veins whose length is tested [m].
 SCAN_DEPTHS = (1.5e-3, 2.5e-3, 3.5e-3)  # Depths below the surface at which the scan is read [m].
 SCAN_WEIGHT = 0.15  # Weight of the scan in the pattern, per standard deviation of its grey values.
 # Colours (RGB, 0 to 1).
@@ -43,6 +44,7 @@ class GyriSettings:
     wander: float = 0.7e-3  # Standard deviation of the sulci's shift by smooth noise [m].
     sulcus_depth: float = 3.4e-3  # Largest depth of a sulcus [m].
     sulcus_width: float = 0.5e-3  # Half width of a sulcus [m].
+    sulcus_length: float = 16e-3  # Smallest length of a sulcus [m].
     crown_height: float = 0.9e-3  # Height of a gyrus' rounded crown [m].
     vein_radius: float = 0.65e-3  # Largest radius of a vein [m].
     vein_length: float = 12e-3  # Smallest length of a vein [m].
@@ -104,6 +106,7 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
     across = np.arccos(np.clip(-field, -1.0, 1.0)) / np.pi  # 0 in a sulcus, 1 on a crown
     strength *= np.clip(2.2 - 5.0 * across, 0.0, 1.0) * np.clip(0.9 + 0.2 * smooth(6e-3), 0.4, 1.0)
     away *= MAP_SPACING
+    strength[_find_short((strength > 0.05) & (away < 2.0 * GYRI.sulcus_width), GYRI.sulcus_length)] = 0.0
     crown = GYRI.crown_height * (1.0 - across) ** 2
     depth = crown + GYRI.sulcus_depth * strength * np.exp(-((away / GYRI.sulcus_width) ** 2))
     hollow = np.maximum(depth - 0.4 * gaussian_filter(depth, 2e-3 / MAP_SPACING), 0.0)  # ambient occlusion
@@ -112,10 +115,7 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
 
     # Veins lie in some of the sulci.
     radius = GYRI.vein_radius * np.clip(0.25 + 0.6 * smooth(9e-3), 0.0, 1.0) * np.clip(3.0 * strength - 0.6, 0.0, 1.0)
-    parts = np.zeros((count, count), np.int32)
-    label(away < radius, output=parts)
-    least = 2.0 * GYRI.vein_radius * GYRI.vein_length / MAP_SPACING**2
-    radius[(np.bincount(parts.ravel()) < least)[parts]] = 0.0
+    radius[_find_short(away < radius, GYRI.vein_length)] = 0.0
     vein = np.clip((radius - away) / (1.5 * MAP_SPACING) + 0.5, 0.0, 1.0) * (radius > 0.15e-3)
     top = crown + 0.3e-3 - np.sqrt(np.maximum(radius**2 - away**2, 0.0))
     depth += vein * np.minimum(top - depth, 0.0)
@@ -130,6 +130,13 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
     ):  # fmt: skip
         colour += share[..., None] * (np.array(paint) - colour)
     return CortexMaps(np.concatenate([depth[..., None], colour.clip(0.0, 1.0)], axis=2).astype(np.float32), half)
+
+
+def _find_short(lines: np.ndarray, length: float) -> np.ndarray:
+    """Find the connected parts of a mask (n, n) that are shorter than a length [m], by their area."""
+    parts = np.zeros(lines.shape, np.int32)
+    label(lines, output=parts)
+    return lines & (np.bincount(parts.ravel()) < LINE_WIDTH * length / MAP_SPACING**2)[parts]
 
 
 def _find_sulci(field: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
 from ar.rendering.embedding import EmbeddedSurface, build_embedded_surface
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
-from ar.rendering.real_image import add_vignette, enlarge_picture
+from ar.rendering.real_image import add_vignette, scale_picture
 from ar.rendering.renderer import Lamp, Picture, Renderer, build_lamp
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
@@ -57,7 +57,7 @@ READING_DEPTH = 2.0e-3
 # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
 RIM_DISTANCE = 10e-3
 TUMOUR_DEPTH = 0.12e-3  # Depth of that outline below the rounded facets [m]: it cuts corners of the mesh off.
-TUMOUR_EDGE = 1.2e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
+TUMOUR_EDGE = 1.8e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
 DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
 DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 
@@ -191,10 +191,10 @@ class Stage:
 
     def render_view(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool) -> Picture:
         """Return the same in the round field of the scene's microscope; if `coarse`, of half the resolution."""
-        picture = self.render(halve_resolution(camera) if coarse else camera, positions, pose)
+        picture = self.render(scale_camera(camera) if coarse else camera, positions, pose)
         if self.scene.viewpoint.field is not None:
             picture = add_vignette(picture, self.scene.viewpoint.field)
-        return enlarge_picture(picture, camera.width, camera.height) if coarse else picture
+        return scale_picture(picture, camera.width, camera.height) if coarse else picture
 
     def render_tool_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
         """Return the same, of a tool by its corners (t, 3) [m]."""
@@ -224,7 +224,7 @@ class Stage:
 
     def smooth_tumour(self, tumour: Layer) -> Layer:
         """Return a layer of the tumour's surface with rounded facets: for its outline, not for numbers."""
-        surface = self._round_tumour
+        surface = self.round_tumour
         return replace(
             tumour, vertices=surface.place(tumour.vertices), triangles=surface.triangles, colour=tumour.colour[0]
         )
@@ -258,7 +258,8 @@ class Stage:
         return np.unique(self.anatomy.tumour_surface, return_inverse=True)
 
     @cached_property
-    def _round_tumour(self) -> EmbeddedSurface:
+    def round_tumour(self) -> EmbeddedSurface:
+        """Fine surface with rounded facets upon the tumour's surface."""
         at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
         fine = build_embedded_surface(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
         return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=np.inf)
@@ -323,7 +324,7 @@ class Stage:
 
 
 @lru_cache(maxsize=2)
-def halve_resolution(camera: Camera) -> Camera:
+def scale_camera(camera: Camera) -> Camera:
     """Return a camera with half the pixels along each side, the same object for the same camera."""
     return camera.scale(0.5)
 
