@@ -52,5 +52,5 @@ def test_whoever_needs_them_meanwhile_waits(loading):
     while not most:
         time.sleep(0.001)
     load("cpu", "ar.overlay.window")
-    assert loaded[-1] == "ar.overlay.window" and len(loaded) == 7 and max(most) == 1
+    assert loaded[-1] == "ar.overlay.window" and len(loaded) == 8 and max(most) == 1
     ahead.join()

@@ -103,7 +103,7 @@ def test_what_was_not_perturbed_passes(play, frames, truth):
     sentences, figures = broken(play, frames, truth)
     assert not sentences
     assert figures.overlap > 0.97 and figures.pixels < 1e-9 and figures.motion_mm > 0.4
-    assert figures.error_mm < 0.05 and figures.drawn < 1.5 and figures.printed
+    assert figures.error_mm < 0.05 and figures.drawn < 2.1 and figures.printed
 
 
 def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):

@@ -19,6 +19,7 @@ from scenes.episodes.reading.validation import mask_findings, validate_episode
 from scenes.play.player import STAGES
 from scenes.play.stage import CORTEX, DRAPE, TOOL
 from scenes.script.tool_paths import press
+from scenes.script.viewpoint import PLAIN_APPEARANCE
 from sim.accuracy import TRAIN
 from sim.effects import Held, ToolForce
 from sim.errors import InputError
@@ -41,7 +42,7 @@ def brief(monkeypatch):
 @pytest.fixture(scope="module")
 def episode(theatre, tmp_path_factory):
     path = tmp_path_factory.mktemp("episode") / "press.h5"
-    play = replace(player(theatre, short(), "linear"), motion_error=None)
+    play = replace(player(theatre, replace(short(), look=PLAIN_APPEARANCE), "linear"), motion_error=None)
     report = collect(path, theatre, play, "linear", iter)
     assert list(path.parent.iterdir()) == [path]
     with h5py.File(path, "r") as file:

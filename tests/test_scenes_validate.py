@@ -15,7 +15,7 @@ def test_the_command_names_broken_files_and_ends_with_one(whole, tmp_path, capsy
     broken.write_bytes(whole.read_bytes()[:3000])
     assert main(["validate", str(whole), "--workers", "1"]) == 0
     out = capsys.readouterr().out
-    assert "1 of 1 episodes are whole: 7 frames, 4 of them solved" in out and "0.100 mm at most" in out
+    assert "1 of 1 episodes are whole: 7 frames, 4 of them solved" in out and "maximum 0.100 mm" in out
     assert main(["validate", str(whole), str(broken), "--workers", "1", "--json"]) == 1
     said = json.loads(capsys.readouterr().out)
     assert said["broken"] == 1 and said["files"][1]["path"] == str(broken)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from ..rendering import rasteriser, real_image, shade, surfaces
+from ..rendering import embedding, rasteriser, real_image, shade, surfaces
 from ..rendering.layer import Layer, compute_vertex_normals
 from ..rendering.parallel import load
 from ..rendering.rasteriser import RasterisedSurface, rasterise_surface
@@ -95,7 +95,7 @@ class Ground:
 
 def load_kernels(device: str = "cpu") -> None:
     """Load all kernels that draw an image with its overlay, so that the first image does not wait for them."""
-    load(device, surfaces, rasteriser, shade, real_image, window, distances)
+    load(device, surfaces, embedding, rasteriser, shade, real_image, window, distances)
 
 
 @dataclass(frozen=True, eq=False)
