@@ -153,7 +153,7 @@ class TestCamera:
         frame = play.draw(40, 1.3, play.scene.path(1.3))
         share = np.bincount(frame.picture.segmentation.ravel(), minlength=5) / frame.picture.segmentation.size
         assert share[CORTEX] > 0.08 and share[TOOL] > 0.03 and share[DRAPE] > 0.2 and share[4] == 0.0
-        # What is called cortex lies on the deformed surface or in its sulci, under the edge of the bone too.
+        # Pixels of the cortex lie on the deformed surface or in its sulci, under the edge of the bone too.
         pixels = np.argwhere(frame.picture.segmentation == CORTEX)[::97]
         depth = frame.picture.depth[tuple(pixels.T)]
         seen = frame.camera.unproject(pixels[:, ::-1].astype(float), depth)

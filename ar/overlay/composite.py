@@ -310,9 +310,8 @@ def draw_broken(
     if doubtful:
         draw_dashes(sheet, find_outlines(found.mask), ink, BROKEN_STROKES)
     elif ground is not None and ground.closed.any():
-        draw_dashes(
-            sheet, cut_outlines(find_outlines(ground.mask), ground.closed), ink, HIDDEN_STROKES, HIDDEN_LINE_WIDTH
-        )
+        pieces = cut_outlines(find_outlines(ground.mask), ground.closed)
+        draw_dashes(sheet, pieces, ink, HIDDEN_STROKES, HIDDEN_LINE_WIDTH)
 
 
 def get_margin_ink(hidden: Layer) -> tuple[float, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -33,7 +33,6 @@ from ..script.registration import REGISTRATIONS, describe_registration
 from ..script.scene import Scene
 from ..script.shipped_files import get_template_path
 from ..script.tool import Probe
-from ..script.viewpoint import PLAIN_APPEARANCE
 from .packing import pack_arrays
 from .scene_arrays import build_arrays, describe_stage
 
@@ -131,7 +130,7 @@ def _count_bytes(sheet: Sheet) -> int:
 
 def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> str:
     """Build the text of the page, with all that it needs: model, surfaces, scripts and style."""
-    stage, model = theatre.build_stage(replace(scene, look=PLAIN_APPEARANCE)), exported.model
+    stage, model = theatre.build_stage(scene).plain, exported.model
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
     table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
     described = describe_stage(stage, scene.viewpoint.build_camera(stage.site))

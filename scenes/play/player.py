@@ -226,9 +226,10 @@ class Player:
         held = None if self.scene.tool is None else self.place_tool(self.scene.tool, touch, positions)
         stage, camera = self.stage.select_stage(loads), self.get_camera(float(loads.times[0]))
         drawn = stage.plain if self.style == "rings" else stage  # rings lie on the FEM surface
-        picture = drawn.render_view(camera, positions, held and held.pose, self.coarse)
-        corners = stage.compute_corners(None if held is None else held.pose)
-        estimate = None if stage.observer is None else stage.observer.estimate(number, positions, corners)
+        pose, estimate = None if held is None else held.pose, None
+        picture = drawn.render_view(camera, positions, pose, self.coarse)
+        if stage.observer is not None:
+            estimate = stage.observer.estimate(number, positions, stage.compute_corners(pose))
         seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds  # without rendering
         tumour, rest = stage.build_tumour(_estimate_positions(positions, estimate)), stage.tumour_at_rest
         doubt = describe_outcome(deformation.outcome[0]) or (
@@ -265,7 +266,7 @@ class Player:
         how_far, moved_error = (motion, None) if moved is None else moved
         return Frame(
             number=number, time=float(loads.times[0]), touch=touch, loads=loads, deformation=deformation, camera=camera,
-            pose=None if held is None else held.pose, tip=None if held is None else held.tip,
+            pose=pose, tip=None if held is None else held.tip,
             picture=picture, shown=over.colour, taken=over.taken, named=over.named,
             distance=None if gauge is None else gauge.distance, distance_error=None if gauge is None else gauge.error,
             inside=gauge is not None and gauge.inside, moved=how_far, moved_error=moved_error,

@@ -192,7 +192,7 @@ class Stage:
 
     def render_view(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool) -> Picture:
         """Return the same in the round field of the scene's microscope; if `coarse`, of half the resolution."""
-        picture = self.render(scale_camera(camera) if coarse else camera, positions, pose)
+        picture = self.render(_halve_resolution(camera) if coarse else camera, positions, pose)
         if self.scene.viewpoint.field is not None:
             picture = add_vignette(picture, self.scene.viewpoint.field)
         return scale_picture(picture, camera.width, camera.height) if coarse else picture
@@ -325,7 +325,7 @@ class Stage:
 
 
 @lru_cache(maxsize=2)
-def scale_camera(camera: Camera) -> Camera:
+def _halve_resolution(camera: Camera) -> Camera:
     """Return a camera with half the pixels along each side, the same object for the same camera."""
     return camera.scale(0.5)
 

@@ -5,7 +5,6 @@ from typing import Any
 import warp as wp
 
 from .device import Device
-from .threads import wait_for_foreground
 
 
 @wp.func_native(
@@ -87,14 +86,4 @@ def get_block_shape(device: Device) -> tuple[int, int]:
 def launch(device: Device, kernel: wp.Kernel, columns: int, inputs: list[Any], outputs: list[Any]) -> None:
     """Launch a kernel over (load case, thread)."""
     rows, along = get_block_shape(device)
-    if columns:
-        wait_for_foreground()
-        wp.launch(
-            kernel,
-            dim=(columns, rows * along),
-            inputs=inputs,
-            outputs=outputs,
-            device=device.name,
-            block_dim=rows * along,
-            record_tape=False,
-        )
+    device.launch(kernel, (columns, rows * along), inputs, outputs, rows * along)

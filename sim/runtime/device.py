@@ -64,13 +64,18 @@ class Device:
         """Return a copy of `values` on the device, of the scalar type unless `dtype` is given."""
         return wp.array(np.ascontiguousarray(values), dtype=dtype or self.scalar, device=self.name)
 
-    def launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel on the device; an empty launch is skipped."""
+    def launch(
+        self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any], block_dim: int = 256
+    ) -> None:
+        """Launch a kernel on the device, in blocks of `block_dim` threads; an empty launch is skipped."""
         if min(dim) > 0:
             wait_for_foreground()
             if not self.on_cuda:
                 load(kernel.module)
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.name, record_tape=False)
+            wp.launch(
+                kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.name, block_dim=block_dim,
+                record_tape=False,
+            )  # fmt: skip
 
 
 _loading, _loaded = Lock(), set[wp.Module]()  # Lock of compilation; modules that are loaded on the CPU.
