@@ -1,7 +1,5 @@
 """Image files (PNG, folder of frames, video), and decoding of untrusted image bytes with a given size."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Measurements of sulcus itself: `python -m benchmarks NAME ...`, from a checkout of the repository."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import sys

@@ -8,8 +8,6 @@ A row has the mean motion of the tumour's vertices [mm], with a bonded and with 
 needs the extra `anatomies`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from functools import partial

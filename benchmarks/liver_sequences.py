@@ -12,8 +12,6 @@ its vertices), tissue is linear, and each cloud conditions them; the closest poi
 those of greatest evidence on the first cloud. Neo-Hookean livers are answered by linear tissue too, and it is said.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -8,8 +8,6 @@ has how far the tumour's middle moves and how far the answer is off [mm], the me
 95 % ellipsoid holds the truth, and how many are in doubt or refused, as CSV.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import sys

@@ -1,7 +1,5 @@
 """Simulate brain deformation under surgical tools, and draw the tumour into camera images."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import os

@@ -1,7 +1,5 @@
 """Accuracy and cost limits of a solve."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Literal

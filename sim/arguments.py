@@ -1,7 +1,5 @@
 """Validation of arguments: numeric arrays, vertex numbers, counts."""
 
-from __future__ import annotations
-
 import operator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Contact pressure on the surface of a body."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from .deformation import Deformation

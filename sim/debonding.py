@@ -1,7 +1,5 @@
 """Debonding of brain from skull: overloaded bonds fail, and the tissue then slides on the skull or separates."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter

@@ -1,7 +1,5 @@
 """FEM solver for a body under resection: one solver per resection step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache

@@ -5,8 +5,6 @@ User-defined tools are unions of several such sets.
 In tool coordinates the lowest point is the origin and the shaft points along +z.
 """
 
-from __future__ import annotations
-
 import ast
 import math
 from contextlib import suppress

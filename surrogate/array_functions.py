@@ -1,7 +1,5 @@
 """Array functions that NumPy lacks. Other array types, as graphs for export, register their own versions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, singledispatch

@@ -3,8 +3,6 @@
 Image positions are normalised here: (x, y) = (X / Z, Y / Z) of a point in the camera frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import astuple, dataclass
 from functools import cached_property, lru_cache
 

@@ -7,8 +7,6 @@ Intell. 30:328-341, gives whole pixels. Lucas, Kanade 1981, "An iterative image 
 674-679, gives the sub-pixel part, and its error from the image gradient.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

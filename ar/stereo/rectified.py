@@ -1,7 +1,5 @@
 """Rectification of stereo pairs: windows around the target, whose rows correspond."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

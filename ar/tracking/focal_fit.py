@@ -1,7 +1,5 @@
 """Check of a calibration's focal length against images: markers of known geometry determine it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

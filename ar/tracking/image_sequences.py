@@ -1,7 +1,5 @@
 """Image sequences of one camera, grey or in colour, from a folder or a video of unknown origin."""
 
-from __future__ import annotations
-
 import os
 import re
 import warnings

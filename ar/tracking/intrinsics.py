@@ -1,7 +1,5 @@
 """Views of the calibration board, and the intrinsics of a camera that follow from them, with their errors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Live images of a camera of this machine."""
 
-from __future__ import annotations
-
 import threading
 import time as clock
 from collections.abc import Callable, Generator, Iterator

@@ -1,7 +1,5 @@
 """A4 pages to print the targets, exact in millimetres, and the list of targets for other programs."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass

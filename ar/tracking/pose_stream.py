@@ -1,7 +1,5 @@
 """Poses of an external tracker: interpolation between samples, and the time offset of its clock."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rotations and rigid motions as matrices: angles, axes and validation."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """Synthetic camera images of printed targets and time stamps, for tests with known poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache

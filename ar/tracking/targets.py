@@ -4,8 +4,6 @@ Every face is a ChArUco board of odd by odd squares, whose corners are those of 
 tenth of a pixel. A marker's own corners have an error of a fifth, always inwards.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache

@@ -1,7 +1,5 @@
 """Calibration of a tracker: the camera on it by hand and eye, and the tip of a tool by pivoting."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`python -m benchmarks contact`: the mesh's share of a contact force."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """`python -m benchmarks elements`: how far each element is from the limit of fine meshes."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

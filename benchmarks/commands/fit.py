@@ -1,7 +1,5 @@
 """`python -m benchmarks fit`: what `sulcus fit` says of patients whose tissue is known."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

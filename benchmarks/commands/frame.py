@@ -1,7 +1,5 @@
 """`python -m benchmarks frame`: where the time of a page's frame goes."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """`python -m benchmarks gym`: how many steps a second the Gymnasium environments make."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """`python -m benchmarks link`: how long an OpenIGTLink client waits for the answer to a pose."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """`python -m benchmarks microscope`: error of a tumour that is located from pictures of two eyes."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import asdict, replace

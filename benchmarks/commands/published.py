@@ -1,7 +1,5 @@
 """`python -m benchmarks published`: the published learners under the published test."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

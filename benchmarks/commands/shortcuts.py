@@ -1,7 +1,5 @@
 """`python -m benchmarks shortcuts`: what each shortcut of the solver is worth on work that users do."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """`python -m benchmarks skull`: how far the tumour moves under each skull, on meshes of several sizes."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

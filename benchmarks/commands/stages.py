@@ -1,7 +1,5 @@
 """`python -m benchmarks stages`: what each stage costs, as a table."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

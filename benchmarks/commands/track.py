@@ -1,7 +1,5 @@
 """`python -m benchmarks track`: error of a tool's tip that a camera sees by its printed cube."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """Two records of figures side by side: what got worse."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Where the numbers of a figure stand in the JSON of each bench, and which way they are better."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Files of figures: what `python -m benchmarks all` writes after every figure, and reads again."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Figures measured one by one, each by its own process, and its numbers taken out of what that process says."""
 
-from __future__ import annotations
-
 import json
 import signal
 import sys

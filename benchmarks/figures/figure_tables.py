@@ -1,7 +1,5 @@
 """Figures as Markdown tables, printed or written between two marks of a page."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

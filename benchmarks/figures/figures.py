@@ -1,7 +1,5 @@
 """The figures of the performance pages: by which bench, on which device, and which of its numbers they are."""
 
-from __future__ import annotations
-
 import shlex
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """Processes of their own: a crash, or memory that runs out, ends only them."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

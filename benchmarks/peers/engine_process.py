@@ -3,8 +3,6 @@
 Between the processes pass files and lines alone, so that an engine of another licence stays in its own.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """sulcus as an engine in a process of its own, beside its peers."""
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The published neural network: four hidden units per output, Levenberg-Marquardt, Bayesian regularisation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 

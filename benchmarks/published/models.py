@@ -7,8 +7,6 @@ features, 3.6. The mean error depends little on it: 0.37, 0.36, 0.40 and 0.53 mm
 distance to the brain's centroid, the mean of its vertices, is the loaded point's, as a vertex's own never varies.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The published test: every force position is left out in turn, and answered by a model that never saw it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The mesh's share of a contact force: a ball is moved over one cell, and over the same cell cut into smaller ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What each element is worth: the tumour's motion under one press, on meshes from coarse to fine."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What `sulcus fit` says of patients whose tissue is known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

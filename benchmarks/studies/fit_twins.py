@@ -1,7 +1,5 @@
 """Patients of known tissue, whose cortex is seen while a tool presses here and there and while fluid drains."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A frame of the page, stage by stage: load, deform, render, composite, encode, send."""
 
-from __future__ import annotations
-
 import time as clock
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """How many steps a second Gymnasium environments make, all of them stepped together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Smooth motions by forces in an infinite elastic body: an estimator that knows nothing of a brain but its tissue."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim.material import BRAIN

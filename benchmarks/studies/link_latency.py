@@ -1,7 +1,5 @@
 """How long a live link takes: from a pose's time stamp to when each client has the whole surface that answers it."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import threading

@@ -1,7 +1,5 @@
 """Live frames: a tool moves over the open cortex, one warm-started solve a frame; how long they take, how exact."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

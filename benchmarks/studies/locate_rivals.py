@@ -1,7 +1,5 @@
 """How else a tumour's motion is estimated from points that are seen to move: rivals of `sulcus locate`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

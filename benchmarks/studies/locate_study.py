@@ -1,7 +1,5 @@
 """Twin experiments: what of a known motion of a tumour is found from points on the open cortex, and how surely."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product

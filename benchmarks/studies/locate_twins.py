@@ -1,7 +1,5 @@
 """Truths to locate a tumour in: another mesh, law, stiffness and skull than an estimator knows, moved by some cause."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How many random loads converge: from the tools of surgery to what no surgeon does, on record load by load."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

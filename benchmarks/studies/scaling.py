@@ -1,7 +1,5 @@
 """What a load costs as the mesh grows: seconds and memory, each size and batch in a process of its own."""
 
-from __future__ import annotations
-
 import resource
 import sys
 from collections.abc import Callable, Iterator, Sequence

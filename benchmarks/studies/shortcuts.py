@@ -1,7 +1,5 @@
 """What each shortcut of the solver is worth: the same loads with it and without it, in turn."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What the skull and the mesh decide: the tumour's motion, what passes the closed skull, what its bond bears."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

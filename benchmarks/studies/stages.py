@@ -1,7 +1,5 @@
 """What each stage costs: medians where a stage is short, warm-up excluded, the device waited for at each reading."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

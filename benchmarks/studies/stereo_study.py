@@ -1,7 +1,5 @@
 """How far off a tumour is that is located from pairs of pictures, frame by frame, and how long an update takes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 

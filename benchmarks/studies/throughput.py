@@ -1,7 +1,5 @@
 """How many loads a second the finite elements solve: one mesh, thousands of loads, set-up off the clock."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ FMAC (arXiv 2601.07723) spreads poses evenly over all six freedoms. ASTM F2554 (
 again, the tool turned about it, and distances between points.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass

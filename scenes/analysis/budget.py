@@ -1,7 +1,5 @@
 """Reported error and measured frame time of each deformation model: the choices of a budget."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim.deformation import Deformer

@@ -1,7 +1,5 @@
 """Error budget of an overlay on a tracked camera, by contributor: a Monte Carlo simulation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

@@ -1,7 +1,5 @@
 """Tumour motion under every combination of skull, tissue, craniotomy, depth and stiffness."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product

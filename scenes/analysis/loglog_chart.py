@@ -1,7 +1,5 @@
 """Charts with logarithmic axes, drawn by matplotlib as arrays of pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Measurement of wall time and memory, with the machine that it was done on; tables of figures as CSV."""
 
-from __future__ import annotations
-
 import csv
 import os
 import platform

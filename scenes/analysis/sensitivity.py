@@ -1,7 +1,5 @@
 """Sensitivity of the tumour's motion to tissue, skull, tool and element, one change at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Errors of a camera calibration and of detected target corners, for a Monte Carlo simulation without images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Ensemble of a scene: bodies and tools sampled from priors, solved by FEM, and their differences."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 

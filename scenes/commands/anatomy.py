@@ -1,7 +1,5 @@
 """`sulcus anatomy`: a tetrahedral brain with a tumour, from a label volume or drawn in a healthy head."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """`sulcus calibrate`: a camera by the board, a tool's tip by pivoting, or how two tracked bodies lie together."""
 
-from __future__ import annotations
-
 import argparse
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`sulcus collect`: a scene as one episode in HDF5."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

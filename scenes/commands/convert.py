@@ -1,7 +1,5 @@
 """`sulcus convert`: episodes in the formats of others, and the card of a data set."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable

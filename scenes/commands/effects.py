@@ -1,7 +1,5 @@
 """`sulcus effects`: what each effect of a scene costs and changes."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

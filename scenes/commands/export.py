@@ -1,7 +1,5 @@
 """`sulcus export`: a trained model as an ONNX file for other programs, or as a page that needs no server."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Text below each command's help: examples, the next step, and the scenes."""
 
-from __future__ import annotations
-
 # Names of the scenes. Repeated here, so that a command's help does not import scenes.
 NAMES = "spatula, press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force, microscope"
 PLAYING_COMMANDS = ("demo", "render", "film", "collect", "check", "effects")

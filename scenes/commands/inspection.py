@@ -1,7 +1,5 @@
 """Preview of an anatomy from a patient's labels, in seconds: volumes, depth, craniotomy and warnings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Image sheet of an inspection: three slices, the craniotomy as a surgeon sees it, and the numbers."""
 
-from __future__ import annotations
-
 import textwrap
 from dataclasses import dataclass
 

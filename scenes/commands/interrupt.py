@@ -1,7 +1,5 @@
 """A command that serves ends when it is asked to, whatever it computes just then."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

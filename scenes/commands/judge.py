@@ -1,7 +1,5 @@
 """`sulcus judge`: evaluate models on an independent data set: errors, and coverage of their bounds."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Mapping

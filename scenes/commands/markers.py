@@ -1,7 +1,5 @@
 """`sulcus markers`: the pages to print for tracking, and the list of what is on them."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

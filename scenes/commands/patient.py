@@ -1,7 +1,5 @@
 """`sulcus patient`: from a label volume to a brain that the scenes can play, in one go."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import shlex

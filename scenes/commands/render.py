@@ -1,7 +1,5 @@
 """`sulcus render`: the frames of a scene as images, without display or browser."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """`sulcus scenes`: the built-in scenes, their effects, who can play them, and what they look like."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

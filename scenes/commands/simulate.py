@@ -1,7 +1,5 @@
 """`sulcus simulate`: sample loads of a tool, solve them by FEM, store every displacement."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """`sulcus solve`: static equilibrium of any tetrahedral mesh."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -1,7 +1,5 @@
 """`sulcus track`: poses of the tool and the patient's reference in every frame of a calibrated camera."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """`sulcus train`: fit the learners to a data set, and compare their errors on held-out discs."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

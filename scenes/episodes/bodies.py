@@ -1,7 +1,5 @@
 """The bodies that episodes are played on: each is drawn, meshed, and given a trained model, once."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

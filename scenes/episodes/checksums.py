@@ -1,7 +1,5 @@
 """Checksums of a file's data sets and attributes."""
 
-from __future__ import annotations
-
 from hashlib import sha256
 
 import h5py

@@ -1,7 +1,5 @@
 """Numbers and words that a plan leaves to chance, and how each is drawn from a seed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from zlib import crc32
 

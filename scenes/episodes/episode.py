@@ -5,8 +5,6 @@ Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forwa
 with which tissue, element and tool: `finite_elements` gives them in words, `tissue` and `element` for a program.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """A run planned on paper: time, disk and processes of many episodes, from those that were made."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Families of motions: what hands do in the episodes of a data set, each with numbers that are left to chance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any

@@ -4,8 +4,6 @@ Each process makes a body in its own hidden folder, and copies results of others
 needed: records of loads have checksums (`sim.runtime.journal`), also those of running processes.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """One episode, or one body, of a data set: made in a folder, and only if it is not there."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Plan of a data set: distributions that episodes are sampled from."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Mapping

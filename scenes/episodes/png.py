@@ -1,7 +1,5 @@
 """Grey images as PNG, by ISA-L: four times as fast as zlib for depth, ten times for labels, and no larger."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

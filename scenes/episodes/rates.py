@@ -1,7 +1,5 @@
 """Duration of tasks: stored next to the episodes and never in them, whose bytes do not depend on the machine."""
 
-from __future__ import annotations
-
 import os
 import platform
 import time

@@ -4,8 +4,6 @@ The folder is the only state: an episode is complete if its file exists, because
 Processes that work in the folder do not communicate. Two that make the same episode write the same bytes.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

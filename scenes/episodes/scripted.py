@@ -1,7 +1,5 @@
 """Episodes of a plan: sampled from the seed and the episode's number alone, and converted to scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Tasks of a worker: one body or one episode, and their outcome."""
 
-from __future__ import annotations
-
 import errno
 import os
 import platform

@@ -3,8 +3,6 @@
 Dask's own nanny gives up on a worker that is killed while it starts.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import os

@@ -1,7 +1,5 @@
 """A task as a `gymnasium.Env`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

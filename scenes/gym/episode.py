@@ -1,7 +1,5 @@
 """Episode of one environment: goal, tool, reached amount and reward."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """FEM response to a moved tool, and to drainage and resection of the brain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Predicted response to a moved tool, by models trained on forces or on tool poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

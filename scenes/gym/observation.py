@@ -1,7 +1,5 @@
 """Observations of a robot: tracked poses, measured forces, the planned goal, and images."""
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
 

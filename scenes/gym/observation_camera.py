@@ -1,7 +1,5 @@
 """Images of environments: colour and depth; those of one cavity are rendered together."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 

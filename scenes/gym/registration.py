@@ -1,7 +1,5 @@
 """The names by which `gymnasium.make` finds the environments."""
 
-from __future__ import annotations
-
 from sim.runtime.optional_packages import require_extra
 
 NAMESPACE = "sulcus"  # Prefix of the environments' names.

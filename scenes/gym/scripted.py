@@ -1,7 +1,5 @@
 """Scripted policy of each task, based on the robot's observations."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

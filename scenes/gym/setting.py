@@ -1,7 +1,5 @@
 """Shared data of the environments of one task on one body: the body, its tissue, and possible goals."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Tasks: tool, step sizes, limits of force and pressure, and tissue."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

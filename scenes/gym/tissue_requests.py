@@ -1,7 +1,5 @@
 """Request to a tissue model in a step, and its response."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Tool moved by twists: its pose, and the limits of its motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

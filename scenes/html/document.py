@@ -1,7 +1,5 @@
 """One HTML file of a scene: the tool is dragged over the cortex, and a fast model moves the tumour in the browser."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

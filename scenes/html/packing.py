@@ -1,7 +1,5 @@
 """Arrays as text for a page: shuffled bytes, deflated, base64."""
 
-from __future__ import annotations
-
 import base64
 import zlib
 from collections.abc import Mapping

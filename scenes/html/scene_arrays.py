@@ -1,7 +1,5 @@
 """Surfaces, colours, light and camera of a scene, as its page draws them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Connections of many OpenIGTLink clients: input is checked, each is sent the newest, and none blocks another."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 from collections import Counter

@@ -1,7 +1,5 @@
 """Lines on a console: of many at once a few, and how many others there were."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

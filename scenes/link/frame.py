@@ -1,7 +1,5 @@
 """The frame round every OpenIGTLink message: its header of 58 bytes, its checksum and its time stamp."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field

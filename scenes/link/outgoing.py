@@ -1,7 +1,5 @@
 """Messages of a result: surfaces, the tumour's pose, distances with bounds, and requested points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

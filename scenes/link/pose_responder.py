@@ -1,7 +1,5 @@
 """Tracking result of a tool's pose: positions of tumour and open cortex, with their errors."""
 
-from __future__ import annotations
-
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

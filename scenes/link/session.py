@@ -1,7 +1,5 @@
 """Loop of a live link: the newest pose is solved in a thread, and a separate task reports old poses."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import time as clock

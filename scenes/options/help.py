@@ -1,7 +1,5 @@
 """Help of commands: options in sections, `(default: X)` for each default, metavars of type or unit."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import sys

@@ -3,8 +3,6 @@
 An existing file is replaced only with --force. Commands that resume or extend their own output need no --force.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

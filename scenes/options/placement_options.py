@@ -1,7 +1,5 @@
 """Command-line options for the craniotomy, shared by `anatomy` and `patient`."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

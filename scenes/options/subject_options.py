@@ -1,7 +1,5 @@
 """Brain and tumour on the command line: labels of a volume, or a tumour that is drawn in a healthy head."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

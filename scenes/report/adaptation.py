@@ -1,7 +1,5 @@
 """Adaptation time of a row to a body whose tumour was debulked by a fifth."""
 
-from __future__ import annotations
-
 import time as clock
 from collections.abc import Callable
 from dataclasses import replace

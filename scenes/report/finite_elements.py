@@ -1,7 +1,5 @@
 """Row of a FEM variant: each test load alone, from rest, on this mesh or another."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

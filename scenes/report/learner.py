@@ -1,7 +1,5 @@
 """A row of a learner: trained without the discs, without the sectors, and with ever fewer loads."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The report as files: a page that needs nothing else, plots, a table for spreadsheets, and every number as JSON."""
 
-from __future__ import annotations
-
 import json
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence

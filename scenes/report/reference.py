@@ -1,7 +1,5 @@
 """Reference of the rows: reference solutions, stored load by load, and FEM solutions beyond the data."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

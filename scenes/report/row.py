@@ -1,7 +1,5 @@
 """Row of the report: errors, milliseconds, memory, and cost of preparation."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

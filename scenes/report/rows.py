@@ -1,7 +1,5 @@
 """Rows of the report, each measured in its own process, by a resumable run."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections import deque

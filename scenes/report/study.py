@@ -1,7 +1,5 @@
 """Study of a report: the played loads, inside and beyond the training range, and the seconds that its files took."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace

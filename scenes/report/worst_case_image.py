@@ -1,7 +1,5 @@
 """The camera's view of a row's worst case: the tumour as predicted, and where the reference has it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

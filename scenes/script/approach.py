@@ -1,7 +1,5 @@
 """Entry point and direction of a planned trajectory, which a scene's tool then follows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Camera motion, zoom and focus as functions of time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

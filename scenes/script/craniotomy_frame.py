@@ -1,7 +1,5 @@
 """The open cortex as a place to work at: where a hand touches it, and which way it goes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Schedule of a resection: a corridor to the tumour, and the tumour in shares."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

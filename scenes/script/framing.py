@@ -1,7 +1,5 @@
 """Framing: direction, target and field of view from which a camera sees the tumour through the craniotomy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

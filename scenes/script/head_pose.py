@@ -1,7 +1,5 @@
 """Head pose as pure functions of time: direction of gravity and fluid level."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Observation models of the open cortex with their errors: the only input of an estimate of the tumour position."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

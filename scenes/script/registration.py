@@ -1,7 +1,5 @@
 """Registration of the scan to the patient: a setting of a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Sampling of a scene's tool poses, as a hand sets them on the page: place on the cortex, and depth."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import qmc
 

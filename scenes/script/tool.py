@@ -1,7 +1,5 @@
 """Tools: how one looks, and where it is."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol

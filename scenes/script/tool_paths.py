@@ -1,7 +1,5 @@
 """Scripted tool motion as pure functions of time: what a surgeon's hand does, without a surgeon."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

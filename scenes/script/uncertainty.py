@@ -1,7 +1,5 @@
 """Error bounds of the displayed tumour position: results of an ensemble, stored next to the anatomy."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field

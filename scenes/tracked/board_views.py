@@ -1,7 +1,5 @@
 """Views of the calibration board in a folder of images or a video."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

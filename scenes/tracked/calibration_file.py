@@ -1,7 +1,5 @@
 """Calibration files of real cameras: intrinsics of OpenCV and ROS, and hand-eye transforms."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Literal

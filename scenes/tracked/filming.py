@@ -1,7 +1,5 @@
 """Synthetic videos of a scene by a realistic camera, with printed targets in view and their ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Frame-by-frame tracking with a real camera: tumour position, its error, and lost targets."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum

@@ -1,7 +1,5 @@
 """Tumour overlay on a real image: reliable position in colour, last known position in grey, nothing when lost."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

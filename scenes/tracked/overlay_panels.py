@@ -1,7 +1,5 @@
 """Side panels of an overlay page's 3-D view: slices of the scan, and recent readings."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ar.overlay.gauge import Gauge

@@ -1,7 +1,5 @@
 """Text of an overlay's page, as HTML: overlay state, reasons of unreliable results, and both errors."""
 
-from __future__ import annotations
-
 from html import escape
 
 from ar.overlay.composite import DOUBTFUL_COLOUR

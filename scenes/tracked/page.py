@@ -1,7 +1,5 @@
 """Page of a video, or of a live camera, with the tumour overlay."""
 
-from __future__ import annotations
-
 import time as clock
 from collections import deque
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Plausibility of a registration for this patient: positions of the opening and of the tool relative to the head."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ar.optics.camera import Camera

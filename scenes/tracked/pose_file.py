@@ -1,7 +1,5 @@
 """Poses of a tracked body as a CSV file: seconds, millimetres and unit quaternions. Rows where it is lost are blank."""
 
-from __future__ import annotations
-
 import csv
 import warnings
 from collections import Counter

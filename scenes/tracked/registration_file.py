@@ -1,7 +1,5 @@
 """Registration of the scan to the frame of the patient's reference, as a JSON file: millimetres, radians."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

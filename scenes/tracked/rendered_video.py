@@ -1,7 +1,5 @@
 """Short rendered video with temporarily covered markers, of a brain whose motion under the tool is known exactly."""
 
-from __future__ import annotations
-
 import time as clock
 from dataclasses import dataclass, replace
 

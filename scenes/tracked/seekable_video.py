@@ -1,7 +1,5 @@
 """Random access to the images of a video by number."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

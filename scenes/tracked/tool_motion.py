@@ -1,7 +1,5 @@
 """Brain motion under a tracked tool: deformation by a model or FEM from its pose, with its error."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tool that carries the printed cube: its shape, and where it is on the cube."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from functools import cached_property

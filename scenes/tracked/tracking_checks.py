@@ -1,7 +1,5 @@
 """Verification of an overlay by its pixels, when markers are lost and found again, and images are late."""
 
-from __future__ import annotations
-
 import time as clock
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Overlays compared with the ground truth of a video: errors of outline and tumour, and coverage of the band."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Check that a video is of the given camera."""
 
-from __future__ import annotations
-
 from itertools import islice
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The moment that is exported: how a body is displaced, by what, and how surely."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """All files of a warp."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Sequence

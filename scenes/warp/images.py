@@ -1,7 +1,5 @@
 """A patient's own images and label maps, as they would be now: on their own grids, as NIfTI."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Named points of a body at rest and now, each a place in tissue that the finite elements carry."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

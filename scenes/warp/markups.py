@@ -1,7 +1,5 @@
 """Points and lines as 3D Slicer's markups: JSON in millimetres, LPS."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Triangles as VTP, STL and glTF, each with the space that it is in."""
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

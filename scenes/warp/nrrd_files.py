@@ -1,7 +1,5 @@
 """NRRD files: vector fields and segmentations."""
 
-from __future__ import annotations
-
 import gzip
 from collections.abc import Mapping, Sequence
 from pathlib import Path

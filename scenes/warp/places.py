@@ -1,7 +1,5 @@
 """Comparison of a warp's fields with FEM, and places where FEM folds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """README of a warp's files: content, how to open them, and limits."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from .images import Warped

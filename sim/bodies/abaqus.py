@@ -1,7 +1,5 @@
 """Reader for Abaqus input files: nodes, elements and element sets of all blocks."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field

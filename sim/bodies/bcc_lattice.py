@@ -6,8 +6,6 @@ Meshes with Good Dihedral Angles", section 3. Between cells of one size lie the 
 least 45).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

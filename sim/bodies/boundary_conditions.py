@@ -1,7 +1,5 @@
 """Boundary conditions of a brain: nodes fixed at brainstem and dura, skull contact nodes, and the craniotomy."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import reduce
 

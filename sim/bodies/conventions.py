@@ -1,7 +1,5 @@
 """Table of label conventions of common segmentation programs, by convention name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ Dural septa act as rigid membranes: Chen et al. 2011, IEEE Trans. Biomed. Eng. 5
 bonded to them, and does not slide along them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Voxelisation of a closed surface."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..errors import InputError

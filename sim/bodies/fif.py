@@ -1,7 +1,5 @@
 """Reader for head surfaces in FIF, the format of MNE's boundary elements: tags with headers of four integers."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

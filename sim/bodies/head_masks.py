@@ -1,7 +1,5 @@
 """Masks of brain and tumour from one label map or from several files on different grids."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Healthy heads other than the template: from a brain mask, or from the inner skull of fsaverage."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Contact areas between labels of a volume, and detection of conventions that contradict the anatomy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Labels of voxels by number or name, and resampling of masks between grids."""
 
-from __future__ import annotations
-
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass

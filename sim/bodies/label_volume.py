@@ -1,7 +1,5 @@
 """Subject from a label volume: masks of brain and tumour, and the position of the craniotomy."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

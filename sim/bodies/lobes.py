@@ -1,7 +1,5 @@
 """Side and lobe of a tumour, from its place in the proportions of the brain."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..anatomy import Anatomy

@@ -1,7 +1,5 @@
 """Removal of tetrahedra so that a mesh is one component with a 2-manifold surface."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import coo_array, csgraph
 

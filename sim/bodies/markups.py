@@ -1,7 +1,5 @@
 """Reader for 3D Slicer markups: points, lines and curves in `.mrk.json`, and points in `.fcsv`."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Checks and regions of a given tetrahedral mesh: one conforming body without overlaps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Checks for mesh files with external references or oversized arrays, before a library opens them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree
 

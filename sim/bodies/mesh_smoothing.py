@@ -1,7 +1,5 @@
 """Node relocation in a stuffed mesh: fit surfaces to level sets and improve dihedral angles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

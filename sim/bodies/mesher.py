@@ -1,7 +1,5 @@
 """Conforming tetrahedral mesh of brain and tumour with a requested number of nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

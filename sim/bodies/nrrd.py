@@ -1,7 +1,5 @@
 """Reader for NRRD volumes, with attached or detached data, and for 3D Slicer segmentations (`.seg.nrrd`)."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import math

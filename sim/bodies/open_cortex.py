@@ -1,7 +1,5 @@
 """Exposed cortex of an anatomy: local coordinate system, craniotomy edge, and contact points of a tool."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

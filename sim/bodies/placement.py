@@ -1,7 +1,5 @@
 """Positions in a head: cortex accessible through the skull, openings, and anatomical directions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Red-green refinement of an anatomy's mesh, everywhere or near the exposed cortex."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Synthetic patient with the brain surface of an anatomy: label map and T1, for users without data."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Solids as level set functions, negative inside and zero on the surface; level sets of voxel masks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast

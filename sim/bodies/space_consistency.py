@@ -1,7 +1,5 @@
 """Consistency of the spaces of several files; detects LPS declared as RAS."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

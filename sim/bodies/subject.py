@@ -1,7 +1,5 @@
 """Head model before meshing, common to the template and to label volumes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import product
 from typing import cast

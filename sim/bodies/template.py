@@ -1,7 +1,5 @@
 """Synthetic tumour in a healthy head; by default the MNI152 brain in the nilearn wheel, scaled to a typical volume."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, cast

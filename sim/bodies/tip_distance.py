@@ -1,7 +1,5 @@
 """Distance from the tip of a tool to the tumour in the deformed brain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 

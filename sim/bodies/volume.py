@@ -1,7 +1,5 @@
 """Reader for voxel volumes of several formats, with any affine, in metres, RAS."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Voxel volume read from a file, and limits of a brain volume."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import lzma

@@ -1,7 +1,5 @@
 """Uncompressed size of a `.vtu` file, measured in bounded memory: a few bytes may expand to gigabytes."""
 
-from __future__ import annotations
-
 import base64
 import lzma
 import re

@@ -1,7 +1,5 @@
 """Diagnostic fields of a `Deformation`: leak, bond, stretch, and the outcomes that follow from them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

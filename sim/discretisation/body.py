@@ -1,7 +1,5 @@
 """Arguments from which a term is built: anatomy, discretisation, surface and device."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ..anatomy import Anatomy

@@ -1,7 +1,5 @@
 """Detection of inverted tetrahedra: an equilibrium may have them, but it is not physical."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Boundary value problem: sum of energy terms under constraints."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

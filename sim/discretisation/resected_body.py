@@ -1,7 +1,5 @@
 """Remaining body after each step of a resection, and its disconnected parts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 

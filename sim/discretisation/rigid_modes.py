@@ -1,7 +1,5 @@
 """Rigid body modes: test that the constraints prevent rigid motion of every part of a body."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sp
 

@@ -6,8 +6,6 @@ around an edge, weighted by a sixth of their volumes, and determines the deviato
 elements around a node, with a quarter of each, determines the volumetric response.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys

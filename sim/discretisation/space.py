@@ -1,7 +1,5 @@
 """Nodes and elements of an element type over a mesh; mesh vertices come first."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 

@@ -1,7 +1,5 @@
 """Extension of a field outside its domain: nearest known value, faded to zero."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

@@ -1,7 +1,5 @@
 """Detection and removal of folds (negative Jacobian determinants) in displacement fields."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

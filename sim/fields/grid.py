@@ -1,7 +1,5 @@
 """Regular grid along the patient's coordinate axes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Interpolation of vertex values in tetrahedra at the nodes of a grid."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Inverse of a displacement field on a grid, outside the tetrahedra."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Extrapolation of a body's field to points just outside its surface."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import KDTree
 

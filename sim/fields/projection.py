@@ -1,7 +1,5 @@
 """L2 projection of a body's field onto a grid, where sampling at the nodes is not accurate enough."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Displacement fields of a body and its surroundings on a grid, forward and backward."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Closest point of a triangulated surface, in plain NumPy."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

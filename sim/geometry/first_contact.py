@@ -1,7 +1,5 @@
 """First contact of a ball with a triangulated surface: exact for faces, edges and vertices."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..errors import InputError

@@ -1,7 +1,5 @@
 """Geodesic distances on a triangulated surface."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import coo_array, csgraph
 

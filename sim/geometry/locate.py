@@ -1,7 +1,5 @@
 """Interpolation of one mesh's solution at material points of another: tetrahedron and barycentric weights of points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple

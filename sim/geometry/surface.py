@@ -1,7 +1,5 @@
 """Triangulated surfaces: areas, normals, and a test whether a closed one contains a point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

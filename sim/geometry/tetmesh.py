@@ -1,7 +1,5 @@
 """Tetrahedral meshes: nodes, linear or quadratic tetrahedra, region labels, and their surface."""
 
-from __future__ import annotations
-
 import hashlib
 import warnings
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ Exchanging all unknowns gives the inverse, in n^3 operations and 4 n^2 bytes of 
 memory for factor and inverse at once. Uses torch, as `dense_inverse` does.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Compliance of the undeformed mesh at some nodes: columns of its preconditioner, computed when needed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any

@@ -5,8 +5,6 @@ right-hand side, by arithmetic for many. SuperLU, with its small supernodes, tak
 twenty times for 64.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Choice of a problem's preconditioner by its size, its element and its device."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

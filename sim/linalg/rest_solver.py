@@ -1,7 +1,5 @@
 """Solver with the undeformed stiffness alone, in the problem's precision, for power series."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -3,8 +3,6 @@
 Guyan 1965, "Reduction of stiffness and mass matrices", AIAA J. 3:380.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Duff, Reid 1983, "The multifrontal solution of indefinite sparse symmetric linea
 9:302-325; the elimination tree is Liu's: 1990, SIAM J. Matrix Anal. Appl. 11:134-172.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

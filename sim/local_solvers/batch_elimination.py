@@ -12,8 +12,6 @@ of the far part, condensed. The far part takes e + H (x - e), where H maps the s
 linear, x would be e.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 

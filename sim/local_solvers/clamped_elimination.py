@@ -5,8 +5,6 @@ near a load, clamped at its boundary (`clamped_part.py`), is solved as a local s
 remaining function of the surrounding nodes, whose curvature is close to the undeformed stiffness.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Local subproblem of some tetrahedra, whose nodes shared with other tetrahedra are fixed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

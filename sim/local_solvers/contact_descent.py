@@ -10,8 +10,6 @@ of the tools, not approximated. c depends on the few touchable nodes, and all ot
 move by x = -H (s'(u) + f), with the tools' forces f on them from `contact_forces`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial

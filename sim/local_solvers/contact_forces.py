@@ -9,8 +9,6 @@ tools' forces f, with w = w0 - C f: these vanish except at touched nodes, so tha
 position under approximate forces, w1 = w0 - C f1, because differences from it have little round-off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

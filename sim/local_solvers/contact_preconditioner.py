@@ -5,8 +5,6 @@
 Woodbury 1950, with D positive semi-definite. A factor of K0 alone lacks contact, which is a thousand times as stiff.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 from scipy.linalg import lu_factor, lu_solve

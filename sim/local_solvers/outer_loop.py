@@ -4,8 +4,6 @@ Cai, Keyes 2002, "Nonlinearly preconditioned inexact Newton algorithms", SIAM J.
 solver defines one cycle; this module decides for each load case of a batch when cycles end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

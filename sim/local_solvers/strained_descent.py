@@ -6,8 +6,6 @@ Woodbury 1950, with D as in `strained_part.py`. From the undeformed stiffness L-
 Most tissue that is strained in one frame is strained in the next, whose descent begins with the same D.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

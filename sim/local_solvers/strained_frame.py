@@ -3,8 +3,6 @@
 It is that of `strained_descent.py`, with the matrix M = -(1 + D C)^-1 D explicit: a captured graph multiplies by it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

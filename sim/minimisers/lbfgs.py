@@ -5,8 +5,6 @@ the preconditioner and computes the next direction. The launches are always the 
 captured graph. Between iterations the host removes the load cases that have ended.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Energies are not compared: in single precision round-off hides their differences long before those of the gradient.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -3,8 +3,6 @@
 It uses terms only through their protocol. Load cases that have ended leave the batch, to save time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

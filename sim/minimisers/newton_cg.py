@@ -1,7 +1,5 @@
 """Search directions of the Newton iteration, which runs on the host."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

@@ -6,8 +6,6 @@ module computes the second term for pairs of unit forces, element by element. `p
 only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Product of a dense matrix with columns, by the fastest library: torch on CUDA, NumPy's BLAS on the CPU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Device and precision of arrays."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

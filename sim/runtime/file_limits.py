@@ -1,7 +1,5 @@
 """Size limits of files from outside, so that a malicious or damaged file cannot exhaust the memory."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Each record has a digest keyed with the run's description, so that torn, damaged
 Records follow each other; after an invalid one, the next is found by its mark.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import mmap

@@ -1,7 +1,5 @@
 """Folder in which Warp compiles kernels: a private temporary one if the user's cannot be written."""
 
-from __future__ import annotations
-
 import os
 import stat
 import sys

@@ -1,7 +1,5 @@
 """Memory estimates of a batch, and a check before it is solved that names the batch that fits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Mutual exclusion of threads in methods that work on their object's arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import wraps
 from threading import RLock

@@ -1,7 +1,5 @@
 """Import of optional packages, with a one-line error that names the missing one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

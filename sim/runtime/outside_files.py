@@ -1,7 +1,5 @@
 """Reading of files from outside: every failure becomes an error message of one sentence."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Hidden names of files and folders during writing, and removal of those left by killed processes."""
 
-from __future__ import annotations
-
 import glob
 import os
 import platform

@@ -1,7 +1,5 @@
 """Spawned processes: a single one that runs a function, and a pool with one per device that runs tasks."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Control of threads: BLAS limited to one, where several would wait for one another; native loops on several cores."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Wall time by stage, for active listeners."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

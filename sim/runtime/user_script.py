@@ -1,7 +1,5 @@
 """Execution of a user's Python file with the user's rights; failures become one-sentence errors."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 import traceback

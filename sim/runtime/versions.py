@@ -1,7 +1,5 @@
 """Versions of installed packages, and this package's name on package indexes."""
 
-from __future__ import annotations
-
 import tomllib
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version

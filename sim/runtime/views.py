@@ -1,7 +1,5 @@
 """Warp arrays as arrays of the library for their device: NumPy on the CPU, torch on a GPU."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

@@ -1,7 +1,5 @@
 """Load cases whose tools overlap bone: they are not solved, and the mesh stays as it was."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ from u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2: the component of the new
 zero if the load stays the same or turns at a right angle, and negative if the load returns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

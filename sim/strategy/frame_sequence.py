@@ -4,8 +4,6 @@ A start that must be uploaded from the host gives the same solution. Loads that 
 the caller to solve otherwise.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from threading import RLock

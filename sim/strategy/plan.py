@@ -1,7 +1,5 @@
 """Selection and order of solvers for a load: one table, with a description in sentences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum

@@ -1,7 +1,5 @@
 """Control of load steps, and of the gap of tools on a long path."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Time steps: choice of their preconditioner, and the step of zero length."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Change of weight since the scan, due to another posture or another fluid level around the brain."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 

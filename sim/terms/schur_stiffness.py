@@ -1,7 +1,5 @@
 """Static condensation of the surrounding body: undeformed Schur complement stiffness on the shared nodes."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sp
 import warp as wp

@@ -1,7 +1,5 @@
 """Interface of coefficients that a law takes per quadrature point and load case."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Descriptions of the arrays of a data set, stored as attributes, so that the file is readable without this project."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import h5py

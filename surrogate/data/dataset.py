@@ -7,8 +7,6 @@ Data of poses have none, but `answers/reaction` (n, tools, 6), which older files
 describe it (`array_meanings`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property

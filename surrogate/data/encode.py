@@ -1,7 +1,5 @@
 """Features of loads, and a reduced basis of displacements."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

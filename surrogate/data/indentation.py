@@ -4,8 +4,6 @@ A tool's pose is tracked while its force is unknown. Without friction the deform
 its path. For the regressors depth replaces force: both are zero if nothing moves.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ A load of a pose at a time [s] is such a history. The tool arrives within `APPRO
 shorter, and stays in place until the time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 

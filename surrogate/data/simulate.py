@@ -1,7 +1,5 @@
 """Simulation of a data set with a deformer, batch by batch, so that a killed run resumes."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Rows of a data set: one result each, with a checksum that detects damage."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterable, Mapping
 

@@ -1,7 +1,5 @@
 """Solvers of a data set's loads: FEM in this process, or a process with its own FEM on each of several devices."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

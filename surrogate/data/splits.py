@@ -1,7 +1,5 @@
 """Splits of a data set's loads: by direction of the force, and by disc of the cortex."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Batches of a data set, and their solution: by one deformer in this process, or one on each of several devices."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Sampling of loads as made by surgical tools: position, force, direction and footprint."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

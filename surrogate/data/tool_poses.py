@@ -1,7 +1,5 @@
 """Sampling of surgical poses of a rigid tool: position, direction and depth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Selection of a deformer by error limit or time limit, and the Pareto front of error and time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

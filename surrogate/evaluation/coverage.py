@@ -1,7 +1,5 @@
 """Empirical coverage of a model's bounds on loads that it was not trained on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from operator import attrgetter
 

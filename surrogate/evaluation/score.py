@@ -1,7 +1,5 @@
 """Errors of a model on the loads of a data set: displacement and tool force."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Estimation of a patient's tissue from several frames: sum of their log evidence in each tissue."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Likelihood of one frame in each tissue: Gaussian in the unknown sizes of the tissue's own motions, and in errors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

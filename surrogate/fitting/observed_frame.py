@@ -1,7 +1,5 @@
 """Frames with observed points and tools, and the CSV table of those tools."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

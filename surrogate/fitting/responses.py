@@ -1,7 +1,5 @@
 """Responses of linear tissue to drained fluid and to forces, for each tissue, as basis of the likelihood."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Fitted tissue, in memory and as a JSON file."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

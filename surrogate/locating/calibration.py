@@ -1,7 +1,5 @@
 """Calibration of covariances on ensemble members whose tissue and skull group are not in the prior."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

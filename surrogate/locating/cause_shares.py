@@ -4,8 +4,6 @@ Shares are computed from posterior samples. Causes whose own shares scatter wide
 grouping is chosen in which the joint share of each group is determined.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Causes of brain motion to be located from an observation: tools, CSF drainage and swelling, in unmeasured tissue."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

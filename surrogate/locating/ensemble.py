@@ -1,7 +1,5 @@
 """Ensemble of brain motions by every cause, in many tissues and skulls, from which the prior is built."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

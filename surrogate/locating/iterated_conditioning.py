@@ -4,8 +4,6 @@ The closest points are recomputed in each iteration, as in Besl, McKay 1992, "A 
 IEEE Trans. Pattern Anal. Mach. Intell. 14:239-256.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from .observation import Observation, place_again, to_evidence

@@ -1,7 +1,5 @@
 """Locators of patients: made once before anything is seen, kept in files, and read in a second."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import asdict

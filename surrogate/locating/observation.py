@@ -1,7 +1,5 @@
 """Observations of a brain, validated against the anatomy: moved points, a point cloud of the surface, tool tips."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import product

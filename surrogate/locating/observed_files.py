@@ -1,7 +1,5 @@
 """Observations in CSV files: millimetres, RAS, a header that names the columns."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Regions of known stiffness, in a brain of unknown stiffness."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import isclose

@@ -1,7 +1,5 @@
 """Applicability check: scenes that a trained model supports, by the effects that it was trained under."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterable, Mapping
 from contextlib import suppress

@@ -6,8 +6,6 @@ Assoc. 113:1094-1111, section 5.2. The quantiles are by classes as in Vovk, Lind
 the bounds of strong ones.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

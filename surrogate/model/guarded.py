@@ -1,7 +1,5 @@
 """Trained model with FEM fallback: loads with too large an error bound are solved by FEM."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors of a model on held-out cortex, and the test whether it needs FEM fallback."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

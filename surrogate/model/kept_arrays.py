@@ -1,7 +1,5 @@
 """Cache of computed arrays in a folder, so that an interrupted run continues."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 

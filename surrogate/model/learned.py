@@ -1,7 +1,5 @@
 """Trained deformer, for the tumour and the open cortex."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Validation of models from files: models that no training can produce are rejected before use."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

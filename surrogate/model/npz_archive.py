@@ -1,7 +1,5 @@
 """Arrays of an untrusted `.npz` file: only requested ones are read, up to a size limit."""
 
-from __future__ import annotations
-
 import json
 import math
 import zipfile

@@ -1,7 +1,5 @@
 """User-defined learners: registered from a file or package; trained, stored and read like the built-in ones."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass

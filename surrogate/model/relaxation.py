@@ -7,8 +7,6 @@ model stores the same for one number, the tool's depth d:
 The resistance to a change of shape has then lost the share r = sum_i (g_i - h_i / d), which all else depends on.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Model files: one `.npz` of plain arrays with a JSON header, no pickle."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Distance from tip to tumour by a trained model: corrected for its mean error, with a bound."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Contact of a tool that a model of its poses learned: its force, and the start of the search for contact."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

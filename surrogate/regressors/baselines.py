@@ -3,8 +3,6 @@
 torch and scikit-learn fit; NumPy predicts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Power series in the force: single forces, pairs of forces, and a Gaussian process for the remainder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

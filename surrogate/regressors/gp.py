@@ -1,7 +1,5 @@
 """Gaussian process from a load to the coefficients of a reduced basis, with its own standard deviation."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

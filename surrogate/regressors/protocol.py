@@ -1,7 +1,5 @@
 """Protocols of regressors, and the compliance matrix as the baseline of trained models."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import ClassVar, Protocol, Self
 

@@ -1,7 +1,5 @@
 """Loads with their responses, and residuals of models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

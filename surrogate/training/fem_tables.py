@@ -1,7 +1,5 @@
 """Tables of finite elements: a body condensed to what a tool may touch, and the series at places of the cortex."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

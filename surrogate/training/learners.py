@@ -1,7 +1,5 @@
 """Learners: what each is given, and the summands of its response, fitted to displacements."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial

@@ -1,7 +1,5 @@
 """Training: from a data set to models, their scores and bounds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The card of a data set, written into its folder: table of episodes, Croissant, data sheet and licence."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

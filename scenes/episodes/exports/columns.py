@@ -1,7 +1,5 @@
 """Columns of exports: task, held-out flag, images, frame rate and numbers of an episode."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path

@@ -3,8 +3,6 @@
 Akhtar et al. (2024), "Croissant: A Metadata Format for ML-Ready Datasets", DEEM; version 1.1 of the specification.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

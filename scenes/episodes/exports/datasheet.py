@@ -1,7 +1,5 @@
 """The data sheet of a data set, by the questions of Gebru et al. (2021), "Datasheets for Datasets", CACM 64(12)."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Episodes as folders: images as JPEG and PNG files, numbers as CSV, and their description as JSON."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable, Iterable, Sequence

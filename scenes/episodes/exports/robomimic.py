@@ -1,7 +1,5 @@
 """Episodes as one robomimic file: HDF5 with `data/demo_0`, ... and masks of those to train on and to hold out."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tumour, and the cortex where it is there, over time: XDMF with its numbers in HDF5, for ParaView."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

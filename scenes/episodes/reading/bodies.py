@@ -1,7 +1,5 @@
 """Anatomies of episodes: the template, or files next to the episodes."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

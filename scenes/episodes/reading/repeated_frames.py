@@ -1,7 +1,5 @@
 """Some frames of an episode solved again by finite elements, from its plan and its body alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

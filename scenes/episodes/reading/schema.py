@@ -1,7 +1,5 @@
 """Arrays of an episode: axes, kinds and units, in the current and in the former format."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

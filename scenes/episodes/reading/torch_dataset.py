@@ -1,7 +1,5 @@
 """Episodes as a PyTorch data set, for a `DataLoader` with any number of workers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Faults of an untrusted episode: each finding is a sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

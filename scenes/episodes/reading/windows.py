@@ -1,7 +1,5 @@
 """Rows of one episode's arrays, decoded, and windows of frames of many episodes in one order."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Tool contact barrier restricted to the nodes that tools can touch, in double precision."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any, Protocol
 

@@ -1,7 +1,5 @@
 """Bone over the nodes of a brain surface, and its edge at the craniotomy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

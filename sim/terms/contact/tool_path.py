@@ -1,7 +1,5 @@
 """Paths of rigid tools between poses, and contact-free start poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Interface of hyperelastic laws: three Warp functions of the displacement gradient."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import warp as wp
