@@ -184,9 +184,9 @@ def test_held_out_coverage_is_reported(trained, scored, data):
         share, solved = np.concatenate(alone, axis=1)
         assert (stated.mean, stated.solved) == pytest.approx((share.mean(), solved.mean())) and solved.any()
         assert stated.guarded == pytest.approx((share * (1.0 - solved)).mean())
-        found, held = trained.left_out[name], np.concatenate(held, axis=1)
+        found, held = trained.held_out_coverage[name], np.concatenate(held, axis=1)
         assert found.loads == held.shape[1] == split.test.sum() and found.shares == (held[0].mean(), None)
-    assert scored.left_out == {}
+    assert scored.held_out_coverage == {}
 
 
 def test_outside_the_training_range_bounds_grow(trained):

@@ -123,7 +123,7 @@ def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
         bound = bound_by(near, TIP_FIT, compute_growth(near, seen(others), TIP_FIT))
         bounded = replace(scored, tip=replace(scored.tip, bound=bound))
         held.append(seen(here).error <= bounded.predict_distance(good.select(here)).bound)
-    found = trained.distance_left_out["linear"]
+    found = trained.held_out_distance_coverage["linear"]
     held = np.concatenate(held, axis=1)
     assert found.loads == held.shape[1] == split.test.sum() and found.shares == (held[0].mean(), None)
 

@@ -112,10 +112,10 @@ def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
             format_scores(trained.scores, 1e3 * trained.motion),
             f"95th percentile of the maximum vertex error on held-out loads [mm]: {bounds}; scenes use the smallest",
             *(f"on those discs, {name}: {describe_error(model)}" for name, model in trained.models.items()),
-            *(f"on those discs, bounds of {name} cover {found}" for name, found in trained.left_out.items()),
+            *(f"on those discs, bounds of {name} cover {found}" for name, found in trained.held_out_coverage.items()),
             *(
                 f"on those discs, bounds of the distance from tip to tumour by {name} cover {found}"
-                for name, found in trained.distance_left_out.items()
+                for name, found in trained.held_out_distance_coverage.items()
             ),
             *(f"on those discs, the tool's force by {name}: {found}" for name, found in trained.force.items()),
             f"the models written were trained on {trained.training_loads} loads; {_describe_calibration(trained)}",
@@ -152,8 +152,8 @@ def _format_json(trained: Trained, out: str, failed: int, preset: str) -> str:
             "training_loads": int(split.train.sum()),
             "held_out": int(split.test.sum()),
             "calibrated": trained.calibrated,
-            "left_out": {name: asdict(found) for name, found in trained.left_out.items()},
-            "distance_left_out": {name: asdict(found) for name, found in trained.distance_left_out.items()},
+            "left_out": {name: asdict(found) for name, found in trained.held_out_coverage.items()},
+            "distance_left_out": {name: asdict(found) for name, found in trained.held_out_distance_coverage.items()},
             "force": {name: asdict(found) for name, found in trained.force.items()},
             "not_converged": failed,
             "nominal_refused": compute_rejected_share(preset),

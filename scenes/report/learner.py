@@ -95,7 +95,7 @@ def compute_coverage_beyond(
 ) -> dict[str, float]:
     """Return the coverage of the 95 % bounds outside their guarantee; `truth` (B, n, 3) [m] of the loads `outside`."""
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
-    model, found = trained.models[spec.name], trained.left_out.get(spec.name)
+    model, found = trained.models[spec.name], trained.held_out_coverage.get(spec.name)
     shares = {} if found is None else {"discs": found.shares[0]}
     if model.bounds is not None and len(outside) >= FORCE_CLASSES:
         shares["beyond"] = compute_coverage(model, outside, truth).shares[0]

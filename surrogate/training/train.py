@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -46,11 +47,11 @@ class Trained:
     """Models by type, their scores on held-out discs, and the split.
 
     `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` is the number of loads
-    that calibrated the models' bounds, and `training_loads` the number of training loads. `left_out` gives by model
-    type the empirical coverage of bounds on held-out discs. These are bounds of the scored model, calibrated on loads
-    outside the discs; their growth with the distance from training loads is estimated from the other discs.
-    `distance_left_out` gives the same for the distance from tip to tumour, and `force` the errors of the tool's force
-    there, for poses whose data has it.
+    that calibrated the models' bounds, and `training_loads` the number of training loads. `held_out_coverage` gives by
+    model type the empirical coverage of bounds on held-out discs. These are bounds of the scored model, calibrated on
+    loads outside the discs; their growth with the distance from training loads is estimated from the other discs.
+    `held_out_distance_coverage` gives the same for the distance from tip to tumour, and `force` the errors of the
+    tool's force there, for poses whose data has it.
     """
 
     models: dict[str, Learned]
@@ -59,9 +60,13 @@ class Trained:
     motion: float
     calibrated: int
     training_loads: int
-    left_out: dict[str, Coverage]
-    distance_left_out: dict[str, Coverage]
+    held_out_coverage: dict[str, Coverage]
+    held_out_distance_coverage: dict[str, Coverage]
     force: dict[str, ForceScore]
+
+    # Former names, for one release.
+    left_out = property(attrgetter("held_out_coverage"))
+    distance_left_out = property(attrgetter("held_out_distance_coverage"))
 
 
 def list_learners(data: Dataset) -> tuple[str, ...]:
@@ -152,8 +157,10 @@ def train(
         motion=float(_compute_motion(answers, split.test).mean()),
         calibrated=int(apart.sum()),
         training_loads=int(fits[-1].rows.sum()),
-        left_out={name: each.left_out for name, each in results.items() if each.left_out},
-        distance_left_out={name: each.distance_left_out for name, each in results.items() if each.distance_left_out},
+        held_out_coverage={name: each.coverage for name, each in results.items() if each.coverage},
+        held_out_distance_coverage={
+            name: each.distance_coverage for name, each in results.items() if each.distance_coverage
+        },
         force={name: each.force for name, each in results.items() if each.force},
     )
 
@@ -180,8 +187,8 @@ class Result:
 
     model: Learned
     score: Score
-    left_out: Coverage | None
-    distance_left_out: Coverage | None
+    coverage: Coverage | None
+    distance_coverage: Coverage | None
     force: ForceScore | None
 
 
