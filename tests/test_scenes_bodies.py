@@ -16,7 +16,7 @@ from scenes.episodes.make import make_body, to_body_path
 from scenes.episodes.plan import load_plan
 from sim.anatomy import PART_LABELS, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
-from surrogate.model.held_out import MAX_VERTEX_ERROR, HeldOutError, LeftOut
+from surrogate.model.held_out import MAX_VERTEX_ERROR, HeldOutErrors, ReportedErrors
 from surrogate.model.store import load, read_reported_errors
 
 PLAN = """title = "A box"
@@ -89,25 +89,25 @@ def made(tmp_path_factory):
 
 def test_a_model_is_weak_by_what_it_states():
     def left_out(mean, p999=None):
-        return HeldOutError(1.0, LeftOut(mean, 0.0, p999, 0.0))
+        return ReportedErrors(1.0, HeldOutErrors(mean, 0.0, p999, 0.0))
 
     assert (
-        not HeldOutError(MAX_VERTEX_ERROR, None).weak
-        and HeldOutError(1.1 * MAX_VERTEX_ERROR, None).weak
-        and HeldOutError(math.nan, None).weak
+        not ReportedErrors(MAX_VERTEX_ERROR, None).weak
+        and ReportedErrors(1.1 * MAX_VERTEX_ERROR, None).weak
+        and ReportedErrors(math.nan, None).weak
     )
     assert not left_out(0.01).weak and left_out(0.02).weak and left_out(0.01, 3e-4).weak
-    assert str(HeldOutError(4e-4, None)) == "maximum error up to 0.4 mm in 95 % of loads (limit 0.2 mm)"
+    assert str(ReportedErrors(4e-4, None)) == "maximum error up to 0.4 mm in 95 % of loads (limit 0.2 mm)"
     assert str(left_out(0.042)) == "mean error 4.2 % of the motion (limit 1 %)"
     assert str(left_out(0.042, 3e-4)).endswith("); 99.9th percentile 0.3 mm (limit 0.2 mm)")
 
 
 def test_the_worst_are_named_first_and_not_all_of_many():
-    many = {number: HeldOutError(1e-5 * number, None) for number in range(35)}
+    many = {number: ReportedErrors(1e-5 * number, None) for number in range(35)}
     first, *named = describe_weak(many)
     assert first.startswith("14 of 35 bodies with a model have a weak one")
     assert named[0] == f"- body 34: {many[34]}" and len(named) == 11 and named[-1] == "- and 4 more"
-    assert describe_weak({0: HeldOutError(0.0, None)}) == [] == to_weak_json({0: HeldOutError(0.0, None)})
+    assert describe_weak({0: ReportedErrors(0.0, None)}) == [] == to_weak_json({0: ReportedErrors(0.0, None)})
 
 
 def test_files_say_what_their_models_state(made):
@@ -116,10 +116,10 @@ def test_files_say_what_their_models_state(made):
     (model,) = load(path, anatomy).values()
     (to_body_path(folder, 1)).mkdir()  # of a body that plays by another's model there is none
     assert (
-        read_reported_errors(path) == {"linear": HeldOutError(model.bound, model.held_out)}
+        read_reported_errors(path) == {"linear": ReportedErrors(model.bound, model.held_out)}
         and model.bound > MAX_VERTEX_ERROR
     )
-    assert list_model_errors(folder) == {0: HeldOutError(model.bound, None)}
+    assert list_model_errors(folder) == {0: ReportedErrors(model.bound, None)}
     to_body_path(folder, 1).rmdir()
 
 

@@ -16,7 +16,7 @@ from sim.deformation import Outcome
 from sim.errors import InputError
 from surrogate.data.tool_loads import draw
 from surrogate.model.guarded import describe_error, find_first_model
-from surrogate.model.held_out import MAX_VERTEX_ERROR, LeftOut, measure_held_out
+from surrogate.model.held_out import MAX_VERTEX_ERROR, HeldOutErrors, measure_held_out
 from surrogate.model.store import load, save
 
 
@@ -186,7 +186,7 @@ def test_fem_share_matches_held_out_errors(theatre):
 )
 def test_default_deformer_is_model_alone_where_valid(theatre, mean, bound, who):
     (_, model), *_ = theatre.models.items()
-    stated = None if mean is None else LeftOut(mean, 0.001, None, 0.3)
+    stated = None if mean is None else HeldOutErrors(mean, 0.001, None, 0.3)
     some = replace(theatre, models={"series-gp": replace(model, bound=bound, held_out=stated)})
     assert some.select_default(small()) == who and some.select_best(small()) == "series-gp"
     said = describe_error(some.models["series-gp"])
@@ -195,7 +195,7 @@ def test_default_deformer_is_model_alone_where_valid(theatre, mean, bound, who):
 
 def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):
     (name, model), *_ = theatre.models.items()
-    stated = LeftOut(0.02, 0.004, 0.3e-3, 0.4)
+    stated = HeldOutErrors(0.02, 0.004, 0.3e-3, 0.4)
     save(tmp_path / "a.npz", {name: replace(model, held_out=stated)})
     assert load(tmp_path / "a.npz", model.anatomy)[name].held_out == stated
     for bad in (replace(stated, mean=float("nan")), replace(stated, solved=1.1), replace(stated, p999="1")):

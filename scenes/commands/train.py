@@ -17,7 +17,7 @@ from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.splits import CALIBRATION_STRIDE
 from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
 from surrogate.evaluation.score import find_best, format_scores
-from surrogate.model.guarded import describe_error, get_held_out_error
+from surrogate.model.guarded import describe_error, get_reported_errors
 from surrogate.model.learned import Learned
 from surrogate.model.store import save
 from surrogate.training.expansion import SERIES_MODELS, Expansion
@@ -133,7 +133,7 @@ def _describe_calibration(trained: Trained) -> str:
 
 def _describe_error(model: Learned) -> dict[str, object]:
     """Describe the model's own reported errors, next to its score."""
-    reported = get_held_out_error(model)
+    reported = get_reported_errors(model)
     discs = None if reported.held_out is None else asdict(reported.held_out)
     return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.weak}
 

@@ -23,7 +23,7 @@ from surrogate.data.simulate import CREATION_KEYS, simulate
 from surrogate.data.solution_rows import describe_tissue_source
 from surrogate.data.tool_loads import draw as draw_loads
 from surrogate.model.applicability import find_rejection
-from surrogate.model.held_out import HeldOutError
+from surrogate.model.held_out import ReportedErrors
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, read_reported_errors, save
 from surrogate.training.expansion import Expansion
@@ -235,7 +235,7 @@ MAX_LISTED_BODIES = 10
 """Maximum number of bodies that are listed one by one."""
 
 
-def list_model_errors(folder: Path) -> dict[int, HeldOutError]:
+def list_model_errors(folder: Path) -> dict[int, ReportedErrors]:
     """Read the reported errors of the models of a folder's bodies, by number; bodies without a model are excluded."""
     found = {}
     for path in sorted((folder / BODIES).glob("[0-9]*")):
@@ -246,12 +246,12 @@ def list_model_errors(folder: Path) -> dict[int, HeldOutError]:
     return found
 
 
-def find_weak(models: Mapping[int, HeldOutError]) -> dict[int, HeldOutError]:
+def find_weak(models: Mapping[int, ReportedErrors]) -> dict[int, ReportedErrors]:
     """Those that are weak, the worst first."""
     return dict(sorted(((number, one) for number, one in models.items() if one.weak), key=lambda each: -each[1].bound))
 
 
-def describe_weak(models: Mapping[int, HeldOutError]) -> list[str]:
+def describe_weak(models: Mapping[int, ReportedErrors]) -> list[str]:
     """Describe the weak models and their errors, in sentences; empty if there is none."""
     weak = find_weak(models)
     if not weak:
@@ -264,7 +264,7 @@ def describe_weak(models: Mapping[int, HeldOutError]) -> list[str]:
     ]
 
 
-def to_weak_json(models: Mapping[int, HeldOutError]) -> list[dict[str, float | int | None]]:
+def to_weak_json(models: Mapping[int, ReportedErrors]) -> list[dict[str, float | int | None]]:
     """Return the weak ones as numbers."""
     return [
         {

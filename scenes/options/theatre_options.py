@@ -154,10 +154,10 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
             print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {reason}", file=sys.stderr)
         default, best = theatre.select_default(scene), theatre.select_best(scene)
         if args.deformer is None and best in theatre.models and default != scene.deformer:
-            from surrogate.model.guarded import describe_error, get_held_out_error
+            from surrogate.model.guarded import describe_error, get_reported_errors
 
             model = theatre.models[best]
-            if get_held_out_error(model).weak:
+            if get_reported_errors(model).weak:
                 print(f"{args.program}: on held-out cortex, {best}: {describe_error(model)}", file=sys.stderr)
         return args.deformer or default
     if args.deformer not in (None, "auto"):

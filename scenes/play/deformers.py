@@ -26,7 +26,7 @@ from surrogate.locating.locator import Locator
 from surrogate.locating.locator_store import load_locator, to_locator_path
 from surrogate.locating.regions import find_differing_regions
 from surrogate.model.applicability import find_rejection
-from surrogate.model.guarded import Guarded, get_held_out_error
+from surrogate.model.guarded import Guarded, get_reported_errors
 from surrogate.model.held_out import MAX_VERTEX_ERROR
 from surrogate.model.learned import Learned
 from surrogate.model.store import load
@@ -177,7 +177,7 @@ class PatientSetup:
         name = self.select_best(scene)
         if scene.deformer in self.select_models(scene):
             return scene.deformer
-        return GUARDED if self._can_guard(scene) and get_held_out_error(self.models[name]).weak else name
+        return GUARDED if self._can_guard(scene) and get_reported_errors(self.models[name]).weak else name
 
     def _can_guard(self, scene: Scene) -> bool:
         """Return True if FEM can serve as fallback of the best model.

@@ -13,7 +13,7 @@ from sim.loads import Loads
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS
 from ..regressors.rigid_contact import RigidContact
-from .held_out import MAX_VERTEX_ERROR, HeldOutError, find_handed_over
+from .held_out import MAX_VERTEX_ERROR, ReportedErrors, find_handed_over
 from .learned import Learned, ModelPart
 from .tool_contact import CONTACT_KEY
 
@@ -86,14 +86,14 @@ class Guarded:
     unsure = find_unreliable  # Former names, for one release.
 
 
-def get_held_out_error(model: Learned) -> HeldOutError:
+def get_reported_errors(model: Learned) -> ReportedErrors:
     """Return a model's reported errors on held-out cortex."""
-    return HeldOutError(model.bound, model.held_out)
+    return ReportedErrors(model.bound, model.held_out)
 
 
 def describe_error(model: Learned) -> str:
     """Describe a model's reported errors, and the deformer used in scenes: see `Guarded`."""
-    stated = get_held_out_error(model)
+    stated = get_reported_errors(model)
     guarded = "scenes play it without FEM, as its tissue relaxes" if model.series else "scenes play it guarded"
     return f"{model.held_out or stated}: {guarded if stated.weak else 'scenes play it without FEM'}"
 

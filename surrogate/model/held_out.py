@@ -18,7 +18,7 @@ MIN_LOADS_FOR_P999 = 1000
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class HeldOutErrors:
     """Errors on held-out cortex, of a model alone and with FEM fallback.
 
     Parameters
@@ -56,11 +56,11 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class HeldOutError:
+class ReportedErrors:
     """Reported errors of a model on held-out cortex: `bound` and `held_out` as in `Learned`."""
 
     bound: float
-    held_out: LeftOut | None
+    held_out: HeldOutErrors | None
 
     @property
     def weak(self) -> bool:
@@ -87,7 +87,7 @@ def find_handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np
     return ~(bound <= limit) | outside
 
 
-def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> LeftOut:
+def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> HeldOutErrors:
     """Compute errors on B loads, and the largest of `VERTEX_ERROR_LIMITS` with a guarded model of small error.
 
     Its mean error is at most `MAX_MEAN_ERROR`, its 99.9th percentile `MAX_P999_ERROR`.
@@ -109,7 +109,7 @@ def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray
         left = float(np.where(solved, 0.0, share).mean())
         if _is_enough(left, _compute_p999(np.where(solved[:, None], 0.0, distance))):
             break
-    return LeftOut(float(share.mean()), left, _compute_p999(distance), float(solved.mean()), limit)
+    return HeldOutErrors(float(share.mean()), left, _compute_p999(distance), float(solved.mean()), limit)
 
 
 def _compute_p999(distance: np.ndarray) -> float | None:

@@ -27,7 +27,7 @@ from ..data.solution_rows import read_tissue_statement
 from ..regressors.protocol import Fitted
 from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound, compute_features
-from .held_out import LeftOut
+from .held_out import HeldOutErrors
 from .relaxation import MEMORY_KEY, Relaxed, follow_relaxation
 from .tip_distance import Distance, TipModel
 from .tool_contact import ForceModel, build_warm_encoders, collect_held_state, compute_wrench
@@ -110,7 +110,7 @@ class Learned:
     training: Mapping[str, str] = field(default_factory=dict)
     tool: BuiltIn | None = None
     tip: TipModel | None = None
-    held_out: LeftOut | None = None
+    held_out: HeldOutErrors | None = None
     force: ForceModel | None = None
 
     @cached_property

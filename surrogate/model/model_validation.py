@@ -15,7 +15,7 @@ from ..data.indentation import Indented, add_relaxation
 from ..data.tool_loads import build_axes_about
 from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound
-from .held_out import LeftOut
+from .held_out import HeldOutErrors
 from .learned import Learned, ModelPart
 from .training_range import Envelope
 
@@ -169,7 +169,7 @@ def _check_bounds(bounds: Bound) -> None:
     _require_good(bool((bounds.quantile[1] >= bounds.quantile[0]).all()), "its bounds shrink with their probability")
 
 
-def _is_valid_error(stated: LeftOut) -> bool:
+def _is_valid_error(stated: HeldOutErrors) -> bool:
     """Return True if errors on held-out cortex have valid values."""
     sizes = (stated.mean, stated.guarded, stated.solved, *([] if stated.p999 is None else [stated.p999]))
     return all(type(size) is float and 0.0 <= size < np.inf for size in sizes) and stated.solved <= 1.0

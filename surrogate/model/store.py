@@ -26,7 +26,7 @@ from ..regressors.gp import Gp
 from ..regressors.protocol import Fitted, Linear, Regressor
 from ..regressors.rigid_contact import RigidContact
 from .conformal import GROWTH, Bound
-from .held_out import HeldOutError, LeftOut
+from .held_out import HeldOutErrors, ReportedErrors
 from .learned import Learned, ModelPart
 from .model_validation import check_finite_state, check_model_state
 from .npz_archive import Archive, compute_seal, write_archive
@@ -121,7 +121,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         return models
 
 
-def read_reported_errors(path: str | Path) -> dict[str, HeldOutError]:
+def read_reported_errors(path: str | Path) -> dict[str, ReportedErrors]:
     """Read the reported errors of a file's models, by name; their arrays are not read.
 
     Raises
@@ -130,7 +130,7 @@ def read_reported_errors(path: str | Path) -> dict[str, HeldOutError]:
         A file that is missing, or not a model file of this project.
     """
     with _open_header(path) as header:
-        return {name: HeldOutError(about["bound"], _read_held_out(about)) for name, about in header["models"].items()}
+        return {name: ReportedErrors(about["bound"], _read_held_out(about)) for name, about in header["models"].items()}
 
 
 def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
@@ -165,10 +165,10 @@ def _read_header(archive: Archive) -> dict[str, Any]:
     return header
 
 
-def _read_held_out(description: dict[str, Any]) -> LeftOut | None:
+def _read_held_out(description: dict[str, Any]) -> HeldOutErrors | None:
     """Read the errors on held-out cortex; None for older files."""
     stated = description.get("left_out")
-    return None if stated is None else LeftOut(**stated)
+    return None if stated is None else HeldOutErrors(**stated)
 
 
 def _list_array_keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
