@@ -18,7 +18,7 @@ from .discretisation.constraint import Constraint
 from .discretisation.element import Elements
 from .discretisation.footprint import ContactSurface
 from .discretisation.problem import Imposed, Problem
-from .discretisation.rigid_modes import check_held
+from .discretisation.rigid_modes import check_fixed
 from .discretisation.space import Discretisation, discretise
 from .discretisation.term import Barrier, Curved, Term
 from .effects import (
@@ -93,16 +93,16 @@ def compile_problem(
     terms: list[Term] = []
     own: list[Term] = []
     barriers: list[Barrier] = []
-    held, normal = np.zeros_like(anatomy.fixed), np.zeros_like(anatomy.slide_normal)
+    fixed, normal = np.zeros_like(anatomy.fixed), np.zeros_like(anatomy.slide_normal)
     pulsation = next((effect for effect in effects if isinstance(effect, Pulsation)), None)
     for effect in effects:
         match effect:
             case Elasticity():
                 terms += _build_elasticity(effect, space, device, pulsation=pulsation)
             case Held():
-                held = held | anatomy.fixed
+                fixed = fixed | anatomy.fixed
             case Bonded():
-                held = held | (anatomy.slide_normal != 0.0).any(axis=1)[:, None]
+                fixed = fixed | (anatomy.slide_normal != 0.0).any(axis=1)[:, None]
             case Slide():
                 normal = anatomy.slide_normal
             case ToolForce():
@@ -143,9 +143,9 @@ def compile_problem(
                     f"no effect is called {type(effect).__name__}: choose from {allowed}; "
                     "or let your own have cause, remembers and term, as sim.OwnEffect does."
                 )
-    check_held(anatomy.mesh, held, normal)
+    check_fixed(anatomy.mesh, fixed, normal)
     _check_names((*terms, *barriers), own)
-    constraint = Constraint(space.extend_held(held), space.extend_normals(normal, held), device)
+    constraint = Constraint(space.extend_fixed(fixed), space.extend_normals(normal, fixed), device)
     elastic = all(term.constant for term in own)
     return Problem(
         (*terms, *own, *barriers), constraint, device, partial(_build_imposed, space, skin), tuple(barriers), elastic
@@ -230,7 +230,7 @@ def compile_part(
 ) -> Problem:
     """Compile the elasticity of the `chosen` tetrahedra (T,) bool alone, on their `nodes` (n,), ascending."""
     effect = next(effect for effect in effects if isinstance(effect, Elasticity))
-    constraint = Constraint(whole.constraint.held[nodes], whole.constraint.normal[nodes], whole.device)
+    constraint = Constraint(whole.constraint.fixed[nodes], whole.constraint.normal[nodes], whole.device)
     return Problem(tuple(_build_elasticity(effect, space, whole.device, chosen, nodes)), constraint, whole.device)
 
 
@@ -251,8 +251,8 @@ def compile_clamped_part(
     effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), whole.device
     terms = _build_elasticity(effect, space, device, chosen, nodes)
     rim = np.isin(nodes, space.table[~chosen])[:, None]
-    held, normal = whole.constraint.held[nodes] | rim, np.where(rim, 0.0, whole.constraint.normal[nodes])
-    part = _build_local_problem(Problem(tuple(terms), Constraint(held, normal, device), device))
+    fixed, normal = whole.constraint.fixed[nodes] | rim, np.where(rim, 0.0, whole.constraint.normal[nodes])
+    part = _build_local_problem(Problem(tuple(terms), Constraint(fixed, normal, device), device))
     return part, lambda: reduce(add, [term.curvature() for term in terms])
 
 

@@ -75,7 +75,7 @@ class TestProjection:
 
     def test_removes_what_is_forbidden(self, device: Device, footprint: bool) -> None:
         of = constraint(device, footprint)
-        held, normal = of.held, of.normal
+        held, normal = of.fixed, of.normal
         v = projected(of, device, RNG.normal(size=(3 * COUNT, 3))).reshape(COUNT, 3, 3)
         assert not v[held].any()
         np.testing.assert_allclose(np.einsum("ni,nic->nc", normal, v), 0.0, atol=1e-12)

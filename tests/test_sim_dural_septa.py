@@ -11,7 +11,7 @@ from test_sim_head_masks import MIDDLE, grid, head, nifti
 
 from scenes.cli import main
 from sim.bodies.boundary_conditions import add_boundary_conditions
-from sim.bodies.dural_septa import Septum, find_held_vertices, synthesise_falx
+from sim.bodies.dural_septa import Septum, find_fixed_vertices, synthesise_falx
 from sim.bodies.head_masks import Sources, read_head_masks
 from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.meshfile import read_anatomy
@@ -58,7 +58,7 @@ def test_each_edge_that_meets_the_sheet_has_an_end_that_is_held(box, edge):
     y, z = np.meshgrid(steps, steps[steps > -20e-3], indexing="ij")
     sheet = np.column_stack([1e-3 + 0.2 * y.ravel(), y.ravel(), z.ravel()])
     reach = 0.5 * np.sqrt(3.0) * edge
-    held = find_held_vertices(box.mesh, Septum("falx", sheet, reach))
+    held = find_fixed_vertices(box.mesh, Septum("falx", sheet, reach))
     side = nodes[:, 0] - 1e-3 - 0.2 * nodes[:, 1]
     a, b = tets[:, [0, 0, 0, 1, 1, 2]].ravel(), tets[:, [1, 2, 3, 2, 3, 3]].ravel()
     share = side[a] / np.where(side[a] == side[b], 1.0, side[a] - side[b])
@@ -67,7 +67,7 @@ def test_each_edge_that_meets_the_sheet_has_an_end_that_is_held(box, edge):
     assert cut.sum() > 500 and (held[a[cut]] | held[b[cut]]).all()
     away = np.abs(side[held]) / np.hypot(1.0, 0.2)
     assert away.max() < 0.5 * 6e-3 * np.sqrt(3.0) + reach and not held[nodes[:, 2] < -25e-3].any()
-    assert not find_held_vertices(box.mesh, Septum("falx", sheet + [1.0, 0.0, 0.0], edge)).any()
+    assert not find_fixed_vertices(box.mesh, Septum("falx", sheet + [1.0, 0.0, 0.0], edge)).any()
 
 
 def test_a_drawn_falx_hangs_from_the_convexity_in_the_midline():

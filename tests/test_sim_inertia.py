@@ -75,7 +75,7 @@ def test_a_rod_swings_with_its_analytic_period(element: str, cells: int) -> None
 
 def mode(problem: Problem, mass: np.ndarray) -> tuple[float, np.ndarray]:
     """The lowest circular frequency [1/s], and its motion (N, 3), at most 0.1 mm."""
-    free = np.flatnonzero(~problem.constraint.held.ravel())
+    free = np.flatnonzero(~problem.constraint.fixed.ravel())
     stiffness = problem.rest_curvature().toarray()[np.ix_(free, free)]
     squares, shapes = eigh(stiffness, np.diag(np.repeat(mass, 3)[free]))
     motion = np.zeros(problem.rows)

@@ -57,7 +57,7 @@ def test_an_added_node_is_held_where_a_surface_triangle_is() -> None:
     """Component by component; not where two held nodes are joined through the body."""
     held = np.random.default_rng(0).uniform(size=THIN.nodes.shape) < 0.8
     space = discretise(THIN, "p2")
-    found = space.extend_held(held)
+    found = space.extend_fixed(held)
     np.testing.assert_array_equal(found[: len(held)], held)
     expected = np.array(
         [np.any([held[t].all(axis=0) for t in triangles_round(THIN, e)] or [[False] * 3], axis=0) for e in space.edges]
@@ -72,7 +72,7 @@ def test_nodes_that_the_mesh_brings_are_held_as_the_mesh_says() -> None:
     mesh = quadratic(THIN)
     held = np.zeros((len(mesh.nodes), 3), bool)
     held[np.unique(mesh.tets)] = True
-    np.testing.assert_array_equal(discretise(mesh, "p2").extend_held(held), held)
+    np.testing.assert_array_equal(discretise(mesh, "p2").extend_fixed(held), held)
 
 
 def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:

@@ -99,7 +99,7 @@ def test_a_tool_reads_what_the_base_bears(name: str, element: str) -> None:
         if term.passive:
             term.add_gradient(u, elastic)
     internal = elastic.numpy().reshape(-1, 3)
-    bears = np.where(fem.problem.constraint.held, internal, 0.0)
+    bears = np.where(fem.problem.constraint.fixed, internal, 0.0)
     size = np.linalg.norm(force)
     np.testing.assert_allclose(force, -bears.sum(axis=0), atol=1e-6 * size)
     place = at(0.5 * SIDE + 1e-3, 0.5 * SIDE - 2e-3, HEIGHT - DEPTHS[name])[:3, 3]

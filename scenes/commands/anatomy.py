@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sim.anatomy import PART_LABELS, Anatomy, name_region
-from sim.bodies.dural_septa import find_held_vertices
+from sim.bodies.dural_septa import find_fixed_vertices
 from sim.bodies.head_masks import read_head_masks
 from sim.bodies.intensity import to_intensity_path, write_intensity
 from sim.bodies.label_volume import build_masked_subject
@@ -137,7 +137,7 @@ def _summarise_anatomy(
     mesh = anatomy.mesh
     volume = mesh.volumes[anatomy.in_tumour].sum()
     error, weight = compute_surface_errors(mesh.nodes, mesh.surface, subject.brain)
-    septa = [int((find_held_vertices(mesh, one) & anatomy.fixed.all(axis=1)).sum()) for one in subject.septa]
+    septa = [int((find_fixed_vertices(mesh, one) & anatomy.fixed.all(axis=1)).sum()) for one in subject.septa]
     regions = {
         name_region(part.label): (float(mesh.volumes[mesh.mark_elements(part.label)].sum()), part)
         for part in subject.parts

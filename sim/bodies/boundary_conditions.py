@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..geometry.geodesic import compute_geodesic_distances
 from ..geometry.surface import compute_vertex_normals
 from ..geometry.tetmesh import TetMesh
-from .dural_septa import Septum, find_held_vertices
+from .dural_septa import Septum, find_fixed_vertices
 from .placement import Placement, find_within_outline
 
 
@@ -55,11 +55,11 @@ def add_boundary_conditions(
             f"{said} holds {opened.sum()} mesh nodes, and {settings.min_open_nodes} are "
             "needed: ask for a larger one, or for more nodes."
         )
-    held = reduce(np.logical_or, (find_held_vertices(mesh, septum) & ~opened for septum in septa), stem)
+    fixed = reduce(np.logical_or, (find_fixed_vertices(mesh, septum) & ~opened for septum in septa), stem)
     rest = np.zeros(len(mesh.nodes), bool)
     rest[outer] = True
-    rest &= ~held & ~opened
+    rest &= ~fixed & ~opened
     if not rest.any():
         raise InputError(f"{said} leaves no skull: ask for a smaller one.")
     normals = np.where(rest[:, None], compute_vertex_normals(mesh.nodes, surface), 0.0)
-    return Anatomy(mesh, np.repeat(held[:, None], 3, axis=1), normals, opened)
+    return Anatomy(mesh, np.repeat(fixed[:, None], 3, axis=1), normals, opened)

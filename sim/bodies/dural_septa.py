@@ -59,7 +59,7 @@ def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
     return Septum("falx", np.column_stack([np.full(len(sheet), middle[0]), sheet]), np.sqrt(0.5) * SPACING)
 
 
-def find_held_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
+def find_fixed_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
     """Return a mask (V,) of vertices to fix: of each edge that meets the sheet, the end nearer to the intersection.
 
     Every mesh edge that the sheet cuts therefore has at least one fixed end.
@@ -71,9 +71,9 @@ def find_held_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
     length = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
     near = tree.query(corners.mean(axis=1), distance_upper_bound=0.5 * length.max() + septum.reach)[0]
     close = near <= 0.5 * length + septum.reach
-    held = np.zeros(len(mesh.nodes), bool)
+    fixed = np.zeros(len(mesh.nodes), bool)
     if not close.any():
-        return held
+        return fixed
     ends, corners = ends[close], corners[close]
     count = int(np.clip(np.ceil(length[close].max() / septum.reach), MIN_SAMPLES, MAX_SAMPLES))
     along = np.linspace(0.0, 1.0, count)
@@ -82,5 +82,5 @@ def find_held_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
     inside = np.isfinite(distance)
     meets = inside.any(axis=1)
     where = (inside[meets] * along).sum(axis=1) / inside[meets].sum(axis=1)
-    held[ends[meets, (where > 0.5).astype(int)]] = True
-    return held
+    fixed[ends[meets, (where > 0.5).astype(int)]] = True
+    return fixed

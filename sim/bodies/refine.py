@@ -73,15 +73,15 @@ def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
         halved[count:] = KDTree(nodes[np.unique(opening)]).query(nodes[count:])[0] <= reach
     halved = _make_conforming(table, halved)
     tets, parent = _build_children(nodes, table, halved[table[:, 4:]])
-    held, normal = space.extend_held(anatomy.fixed), space.extend_normals(anatomy.slide_normal, anatomy.fixed)
+    fixed, normal = space.extend_fixed(anatomy.fixed), space.extend_normals(anatomy.slide_normal, anatomy.fixed)
     craniotomy = np.zeros(space.count, bool)
     craniotomy[opening] = True
     craniotomy[:count] = anatomy.craniotomy
-    free = ~held.any(axis=1) & (normal == 0.0).all(axis=1)
+    free = ~fixed.any(axis=1) & (normal == 0.0).all(axis=1)
     tets, _ = orient_tetrahedra(nodes, tets)
     number = np.cumsum(halved) - 1
     fine = TetMesh(nodes[halved], number[tets], mesh.region[parent])
-    return Anatomy(fine, held[halved], normal[halved], (craniotomy & free)[halved])
+    return Anatomy(fine, fixed[halved], normal[halved], (craniotomy & free)[halved])
 
 
 def _make_conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:

@@ -51,7 +51,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
 
     @forward_kernel(module="unique")
     def project(
-        held: wp.array2d(dtype=wp.int8),
+        fixed: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
         # outputs
         v: wp.array2d(dtype=scalar),
@@ -62,11 +62,11 @@ def build_kernels(device: Device) -> ConstraintKernels:
         n = normal[i]
         x -= wp.dot(n, x) * n
         for k in range(3):
-            v[3 * i + k, c] = wp.where(held[i, k] == wp.int8(0), x[k], scalar(0.0))
+            v[3 * i + k, c] = wp.where(fixed[i, k] == wp.int8(0), x[k], scalar(0.0))
 
     @forward_kernel(module="unique")
     def close(
-        held: wp.array2d(dtype=wp.int8),
+        fixed: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
         drag: wp.array(dtype=vec),
         value: wp.array2d(dtype=scalar),
@@ -82,7 +82,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         slip = (dragged - wp.dot(n, x)) * n
         for k in range(3):
             r = 3 * i + k
-            gap[r, c] = wp.where(held[i, k] == wp.int8(0), slip[k], value[r, c] - x[k])
+            gap[r, c] = wp.where(fixed[i, k] == wp.int8(0), slip[k], value[r, c] - x[k])
 
     @forward_kernel(module="unique")
     def average(
@@ -119,7 +119,7 @@ class Constraint:
 
     Parameters
     ----------
-    held
+    fixed
         Mask (N, 3) of components with prescribed values.
     normal
         Unit normals (N, 3) of sliding nodes, zero elsewhere. If components of a sliding node are fixed, the
@@ -130,11 +130,11 @@ class Constraint:
         Thresholds below which motion counts as fixed.
     """
 
-    def __init__(self, held: np.ndarray, normal: np.ndarray, device: Device, freedom: MinFreeDofs = MinFreeDofs()):
-        self.held, self._freedom = held, freedom
-        self.normal, drag = _restrict_normals(held, normal, freedom.normal)
+    def __init__(self, fixed: np.ndarray, normal: np.ndarray, device: Device, freedom: MinFreeDofs = MinFreeDofs()):
+        self.fixed, self._freedom = fixed, freedom
+        self.normal, drag = _restrict_normals(fixed, normal, freedom.normal)
         self.device = device
-        self._held = device.upload(held.astype(np.int8), wp.int8)
+        self._fixed = device.upload(fixed.astype(np.int8), wp.int8)
         self._normal = device.upload(self.normal, device.vector)
         self._drag = device.upload(drag, device.vector)
         self._value: wp.array | None = None
@@ -156,7 +156,7 @@ class Constraint:
         if weight is not None and target is not None:
             self._weight, self._target = self.device.upload(weight), target
             square = weight**2
-            free = np.eye(3) * ~self.held[:, None, :] - self.normal[:, :, None] * self.normal[:, None, :]
+            free = np.eye(3) * ~self.fixed[:, None, :] - self.normal[:, :, None] * self.normal[:, None, :]
             self._gram = np.einsum("nb,nij->bij", square, free)
             share = np.linalg.eigvalsh(self._gram)[:, 0] / square.sum(axis=0)
             if (share < self._freedom.footprint).any():
@@ -175,7 +175,7 @@ class Constraint:
     @property
     def nodes(self) -> tuple[wp.array, wp.array]:
         """Arrays of `project_nodes` on the device: fixed components (N, 3) int8 and normals (N,)."""
-        return self._held, self._normal
+        return self._fixed, self._normal
 
     @property
     def imposes(self) -> bool:
@@ -191,15 +191,15 @@ class Constraint:
 
     def project_nodes(self, v: wp.array) -> None:
         """Project v (3N, b) onto the motions that fixed and sliding nodes admit, in place, regardless of the loads."""
-        dim = (len(self.held), v.shape[1])
-        self.device.launch(build_kernels(self.device).project, dim, [self._held, self._normal], [v])
+        dim = (len(self.fixed), v.shape[1])
+        self.device.launch(build_kernels(self.device).project, dim, [self._fixed, self._normal], [v])
 
     def close_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
         """Return the smallest motion (3N, b) from u (3N, b) to the constraints, and its largest component (b,) [m]."""
         gap = self.device.allocate(*u.shape)
         value = self._value if self._value is not None else gap
-        inputs = [self._held, self._normal, self._drag, value, u]
-        self.device.launch(build_kernels(self.device).close, (len(self.held), u.shape[1]), inputs, [gap])
+        inputs = [self._fixed, self._normal, self._drag, value, u]
+        self.device.launch(build_kernels(self.device).close, (len(self.fixed), u.shape[1]), inputs, [gap])
         if self._weight is not None:
             rest = self.device.allocate(*u.shape)
             reached = self._average(u) + self._average(gap)
@@ -221,26 +221,26 @@ class Constraint:
     def build_basis(self) -> sp.csc_array:
         """Return a sparse orthonormal basis (3N, n) of the motions that fixed and sliding nodes admit."""
         sliding = (self.normal != 0.0).any(axis=1)
-        rows = [np.flatnonzero(~self.held & ~sliding[:, None])]
+        rows = [np.flatnonzero(~self.fixed & ~sliding[:, None])]
         columns, values = [np.arange(len(rows[0]))], [np.ones(len(rows[0]))]
         count = len(rows[0])
-        for fixed in range(2):  # with two fixed components a sliding node is fully constrained
-            node = np.flatnonzero(sliding & (self.held.sum(axis=1) == fixed))
+        for fixed_count in range(2):  # with two fixed components a sliding node is fully constrained
+            node = np.flatnonzero(sliding & (self.fixed.sum(axis=1) == fixed_count))
             # Free directions: orthogonal complement of the fixed axes and the normal.
-            axes = np.eye(3)[np.nonzero(self.held[node])[1]].reshape(len(node), fixed, 3)
-            free = np.linalg.svd(np.concatenate([axes, self.normal[node, None]], axis=1))[2][:, fixed + 1 :]
-            number = count + np.arange(len(node) * (2 - fixed))
-            rows.append(np.repeat(3 * node[:, None] + np.arange(3), 2 - fixed, axis=0).ravel())
+            axes = np.eye(3)[np.nonzero(self.fixed[node])[1]].reshape(len(node), fixed_count, 3)
+            free = np.linalg.svd(np.concatenate([axes, self.normal[node, None]], axis=1))[2][:, fixed_count + 1 :]
+            number = count + np.arange(len(node) * (2 - fixed_count))
+            rows.append(np.repeat(3 * node[:, None] + np.arange(3), 2 - fixed_count, axis=0).ravel())
             columns.append(np.repeat(number, 3))
             values.append(free.ravel())
             count += len(number)
         data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-        return sp.csc_array(sp.coo_array(data, shape=(self.held.size, count)))
+        return sp.csc_array(sp.coo_array(data, shape=(self.fixed.size, count)))
 
     def _average(self, v: wp.array) -> np.ndarray:
         assert self._weight is not None
         out = self.device.allocate(3, v.shape[1])
-        dim = (-(-len(self.held) // CHUNK), v.shape[1])
+        dim = (-(-len(self.fixed) // CHUNK), v.shape[1])
         self.device.launch(build_kernels(self.device).average, dim, [self._weight, v], [out])
         return out.numpy().astype(np.float64)
 
@@ -249,15 +249,15 @@ class Constraint:
 
     def _spread(self, mean: np.ndarray, v: wp.array) -> None:
         inputs = [self._weight, self.device.upload(self._solve_gram(mean))]
-        self.device.launch(build_kernels(self.device).spread, (len(self.held), v.shape[1]), inputs, [v])
+        self.device.launch(build_kernels(self.device).spread, (len(self.fixed), v.shape[1]), inputs, [v])
 
 
-def _restrict_normals(held: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+def _restrict_normals(fixed: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the unit normals (N, 3) of sliding nodes without their fixed components; zero if these leave too little.
 
     Also return `drag` (N, 3), the motion along them per unit of each fixed component, so that normal . u = 0.
     """
-    inside = np.where(held, 0.0, normal)
+    inside = np.where(fixed, 0.0, normal)
     length = np.linalg.norm(inside, axis=1, keepdims=True)
     left = length > least
     unit = np.divide(inside, length, out=np.zeros_like(inside), where=left)

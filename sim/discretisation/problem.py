@@ -52,7 +52,7 @@ class Problem:
     @property
     def rows(self) -> int:
         """Number of unknowns 3N."""
-        return self.constraint.held.size
+        return self.constraint.fixed.size
 
     @property
     def plain(self) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from ..anatomy import Anatomy
 from ..effects import Bonded, Effect, Held, Resection, Slide
 from ..errors import InputError
-from .rigid_modes import check_held, find_loose_tetrahedra
+from .rigid_modes import check_fixed, find_loose_tetrahedra
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def compute_remains(anatomy: Anatomy, effect: Resection, slides: bool = True) ->
 
 def _iterate_bodies(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[RemainingBody]:
     normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
-    check_held(anatomy.mesh, anatomy.fixed, normal)  # else all of it would count as disconnected
+    check_fixed(anatomy.mesh, anatomy.fixed, normal)  # else all of it would count as disconnected
     yield RemainingBody(0, anatomy, np.zeros(0, np.int64))
     taken: set[int] = set()
     for done, step in enumerate(effect.steps, start=1):

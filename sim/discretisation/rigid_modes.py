@@ -8,10 +8,10 @@ from ..errors import InputError
 from ..geometry.tetmesh import FACES, TetMesh, compute_row_keys
 
 
-def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, tolerance: float = 1e-6) -> None:
+def check_fixed(mesh: TetMesh, fixed: np.ndarray, normal: np.ndarray, tolerance: float = 1e-6) -> None:
     """Reject a body with a part that can translate or rotate freely.
 
-    held (V, 3) bool and normal (V, 3) are the constraints. A node without element must be fixed.
+    fixed (V, 3) bool and normal (V, 3) are the constraints. A node without element must be fixed.
     Elements joined by faces form a rigid cluster; clusters that share only a corner or an edge are hinged there. A
     rigid motion is resisted if it moves the constraints by more than a fraction `tolerance` of it, on average.
 
@@ -23,7 +23,7 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, tolerance: f
     count = len(mesh.nodes)
     used = np.zeros(count, bool)
     used[mesh.table] = True
-    loose = np.flatnonzero(~used & ~held.all(axis=1))
+    loose = np.flatnonzero(~used & ~fixed.all(axis=1))
     if len(loose):
         raise InputError(f"node {loose[0]} (and {len(loose) - 1} more) belongs to no tetrahedron: remove or hold it.")
     key = np.unique(np.repeat(_label_clusters(mesh.tets), mesh.table.shape[1]) * count + mesh.table.ravel())
@@ -31,7 +31,7 @@ def check_held(mesh: TetMesh, held: np.ndarray, normal: np.ndarray, tolerance: f
     piece = _label_components(cluster, cluster.max() + 1 + node, cluster.max() + 1 + count)[cluster]
     for number in np.unique(piece):
         mine = piece == number
-        free, at = _count_free_motions(mesh.nodes, held, normal, cluster[mine], node[mine], tolerance)
+        free, at = _count_free_motions(mesh.nodes, fixed, normal, cluster[mine], node[mine], tolerance)
         if free == 0:
             continue
         hinged = len(np.unique(cluster[mine])) > 1
@@ -79,7 +79,7 @@ def _label_clusters(tets: np.ndarray) -> np.ndarray:
 
 
 def _count_free_motions(
-    nodes: np.ndarray, held: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray, tolerance: float
+    nodes: np.ndarray, fixed: np.ndarray, normal: np.ndarray, cluster: np.ndarray, node: np.ndarray, tolerance: float
 ) -> tuple[int, int]:
     """Return the number of unresisted rigid motions, and the cluster that moves most in one of them.
 
@@ -102,8 +102,8 @@ def _count_free_motions(
     order, x = np.argsort(node, kind="stable"), np.arange(3)
     joint = np.flatnonzero(node[order[1:]] == node[order[:-1]])
     one, other = ((3 * order[joint + k][:, None] + x).ravel() for k in (0, 1))
-    resisted = sp.vstack([moves[held[node].ravel()], across, moves[one] - moves[other]])
-    equations = int(held[node].sum() + (normal[node] != 0.0).any(axis=1).sum() + len(one))
+    resisted = sp.vstack([moves[fixed[node].ravel()], across, moves[one] - moves[other]])
+    equations = int(fixed[node].sum() + (normal[node] != 0.0).any(axis=1).sum() + len(one))
     values, vectors = np.linalg.eigh((resisted.T @ resisted).toarray())
     amount = np.abs(vectors[:, 0]).reshape(-1, 6).max(axis=1)
     return int((values <= tolerance**2 * max(equations, 1)).sum()), int(names[np.argmax(amount)])

@@ -89,20 +89,20 @@ class Discretisation:
         edges, nodes = _build_smoothed_elements(self.mesh, chosen.tobytes())
         return ElementPart(edges, "shape"), ElementPart(nodes, "volume")
 
-    def extend_held(self, held: np.ndarray) -> np.ndarray:
+    def extend_fixed(self, fixed: np.ndarray) -> np.ndarray:
         """Return the fixed components (N, 3) of all nodes from those of the mesh (V, 3).
 
         An added node is fixed if its edge lies on a surface triangle whose corners are all fixed.
         """
         out = np.zeros((self.count, 3), bool)
-        out[: len(held)] = held
+        out[: len(fixed)] = fixed
         for component in range(3):
-            wall = self.surface[held[self.mesh.surface, component].all(axis=1), 3:]
-            out[wall[wall >= len(held)], component] = True
+            wall = self.surface[fixed[self.mesh.surface, component].all(axis=1), 3:]
+            out[wall[wall >= len(fixed)], component] = True
         return out
 
-    def extend_normals(self, normal: np.ndarray, held: np.ndarray, facing: float = 0.75) -> np.ndarray:
-        """Return the slide normals (N, 3) of all nodes from those of the mesh (V, 3); held (V, 3) bool.
+    def extend_normals(self, normal: np.ndarray, fixed: np.ndarray, facing: float = 0.75) -> np.ndarray:
+        """Return the slide normals (N, 3) of all nodes from those of the mesh (V, 3); fixed (V, 3) bool.
 
         An added node slides if its edge lies on a surface triangle whose corners all slide or are fixed. Its normal
         is the integral of its shape function's gradient over all adjacent triangles, so no volume passes through.
@@ -115,7 +115,7 @@ class Discretisation:
             return out
         corners = self.mesh.surface
         slides = (normal != 0.0).any(axis=1)
-        wall = (slides | held.all(axis=1))[corners].all(axis=1) & slides[corners].any(axis=1)
+        wall = (slides | fixed.all(axis=1))[corners].all(axis=1) & slides[corners].any(axis=1)
         a, b, c = np.moveaxis(self.mesh.nodes[corners], 1, 0)
         twice = np.cross(b - a, c - a)
         near, every = np.zeros_like(out), np.zeros_like(out)

@@ -193,7 +193,7 @@ def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_a
     """Compute P K P (3N, 3N) in blocks of nodes, P the projection to free unknowns; regularised at the others."""
     basis = constraint.build_basis()
     projection = sp.csr_array(basis @ basis.T)
-    blocked = sp.eye_array(constraint.held.size) - projection
+    blocked = sp.eye_array(constraint.fixed.size) - projection
     return make_regular(sp.csr_array(projection @ stiffness @ projection + stiffness.diagonal().mean() * blocked), 3)
 
 

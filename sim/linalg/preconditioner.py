@@ -127,7 +127,7 @@ def _build_corner_preconditioner(
     """Build the coarse preconditioner on linear tetrahedra with the same corners, as far as their motion is free."""
     corner, free = np.unique(space.table[:, :4]), constraint.build_basis()
     every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
-    own = Constraint(constraint.held[corner], constraint.normal[corner], device)
+    own = Constraint(constraint.fixed[corner], constraint.normal[corner], device)
     coarse = _build_solver(sp.csc_array(every.T @ stiffness @ every), own, space.nodes[corner], device, settings)
     return ReducedPreconditioner(sp.bsr_array(sp.csr_array(every), blocksize=(3, 3)), coarse, device)
 

@@ -139,7 +139,7 @@ def find_near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.nd
 def open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:
     """List the surface vertices (n,) that are neither fixed nor slide."""
     surface = np.unique(space.mesh.surface)
-    return surface[~constraint.held[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
+    return surface[~constraint.fixed[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
 
 
 def build_batch_elimination(

@@ -84,7 +84,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
     @forward_kernel(module="unique")
     def finish(
         constant: wp.array2d(dtype=scalar),
-        held: wp.array2d(dtype=wp.int8),
+        fixed: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
         d: wp.array2d(dtype=scalar),
         # outputs
@@ -95,7 +95,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
         thread, c = wp.tid()
         own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         first = first_row(thread, lanes, each)
-        for i in range(first, wp.min(first + lanes * each, held.shape[0]), lanes):
+        for i in range(first, wp.min(first + lanes * each, fixed.shape[0]), lanes):
             x = vec(total[3 * i, c], total[3 * i + 1, c], total[3 * i + 2, c])
             y = x - vec(constant[3 * i, c], constant[3 * i + 1, c], constant[3 * i + 2, c])
             own += wp.float64(wp.dot(y, y))
@@ -103,7 +103,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
             n = normal[i]
             x -= wp.dot(n, x) * n
             for k in range(3):
-                f = wp.where(held[i, k] == wp.int8(0), x[k], scalar(0.0))
+                f = wp.where(fixed[i, k] == wp.int8(0), x[k], scalar(0.0))
                 total[3 * i + k, c] = f
                 free += wp.float64(f) * wp.float64(f)
                 slope += wp.float64(f) * wp.float64(d[3 * i + k, c])

@@ -135,7 +135,7 @@ def compute_needed(
 def _list_unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
     """List the numbers of unknowns that a preconditioner may invert, largest first: of all nodes, or of the corners."""
     corners = int((~anatomy.fixed).sum())
-    return (int((~space.extend_held(anatomy.fixed)).sum()), corners) if space.element == "p2" else (corners,)
+    return (int((~space.extend_fixed(anatomy.fixed)).sum()), corners) if space.element == "p2" else (corners,)
 
 
 def _find_invertible(unknowns: tuple[int, ...], device: Device) -> int:

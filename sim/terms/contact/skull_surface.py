@@ -96,9 +96,9 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
     InputError
         An anatomy without nodes that can touch the skull.
     """
-    held = space.extend_held(anatomy.fixed).all(axis=1)
+    fixed = space.extend_fixed(anatomy.fixed).all(axis=1)
     normal = space.extend_normals(anatomy.slide_normal, anatomy.fixed)
-    slides = (normal != 0.0).any(axis=1) & ~held
+    slides = (normal != 0.0).any(axis=1) & ~fixed
     if not slides.any():
         raise InputError("SkullContact finds no node that can touch: all slide normals are zero, or their nodes fixed.")
     inside, way = np.full(space.count, COVERED_DISTANCE), np.zeros_like(normal)
@@ -109,7 +109,7 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
         opened[
             space.surface[find_triangles_about_opening(anatomy) & anatomy.craniotomy[space.mesh.surface].any(axis=1)]
         ] = True
-        opened &= ~slides & ~held
+        opened &= ~slides & ~fixed
         edge = compute_edge_radius(space.nodes, rim)
         blur, points = settings.blur * edge, space.nodes[opened]
         normal[opened] = compute_blurred_normals(space.nodes, space.surface[:, :3], points, blur)
