@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from limits import files_below
 from tiny_episodes import SCALE, packed
 
 from ar.screen import Film, decode_colour, decode_depth, decode_labels, read_image_size, read_png, write_film
@@ -58,14 +59,8 @@ def test_a_film_that_fails_leaves_nothing(tmp_path, suffix):
 
 
 def test_a_full_disk_leaves_no_part_of_a_frame(tmp_path):
-    resource = pytest.importorskip("resource")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
-        with pytest.raises(OSError, match="large"):
-            Film(tmp_path).show(0, picture())
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with files_below(100), pytest.raises(OSError, match="large"):
+        Film(tmp_path).show(0, picture())
     assert not list(tmp_path.iterdir())
 
 

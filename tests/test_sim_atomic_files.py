@@ -10,6 +10,7 @@ import zlib
 from pathlib import Path
 
 import pytest
+from limits import files_below
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import check_disk_space, check_output, write_atomically, write_stream_atomically
@@ -51,10 +52,7 @@ class TestWriting:
             check_output("/proc/a.txt", ".txt")
 
     def test_a_stream_that_cannot_be_written_is_reported_at_the_end(self, tmp_path: Path) -> None:
-        resource = pytest.importorskip("resource")
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-        try:
+        with files_below(100_000):
             with (
                 pytest.raises(InputError, match="File too large"),
                 write_stream_atomically(tmp_path / "a.h5", ".h5") as file,
@@ -64,8 +62,6 @@ class TestWriting:
             with pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
                 check_disk_space(tmp_path / "a.h5", 1, 200_000)
             check_disk_space(tmp_path / "a.h5", 1, 50_000)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert not list(tmp_path.iterdir())
 
     def test_a_library_that_fails_says_nothing(self, tmp_path: Path) -> None:

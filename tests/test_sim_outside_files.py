@@ -6,7 +6,6 @@ import os
 import re
 import resource
 import struct
-import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import meshio
 import numpy as np
 import pytest
 from boxes import base_held, box
+from limits import memory_below
 
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import read_anatomy, read_mesh, write_anatomy, write_mesh
@@ -86,13 +86,8 @@ class TestMeshes:
     def test_raw_bytes_behind_the_xml_are_counted(self, tmp_path: Path) -> None:
         block = zlib.compress(bytes(2**23))
         path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<4Q", 1, 2**23, 0, len(block)) + block)
-        tracemalloc.start()
-        try:
-            with pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
-                read_mesh(path, limits=FEW)
-            assert tracemalloc.get_traced_memory()[1] < 2**22
-        finally:
-            tracemalloc.stop()
+        with memory_below(2**22), pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
+            read_mesh(path, limits=FEW)
         few = zlib.compress(np.zeros(3).tobytes())
         small = with_raw_bytes(tmp_path / "b.vtu", struct.pack("<4Q", 1, 24, 0, len(few)) + few)
         assert not check_vtu_size(small, 24)  # it is small, but meshio's own way through it is bounded besides
@@ -103,13 +98,8 @@ class TestMeshes:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
         assert read_mesh(tmp_path / "a.vtu", limits=FEW).mesh.digest == BODY.mesh.digest
         fattened(tmp_path / "a.vtu", 64)
-        tracemalloc.start()
-        try:
-            with pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
-                read_mesh(tmp_path / "a.vtu", limits=FEW)
-            assert tracemalloc.get_traced_memory()[1] < 2**24
-        finally:
-            tracemalloc.stop()
+        with memory_below(2**24), pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
+            read_mesh(tmp_path / "a.vtu", limits=FEW)
         assert MeshBytes().max_bytes > 2**31
 
     def test_a_file_is_no_larger_than_the_limit(self, tmp_path: Path) -> None:
@@ -161,13 +151,8 @@ class TestMeshes:
         tens = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
         for entities in (f'<!ENTITY a0 "aaaaaaaaaa">{tens}', '<!ENTITY a11 SYSTEM "file:///etc/passwd">'):
             (tmp_path / name).write_text(f"<!DOCTYPE x [{entities}]><Xdmf Version='3.0'>&a11;</Xdmf>")
-            tracemalloc.start()
-            try:
-                with pytest.raises(InputError, match="it is damaged, or of another kind"):
-                    read_mesh(tmp_path / name)
-                assert tracemalloc.get_traced_memory()[1] < 2**26
-            finally:
-                tracemalloc.stop()
+            with memory_below(2**26), pytest.raises(InputError, match="it is damaged, or of another kind"):
+                read_mesh(tmp_path / name)
 
     @pytest.mark.parametrize("path", [None, 3, b"a.vtu"])
     def test_what_names_no_file_is_a_sentence(self, path: object) -> None:
