@@ -46,7 +46,7 @@ def theatre(box, tmp_path_factory):
 @pytest.fixture(scope="module")
 def scene():
     near = replace(OBLIQUE_VIEWPOINT, width=480, height=360)
-    return replace(small(path=press(0.3, rise=1.0, hold=0.5)), viewpoint=near, sight=SIGHT)
+    return replace(small(path=press(0.3, rise=1.0, hold=0.5)), viewpoint=near, observation_model=SIGHT)
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,9 @@ class Wild:
         self.observer = observer
 
     def estimate(self, number, positions, tool=None):
-        wild = replace(self.observer, sight=replace(self.observer.sight, white=8e-3, smooth=1e-4))
+        wild = replace(
+            self.observer, observation_model=replace(self.observer.observation_model, white=8e-3, smooth=1e-4)
+        )
         sigma = replace(wild.observe(number, positions, tool), sigma=None)
         return _estimated(replace(wild), sigma, positions)
 
@@ -242,7 +244,7 @@ def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
 def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
     said = format_page_legend(play.scene)
     assert all(words in said for words in ("estimate", "simulated", "95 %", "scan", "tip to tumour"))
-    assert "estimate" not in format_page_legend(replace(play.scene, sight=None))
+    assert "estimate" not in format_page_legend(replace(play.scene, observation_model=None))
     found = frames[1].estimate
     words = " ".join(describe_estimate(found))
     assert f"error {1e3 * found.off:.1f} mm; the simulated centre is inside the 95 % region" in words
@@ -252,7 +254,7 @@ def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
 
 def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
     with pytest.raises(InputError, match="sulcus locator"):
-        PatientSetup(box, None, {}, "cpu").build_stage(replace(short(), sight=SIGHT))
+        PatientSetup(box, None, {}, "cpu").build_stage(replace(short(), observation_model=SIGHT))
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["--anatomy", str(tmp_path / "box.vtu"), "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["render", "sag", *words]) == 2
@@ -270,7 +272,9 @@ def test_locator_of_other_regions_is_rejected(theatre, scene):
 
 def test_no_trained_model_is_the_truth(scene):
     theatre = open_theatre(device="cpu")
-    assert theatre.list_deformers(scene) == ("fem",) and theatre.list_deformers(replace(scene, sight=None)) != ("fem",)
+    assert theatre.list_deformers(scene) == ("fem",) and theatre.list_deformers(
+        replace(scene, observation_model=None)
+    ) != ("fem",)
 
 
 def test_what_ships_locates_its_tumour(capsys):

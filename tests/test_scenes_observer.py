@@ -12,12 +12,14 @@ def test_what_is_seen_has_the_errors_that_are_stated(still):
     steady = seen.mean(axis=0)
     assert (seen - steady).std() == pytest.approx(0.3e-3, rel=0.05)
     assert np.linalg.norm(steady.mean(axis=0)) == pytest.approx(0.7e-3, abs=0.5e-3)  # the smooth one is in it
-    bare = replace(observer, sight=replace(observer.sight, white=0.0, smooth=0.0))
+    bare = replace(observer, observation_model=replace(observer.observation_model, white=0.0, smooth=0.0))
     rigid = bare.observe(0, rest).now - bare.observe(0, rest).rest
     assert np.linalg.norm(rigid.mean(axis=0)) == pytest.approx(0.7e-3, rel=1e-6)
     turned = rigid - rigid.mean(axis=0)
     assert 0.0 < np.abs(turned).max() < 1.01 * np.radians(0.3) * np.ptp(bare.observe(0, rest).rest, axis=0).max()
-    smooth = replace(observer, sight=replace(observer.sight, white=0.0, shift=0.0, turn=0.0)).observe(3, rest)
+    smooth = replace(
+        observer, observation_model=replace(observer.observation_model, white=0.0, shift=0.0, turn=0.0)
+    ).observe(3, rest)
     off = smooth.now - smooth.rest
     assert np.sqrt((off**2).mean()) == pytest.approx(0.5e-3, rel=0.5)
     apart = np.linalg.norm(smooth.rest[:, None] - smooth.rest, axis=2)
@@ -29,7 +31,7 @@ def test_what_is_seen_has_the_errors_that_are_stated(still):
 def test_the_same_seed_sees_the_same_and_another_does_not(still):
     observer, rest = still
     again = replace(observer)
-    other = replace(observer, sight=replace(observer.sight, seed=1))
+    other = replace(observer, observation_model=replace(observer.observation_model, seed=1))
     assert np.array_equal(observer.observe(7, rest).now, again.observe(7, rest).now)
     assert not np.array_equal(observer.observe(7, rest).now, observer.observe(8, rest).now)
     assert not np.array_equal(observer.observe(7, rest).rest, other.observe(7, rest).rest)

@@ -25,10 +25,10 @@ MICROSCOPE = find_scene("microscope")
 NONE = np.zeros((0, 3))
 
 
-def observer_of(sight: StereoObservation = EXACT) -> StereoObserver:
+def observer_of(model: StereoObservation = EXACT) -> StereoObserver:
     """On few pixels."""
     theatre = replace(template_theatre(), locator_file=to_locator_path(get_template_path()))
-    scene = replace(MICROSCOPE, viewpoint=replace(MICROSCOPE.viewpoint, width=400, height=300), sight=sight)
+    scene = replace(MICROSCOPE, viewpoint=replace(MICROSCOPE.viewpoint, width=400, height=300), observation_model=model)
     return theatre.build_stage(scene).observer
 
 
@@ -126,7 +126,9 @@ def test_a_cortex_without_a_scan_has_vessels_to_follow(observer):
     """A head without T1 gets the same vessels, on even tissue; before, it was bare and nothing was found on it."""
     bare = replace(observer, stage=replace(observer.stage, intensity=None))
     assert len(bare.first.rest) > 60
-    plain = replace(bare, stage=replace(bare.stage, scene=replace(MICROSCOPE, sight=StereoObservation(vessels=False))))
+    plain = replace(
+        bare, stage=replace(bare.stage, scene=replace(MICROSCOPE, observation_model=StereoObservation(vessels=False)))
+    )
     assert plain.stage.scan is None
 
 
@@ -184,7 +186,7 @@ class TestRefusals:
 def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):
     found = observer.estimate(30, moved)
     assert found.held and found.off < 0.6 * np.linalg.norm(found.true) and found.location.calibrated
-    stage = replace(observer.stage, observer=replace(observer, sight=replace(EXACT, darker=0.999)))
+    stage = replace(observer.stage, observer=replace(observer, observation_model=replace(EXACT, darker=0.999)))
     still = AtRest(stage.site.anatomy)
     player = Player(stage, still)
     answer = replace(still.deform(player.build_loads(0)), outcome=(Outcome.CONVERGED,))
@@ -196,7 +198,10 @@ def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):
 
 
 def test_a_study_sums_up_what_was_refused_too(observer, moved):
-    good, none = observer.estimate(30, moved), replace(observer, sight=replace(EXACT, darker=0.999)).estimate(3, moved)
+    good, none = (
+        observer.estimate(30, moved),
+        replace(observer, observation_model=replace(EXACT, darker=0.999)).estimate(3, moved),
+    )
     found = row(4, [good, good, none])
     assert (found.seed, found.frames, found.refused) == (4, 3, 1) and found.covered == float(good.held)
     length = float(np.linalg.norm(good.true))

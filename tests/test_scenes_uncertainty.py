@@ -251,7 +251,7 @@ class TestStored:
         template = open_theatre(device="cpu")
         known = [name for name in SCENES if template.estimate_uncertainty(find_scene(name))]
         assert known == sorted(template.uncertainties, key=SCENES.index)
-        assert known == [name for name in SCENES if find_scene(name).sight is None]
+        assert known == [name for name in SCENES if find_scene(name).observation_model is None]
 
 
 class TestSaid:

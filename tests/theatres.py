@@ -40,7 +40,7 @@ from surrogate.training.train import train
 LENS = Lens(-4.0, 6.0, 0.02, -0.015, 0.0)
 REAL = Calibration((1750.0, 1740.0), (250.0, 170.0), 480, 360, LENS, "theatre")
 """The calibrated camera that looks at a theatre."""
-SIGHTED = tuple(name for name in SCENES if find_scene(name).sight is not None)
+SIGHTED = tuple(name for name in SCENES if find_scene(name).observation_model is not None)
 """The built-in scenes in which a tumour is located."""
 PUSHING = tuple(name for name in SCENES if ToolForce() in find_scene(name).effects and name not in SIGHTED)
 """The others in which a tool pushes."""

@@ -37,9 +37,9 @@ def run(args: argparse.Namespace) -> int:
     check_at_least("--every", args.every, 1)
     theatre = build_requested_theatre(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)
-    if isinstance(scene.sight, StereoObservation):
-        sight = replace(scene.sight, named=not args.cloud, vessels=not args.plain)
-        scene = replace(scene, sight=sight)
+    if isinstance(scene.observation_model, StereoObservation):
+        model = replace(scene.observation_model, named=not args.cloud, vessels=not args.plain)
+        scene = replace(scene, observation_model=model)
     with bar("estimates") as heard:
         found = list(rows(theatre, scene, range(args.seeds), args.every, heard))
     if args.json:

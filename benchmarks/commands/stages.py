@@ -37,7 +37,9 @@ def run(args: argparse.Namespace) -> int:
     scene = build_requested_scene(args, args.scene, theatre)
     if not any(isinstance(effect, ToolForce) for effect in scene.effects):
         pushing = ", ".join(
-            name for name in SCENES if find_scene(name).sight is None and ToolForce() in find_scene(name).effects
+            name
+            for name in SCENES
+            if find_scene(name).observation_model is None and ToolForce() in find_scene(name).effects
         )
         raise InputError(f"in the scene {scene.name} no tool pushes, which is what is measured: choose {pushing}.")
     name = choose_deformer(args, theatre, scene)

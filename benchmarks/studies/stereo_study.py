@@ -65,7 +65,7 @@ def rows(
     InputError
         A scene that no pair of eyes sees; an anatomy without a locator.
     """
-    if not isinstance(scene.sight, StereoObservation):
+    if not isinstance(scene.observation_model, StereoObservation):
         raise InputError(f"no pair of eyes sees the scene {scene.name}: choose one with a StereoSight, as microscope.")
     player, numbers = theatre.build_player("fem", scene), range(0, len(scene.times), every)
     seen, last, total, done = [], None, len(numbers) * (1 + len(seeds)), 0
@@ -79,7 +79,9 @@ def rows(
         progress(done, total)
     found: list[TumourEstimate] = []
     for seed in seeds:
-        observer = theatre.build_stage(replace(scene, sight=replace(scene.sight, seed=seed))).observer
+        observer = theatre.build_stage(
+            replace(scene, observation_model=replace(scene.observation_model, seed=seed))
+        ).observer
         assert observer is not None
         own = []
         for number, positions, tool in seen:

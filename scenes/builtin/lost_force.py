@@ -20,7 +20,7 @@ SCENE = Scene(
     tool=Probe(radius=10e-3),  # under a smaller one tetrahedra are inverted
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Bonded(), ToolForce()),
-    sight=PointObservation(),
+    observation_model=PointObservation(),
     viewpoint=Viewpoint(width=800, height=600),
     # The tumour moves little more than the rigid error: in four frames 43 % of the motion is removed.
     bounds=Bounds(overlap=0.75, error=2e-3, removed=0.3),

@@ -31,7 +31,7 @@ SCENE = Scene(
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),
     lying=build_drainage(2.0, to=0.2),
-    sight=StereoObservation(),
+    observation_model=StereoObservation(),
     viewpoint=Viewpoint(width=800, height=600, eye="left", field=1.0),
     look=PLAIN_APPEARANCE,  # the stereo images of the FEM surface itself
     bounds=Bounds(overlap=0.7, error=3e-3, drawn=2.5, removed=0.5),

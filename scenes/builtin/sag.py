@@ -19,7 +19,7 @@ SCENE = Scene(
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity()),
     tool=None,
     lying=build_drainage(3.0, to=0.2),
-    sight=PointObservation(),
+    observation_model=PointObservation(),
     viewpoint=Viewpoint(width=800, height=600),
     # # The truth's dashed outline is drawn with an error of up to 0.4 pixels at a live solution: in one frame that
     # makes 2.2.

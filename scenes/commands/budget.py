@@ -153,7 +153,7 @@ def _build_filmed_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scen
     from ..analysis.uncertainty import get_tissue
 
     scene = build_requested_scene(args, args.scene, theatre)
-    if scene.sight is not None:
+    if scene.observation_model is not None:
         raise InputError(
             f"the scene {scene.name} estimates the tumour position and reports its error: choose another scene."
         )

@@ -139,7 +139,7 @@ def _to_millimetres(metres: float | None) -> float | None:
 
 def _describe_compared(scene: Scene, name: str) -> str:
     """Describe what is compared with FEM: the tumour of a deformation model, or an estimated one."""
-    return f"{name}: the tumour" if scene.sight is None else f"{name} is the reference; tumour estimate"
+    return f"{name}: the tumour" if scene.observation_model is None else f"{name} is the reference; tumour estimate"
 
 
 def _describe_bond(share: float) -> str:

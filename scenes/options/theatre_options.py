@@ -148,7 +148,9 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
             from ..play.deformers import TRUTH_TEXT
 
             none = (
-                "no model exists next to this anatomy; `sulcus train` trains one" if scene.sight is None else TRUTH_TEXT
+                "no model exists next to this anatomy; `sulcus train` trains one"
+                if scene.observation_model is None
+                else TRUTH_TEXT
             )
             reason = next(iter(theatre.list_rejections(scene).values()), none)
             print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {reason}", file=sys.stderr)

@@ -56,7 +56,7 @@ def describe_effect(name: str) -> str:
 def format_caption(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
     """Describe the image: visible parts, meaning of the lines, and anatomy."""
     title = " ".join(scene.title.split())
-    seen = "" if scene.sight is None else f" {ESTIMATE_EXPLANATION}"
+    seen = "" if scene.observation_model is None else f" {ESTIMATE_EXPLANATION}"
     return (
         f'<p class="number">Simulation: {describe_location(theatre.anatomy)} tumour '
         f"<small>{RESEARCH_ONLY}</small></p><p>{escape(title)}{seen}</p>{format_page_legend(scene)}"
@@ -76,7 +76,7 @@ def format_page_legend(scene: Scene) -> str:
         scan,
         (f'{true} stroke-width="1.5"', "FEM reference (3-D view)"),
     ]
-    if scene.sight is not None:
+    if scene.observation_model is not None:
         keys = [
             (f'{now} stroke-width="3"', "estimated tumour"),
             under,

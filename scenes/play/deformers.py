@@ -106,7 +106,7 @@ class PatientSetup:
 
     def is_without_locator(self, scene: Scene) -> bool:
         """Return True if a scene has an observation model and this anatomy has no locator file."""
-        return scene.sight is not None and (self.locator_file is None or not self.locator_file.is_file())
+        return scene.observation_model is not None and (self.locator_file is None or not self.locator_file.is_file())
 
     def build_stage(self, scene: Scene) -> Stage:
         """Build a scene's stage on this anatomy, rendered on this theatre's device.
@@ -117,20 +117,22 @@ class PatientSetup:
             A scene with observations on an anatomy without a locator, or with a locator of other regions.
         """
         device = find_device(self.device, LIVE.precision).name
-        if scene.sight is not None and (unlike := find_differing_regions(scene.elasticity, self.locator.regions)):
+        if scene.observation_model is not None and (
+            unlike := find_differing_regions(scene.elasticity, self.locator.regions)
+        ):
             raise InputError(
                 f"{scene.name}: the locator at {self.locator_file} has another stiffness of "
                 f"{' and '.join(map(describe_region, unlike))} than the scene. Compute it again: `sulcus locator "
                 "ANATOMY.vtu`, with the same --region."
             )
         stage = Stage(scene, self.site, self.intensity, device=device)
-        match scene.sight:
+        match scene.observation_model:
             case None:
                 return stage
             case PointObservation():
-                return replace(stage, observer=Observer(self.site, self.locator, scene.sight))
+                return replace(stage, observer=Observer(self.site, self.locator, scene.observation_model))
             case StereoObservation():
-                return replace(stage, observer=StereoObserver(stage, self.locator, scene.sight))
+                return replace(stage, observer=StereoObserver(stage, self.locator, scene.observation_model))
 
     def list_rejections(self, scene: Scene) -> dict[str, str | None]:
         """Find the reason why each trained model does not support a scene, by name; None if it does.
@@ -139,7 +141,7 @@ class PatientSetup:
         which
         an estimate is compared.
         """
-        if scene.sight is not None:
+        if scene.observation_model is not None:
             return dict.fromkeys(self.models, TRUTH_TEXT)
         effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
         return {name: find_rejection(model, effects, element) for name, model in self.models.items()}

@@ -160,7 +160,7 @@ class Observer:
 
     site: CraniotomyFrame
     locator: Locator
-    sight: PointObservation
+    observation_model: PointObservation
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour position in frame `number`, for a body at `positions` (V, 3) [m].
@@ -174,15 +174,15 @@ class Observer:
 
     def observe(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
         """Sample the observation of a frame; arguments as of `estimate`."""
-        sight, random = self.sight, np.random.default_rng([self.sight.seed, 1 + number])
+        model, random = self.observation_model, np.random.default_rng([self.observation_model.seed, 1 + number])
         now = self._interpolate_points(positions)
-        off = self._smooth + sight.white * random.standard_normal(now.shape)
+        off = self._smooth + model.white * random.standard_normal(now.shape)
         shown, tips = np.ones(len(now), bool), np.zeros((0, 3))
         if tool is not None:
             shown = KDTree(tool).query(now)[0] > HIDING_DISTANCE
             tips = find_touched(self.site.anatomy, positions, tool)
-            tips = self._as_a_whole(tips + sight.white * random.standard_normal(tips.shape))
-        sigma = np.full(shown.sum(), np.hypot(sight.white, sight.smooth))
+            tips = self._as_a_whole(tips + model.white * random.standard_normal(tips.shape))
+        sigma = np.full(shown.sum(), np.hypot(model.white, model.smooth))
         return Observation(self._as_a_whole(now + off)[shown], self._interpolate_points(self._rest)[shown], sigma, tips)
 
     @property
@@ -201,25 +201,25 @@ class Observer:
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
         """The points: vertices (n, 3) of the mesh, and weights (n, 3)."""
-        site, random = self.site, np.random.default_rng([self.sight.seed, 0])
+        site, random = self.site, np.random.default_rng([self.observation_model.seed, 0])
         triangles = site.anatomy.open_surface
         corners = self._rest[triangles]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         area *= (site.compute_axis_distance(corners.reshape(-1, 3)).reshape(-1, 3) < HOLE_RATIO * site.clearance).all(
             axis=1
         )
-        some = random.choice(len(area), self.sight.points, p=area / area.sum())
+        some = random.choice(len(area), self.observation_model.points, p=area / area.sum())
         return triangles[some], random.dirichlet(np.ones(3), len(some))
 
     @cached_property
     def _smooth(self) -> np.ndarray:
         """(n, 3) [m]: the error that neighbours share."""
-        at, random = self._interpolate_points(self._rest), np.random.default_rng([self.sight.seed, 0, 1])
-        return self.sight.smooth * smooth_root(at) @ random.standard_normal(at.shape)
+        at, random = self._interpolate_points(self._rest), np.random.default_rng([self.observation_model.seed, 0, 1])
+        return self.observation_model.smooth * smooth_root(at) @ random.standard_normal(at.shape)
 
     @cached_property
     def _rigid(self) -> RigidError:
-        return sample_rigid_error(self.sight, 2)
+        return sample_rigid_error(self.observation_model, 2)
 
 
 @dataclass(frozen=True, eq=False)

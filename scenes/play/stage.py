@@ -296,9 +296,9 @@ class Stage:
     @cached_property
     def scan(self) -> Solid | None:
         """The scan as a solid texture, with vessels where the scene has some; None where there is neither."""
-        sight, seed = self.scene.sight, self.scene.look.vessels
-        if isinstance(sight, StereoObservation) and sight.vessels:
-            seed = sight.seed
+        model, seed = self.scene.observation_model, self.scene.look.vessels
+        if isinstance(model, StereoObservation) and model.vessels:
+            seed = model.seed
         if seed is not None:
             return add_vessels(self.intensity, self.site, seed, DARK_SHARES, RELIEF_DEPTH)
         if self.intensity is None:

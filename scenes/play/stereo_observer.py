@@ -26,7 +26,7 @@ class StereoObserver:
 
     stage: Stage
     locator: Locator
-    sight: StereoObservation
+    observation_model: StereoObservation
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
@@ -44,9 +44,9 @@ class StereoObserver:
         InputError
             See `observe_points`, or `observe_point_cloud` without correspondences; see also `observe_first`.
         """
-        site, sight = self.stage.site, self.sight
-        if not sight.named:
-            return observe_point_cloud(site, shot, sight.points, self._build_microscope(0), tips)
+        site, model = self.stage.site, self.observation_model
+        if not model.named:
+            return observe_point_cloud(site, shot, model.points, self._build_microscope(0), tips)
         return observe_points(site, self.first, shot, self._build_microscope(1), tips)
 
     def render_pair(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> StereoPair:
@@ -75,7 +75,9 @@ class StereoObserver:
         InputError
             See `observe_first`.
         """
-        return observe_first(self.stage.site, self._first_shot, self.sight.points, self._build_microscope(0))
+        return observe_first(
+            self.stage.site, self._first_shot, self.observation_model.points, self._build_microscope(0)
+        )
 
     @cached_property
     def _first_shot(self) -> StereoPair:
@@ -88,13 +90,13 @@ class StereoObserver:
 
     def _add_noise(self, picture: np.ndarray, number: int, eye: int) -> np.ndarray:
         """Add camera noise to an image (H, W, 3) uint8; the image of the right camera (1) is darker."""
-        random = np.random.default_rng([self.sight.seed, 2 + number, eye])
-        noise = self.sight.noise * random.standard_normal(picture.shape, np.float32)
-        lit = np.float32(1.0 - eye * self.sight.darker) * picture + noise
+        random = np.random.default_rng([self.observation_model.seed, 2 + number, eye])
+        noise = self.observation_model.noise * random.standard_normal(picture.shape, np.float32)
+        lit = np.float32(1.0 - eye * self.observation_model.darker) * picture + noise
         return np.clip(np.rint(lit), 0.0, 255.0).astype(np.uint8)
 
     def _build_microscope(self, number: int) -> TrackedMicroscope:
-        return TrackedMicroscope(sample_rigid_error(self.sight, 2 + number), self.stage.site.origin)
+        return TrackedMicroscope(sample_rigid_error(self.observation_model, 2 + number), self.stage.site.origin)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Real
+from operator import attrgetter
 from pathlib import Path as FilePath
 from typing import Any, cast
 
@@ -95,7 +96,7 @@ class Scene:
         Head pose, used with `Gravity`.
     surgery
         Resection, if any.
-    sight
+    observation_model
         Observation model of the open cortex, if the tumour position is estimated from observations; the deformer's
         solution is then the ground truth.
     registration
@@ -121,7 +122,7 @@ class Scene:
     tool: Instrument | None = PALPATION
     lying: Lie = get_supine_pose
     surgery: Debulking | None = None
-    sight: PointObservation | StereoObservation | None = None
+    observation_model: PointObservation | StereoObservation | None = None
     viewpoint: Viewpoint = USUAL_VIEWPOINT
     look: Appearance = NATURAL_APPEARANCE
     registration: Registration = "perfect"
@@ -258,7 +259,7 @@ class Scene:
 
     # Former names, for one release.
     made_of, contact, tip, stopped = replace_tissue, find_contact, compute_tip, describe_stop
-    pose, loads = compute_pose, build_loads
+    pose, loads, sight = compute_pose, build_loads, property(attrgetter("observation_model"))
 
 
 @lru_cache(8)

@@ -143,7 +143,7 @@ class Played:
         scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
         moved = result.displacement[0]
         # Nothing is located here, and no locator is asked for.
-        stage = Stage(replace(scene, sight=None), site)
+        stage = Stage(replace(scene, observation_model=None), site)
         player = Player(stage, AtRest(site.anatomy))
         now = site.anatomy.mesh.nodes + moved
         tip = None if scene.tool is None else player.place_tool(scene.tool, scene.path(time), now).tip
