@@ -2,7 +2,6 @@
 
 import gc
 import os
-import sys
 import threading
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -171,13 +170,6 @@ def device():
     from sim.runtime.device import find_device
 
     return find_device("cpu", "float64")
-
-
-@pytest.fixture(params=["metis", "levels"])
-def order(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every order that may be had: without pymetis there is one too."""
-    if request.param == "levels":
-        monkeypatch.setitem(sys.modules, "pymetis", None)
 
 
 @pytest.fixture(scope="module")

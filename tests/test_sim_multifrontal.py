@@ -1,4 +1,4 @@
-"""The sparse factor against dense algebra: every order, precision and number of right-hand sides."""
+"""The sparse factor against dense algebra: every precision and number of right-hand sides."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,6 @@ def applied(factor: Factor, r: np.ndarray, precision: Precision, live: np.ndarra
 
 
 @pytest.mark.parametrize("precision", EXACT)
-@pytest.mark.usefixtures("order")
 def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
@@ -108,7 +107,6 @@ def test_in_single_precision_it_stays_positive_definite() -> None:
     assert np.linalg.eigvalsh(gram / np.abs(gram).max())[0] > -1e-7
 
 
-@pytest.mark.usefixtures("order")
 def test_pieces_that_do_not_touch_are_solved_together() -> None:
     matrix = sp.csc_array(sp.block_diag([np.array([[2.0, -1.0], [-1.0, 2.0]])] * 200))
     factor = Factor(matrix, sp.csc_array(sp.eye_array(400)), np.arange(400), find_device("cpu", "float64"), "float64")
@@ -124,7 +122,6 @@ def test_a_single_unknown_and_none() -> None:
         assert not applied(none, np.ones((3, columns)), "float64").any()
 
 
-@pytest.mark.usefixtures("order")
 def test_what_is_not_held_cannot_be_factorised() -> None:
     """Rigid motions have no stiffness; neither has a node of no element."""
     anatomy = base_held(box(CELLS, 0.1, distortion=0.15))

@@ -11,7 +11,6 @@ from sim.linalg.multifrontal import find_moved_nodes
 from sim.linalg.symbolic import build_fronts, order_by_dissection
 
 
-@pytest.mark.usefixtures("order")
 def test_parts_do_not_touch_one_another_and_share_the_work() -> None:
     stiffness, motions = system(sliding())
     free = sp.csc_array(motions.T @ stiffness @ motions)
@@ -23,7 +22,6 @@ def test_parts_do_not_touch_one_another_and_share_the_work() -> None:
     assert sum(loads) > 1.1 * (max(loads[:2]) + loads[2])
 
 
-@pytest.mark.usefixtures("order")
 def test_a_front_touches_later_unknowns_alone() -> None:
     """And every entry of the matrix lies within the front of its earlier unknown."""
     stiffness, motions = system(sliding())
@@ -42,7 +40,6 @@ def test_a_front_touches_later_unknowns_alone() -> None:
         assert set(touched[touched >= front.first]) <= set(front.rows)
 
 
-@pytest.mark.usefixtures("order")
 @pytest.mark.parametrize("later", [False, True])
 def test_entries_stored_on_one_side_have_the_same_fronts(later: bool) -> None:
     stiffness, motions = system(sliding())
@@ -57,7 +54,6 @@ def test_entries_stored_on_one_side_have_the_same_fronts(later: bool) -> None:
         np.testing.assert_array_equal(front.rows, other.rows)
 
 
-@pytest.mark.usefixtures("order")
 def test_dissection_leaves_little_fill() -> None:
     """A chain of a thousand nodes: an order that ignores the graph fills it."""
     line = sp.csr_array(sp.diags_array([np.ones(999), np.ones(999)], offsets=[-1, 1]).astype(np.int8))

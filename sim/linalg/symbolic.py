@@ -7,8 +7,8 @@ Duff, Reid 1983, "The multifrontal solution of indefinite sparse symmetric linea
 from dataclasses import dataclass
 
 import numpy as np
+import pymetis
 import scipy.sparse as sp
-from scipy.sparse import csgraph
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def build_fronts(
     links = np.ones(int(across.sum()), np.int8), (first[across], second[across])
     graph = sp.csr_array(sp.coo_array(links, shape=(len(number),) * 2))
     graph += graph.T  # an entry may be zero by round-off, and not stored, on one side only
-    order = order_by_dissection(graph, settings.leaf_size)
+    order = order_by_dissection(graph)
     groups = _group_nodes(sp.csr_array(graph[order][:, order]), weight[order], settings)
     divided = _split_subtrees(groups, weight[order], parts, settings.max_fronts_above)
     inner = np.concatenate([np.zeros(0, int), *(groups[number][0] for part in divided for number in part)])
@@ -83,36 +83,15 @@ def build_fronts(
     return np.argsort(np.argsort(order)[member], kind="stable"), fronts
 
 
-def order_by_dissection(graph: sp.csr_array, leaf: int = FrontSizes.leaf_size) -> np.ndarray:
+def order_by_dissection(graph: sp.csr_array) -> np.ndarray:
     """Compute an order (N,) of a symmetric graph's nodes with little fill: nested dissection.
 
-    By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392. Without pymetis by level sets, with more fill, until
-    a part has at most `leaf` unknowns: George, Liu 1978, SIAM J. Numer. Anal. 15:1053-1069.
+    By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392.
     """
-    count = len(graph.indptr) - 1
-    if count == 0:  # METIS would divide by zero
+    if len(graph.indptr) == 1:  # METIS would divide by zero
         return np.zeros(0, int)
-    try:
-        import pymetis
-    except ImportError:
-        return order_by_levels(graph, np.arange(count), leaf)
     order, _ = pymetis.nested_dissection(pymetis.CSRAdjacency(np.ravel(graph.indptr), np.ravel(graph.indices)))
     return np.asarray(order)
-
-
-def order_by_levels(graph: sp.csr_array, nodes: np.ndarray, leaf: int) -> np.ndarray:
-    """Order nodes (k,) by level sets from one end: the middle level last, both sides recursively before it."""
-    if 3 * len(nodes) <= leaf:
-        return nodes
-    inside = graph[nodes][:, nodes]
-    count, part = csgraph.connected_components(inside, directed=False)
-    if count > 1:
-        return np.concatenate([order_by_levels(graph, nodes[part == number], leaf) for number in range(count)])
-    end = csgraph.breadth_first_order(inside, 0, return_predecessors=False)[-1]
-    level = csgraph.dijkstra(inside, indices=end, unweighted=True)
-    middle = np.median(level)
-    sides = [nodes[level < middle], nodes[level > middle]]
-    return np.concatenate([*(order_by_levels(graph, side, leaf) for side in sides), nodes[level == middle]])
 
 
 def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:

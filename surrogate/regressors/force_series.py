@@ -26,7 +26,6 @@ SMALL_FORCE_SHARE = (
 )
 # Rounding step of the Gaussian process's dual coefficients at the largest force [m]: a third of the file size.
 DUAL_STEP = 2e-6
-FEATURE_COUNT = 9  # Number of features: `compute_tool_features`, and force over radius.
 FLAT_TOLERANCE = 1e-6  # Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
 
 
