@@ -8,6 +8,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from limits import files_below
 from theatres import player, put, short
 
 from ar.optics.camera import Camera, project_cv2
@@ -196,21 +197,14 @@ class TestEpisode:
     @pytest.mark.parametrize(("size", "most"), [(40_000, 4), (150_000, 7)])
     def test_a_full_disk_is_a_sentence(self, theatre, tmp_path, size, most, monkeypatch):
         """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
-        resource = pytest.importorskip("resource")
-        monkeypatch.setattr(
-            "scenes.episodes.episode.check_disk_space", lambda *asked: None
-        )  # as if there had been room at first
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        drawn = []
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-        try:
-            with pytest.raises(InputError, match=r"press\.h5: cannot be written \(File too large\)"):
-                collect(
-                    tmp_path / "press.h5", theatre, player(theatre, short(), "linear"), "linear",
-                    lambda frames: (drawn.append(1) or frame for frame in frames),
-                )  # fmt: skip
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        # As if there had been room at first.
+        monkeypatch.setattr("scenes.episodes.episode.check_disk_space", lambda *asked: None)
+        drawn, play = [], player(theatre, short(), "linear")
+        with files_below(size), pytest.raises(InputError, match=r"press\.h5: cannot be written \(File too large\)"):
+            collect(
+                tmp_path / "press.h5", theatre, play, "linear",
+                lambda frames: (drawn.append(1) or frame for frame in frames),
+            )  # fmt: skip
         assert not list(tmp_path.iterdir())
         assert len(drawn) <= most  # the rest is not drawn in vain
 
@@ -262,12 +256,7 @@ class TestRender:
 
 
 def test_oversized_episode_is_reported_before_work(theatre, tmp_path):
-    resource = pytest.importorskip("resource")
-    before, play = resource.getrlimit(resource.RLIMIT_FSIZE), player(theatre, short(), "linear")
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-    try:
-        with pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
-            collect(tmp_path / "press.h5", theatre, play, "linear", iter)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    play = player(theatre, short(), "linear")
+    with files_below(100_000), pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
+        collect(tmp_path / "press.h5", theatre, play, "linear", iter)
     assert not list(tmp_path.iterdir())

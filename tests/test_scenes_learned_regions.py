@@ -158,18 +158,7 @@ class TestPatient:
 
     def test_shows_them_first(self, tmp_path, capsys):
         path = necrotic_labels(tmp_path)
-        words = [
-            "patient",
-            str(path),
-            "--brain",
-            "1",
-            "--tumour",
-            "3",
-            "--necrosis",
-            "6",
-            "--out",
-            str(tmp_path / "a.vtu"),
-        ]
+        words = f"patient {path} --brain 1 --tumour 3 --necrosis 6 --out {tmp_path / 'a.vtu'}".split()
         assert main([*words, "--inspect"]) == 0
         assert "ml: a region of its own, as stiff as the tumour\n" in capsys.readouterr().out
         assert main([*words, "--inspect", "--force", "--json", "--region", "necrosis:500"]) == 0

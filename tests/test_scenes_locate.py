@@ -78,16 +78,7 @@ def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
     """Of no rigid error none is found; what no tracker does is refused before anything is written."""
     folder, _ = files
     out, bias = folder / "rigid.vtu", []
-    words = [
-        "locate",
-        str(folder / "box.vtu"),
-        str(folder / "plain.csv"),
-        "--out",
-        str(out),
-        "--json",
-        "--force",
-        "--rigid",
-    ]
+    words = f"locate {folder / 'box.vtu'} {folder / 'plain.csv'} --out {out} --json --force --rigid".split()
     for rigid in ("-1", "nan", "20.5"):
         assert main([*words, rigid]) == 2 and not out.exists()
         assert f"a rigid error of {rigid} mm is none that a tracker has" in capsys.readouterr().err

@@ -95,17 +95,7 @@ class TestOpenings:
     def test_an_outline_is_the_opening_of_the_mesh(self, folder, capsys):
         """An ellipse twice as wide as high: what is open lies within it, and all that lies well within is open."""
         file = markup(folder / "outline.mrk.json", curve(), "ClosedCurve")
-        words = [
-            "anatomy",
-            "--labels",
-            str(folder / "labels.nii.gz"),
-            "--brain",
-            "1",
-            "--tumour",
-            "2",
-            "--nodes",
-            "2500",
-        ]
+        words = f"anatomy --labels {folder / 'labels.nii.gz'} --brain 1 --tumour 2 --nodes 2500".split()
         assert main([*words, "--opening-at", str(file), "--out", str(folder / "a.vtu"), "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["opening"]["over"] == f"what {file} marks"
         anatomy = read_anatomy(folder / "a.vtu")

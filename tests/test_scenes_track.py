@@ -76,20 +76,7 @@ def test_a_folder_gives_a_row_for_each_picture(folder, camera, tools, tmp_path, 
 
 def test_in_the_patient_s_frame_the_camera_is_of_no_account(folder, camera, tools, tmp_path, capsys):
     out = tmp_path / "tool.csv"
-    wanted = [
-        "track",
-        str(folder),
-        "--camera",
-        camera,
-        "--out",
-        str(out),
-        "--frame",
-        "patient",
-        "--tip",
-        "1",
-        "2",
-        "-150",
-    ]
+    wanted = f"track {folder} --camera {camera} --out {out} --frame patient --tip 1 2 -150".split()
     assert main(wanted) == 0
     assert "in the patient's frame" in capsys.readouterr().out
     tip = np.array([1e-3, 2e-3, -0.15, 1.0])
@@ -100,16 +87,7 @@ def test_in_the_patient_s_frame_the_camera_is_of_no_account(folder, camera, tool
     assert main(["track", str(folder), "--camera", camera, "--out", str(tmp_path / "p.csv"), "--body", "patient"]) == 0
     assert [row["state"] for row in read_csv(tmp_path / "p.csv")] == ["good"] * 5
     capsys.readouterr()
-    boardless = [
-        "track",
-        str(folder),
-        "--camera",
-        camera,
-        "--out",
-        str(tmp_path / "b.csv"),
-        "--reference-frame",
-        "board",
-    ]
+    boardless = f"track {folder} --camera {camera} --out {tmp_path / 'b.csv'} --reference-frame board".split()
     assert main(boardless) == 1 and "60.0 %  board lost: too few corners" in capsys.readouterr().out
 
 

@@ -223,18 +223,7 @@ def test_blade_models_play_retraction_without_relaxation(model):
 def test_the_command_presses_rods_and_blades(tmp_path, box, capsys):
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
-    wanted = [
-        "simulate",
-        str(mesh),
-        "--out",
-        str(out),
-        "--count",
-        "2",
-        "--tool-preset",
-        "dissector",
-        "--pose-control",
-        "--json",
-    ]
+    wanted = f"simulate {mesh} --out {out} --count 2 --tool-preset dissector --pose-control --json".split()
     assert main([*wanted, "--capsule", "2", "20"]) == 0
     found = read_dataset(out)
     assert found.tool == ROD_OF_4 and found.good.all()

@@ -46,17 +46,7 @@ def test_data_say_where_they_come_from(folder, small_box):
 def test_simulate_keeps_strained_answers_of_brutal_loads(folder, tmp_path):
     """The published protocol's are kept too; its loads find no room on small bodies."""
     out = tmp_path / "data.h5"
-    words = [
-        "simulate",
-        str(folder / "box.vtu"),
-        "--tool-preset",
-        "brutal",
-        "--count",
-        "2",
-        "--device",
-        "cpu",
-        "--json",
-    ]
+    words = f"simulate {folder / 'box.vtu'} --tool-preset brutal --count 2 --device cpu --json".split()
     assert main([*words, "--out", str(out)]) == 0 and OVERLOAD_PRESETS == ("seed", "brutal")
     assert "limit_strain=False" in read_dataset(out).provenance["accuracy"]
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from boxes import base_held
 from boxes import box as cube
+from limits import files_below
 from test_surrogate_dataset import SAID
 from test_surrogate_dataset import unfinished as stopped
 
@@ -280,16 +281,10 @@ class TestRoom:
     )
     def test_a_limit_on_files_is_a_sentence(self, tmp_path, pretender, loads, monkeypatch, size, asked, sentence):
         """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
-        resource = pytest.importorskip("resource")
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
         if not asked:
             monkeypatch.setattr("surrogate.data.simulate.check_disk_space", lambda *sizes: None)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-        try:
-            with pytest.raises(InputError, match=sentence):
-                simulate(tmp_path / "data.h5", pretender, loads, SAID, 8)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        with files_below(size), pytest.raises(InputError, match=sentence):
+            simulate(tmp_path / "data.h5", pretender, loads, SAID, 8)
         assert [path.name for path in tmp_path.iterdir()] == ([] if asked else ["data.h5.partial"])
         if size > 3_000_000:  # all was solved
             assert simulate(tmp_path / "data.h5", pretender, loads, SAID, 8).rows == 0

@@ -2,7 +2,6 @@
 
 import json
 import re
-import tracemalloc
 import zipfile
 from contextlib import suppress
 from dataclasses import replace
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from limits import memory_below
 
 from scenes.options.outputs import read_statements as stated_beside
 from scenes.tracked.truth import read_truth
@@ -62,12 +62,8 @@ def test_what_no_model_refers_to_is_not_read(stored, box, tmp_path):
     path.write_bytes(stored.read_bytes())
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("bomb.npy", "w") as member:
         np.lib.format.write_array(member, np.zeros(2**23))
-    tracemalloc.start()
-    try:
+    with memory_below(2**25):
         assert set(load(path, box)) == {"linear", "svr"}
-        assert tracemalloc.get_traced_memory()[1] < 2**25
-    finally:
-        tracemalloc.stop()
 
 
 def rewritten(stored, path, change, seal=""):
@@ -117,13 +113,8 @@ def test_npz_that_inflates_beyond_its_limit_is_not_read(name, tmp_path):
     if name != "truth":
         header = np.array(" " * 10_000_000)
     np.savez_compressed(tmp_path / "a.npz", header=header, **arrays)
-    tracemalloc.start()
-    try:
-        with suppress(InputError):
-            assert not READERS[name](tmp_path / "a.npz")
-        assert tracemalloc.get_traced_memory()[1] < 2**21
-    finally:
-        tracemalloc.stop()
+    with memory_below(2**21), suppress(InputError):
+        assert not READERS[name](tmp_path / "a.npz")
 
 
 def test_archives_are_opened_by_the_reader_with_limits_alone():
