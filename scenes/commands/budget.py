@@ -20,7 +20,7 @@ from sim.runtime.outside_files import read_as
 from ..options.camera_options import add_camera, add_targets
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
 from ..options.theatre_options import add_bodies, build_requested_scene
-from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
+from ..options.tissue_options import add_model_tissue
 
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
@@ -51,8 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "cores",
     )
     add_bodies(parser)
-    add_tissue_arguments(parser, default_regions=AS_LEARNED)
-    add_element_argument(parser)
+    add_model_tissue(parser)
     add_camera(parser, "hand-held")
     parser.add_argument(
         "--intrinsics", type=Path, metavar="K.json",

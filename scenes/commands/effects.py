@@ -9,7 +9,7 @@ from sim.arguments import check_at_least
 
 from ..options.shared_options import add_anatomy, add_device, add_json
 from ..options.theatre_options import add_trajectory, build_requested_scene
-from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
+from ..options.tissue_options import add_model_tissue
 
 COLUMN_TITLES = (
     "effect",
@@ -27,8 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=5, help="solve every Nth frame")
     add_anatomy(parser)
     add_trajectory(parser)
-    add_tissue_arguments(parser, default_regions=AS_LEARNED)
-    add_element_argument(parser)
+    add_model_tissue(parser)
     add_device(parser)
     add_json(parser)
 

@@ -18,13 +18,7 @@ import numpy as np
 from sim.errors import InputError
 
 from ..options.shared_options import add_device
-from ..options.tissue_options import (
-    AS_LEARNED,
-    add_element_argument,
-    add_skull_argument,
-    add_tissue_arguments,
-    apply_tissue_options,
-)
+from ..options.tissue_options import add_model_tissue, apply_tissue_options
 from ..tracked.tracked_scene import build_mover, build_tracked_scene
 from .interrupt import run_until_ended
 
@@ -97,9 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, default=float("inf"), help="exit after this many seconds (default: never)"
     )
-    add_tissue_arguments(parser, default_regions=AS_LEARNED)
-    add_skull_argument(parser)
-    add_element_argument(parser)
+    add_model_tissue(parser, skull=True)
     add_device(parser, "FEM and rendering")
 
 

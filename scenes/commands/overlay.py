@@ -29,13 +29,7 @@ from ..options.shared_options import (
     to_json_line,
 )
 from ..options.theatre_options import add_bodies
-from ..options.tissue_options import (
-    AS_LEARNED,
-    add_element_argument,
-    add_skull_argument,
-    add_tissue_arguments,
-    apply_tissue_options,
-)
+from ..options.tissue_options import add_model_tissue, apply_tissue_options
 from ..tracked.tracked_scene import REST, build_mover, build_tracked_scene
 from .interrupt import run_until_ended
 
@@ -95,9 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=float, default=np.inf, help="close the page after this many seconds (default: never)"
     )
     add_poses(parser)
-    add_tissue_arguments(parser, default_regions=AS_LEARNED)
-    add_skull_argument(parser)
-    add_element_argument(parser)
+    add_model_tissue(parser, skull=True)
     add_device(parser, "FEM and images")
     add_json(parser)
     add_force(parser)

@@ -18,7 +18,7 @@ from sim.arguments import check_at_least
 from ..options.outputs import check_output_path
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
 from ..options.theatre_options import add_bodies, build_requested_scene
-from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments
+from ..options.tissue_options import add_model_tissue
 from .fit import find_fitted_tissue
 
 if TYPE_CHECKING:
@@ -40,8 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
     add_bodies(parser)
-    add_tissue_arguments(parser, default_regions=AS_LEARNED)
-    add_element_argument(parser)
+    add_model_tissue(parser)
     parser.add_argument("--draws", type=int, default=40, help=f"number of sampled bodies to solve, >= {MIN_BODIES}")
     parser.add_argument(
         "--twins",

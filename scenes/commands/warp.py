@@ -15,7 +15,7 @@ from sim.errors import InputError
 from ..options.shared_options import add_device, add_json, to_json_line
 from ..options.subject_options import add_axes
 from ..options.theatre_options import add_trajectory, build_requested_scene
-from ..options.tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, apply_tissue_options
+from ..options.tissue_options import add_model_tissue, apply_tissue_options
 
 if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
@@ -64,8 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="new output folder")
     add_trajectory(parser)
-    add_tissue_arguments(parser, default_regions=AS_LEARNED)
-    add_element_argument(parser)
+    add_model_tissue(parser)
     add_device(parser, "FEM")
     add_json(parser)
 

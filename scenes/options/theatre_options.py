@@ -13,7 +13,7 @@ from sim.errors import InputError
 
 from ..script.registration import REGISTRATIONS
 from .shared_options import add_anatomy, add_device
-from .tissue_options import AS_LEARNED, add_element_argument, add_tissue_arguments, apply_tissue_options
+from .tissue_options import add_model_tissue, apply_tissue_options
 
 if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
@@ -67,8 +67,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         help="registration of the scan to the patient; clinical: standard deviation of 1.6 mm per axis (default: the "
         "scene's, perfect in built-in scenes)",
     )  # fmt: skip
-    add_tissue_arguments(parser, default_regions=AS_LEARNED)
-    add_element_argument(parser)
+    add_model_tissue(parser)
     add_device(parser, "FEM")
 
 

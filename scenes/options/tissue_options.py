@@ -65,6 +65,14 @@ def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, d
     add_region_argument(parser, default_regions)
 
 
+def add_model_tissue(parser: argparse.ArgumentParser, skull: bool = False) -> None:
+    """Declare tissue, --skull if `skull`, and --element of a command that uses trained models."""
+    add_tissue_arguments(parser, default_regions=AS_LEARNED)
+    if skull:
+        add_skull_argument(parser)
+    add_element_argument(parser)
+
+
 def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN) -> None:
     """Declare --region; `default` describes the default."""
     parser.add_argument(
