@@ -176,7 +176,7 @@ class Fem:
             answer = self.following.solve_frame(loads, start, lambda: self.guess(loads, start))
             if answer is not None:
                 return answer if at is None else answer.restrict(at)
-        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self.strategy.held)
+        check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self.strategy.kept_bytes)
         last = None if start is None else self.guess(loads, start)
         cases = Cases(loads, np.zeros(len(loads)))
         if start is not None and last is not None:
@@ -252,7 +252,7 @@ class Fem:
         """
         nodes = self._check_vertices(nodes)
         device, rows = self.problem.device, (3 * nodes[:, None] + np.arange(3)).ravel()
-        check_fits(self.problem.rows, self.batch, len(modes), device, self.strategy.held)
+        check_fits(self.problem.rows, self.batch, len(modes), device, self.strategy.kept_bytes)
         answers = np.empty((len(modes), self.problem.rows))
         for some in self._iterate_batches(len(modes)):
             force = np.zeros((self.problem.rows, len(modes[some])))
@@ -289,7 +289,7 @@ class Fem:
         widest = len(list_factors(sizes, orders))
         groups = min(len(loads) // sizes, max(1, self.batch // widest))
         columns = groups * widest
-        check_fits(self.problem.rows, columns, columns, self.problem.device, self.strategy.held)
+        check_fits(self.problem.rows, columns, columns, self.problem.device, self.strategy.kept_bytes)
         edge = float(np.cbrt(self._anatomy.mesh.volumes.mean() * 6.0))
         found = np.empty((len(loads) // sizes, count_terms(sizes, orders), reading.count))
         # BLAS threads wait for each other, very long if other processes use their cores.

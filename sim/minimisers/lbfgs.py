@@ -81,7 +81,7 @@ class Lbfgs:
         self._ground: dict[str, wp.array] = {}
 
     @property
-    def held(self) -> int:
+    def kept_bytes(self) -> int:
         """Size of the memory that is kept [bytes]."""
         return sum(array.capacity for array in self._ground.values())
 

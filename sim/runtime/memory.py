@@ -69,11 +69,11 @@ def choose_batch_size(rows: int, device: Device, free: int, budget: MemoryBudget
 
 
 def check_fits(
-    rows: int, batch: int, count: int, device: Device, held: int = 0, budget: MemoryBudget = MemoryBudget()
+    rows: int, batch: int, count: int, device: Device, kept: int = 0, budget: MemoryBudget = MemoryBudget()
 ) -> None:
     """Reject `count` load cases of `rows` = 3N unknowns, `batch` of them together, that do not fit.
 
-    `held` bytes already belong to the solver.
+    `kept` bytes already belong to the solver.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def check_fits(
             + (f"solve at most {fitting} at a time." if fitting > 0 else MESH_REMEDY)
         ) from MemoryError()
     available = measure_free_bytes(device) if device.on_cuda else free
-    room = budget.share * available + held - (0 if device.on_cuda else answers)
+    room = budget.share * available + kept - (0 if device.on_cuda else answers)
     columns = min(batch, count)
     taken = column * find_workspace_width(device, columns)
     if taken > room:

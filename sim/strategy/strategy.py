@@ -126,9 +126,9 @@ class Strategy:
         return build_contact_preconditioner(self.problem, self.preconditioner, self.contact)
 
     @property
-    def held(self) -> int:
+    def kept_bytes(self) -> int:
         """Memory that L-BFGS keeps for the next batch [bytes]."""
-        return self.lbfgs.held
+        return self.lbfgs.kept_bytes
 
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
         """Solve for the equilibria of B cases, each from its first usable guess (3N, B) [m], or undeformed.

@@ -118,7 +118,9 @@ def describe_fem_task(asked: LazyFem, task: None) -> tuple[str, str, int]:
     """Return the FEM's element, description and batch size, after a check that it fits in memory."""
     if asked.needed is None:  # on the CPU: before a file is created that keeps its batch
         fem = asked.fem
-        check_fits(fem.problem.rows, fem.batch, min(fem.batch, asked.loads), fem.problem.device, fem.strategy.held)
+        check_fits(
+            fem.problem.rows, fem.batch, min(fem.batch, asked.loads), fem.problem.device, fem.strategy.kept_bytes
+        )
     return asked.fem.space.element, asked.fem.description, asked.fem.batch
 
 
