@@ -38,16 +38,17 @@ def same(one: Deformation, other: Deformation) -> None:
     assert set(one.memory) == set(other.memory)
 
 
-def at_once(work: Callable[[int], list[T]]) -> list[list[T]]:
-    """What each thread's work gives, all begun together."""
-    ready = threading.Barrier(THREADS)
+def together_and_alone(work: Callable[[int], list[T]]) -> list[tuple[T, T]]:
+    """Each result of threads that all begin together, with that of the thread's work alone."""
+    alone, ready = [work(thread) for thread in range(THREADS)], threading.Barrier(THREADS)
 
     def begin(thread: int) -> list[T]:
         ready.wait()
         return work(thread)
 
     with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(begin, range(THREADS)))
+        found = pool.map(begin, range(THREADS))
+        return [pair for theirs, own in zip(found, alone, strict=True) for pair in zip(theirs, own, strict=True)]
 
 
 @pytest.mark.parametrize("accuracy", [LIVE, REFERENCE], ids=["float32", "float64"])
@@ -60,10 +61,8 @@ def test_finite_elements_shared_by_threads_answer_bit_for_bit(accuracy: Accuracy
         warm = [fem.deform(loads.scale(1.1), start) for loads, start in zip(pushes(thread), answers, strict=True)]
         return answers + warm
 
-    alone = [work(thread) for thread in range(THREADS)]
-    for theirs, own in zip(at_once(work), alone, strict=True):
-        for one, other in zip(theirs, own, strict=True):
-            same(one, other)
+    for one, other in together_and_alone(work):
+        same(one, other)
 
 
 def test_residuals_and_series_shared_by_threads() -> None:
@@ -77,10 +76,8 @@ def test_residuals_and_series_shared_by_threads() -> None:
         series = fem.compute_series(loads, 2, fem.build_reading(nodes, modes))
         return [fem.residual(loads, found), series]
 
-    alone = [work(thread) for thread in range(THREADS)]
-    for theirs, own in zip(at_once(work), alone, strict=True):
-        for one, other in zip(theirs, own, strict=True):
-            np.testing.assert_array_equal(one, other)
+    for one, other in together_and_alone(work):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_body_that_is_cut_shared_by_threads() -> None:
@@ -92,9 +89,8 @@ def test_a_body_that_is_cut_shared_by_threads() -> None:
         done = Resected(np.arange(len(loads)) % 2)
         return [fem.deform(Loads((*loads.causes, done)))]
 
-    alone = [work(thread) for thread in range(THREADS)]
-    for (theirs,), (own,) in zip(at_once(work), alone, strict=True):
-        same(theirs, own)
+    for one, other in together_and_alone(work):
+        same(one, other)
 
 
 def test_device_results_survive_later_solves() -> None:
@@ -111,10 +107,8 @@ def test_device_results_survive_later_solves() -> None:
                 dict(answers[-1].warm)
         return answers
 
-    alone = [work(thread) for thread in range(THREADS)]
-    assert isinstance(alone[0][-1].warm, Kept)
-    names = ("head", "known")
-    for theirs, own in zip(at_once(work), alone, strict=True):
-        for one, other in zip(theirs, own, strict=True):
-            same(one, other)
-            assert all(np.array_equal(one.warm[name], other.warm[name]) for name in names)
+    found = together_and_alone(work)
+    assert isinstance(found[-1][1].warm, Kept)
+    for one, other in found:
+        same(one, other)
+        assert all(np.array_equal(one.warm[name], other.warm[name]) for name in ("head", "known"))
