@@ -4,6 +4,7 @@ import numpy as np
 from scipy.special import erf
 
 from sim.anatomy import Anatomy
+from sim.diagnostics.skull_leak import integrate_facet_normals
 from sim.geometry.tetmesh import TetMesh
 
 # Kuhn's six tetrahedra of a cube: paths from corner 0 to corner 7 along the axes; neighbours match.
@@ -70,3 +71,10 @@ def blurred_faces(points: np.ndarray, size: tuple[float, float, float], blur: fl
     share, slope = 0.5 * (erf(high) - erf(low)), np.exp(-(high**2)) - np.exp(-(low**2))
     outward = slope * np.roll(share, 1, axis=1) * np.roll(share, 2, axis=1)
     return outward / np.linalg.norm(outward, axis=1, keepdims=True)
+
+
+def integrate_surface_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """N_i n (N, 3) [m^2] over a whole surface: the integral of grad N_i over the volume (Engelman et al. 1982)."""
+    out = np.zeros_like(nodes)
+    np.add.at(out, triangles, integrate_facet_normals(nodes, triangles))
+    return out

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import trimesh
-from boxes import box, quadratic
+from boxes import box, integrate_surface_normals, quadratic
 from scipy.spatial import Delaunay
 
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
-from sim.diagnostics.skull_leak import Leak, integrate_surface_normals
+from sim.diagnostics.skull_leak import Leak
 from sim.discretisation.element import build_quadratic_elements
 from sim.discretisation.space import discretise
 from sim.effects import build_push_effects

@@ -5,11 +5,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from boxes import VTK_EDGES, base_held, box, hold, quadratic
+from boxes import VTK_EDGES, base_held, box, hold, integrate_surface_normals, quadratic
 
 from sim.accuracy import Accuracy
 from sim.compile import compile_problem
-from sim.diagnostics.skull_leak import integrate_surface_normals
 from sim.discretisation.space import Discretisation, discretise
 from sim.effects import Elasticity, Held, NodalForce, ToolForce
 from sim.errors import InputError

@@ -37,17 +37,6 @@ def integrate_facet_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndar
     return out
 
 
-def integrate_surface_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Integrate N_i n (N, 3) [m^2] over the whole surface, as `integrate_facet_normals`: grad N_i over the volume.
-
-    Engelman, Sani, Gresho 1982, "The implementation of normal and/or tangential boundary conditions in finite element
-    codes for incompressible fluid flow", Int. J. Numer. Methods Fluids 2:225-238.
-    """
-    out = np.zeros_like(nodes)
-    np.add.at(out, triangles, integrate_facet_normals(nodes, triangles))
-    return out
-
-
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
     """Build the kernel for a device's scalar type, over (patch, load case)."""
