@@ -23,6 +23,9 @@ def integrate_facet_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndar
 
     With N_i the shape function of node i (nodes (N, 3) [m]) and n the outward normal. The sum of products with the
     nodes' displacements is the volume that the triangle sweeps.
+
+    Engelman, Sani, Gresho 1982, "The implementation of normal and/or tangential boundary conditions in finite element
+    codes for incompressible fluid flow", Int. J. Numer. Methods Fluids 2:225-238.
     """
     out = np.zeros((*triangles.shape, 3))
     for at, weight in zip(POINTS, WEIGHTS, strict=True):
