@@ -32,7 +32,7 @@ from .elements import (
     keep_together,
     to_data_url,
 )
-from .parts import Control, Fold, LastChange, Note, Playback, SceneSurface, SceneViewpoint, Sign
+from .parts import Control, Fold, LastChange, Note, Playback, ScenePicture, SceneSurface, SceneViewpoint, Sign
 from .recording import Recorder
 from .scene import add_body, set_up_scene
 from .style import PAGE, STATUS, build_style
@@ -63,7 +63,7 @@ class Browser:
         host: str = "127.0.0.1",
         port: int = 8080,
         size: tuple[int, int] = (640, 480),
-        signs: Sequence[Sign] = (),
+        signs: Sequence[Sign | ScenePicture] = (),
         limits: ConnectionLimits = DEFAULT_LIMITS,
         origins: tuple[str, ...] = (),
     ) -> None:

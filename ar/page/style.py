@@ -73,6 +73,9 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
 :root.WITHOUT #ASIDE:has(> input:nth-of-type(1):checked)::after { width: 100%;
   content: "3-D view: not available, as this browser has no WebGL"; padding: 1rem; text-align: center; color: #ddd }
 :root.WITHOUT canvas { visibility: hidden }
+#ASIDE > .key { display: none; position: absolute; left: 0; bottom: 0; padding: 0 0.5rem;
+  font-size: 0.72rem; background: #141414cc }
+#ASIDE > input:nth-of-type(1):checked ~ .key { display: flex; flex-wrap: wrap; gap: 0 0.9rem }
 #ASIDE p { margin: 0; font-size: 0.72rem; opacity: 0.75; line-height: 1.25 }
 #SLICES img { display: block; width: 100%; max-width: calc(3 * (var(--low) - 3.9rem)); margin: 0 auto }
 #HISTORY svg { display: block; width: 100%; height: calc(var(--low) - 2rem) }

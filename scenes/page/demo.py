@@ -46,8 +46,8 @@ from .view import (
     FEM_COLOUR,
     STALE_COLOUR,
     build_page_bodies,
+    build_surroundings,
     choose_viewpoint,
-    list_orientation_labels,
     move_bodies,
     move_wire,
     render_page_image,
@@ -83,7 +83,7 @@ class Demo:
         parts = self._build_contents(deformer)
         self.browser = Browser(
             parts[0], choose_viewpoint(site), *parts[1:],
-            host=host, port=port, size=size, signs=list_orientation_labels(site), origins=origins,
+            host=host, port=port, size=size, signs=build_surroundings(self.stage), origins=origins,
         )  # fmt: skip
         self.busy = Busy(lambda line: self.browser.show_status(escape(line)))
         self.dismissed: list[FemWorker] = []
