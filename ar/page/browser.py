@@ -290,6 +290,11 @@ class Browser:
             value = min(max(value, control.min), control.max)
         self.note(f"control {label}", lambda: self.controls.assign(control, value, wanted))
 
+    def rename(self, label: str, words: str) -> None:
+        """Show other words for a control."""
+        control = self.controls.handles[label]
+        self.note(f"words {label}", lambda: setattr(control, "label", words))
+
     def write(self, label: str, words: str) -> None:
         """Replace the words (HTML) of a note; an empty note is hidden."""
         folder, text = self.controls.notes[label]

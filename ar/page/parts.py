@@ -97,18 +97,20 @@ class Toggle:
 
 @dataclass(frozen=True)
 class Fold:
-    """Folder of controls, closed at first."""
+    """Folder of controls and notes, closed at first unless it is `opened`."""
 
     label: str
-    controls: tuple[Slider | Dropdown | Toggle, ...]
+    controls: tuple[Slider | Dropdown | Toggle | Note, ...]
+    opened: bool = False
 
 
 @dataclass(frozen=True)
 class Note:
-    """Folder of words (HTML) that a user can open, for `Browser.write`; hidden while empty."""
+    """Folder of words (HTML) that a user can open, for `Browser.write`; hidden while empty. `plain`: without folder."""
 
     label: str
     words: str = ""
+    plain: bool = False
 
 
 Control = Slider | Dropdown | Toggle

@@ -50,6 +50,10 @@ RULES = """
 :root:has(DETAILS:focus-visible) #SAID .more { outline: 2px solid #fff }
 #SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
 .NOTE { font-size: 0.8rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
+PARTS .mantine-Flex-root:has(.mantine-Checkbox-root) > :first-child { width: auto !important; order: 1;
+  padding-left: 0.6rem; flex: 1 }
+PARTS .mantine-Flex-root:has(.mantine-Checkbox-root) > :last-child { flex: none !important }
+.NOTE p { margin: 0 }
 .NOTE ul { margin: 0; padding-left: 1.1rem }
 #STATUS { position: fixed; top: 0; right: calc(100vw - var(--w)); z-index: 7; pointer-events: none }
 #STATUS span { display: block; background: #e8590c; color: #fff; border-radius: 0 0 0 0.3rem; padding: 0.1rem 0.6rem;
