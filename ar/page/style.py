@@ -52,6 +52,7 @@ RULES = """
 .NOTE { font-size: 0.8rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
 PARTS .mantine-Flex-root:has(.mantine-Checkbox-root) > :first-child { width: auto !important; order: 1;
   padding-left: 0.6rem; flex: 1 }
+PARTS .mantine-Flex-root:has(.mantine-Checkbox-root) p { color: #ddd }
 PARTS .mantine-Flex-root:has(.mantine-Checkbox-root) > :last-child { flex: none !important }
 .NOTE p { margin: 0 }
 .NOTE ul { margin: 0; padding-left: 1.1rem }
