@@ -8,17 +8,20 @@ from theatres import short, sinking, small
 
 from ar.page.parts import Dropdown, Fold, Slider
 from scenes.page.controls import build_controls, is_animated
+from scenes.page.effect_costs import build_effect_fold
 from scenes.page.requests import Requests
 from scenes.page.side_panels import TIP
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
+
+ACTIONS = print, print, Fold("physics effects", ()), print
 
 
 class TestControls:
     def test_the_sliders_end_where_the_bone_stops_the_tool(self, theatre):
         scene, site = short(), theatre.site
         assert scene.tool is not None
-        found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), print, print, print, print)
+        found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), *ACTIONS)
         places = [control for control in found if isinstance(control, Slider) and control.label.startswith("place")]
         room = site.clearance - scene.tool.radius
         assert len(places) == 2 and all(0.5 <= control.high <= max(0.5, 1e3 * room) for control in places)
@@ -27,27 +30,24 @@ class TestControls:
 
     def test_no_code_name_is_shown(self, theatre):
         for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
-            found = build_controls(
-                small(name), theatre.site, ("fem",), Requests("fem", Touch()), print, print, print, print
-            )
-            switches = [inner for control in found if isinstance(control, Fold) for inner in control.controls]
+            found = build_controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), *ACTIONS)
+            folds = *found, build_effect_fold(theatre, small(name), Requests("fem", Touch()), print)
+            switches = [inner for control in folds if isinstance(control, Fold) for inner in control.controls]
             assert switches and all(inner.words and inner.words != inner.label for inner in switches)
 
     def test_the_overlay_comes_before_the_tool_s_sliders(self, theatre):
         labels = [
             control.label
-            for control in build_controls(
-                short(), theatre.site, ("fem",), Requests("fem", Touch()), print, print, print, print
-            )
+            for control in build_controls(short(), theatre.site, ("fem",), Requests("fem", Touch()), *ACTIONS)
         ]
-        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-9:-7] == [
+        assert labels[:5] == ["scene", "deformer", "overlay", "camera", "tool"] and labels[-7:-5] == [
             "slices",
             "registration",
         ]
 
     def test_every_overlay_style_is_offered(self, theatre):
         wish = Requests("fem", Touch())
-        found = build_controls(short(), theatre.site, ("fem",), wish, print, print, print, print)
+        found = build_controls(short(), theatre.site, ("fem",), wish, *ACTIONS)
         overlay = next(control for control in found if isinstance(control, Dropdown) and control.label == "overlay")
         seen = []
         for option in overlay.options:
@@ -57,10 +57,7 @@ class TestControls:
 
     def test_camera_and_slice_choices_are_offered(self, theatre):
         wish = Requests("fem", Touch())
-        found = {
-            control.label: control
-            for control in build_controls(short(), theatre.site, ("fem",), wish, print, print, print, print)
-        }
+        found = {control.label: control for control in build_controls(short(), theatre.site, ("fem",), wish, *ACTIONS)}
         camera, slices = found["camera"], found["slices"]
         assert isinstance(camera, Dropdown) and isinstance(slices, Dropdown)
         seen = []
@@ -79,7 +76,7 @@ class TestControls:
         registration.changed(registration.options[1])
         assert registration.start == registration.options[0] and wish.look.registration == "clinical"
         assert "slices" not in {
-            each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, print, print, print, print)
+            each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, *ACTIONS)
         }
 
     def test_which_scenes_go_on_by_themselves(self, theatre):

@@ -1,10 +1,34 @@
-import threading
+"""Costs of the effects: record that ships with the template, and what the page shows of it and measures."""
 
-from theatres import short
+import json
+import threading
+from dataclasses import replace
+
+import pytest
+from theatres import short, template_theatre
 
 from scenes.page.background_study import BackgroundStudy
-from scenes.page.effect_costs import format_effect_table, measure_costs
-from scenes.play.effect_ablation import ALL, AblationRow
+from scenes.page.effect_costs import EFFECT_COSTS, build_effect_fold, format_switch, measure_costs
+from scenes.page.requests import Requests
+from scenes.play.effect_ablation import ALL, AblationRow, build_record, list_switchable_effects
+from scenes.play.effect_record import SUFFIX, read_effect_records, write_effect_record
+from scenes.script.scene import SCENES, find_scene
+from scenes.script.shipped_files import get_template_path
+from scenes.script.tool_paths import Touch
+from sim.errors import InputError
+from sim.material import Material
+
+ROWS = AblationRow(ALL, 240.04, 1.0, 4.3, 5.0), AblationRow("ToolForce", 180.0, 1.0, 4.25, 5.0)
+
+
+@pytest.fixture(scope="module")
+def template():
+    return replace(template_theatre(), effect_records=read_effect_records(get_template_path().with_suffix(SUFFIX)))
+
+
+def words_of(theatre, scene):
+    fold = build_effect_fold(theatre, scene, Requests("fem", Touch()), print)
+    return {control.label: control.words for control in fold.controls}
 
 
 def test_each_effect_of_a_scene_is_measured(theatre):
@@ -12,12 +36,48 @@ def test_each_effect_of_a_scene_is_measured(theatre):
     costs = BackgroundStudy(lambda: measure_costs(theatre, scene), threading.Lock(), shown.append)
     costs.start()
     costs.thread.join(120.0)
-    assert len(shown) == 2 + len(scene.effects)
-    assert "all effects" in shown[-1] and "push of the tool" in shown[-1] and "being measured" not in shown[-1]
-    assert "being measured" in shown[-2] and "always on" in shown[-1]
+    assert len(shown) == 2 + len(list_switchable_effects(scene, theatre.anatomy)) == 3
+    assert shown[-1]["ToolForce"].startswith("push of the tool: +") and shown[1]["ToolForce"].endswith("not measured")
+    notes = [said[EFFECT_COSTS] for said in shown]
+    assert "1 more are being measured" in notes[1] and "being measured" not in notes[2]
+    assert "All effects together: " in notes[2] and "Always on: elastic tissue, fixed base of the brain" in notes[2]
 
 
-def test_a_table_has_time_and_motion_of_each_effect():
-    rows = [AblationRow(ALL, 240.0, 1.0, 4.3, 5.0), AblationRow("Retraction", 180.0, 1.0, 4.25, 5.0)]
-    said = format_effect_table(rows, 2)
-    assert "<td>the spatula</td><td>+180 ms</td><td>4.25 mm</td>" in said and "1 more" in said
+@pytest.mark.parametrize("name", SCENES)
+def test_the_template_record_has_the_effects_of_each_scene(template, name):
+    """Otherwise: `sulcus effects --out scenes/data/template.effects.json`."""
+    scene = find_scene(name)
+    record = template.find_effect_record(scene)
+    assert record is not None and set(record.effects) == {ALL, *list_switchable_effects(scene, template.anatomy)}
+    assert set(template.effect_records) == set(SCENES)
+    words = words_of(template, scene)
+    assert record.day in words[EFFECT_COSTS] and record.machine in words[EFFECT_COSTS]
+    assert not any("not measured" in said for said in words.values())
+
+
+def test_a_record_is_shown_of_the_same_scene_and_anatomy_alone(template, theatre):
+    scene = find_scene("press")
+    stiffer = scene.replace_tissue(Material("linear", young=4000.0, poisson=0.49), None)
+    records = template.effect_records
+    for other, changed in ((template, stiffer), (replace(theatre, effect_records=records), scene)):
+        words = words_of(other, changed)
+        assert words["ToolForce"] == "push of the tool: not measured" and "not measured" in words[EFFECT_COSTS]
+
+
+def test_a_record_is_written_and_read(theatre, tmp_path):
+    path = tmp_path / "box.effects.json"
+    found = build_record(theatre, short(), ROWS, 2)
+    write_effect_record(path, found)
+    write_effect_record(path, replace(found, scene="other"))
+    read = read_effect_records(path)
+    assert list(read) == [found.scene, "other"] and read["other"].effects == {
+        ALL: [240.04, 4.3],
+        "ToolForce": [180.0, 4.25],
+    }
+    assert "core" in found.machine and found.day == read["other"].day
+    assert format_switch("ToolForce", found.effects) == "push of the tool: +180 ms, 4.25 mm"
+    stored = json.loads(path.read_text())
+    stored["scenes"][1]["effects"]["ToolForce"][0] = float("nan")
+    path.write_text(json.dumps(stored))
+    with pytest.raises(InputError, match="not finite"):
+        read_effect_records(path)

@@ -1,10 +1,16 @@
 """3-D view of the page: it follows the frame, and an old comparison is marked as such."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
+from theatres import small
 from visitor import report, wait_for
 
+from ar.page.parts import ScenePicture
 from scenes.page.fem_worker import FemWorker
-from scenes.page.view import FEM_COLOUR, STALE_COLOUR
+from scenes.page.view import FEM_COLOUR, STALE_COLOUR, build_page_bodies, build_surroundings
+from scenes.script.craniotomy_frame import HOLE_RATIO
 
 
 def test_the_3d_view_follows(demo, theatre):
@@ -41,3 +47,17 @@ def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
     FemWorker.ask(demo.referee, *asked[0])
     assert wait_for(lambda: demo.run(0.3) and "<p>difference from FEM" in demo.browser.shown[2])
     assert "previous load" not in report(demo) and tints[-1] == FEM_COLOUR
+
+
+def test_the_3d_view_has_craniotomy_scan_and_planes(theatre):
+    stage = theatre.build_stage(small())
+    bodies = {body.name: body for body in build_page_bodies(stage)}
+    hole = HOLE_RATIO * theatre.site.clearance
+    away = theatre.site.compute_axis_distance(bodies["edge"].vertices)
+    assert away.min() == pytest.approx(hole, rel=0.05) and away.max() < hole + 3e-3
+    assert len(bodies["cortex"].triangles) > len(bodies["sulci"].triangles) > 0
+    assert np.array_equal(bodies["scan"].vertices, stage.tumour_at_rest.vertices)
+    planes = [part for part in build_surroundings(stage) if isinstance(part, ScenePicture)]
+    assert [plane.name for plane in planes] == ["axial", "coronal", "sagittal"]
+    assert 0.05 < max((plane.colour[..., 3] > 0).mean() for plane in planes) < 0.55
+    assert not any(isinstance(part, ScenePicture) for part in build_surroundings(replace(stage, intensity=None)))

@@ -32,7 +32,7 @@ from .elements import (
     keep_together,
     to_data_url,
 )
-from .parts import Control, Fold, LastChange, Note, Playback, SceneSurface, SceneViewpoint, Sign
+from .parts import Control, Fold, LastChange, Note, Playback, ScenePicture, SceneSurface, SceneViewpoint, Sign
 from .recording import Recorder
 from .scene import add_body, set_up_scene
 from .style import PAGE, STATUS, build_style
@@ -63,7 +63,7 @@ class Browser:
         host: str = "127.0.0.1",
         port: int = 8080,
         size: tuple[int, int] = (640, 480),
-        signs: Sequence[Sign] = (),
+        signs: Sequence[Sign | ScenePicture] = (),
         limits: ConnectionLimits = DEFAULT_LIMITS,
         origins: tuple[str, ...] = (),
     ) -> None:
@@ -289,6 +289,11 @@ class Browser:
         if isinstance(control, viser.GuiSliderHandle) and not isinstance(value, str):
             value = min(max(value, control.min), control.max)
         self.note(f"control {label}", lambda: self.controls.assign(control, value, wanted))
+
+    def rename(self, label: str, words: str) -> None:
+        """Show other words for a control."""
+        control = self.controls.handles[label]
+        self.note(f"words {label}", lambda: setattr(control, "label", words))
 
     def write(self, label: str, words: str) -> None:
         """Replace the words (HTML) of a note; an empty note is hidden."""

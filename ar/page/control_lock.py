@@ -146,7 +146,7 @@ class Inputs:
     kept
         Last value of each control set by the client with control; other clients' values are reset to it.
     notes
-        Folders of words by their labels.
+        Folders and texts of notes by their labels.
     """
 
     def __init__(self, server: viser.ViserServer, crowd: Clients) -> None:
@@ -155,7 +155,7 @@ class Inputs:
         self.handles: dict[str, viser.GuiInputHandle] = {}
         # Keyed by identity, as viser's controls have no hash.
         self.kept: dict[int, float | str] = {}
-        self.notes: dict[str, tuple[viser.GuiFolderHandle, viser.GuiHtmlHandle]] = {}
+        self.notes: dict[str, tuple[viser.GuiFolderHandle | viser.GuiHtmlHandle, viser.GuiHtmlHandle]] = {}
         self.commands: list[viser.CommandHandle] = []
 
     def clear(self) -> None:
@@ -203,12 +203,16 @@ class Inputs:
     def add(self, control: Control | Fold | Note) -> None:
         """Add a slider, a list, a checkbox, a folder of them, or a folder of words."""
         gui = self.server.gui
+        if isinstance(control, Note) and control.plain:
+            text = gui.add_html(format_note(control.words), visible=bool(control.words))
+            self.notes[control.label] = text, text
+            return
         if isinstance(control, Note):
             with gui.add_folder(control.label, expand_by_default=False, visible=bool(control.words)) as folder:
                 self.notes[control.label] = folder, gui.add_html(format_note(control.words))
             return
         if isinstance(control, Fold):
-            with gui.add_folder(control.label, expand_by_default=False):
+            with gui.add_folder(control.label, expand_by_default=control.opened):
                 for inner in control.controls:
                     self.add(inner)
             return

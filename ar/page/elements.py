@@ -88,6 +88,9 @@ CAPTION = (  # Text under the slices.
     "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: 95 % error of its "
     "outline, by the named source (none: not known). White: tool in the slice; ring: tip outside the slice."
 )
+VIEW_KEY = (  # Legend of the 3-D view: colour and meaning.
+    ("#33f06b", "tumour now"), ("#f5f5eb", "tumour in the scan"), ("#ffd8a8", "edge of the craniotomy"),
+)  # fmt: skip
 # Image of one pixel: loading it runs the script, which an element's HTML alone would not.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 
@@ -146,9 +149,11 @@ def build_tabs(keys: Sequence[Key] = KEYS) -> str:
     listed = ", ".join(f"'{key.name}'" for key in keys)
     script = escape(" ".join(SCRIPT.replace("KEYS", listed, 1).replace("HELP", HELP).split()))
     opens = f"document.getElementById('{HELP}').showModal()"
+    key = "".join(f'<span><b style="color: {colour}">&#9632;</b> {words}</span>' for colour, words in VIEW_KEY)
     return (
         f'<div id="{ASIDE}">{tabs}<input type="checkbox" id="{DETAILS}" aria-label="details of the result">'
         f'<button type="button" aria-label="list of keys" onclick="{opens}">keys</button>'
+        f'<p class="key">{key}</p>'
         f'<div class="shown"><div id="{SLICES}"></div><p>{CAPTION}</p></div>'
         f'<div class="shown"><div id="{HISTORY}"></div></div>'
         f'<dialog id="{HELP}" aria-label="keys"><table>{rows}</table>'

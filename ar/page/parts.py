@@ -22,6 +22,18 @@ class SceneSurface:
     colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
     opacity: float = 1.0
     wireframe: bool = False
+    side: Literal["front", "back", "double"] = "double"
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePicture:
+    """Image (H, W, 4) uint8 in the 3-D view: centre (3,), edges to its right and downwards (3,) [m]."""
+
+    name: str
+    colour: np.ndarray
+    centre: np.ndarray
+    right: np.ndarray
+    down: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,18 +97,20 @@ class Toggle:
 
 @dataclass(frozen=True)
 class Fold:
-    """Folder of controls, closed at first."""
+    """Folder of controls and notes, closed at first unless it is `opened`."""
 
     label: str
-    controls: tuple[Slider | Dropdown | Toggle, ...]
+    controls: tuple[Slider | Dropdown | Toggle | Note, ...]
+    opened: bool = False
 
 
 @dataclass(frozen=True)
 class Note:
-    """Folder of words (HTML) that a user can open, for `Browser.write`; hidden while empty."""
+    """Folder of words (HTML) that a user can open, for `Browser.write`; hidden while empty. `plain`: without folder."""
 
     label: str
     words: str = ""
+    plain: bool = False
 
 
 Control = Slider | Dropdown | Toggle

@@ -6,34 +6,41 @@ from collections.abc import Sequence
 
 import numpy as np
 import viser
+from scipy.spatial.transform import Rotation
 
-from .parts import SceneSurface, SceneViewpoint, Sign
+from .parts import ScenePicture, SceneSurface, SceneViewpoint, Sign
 
 PANEL_WIDTH = 676.0  # Width of the docked panel in browsers that do not support the page's rules [CSS pixel].
 
 
-def set_up_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Sequence[Sign]) -> None:
-    """Set up colours, light, labels, the panel's place and the first view of the 3-D scene."""
+def set_up_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Sequence[Sign | ScenePicture]) -> None:
+    """Set up colours, light, labels, images, the panel's place and the first view of the 3-D scene."""
     gui, scene = server.gui, server.scene
     gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
     gui.main_panel.dock_left()
     gui.main_panel.set_width(PANEL_WIDTH)
     # Two soft lights from the first viewpoint's sides: the page's own four wash the colours out.
     scene.configure_default_lights(enabled=False)
-    scene.add_light_ambient("/light/ambient", intensity=2.0)
+    scene.add_light_ambient("/light/ambient", intensity=0.8)
     across = np.cross(np.asarray(viewpoint.target) - viewpoint.eye, viewpoint.up)
-    for name, side, strength in (("left", -1.0, 2.2), ("right", 1.0, 1.0)):
+    for name, side, strength in (("left", -1.0, 1.8), ("right", 1.0, 0.6)):
         place = np.asarray(viewpoint.eye) + side * across / np.linalg.norm(across)
         scene.add_light_directional(f"/light/{name}", intensity=strength, position=tuple(place))
     for sign in signs:
-        scene.add_label(f"/sign/{sign.word}", sign.word, position=np.asarray(sign.place), anchor="center-center")
+        if isinstance(sign, Sign):
+            scene.add_label(f"/sign/{sign.word}", sign.word, position=np.asarray(sign.place), anchor="center-center")
+            continue
+        sides = [float(np.linalg.norm(edge)) for edge in (sign.right, sign.down)]
+        x, y = sign.right / sides[0], sign.down / sides[1]
+        turn = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], axis=1)).as_quat(scalar_first=True)
+        scene.add_image(f"/{sign.name}", sign.colour, *sides, format="png", wxyz=turn, position=sign.centre)
     start = server.initial_camera
     start.position, start.look_at = tuple(viewpoint.eye), tuple(viewpoint.target)
     start.up, start.fov = tuple(viewpoint.up), viewpoint.fov
 
 
 def add_body(server: viser.ViserServer, body: SceneSurface) -> viser.MeshHandle:
-    """Add a two-sided surface to the 3-D view."""
+    """Add a surface to the 3-D view."""
     return server.scene.add_mesh_simple(
         f"/{body.name}",
         np.asarray(body.vertices, np.float32),
@@ -41,5 +48,7 @@ def add_body(server: viser.ViserServer, body: SceneSurface) -> viser.MeshHandle:
         color=np.asarray(body.colour, np.float64),
         opacity=None if body.opacity >= 1.0 else body.opacity,
         wireframe=body.wireframe,
-        side="double",
+        side=body.side,
+        cast_shadow=False,
+        receive_shadow=False,
     )

@@ -50,6 +50,11 @@ RULES = """
 :root:has(DETAILS:focus-visible) #SAID .more { outline: 2px solid #fff }
 #SAID td, #SAID th { padding: 0 0.9rem 0 0; text-align: left; font-weight: inherit }
 .NOTE { font-size: 0.8rem; line-height: 1.4; padding: 0 0.75rem 0.4rem; overflow-wrap: anywhere }
+PARTS .mantine-Flex-root:has(.mantine-Checkbox-root) > :first-child { width: auto !important; order: 1;
+  padding-left: 0.6rem; flex: 1 }
+PARTS .mantine-Flex-root:has(.mantine-Checkbox-root) p { color: #ddd }
+PARTS .mantine-Flex-root:has(.mantine-Checkbox-root) > :last-child { flex: none !important }
+.NOTE p { margin: 0 }
 .NOTE ul { margin: 0; padding-left: 1.1rem }
 #STATUS { position: fixed; top: 0; right: calc(100vw - var(--w)); z-index: 7; pointer-events: none }
 #STATUS span { display: block; background: #e8590c; color: #fff; border-radius: 0 0 0 0.3rem; padding: 0.1rem 0.6rem;
@@ -73,6 +78,9 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
 :root.WITHOUT #ASIDE:has(> input:nth-of-type(1):checked)::after { width: 100%;
   content: "3-D view: not available, as this browser has no WebGL"; padding: 1rem; text-align: center; color: #ddd }
 :root.WITHOUT canvas { visibility: hidden }
+#ASIDE > .key { display: none; position: absolute; left: 0; bottom: 0; padding: 0 0.5rem;
+  font-size: 0.72rem; background: #141414cc }
+#ASIDE > input:nth-of-type(1):checked ~ .key { display: flex; flex-wrap: wrap; gap: 0 0.9rem }
 #ASIDE p { margin: 0; font-size: 0.72rem; opacity: 0.75; line-height: 1.25 }
 #SLICES img { display: block; width: 100%; max-width: calc(3 * (var(--low) - 3.9rem)); margin: 0 auto }
 #HISTORY svg { display: block; width: 100%; height: calc(var(--low) - 2rem) }

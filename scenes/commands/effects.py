@@ -4,9 +4,11 @@ import argparse
 import json
 import sys
 from dataclasses import asdict
+from pathlib import Path
 
 from sim.arguments import check_at_least
 
+from ..options.outputs import check_output_path
 from ..options.shared_options import add_anatomy, add_device, add_json
 from ..options.theatre_options import add_trajectory, build_requested_scene
 from ..options.tissue_options import add_model_tissue
@@ -23,8 +25,13 @@ COLUMN_TITLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
+    parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
     parser.add_argument("--every", type=int, default=5, help="solve every Nth frame")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.json",
+        help="file to which scenes are added; `sulcus demo` shows MESH.effects.json next to the anatomy. Only effects "
+        "that the page can disable are solved",
+    )  # fmt: skip
     add_anatomy(parser)
     add_trajectory(parser)
     add_model_tissue(parser)
@@ -33,28 +40,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve the scene with and without each."""
+    """Solve each scene with and without each effect."""
     from tqdm import tqdm
 
     from ..play.deformers import open_theatre
-    from ..play.effect_ablation import measure_effects
+    from ..play.effect_ablation import build_record, list_switchable_effects, measure_effects
+    from ..play.effect_record import read_effect_records, write_effect_record
+    from ..script.scene import SCENES
 
     check_at_least("--every", args.every, 1)
-    theatre = open_theatre(args.anatomy, device=args.device, scenes=[args.scene])
-    scene = build_requested_scene(args, args.scene, theatre)
+    names = args.scenes or SCENES
+    theatre = open_theatre(args.anatomy, device=args.device, scenes=names)
+    scenes = [build_requested_scene(args, name, theatre) for name in names]
+    if args.out is not None:
+        check_output_path(args.out, ".json", resumed=True)
+        read_effect_records(args.out)
     table = sys.stderr if args.json else sys.stdout
-    who = theatre.describe_deformer("fem", scene)
-    print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
-    print(f"| {' | '.join(COLUMN_TITLES)} |\n|{'---|' * len(COLUMN_TITLES)}", file=table)
-    found = []
-    count = 1 + len(scene.get_effects_on(theatre.anatomy))
-    with tqdm(total=count, unit="effect", leave=False, file=sys.stderr) as bar:
-        for row in measure_effects(theatre, scene, args.every):
-            found.append(row)
-            figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
-            cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
-            bar.write(f"| {' | '.join([row.effect, *cells, row.refused])} |", file=table)
-            bar.update()
-    if args.json:
-        print(json.dumps({"scene": scene.name, "solver": who, "effects": [asdict(row) for row in found]}))
+    for scene in scenes:
+        who, acting = theatre.describe_deformer("fem", scene), scene.get_effects_on(theatre.anatomy)
+        some = None if args.out is None else list_switchable_effects(scene, theatre.anatomy)
+        print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
+        print(f"| {' | '.join(COLUMN_TITLES)} |\n|{'---|' * len(COLUMN_TITLES)}", file=table)
+        found = []
+        with tqdm(total=1 + len(acting if some is None else some), unit="effect", leave=False, file=sys.stderr) as bar:
+            for row in measure_effects(theatre, scene, args.every, some):
+                found.append(row)
+                figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
+                cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
+                bar.write(f"| {' | '.join([row.effect, *cells, row.refused])} |", file=table)
+                bar.update()
+        if args.out is not None:
+            write_effect_record(args.out, build_record(theatre, scene, found, args.every))
+        if args.json:
+            print(json.dumps({"scene": scene.name, "solver": who, "effects": [asdict(row) for row in found]}))
     return 0

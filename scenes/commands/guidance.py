@@ -48,8 +48,9 @@ next: sulcus uncertainty press --anatomy patient.vtu, which draws its bodies fro
   sulcus scenes
   sulcus scenes --out images
 next: sulcus demo palpate""",
-    "effects": """example:
+    "effects": """examples:
   sulcus effects press --every 20
+  sulcus effects --anatomy patient.vtu --out patient.effects.json
 next: sulcus sensitivity""",
     "demo": """examples:
   sulcus demo

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from html import escape
+from typing import Any
 
+from ar.page.browser import Browser
 from sim.errors import InputError
 
 from ..play.deformers import PatientSetup
 from ..script.scene import Scene
-from .controls import EFFECT_COSTS, REFINED_ERROR
-from .effect_costs import measure_costs
+from .controls import REFINED_ERROR
+from .effect_costs import EFFECT_COSTS, measure_costs
 from .error_refinement import refine_error
 from .requests import Requests
 
 
 class BackgroundStudy:
-    """Computation in a thread, again at each start; `show` receives each text (HTML) that `work` yields."""
+    """Computation in a thread, again at each start; `show` receives what `work` yields, or its failure (HTML)."""
 
-    def __init__(self, work: Callable[[], Iterator[str]], turn: threading.Lock, show: Callable[[str], None]) -> None:
+    def __init__(self, work: Callable[[], Iterator[Any]], turn: threading.Lock, show: Callable[[Any], None]) -> None:
         """Prepare the study; it holds the lock `turn`, so that no other solver is built meanwhile."""
         self.work, self.turn, self.show = work, turn, show
         self.closed, self.thread = threading.Event(), threading.Thread()
@@ -48,9 +49,9 @@ class BackgroundStudy:
 
 
 def build_studies(
-    theatre: PatientSetup, scene: Scene, wish: Requests, turn: threading.Lock, write: Callable[[str, str], None]
+    theatre: PatientSetup, scene: Scene, wish: Requests, turn: threading.Lock, page: Callable[[], Browser]
 ) -> tuple[BackgroundStudy, ...]:
-    """Build the studies of a scene's effects and of the requested load; `write` fills a note by its label."""
+    """Build the studies of a scene's effects and of the requested load, which `page` shows."""
 
     def refine() -> Iterator[str]:
         number, _, touch, _ = wish.read_current()
@@ -58,7 +59,11 @@ def build_studies(
         registered = replace(scene, registration=wish.registration or scene.registration)
         return refine_error(theatre, registered, touch or scene.path(time), time)
 
+    def show_costs(said: Mapping[str, str] | str) -> None:
+        for label, words in ({EFFECT_COSTS: said} if isinstance(said, str) else said).items():
+            (page().write if label == EFFECT_COSTS else page().rename)(label, words)
+
     return (
-        BackgroundStudy(lambda: measure_costs(theatre, scene), turn, partial(write, EFFECT_COSTS)),
-        BackgroundStudy(refine, turn, partial(write, REFINED_ERROR)),
+        BackgroundStudy(lambda: measure_costs(theatre, scene), turn, show_costs),
+        BackgroundStudy(refine, turn, lambda said: page().write(REFINED_ERROR, said)),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from ar.overlay.hud import name_bearings
 from ar.overlay.styles import STYLES, Style
 from ar.page.elements import STYLE_KEY
 from ar.page.parts import Dropdown, Fold, Note, Slider, Toggle
-from sim.effects import Bonded, Elasticity, Gravity, Held, Inertia, Pulsation, Resection, Slide, remember
+from sim.effects import Elasticity, Gravity, Inertia, Pulsation, Resection, remember
 
 from ..script.camera_paths import PATHS
 from ..script.craniotomy_frame import CraniotomyFrame
@@ -20,7 +19,7 @@ from ..script.scene import SCENES, Scene
 from ..script.tool_paths import IDLE_HEIGHT, Touch
 from .requests import HAND, SCRIPT, Requests
 from .side_panels import TIP, TUMOUR_MIDDLE
-from .text import describe_deformer, describe_effect
+from .text import describe_deformer
 
 MAX_FORCE = 0.4  # End of the force slider [N].
 MAX_DEPTH = 8.0  # End of the depth slider [mm], where the scene's script does not go deeper.
@@ -29,8 +28,8 @@ STATIC_CAMERA = "stays"
 """Label of a static camera."""
 PLAN = "solver details (advanced)"
 """Label of the note on the solvers."""
-EFFECT_COSTS, REFINED_ERROR = "cost of the effects", "refined error"
-"""Labels of the notes on the effects' costs, and on the refined error."""
+REFINED_ERROR = "refined error"
+"""Label of the note on the refined error."""
 REFINE_HINT = "solves this load for 16 sampled patients in the background, for minutes"  # Hint of the switch.
 OWN_FILM = "your own video or camera"
 """Label of the note on own videos."""
@@ -51,27 +50,22 @@ def build_controls(
     wish: Requests,
     give: Callable[[str], None],
     take: Callable[..., None],
-    measure: Callable[[], None],
+    effects: Fold,
     refine: Callable[[], None],
 ) -> list[Slider | Dropdown | Toggle | Fold | Note]:
     """Build all controls of a scene that these deformers support.
 
-    `give` receives who gets the tool, `take` numbers of its touch, as `Requests.take_over` does; `measure` starts the
-    measurement of the effects' costs, `refine` the refinement of the error.
+    `give` receives who gets the tool, `take` numbers of its touch, as `Requests.take_over` does; `effects` are the
+    switches of the effects; `refine` starts the refinement of the error.
     """
     cameras = "scene default", STATIC_CAMERA, *PATHS
 
     def film(name: str) -> None:
         wish.set(path="" if name == cameras[0] else name)
 
-    switches = tuple(
-        Toggle(effect, True, partial(wish.switch, effect), describe_effect(effect), "switch this effect on or off")
-        for effect in list_switchable_effects(scene, site)
-    )
-    hint = "solves the scene with and without each effect"
-    costs = Toggle("measure costs", False, lambda on: measure() if on else None, "measure what each costs", hint)
     models = {describe_deformer(name): name for name in names}
     slices = build_slice_control(wish.through, lambda name: wish.set(through=name))
+    hand = [] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
     return [
         Dropdown("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what deforms the brain"),
@@ -85,13 +79,13 @@ def build_controls(
         ),
         add_overlay_controls(wish.style, lambda style: wish.set(style=style)),
         Dropdown("camera", cameras, wish.path or cameras[0], film, hint="motion of the camera"),
-        *([] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]),
+        *hand[:1],
+        effects,
+        *hand[1:],
         build_registration_control(scene, wish),
         Toggle("refine the error", False, lambda on: refine() if on else None, hint=REFINE_HINT),
         Note(REFINED_ERROR),
         Fold("camera position", build_camera_sliders(scene, site, wish)),
-        Fold("physics effects (on/off)", (*switches, costs)),
-        Note(EFFECT_COSTS),
         Note(PLAN),
         Note(OWN_FILM, OWN_VIDEO_NOTE),
     ]
@@ -141,12 +135,6 @@ def build_camera_sliders(scene: Scene, site: CraniotomyFrame, wish: Requests) ->
             lambda value: wish.set(distance=1e-3 * value), words="distance [mm]", hint="a smaller distance magnifies",
         ),
     )  # fmt: skip
-
-
-def list_switchable_effects(scene: Scene, site: CraniotomyFrame) -> list[str]:
-    """List effects that can be disabled: all except tissue and constraints."""
-    kinds = (type(effect) for effect in scene.get_effects_on(site.anatomy))
-    return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Bonded, Slide)]
 
 
 def is_animated(scene: Scene, site: CraniotomyFrame) -> bool:

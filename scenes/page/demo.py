@@ -37,6 +37,7 @@ from .comparison import (
     format_comparison,
 )
 from .controls import PLAN, build_controls, is_animated, to_slider_values
+from .effect_costs import build_effect_fold
 from .fem_worker import FemResult, FemWorker
 from .requests import HAND, SCRIPT, Look, Requests, describe_holder
 from .scene_solvers import SceneSolvers
@@ -46,8 +47,8 @@ from .view import (
     FEM_COLOUR,
     STALE_COLOUR,
     build_page_bodies,
+    build_surroundings,
     choose_viewpoint,
-    list_orientation_labels,
     move_bodies,
     move_wire,
     render_page_image,
@@ -83,7 +84,7 @@ class Demo:
         parts = self._build_contents(deformer)
         self.browser = Browser(
             parts[0], choose_viewpoint(site), *parts[1:],
-            host=host, port=port, size=size, signs=list_orientation_labels(site), origins=origins,
+            host=host, port=port, size=size, signs=build_surroundings(self.stage), origins=origins,
         )  # fmt: skip
         self.busy = Busy(lambda line: self.browser.show_status(escape(line)))
         self.dismissed: list[FemWorker] = []
@@ -172,9 +173,7 @@ class Demo:
         # The frame that is shown.
         self.reached: int | None = None
         self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=is_animated(scene, self.theatre.site))
-        self.studies = build_studies(
-            self.theatre, scene, self.wish, self.turn, lambda *said: self.browser.write(*said)
-        )  # the browser opens later
+        self.studies = build_studies(self.theatre, scene, self.wish, self.turn, lambda: self.browser)  # opens later
 
     def _change(self, name: str) -> None:
         """Play another scene; where this body has none of that name, stay, and say why."""
@@ -353,7 +352,8 @@ class Demo:
     def _build_contents(self, deformer: str) -> tuple:
         """Build the contents of the page: bodies, playback, controls, title, text."""
         scene, names = self.stage.scene, self.theatre.list_deformers(self.stage.scene)
-        actions = self._give, self._take, *(study.start for study in self.studies)
+        effects = build_effect_fold(self.theatre, scene, self.wish, self.studies[0].start)
+        actions = self._give, self._take, effects, self.studies[1].start
         return (
             build_page_bodies(self.stage),
             Playback(len(scene.times), self._play, lambda number: self._give(SCRIPT, number=number)),

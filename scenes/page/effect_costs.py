@@ -1,46 +1,80 @@
-"""Measurement of what each effect of a scene costs, and of how much it moves the tumour."""
+"""Switches of a scene's effects, with the time that each costs and how far it moves the tumour."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from html import escape
 
+from ar.page.parts import Fold, Note, Toggle
+
 from ..play.deformers import PatientSetup
-from ..play.effect_ablation import ALL, AblationRow, measure_effects
+from ..play.effect_ablation import ALL, list_switchable_effects, measure_effects
 from ..script.scene import Scene
+from .requests import Requests
 from .text import describe_effect
 
+EFFECT_COSTS = "cost of the effects"
+"""Label of the note on the effects' costs."""
+EFFECT_FOLD = "physics effects: time per frame, tumour motion"  # Label of the folder of switches.
 SOLVED_FRAMES = 8  # Number of frames of the script that are solved with and without each effect.
+# Hint of an effect's switch.
+HINT = "switch this effect on or off; FEM time per frame that it adds, and how far it moves the tumour"
+MEASURE_HINT = "solves the scene with and without each effect, in the background"  # Hint of the measuring switch.
+
+Figures = Mapping[str, tuple[float | None, float | None]]
+"""Time [ms] and motion [mm] of the effects by class name, as in `EffectRecord`."""
 
 
-def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[str]:
-    """Yield the table (HTML) of a scene's effects whenever a row is added.
+def build_effect_fold(theatre: PatientSetup, scene: Scene, wish: Requests, measure: Callable[[], None]) -> Fold:
+    """Build the switches of a scene's effects with their recorded costs; `measure` starts a measurement."""
+    record = theatre.find_effect_record(scene)
+    figures: Figures = {} if record is None else record.effects
+    switches = (
+        Toggle(name, True, partial(wish.switch, name), format_switch(name, figures), HINT)
+        for name in list_switchable_effects(scene, theatre.anatomy)
+    )
+    source = "" if record is None else f"Recorded on {record.day} with {record.machine}, {record.frames} frames"
+    said = format_costs(theatre, scene, figures, source or "The costs are not measured for this scene and anatomy")
+    costs = Toggle(
+        "measure costs", False, lambda on: measure() if on else None, "measure on this machine", MEASURE_HINT
+    )
+    return Fold(EFFECT_FOLD, (*switches, costs, Note(EFFECT_COSTS, said, plain=True)), opened=True)
+
+
+def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str]]:
+    """Yield the words of the switches and of the note (HTML), by label, whenever an effect is measured.
 
     Raises
     ------
     InputError
         See `measure_effects`.
     """
-    yield "<p>The scene is solved with and without each effect...</p>"
-    rows: list[AblationRow] = []
-    for row in measure_effects(theatre, scene, max(1, len(scene.times) // SOLVED_FRAMES)):
-        rows.append(row)
-        yield format_effect_table(rows, len(scene.get_effects_on(theatre.anatomy)))
+    names, every = list_switchable_effects(scene, theatre.anatomy), max(1, len(scene.times) // SOLVED_FRAMES)
+    figures = dict[str, tuple[float | None, float | None]]()
+    yield {EFFECT_COSTS: "<p>The scene is solved with and without each effect...</p>"}
+    for row in measure_effects(theatre, scene, every, names):
+        figures[row.effect] = row.milliseconds, row.tumour_mm
+        left = len(names) + 1 - len(figures)
+        source = f"Measured on this machine, {len(scene.times[::every])} frames"
+        source += f"; {left} more are being measured" if left else ""
+        words = {name: format_switch(name, figures) for name in names}
+        yield words | {EFFECT_COSTS: format_costs(theatre, scene, figures, source)}
 
 
-def format_effect_table(rows: Sequence[AblationRow], count: int) -> str:
-    """Build the table of `count` effects from the measured rows; the first row is that of the whole scene."""
-    lines = []
-    for row in rows:
-        name = "all effects" if row.effect == ALL else describe_effect(row.effect)
-        if row.milliseconds is None or row.tumour_mm is None:
-            lines.append(f"<tr><td>{escape(name)}</td><td colspan=2>always on ({escape(row.refused)})</td></tr>")
-        else:
-            lines.append(
-                f"<tr><td>{escape(name)}</td><td>{row.milliseconds:+.0f} ms</td><td>{row.tumour_mm:.2f} mm</td></tr>"
-            )
-    left = "" if len(rows) > count else f'<p class="stale">{count + 1 - len(rows)} more are being measured.</p>'
-    return (
-        "<p>FEM time per frame that each effect adds, and how far it moves the tumour (largest mean of the script):</p>"
-        f"<table>{''.join(lines)}</table>{left}"
-    )
+def format_switch(name: str, figures: Figures) -> str:
+    """Return the words of an effect's switch: its name, the time that it adds and the motion that it causes."""
+    milliseconds, motion = figures.get(name, (None, None))
+    if milliseconds is None or motion is None:
+        return f"{describe_effect(name)}: {'not solvable without' if name in figures else 'not measured'}"
+    return f"{describe_effect(name)}: {milliseconds:+.0f} ms, {motion:.2f} mm"
+
+
+def format_costs(theatre: PatientSetup, scene: Scene, figures: Figures, source: str) -> str:
+    """Describe the source of the figures, the whole scene, and the effects that are always on (HTML)."""
+    milliseconds, motion = figures.get(ALL, (None, None))
+    whole = "" if milliseconds is None else f" All effects together: {milliseconds:.0f} ms, {motion:.2f} mm."
+    switchable = list_switchable_effects(scene, theatre.anatomy)
+    kinds = (type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy))
+    fixed = ", ".join(describe_effect(name) for name in kinds if name not in switchable)
+    return f"<p>{escape(source)}.{whole} Always on: {escape(fixed)}.</p>"

@@ -6,17 +6,26 @@ import numpy as np
 
 from ar.overlay.hud import draw_orientation_labels
 from ar.page.browser import Browser
-from ar.page.parts import SceneSurface, SceneViewpoint, Sign
+from ar.page.parts import ScenePicture, SceneSurface, SceneViewpoint, Sign
+from ar.page.slices import HALF_VIEW, OUTSIDE_GREY, PLANES, VIEW_SIDE, resample_view
 
 from ..play.observer import ELLIPSOID_COLOUR, SPHERE, SPHERE_FACES
 from ..play.player import Frame, Player
-from ..play.stage import CORTEX_COLOUR, TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
+from ..play.stage import TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
 from ..script.craniotomy_frame import CraniotomyFrame
+from ..script.framing import DRAPE_HEIGHT
 from .fem_worker import FemResult
 
 FEM_COLOUR = TRUTH_COLOUR  # Colour of the FEM tumour.
 STALE_COLOUR = (0.45, 0.45, 0.45)
 """Colour of the FEM tumour while it belongs to another load than the one shown."""
+BRAIN_COLOUR = (0.50, 0.38, 0.36)  # Colour of the inside of the brain's far side: its near side would hide the rest.
+CORTEX_COLOURS = (0.80, 0.53, 0.47), (0.45, 0.15, 0.16)  # Colours of crowns, and of sulci with their vessels.
+CORTEX_NAMES = "cortex", "sulci"  # Names of these parts.
+DARK_SHARE = 0.6  # Brightness of a sulcus as a share of the brightest crown.
+EDGE_COLOUR, EDGE_WIDTH = (0.93, 0.86, 0.72), 2.5e-3
+"""Colour and width [m] of the ring of bone round the craniotomy."""
+SCAN_COLOUR = (0.96, 0.96, 0.92)  # Colour of the tumour in the scan.
 INITIAL_RADIUS = 1e-4  # Radius of the ellipsoid before there is one [m].
 LETTER_DISTANCE = 12e-3  # Distance of the orientation letters from the brain [m].
 
@@ -40,13 +49,48 @@ def build_page_bodies(stage: Stage) -> list[SceneSurface]:
 
 def build_brain(stage: Stage) -> list[SceneSurface]:
     """Brain, open cortex and tumour, at rest."""
-    positions = stage.site.anatomy.mesh.nodes
-    brain, cortex, tumour = stage.brain, stage.build_cortex(positions), stage.build_tumour(positions)
+    brain, scan, cortex = stage.brain, stage.tumour_at_rest, split_cortex(stage, stage.site.anatomy.mesh.nodes)
     return [
-        SceneSurface("brain", brain.vertices, brain.triangles, (0.80, 0.62, 0.58), opacity=0.25),
-        SceneSurface("cortex", cortex.vertices, cortex.triangles, CORTEX_COLOUR, opacity=0.4),
-        SceneSurface("tumour", tumour.vertices, tumour.triangles, TUMOUR_COLOUR),
+        SceneSurface("brain", brain.vertices, brain.triangles, BRAIN_COLOUR, side="back"),
+        *(SceneSurface(*part, colour) for part, colour in zip(cortex, CORTEX_COLOURS, strict=True)),
+        build_edge(stage),
+        SceneSurface("scan", scan.vertices, scan.triangles, SCAN_COLOUR, side="back"),
+        SceneSurface("tumour", scan.vertices, scan.triangles, TUMOUR_COLOUR),
     ]
+
+
+def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Split the open cortex at `positions` (V, 3) [m] into bright crowns and dark sulci: name, vertices, triangles."""
+    relief = stage.relief
+    at, triangles = relief.surface.place(positions[relief.vertices]), relief.surface.triangles
+    dark = relief.colour[triangles].mean(axis=(1, 2)) < DARK_SHARE * relief.colour.mean(axis=1).max()
+    parts = (np.unique(triangles[some], return_inverse=True) for some in (~dark, dark))
+    return [(name, at[used], faces) for name, (used, faces) in zip(CORTEX_NAMES, parts, strict=True)]
+
+
+def build_edge(stage: Stage) -> SceneSurface:
+    """Build a ring of bone round the craniotomy."""
+    site, (points, _, rim) = stage.site, stage.hole
+    near = points[rim] + DRAPE_HEIGHT * site.axis
+    away = near - site.origin
+    away -= (away @ site.axis)[..., None] * site.axis
+    far = near + EDGE_WIDTH * away / np.linalg.norm(away, axis=2, keepdims=True)
+    corners = 4 * np.arange(len(rim))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])
+    return SceneSurface("edge", np.concatenate([near, far], axis=1).reshape(-1, 3), corners.reshape(-1, 3), EDGE_COLOUR)
+
+
+def build_surroundings(stage: Stage) -> list[Sign | ScenePicture]:
+    """Build what stays in place: orientation letters round the brain, and planes of the scan behind the tumour."""
+    found: list[Sign | ScenePicture] = [*list_orientation_labels(stage.site)]
+    scan, middle = stage.scan, stage.tumour_at_rest.vertices.mean(axis=0)
+    for plane in PLANES if scan is not None else ():
+        assert scan is not None
+        grey = resample_view(plane, scan, middle)
+        behind = (plane.compute_points(middle, VIEW_SIDE) - middle) @ stage.site.axis > 0.0
+        colour = np.stack([grey, grey, grey, 255 * (behind & (grey != OUTSIDE_GREY)).astype(np.uint8)], axis=2)
+        edges = (2.0 * HALF_VIEW * np.array(edge) for edge in (plane.right, plane.down))
+        found.append(ScenePicture(plane.name, colour, middle, *edges))
+    return found
 
 
 def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
@@ -60,15 +104,16 @@ def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
 def choose_viewpoint(site: CraniotomyFrame) -> SceneViewpoint:
     """Obliquely onto the open cortex."""
     eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
-    return SceneViewpoint(eye, site.origin + 0.03 * site.axis - 0.01 * site.right, site.up, fov=np.radians(44.0))
+    return SceneViewpoint(eye, site.origin + 0.02 * site.axis - 0.01 * site.right, site.up, fov=np.radians(38.0))
 
 
 def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
     """Put the bodies of the 3-D view where a frame has them."""
     positions, tool = player.estimate_positions(frame), player.scene.tool
     stage = player.stage.select_stage(frame.loads)
-    for layer in (stage.build_cortex(positions), stage.build_tumour(positions)):
-        browser.move(layer.name, layer.vertices, layer.triangles)
+    tumour = stage.build_tumour(positions)
+    for name, vertices, triangles in (*split_cortex(stage, positions), ("tumour", tumour.vertices, tumour.triangles)):
+        browser.move(name, vertices, triangles)
     ellipsoid = None if frame.estimate is None else frame.estimate.build_ellipsoid()
     if ellipsoid is not None:
         browser.move(ellipsoid.name, ellipsoid.vertices)

@@ -43,6 +43,7 @@ from ..script.uncertainty import (
     read_uncertainties,
     to_uncertainty_path,
 )
+from .effect_record import SUFFIX, EffectRecord, read_effect_records
 from .observer import Observer
 from .player import Player
 from .stage import Stage
@@ -56,7 +57,7 @@ TRUTH_TEXT = "what an estimate is held against is the truth, as finite elements 
 
 @dataclass(frozen=True, eq=False)
 class PatientSetup:
-    """Anatomy, its T1 scan if there is one, models by name, and uncertainties by scene.
+    """Anatomy, its T1 scan if there is one, models by name, uncertainties and costs of effects by scene.
 
     `locator_file` is the locator of its tumour, for scenes with an observation model. `limit` [m] is that of a guarded
     model; None: the limit derived from its own errors on held-out cortex.
@@ -69,6 +70,7 @@ class PatientSetup:
     locator_file: Path | None = None
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict)
     limit: float | None = None
+    effect_records: Mapping[str, EffectRecord] = field(default_factory=dict)
 
     @cached_property
     def site(self) -> CraniotomyFrame:
@@ -257,7 +259,16 @@ class PatientSetup:
     def estimate_uncertainty(self, scene: Scene) -> Uncertainty | None:
         """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""
         found = self.uncertainties.get(scene.name)
-        return found if found and found.mark == mark_of(scene, self.site, self.choose_element(scene)) else None
+        return found if found and found.mark == self.compute_mark(scene) else None
+
+    def find_effect_record(self, scene: Scene) -> EffectRecord | None:
+        """Return the recorded costs of a scene's effects; None without a record of exactly this scene and anatomy."""
+        found = self.effect_records.get(scene.name)
+        return found if found and found.mark == self.compute_mark(scene) else None
+
+    def compute_mark(self, scene: Scene) -> str:
+        """Compute the fingerprint of a scene on this anatomy."""
+        return mark_of(scene, self.site, self.choose_element(scene))
 
     def estimate_motion_error(self, scene: Scene) -> MotionError | None:
         """Return the error in proportion to the motion, from this anatomy's ensemble of the scene or the template's.
@@ -349,5 +360,8 @@ def open_theatre(
     scan = to_intensity_path(path)
     models = load_models(path, body) if model is None else load(Path(model), body)
     intensity = read_intensity(scan) if scan.is_file() else None
-    uncertainties = read_uncertainties(to_uncertainty_path(path))
-    return PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties)
+    uncertainties, records = (
+        read_uncertainties(to_uncertainty_path(path)),
+        read_effect_records(path.with_suffix(SUFFIX)),
+    )
+    return PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties, effect_records=records)

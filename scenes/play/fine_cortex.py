@@ -30,14 +30,17 @@ class FineCortex:
 
 
 def build_fine_cortex(
-    site: CraniotomyFrame, mesh: TetMesh, surface: np.ndarray, intensity: Intensity | None
+    site: CraniotomyFrame, mesh: TetMesh, surface: np.ndarray, intensity: Intensity | None, edge: float = EDGE_LENGTH
 ) -> FineCortex:
-    """Build the fine cortex upon triangles (S, 3) of the surface of a mesh, of which tissue may have been resected."""
+    """Build the fine cortex upon triangles (S, 3) of the surface of a mesh, of which tissue may have been resected.
+
+    `edge`: largest edge of a triangle in the craniotomy [m].
+    """
     vertices, triangles = np.unique(surface, return_inverse=True)
 
     def target(points: np.ndarray) -> np.ndarray:
         beyond = site.compute_axis_distance(points) - site.clearance
-        return np.clip(EDGE_LENGTH + EDGE_GROWTH * beyond, EDGE_LENGTH, MAX_EDGE_LENGTH)
+        return np.clip(edge + EDGE_GROWTH * beyond, edge, max(edge, MAX_EDGE_LENGTH))
 
     fine = build_embedded_surface(mesh.nodes[vertices], triangles, target)
     maps = build_cortex_maps(site, intensity).sample(site, fine.interpolate(mesh.nodes[vertices]))

@@ -58,6 +58,7 @@ READING_DEPTH = 2.0e-3
 RIM_DISTANCE = 10e-3
 TUMOUR_DEPTH = 0.03e-3  # Depth of that outline below the rounded facets [m]: it cuts corners of the mesh off.
 TUMOUR_HEIGHT = 0.06e-3  # Largest height of that outline above the facets [m]: coarse meshes stay visible as such.
+RELIEF_EDGE = 1.0e-3  # Largest edge of the cortex of `relief` [m].
 TUMOUR_EDGE = 1.8e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
 DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
 DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
@@ -158,6 +159,15 @@ class Stage:
         fine, tint = self.fine, self.scene.look.tint
         at = fine.surface.place(positions[fine.vertices])
         return Layer("cortex", CORTEX, at, fine.surface.triangles, fine.colour * tint, gloss=0.7, shininess=110.0)
+
+    @cached_property
+    def relief(self) -> FineCortex:
+        """The open cortex within the drape's hole, with coarse gyri."""
+        mesh, site = self.anatomy.mesh, self.site
+        fine = build_fine_cortex(site, mesh, self.anatomy.open_surface, self.intensity, RELIEF_EDGE)
+        away = site.compute_axis_distance(fine.surface.interpolate(mesh.nodes[fine.vertices]))
+        seen = (away < HOLE_RATIO * site.clearance)[fine.surface.triangles].any(axis=1)
+        return replace(fine, surface=replace(fine.surface, triangles=fine.surface.triangles[seen]))
 
     @cached_property
     def brain(self) -> Layer:
@@ -307,15 +317,20 @@ class Stage:
         return Solid(values, np.linalg.inv(self.intensity.affine), DARK_SHARES, RELIEF_DEPTH)
 
     @cached_property
-    def _drape(self) -> Layer:
-        """The surface lifted off the brain, with a round hole over the open cortex, and a wall round the hole."""
+    def hole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The surface lifted off the brain, with a round hole over the open cortex, as of `clip_surface`."""
         mesh, site = self.site.anatomy.mesh, self.site
         normals = compute_vertex_normals(mesh.nodes, mesh.surface)
         lifted = mesh.nodes + DRAPE_HEIGHT * normals
         # # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
         far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
         outside = np.where(far, site.radius, site.compute_axis_distance(mesh.nodes) - HOLE_RATIO * site.clearance)
-        points, triangles, rim = clip_surface(lifted, mesh.surface, outside)
+        return clip_surface(lifted, mesh.surface, outside)
+
+    @cached_property
+    def _drape(self) -> Layer:
+        """The surface lifted off the brain, with a wall round its hole."""
+        site, (points, triangles, rim) = self.site, self.hole
         # The wall has its own vertices: normals shared with the drape would round its edge off.
         low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis
         corner = len(points) + np.arange(4 * len(rim)).reshape(-1, 4)  # two upper, two lower, of every edge
