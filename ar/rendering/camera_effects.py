@@ -17,27 +17,17 @@ BLURS = (0.0, 0.7, 1.4, 2.8, 5.6, 11.2)  # Standard deviations of the blurred im
 def add_camera_effects(
     picture: Picture, camera: Camera, focus: np.ndarray, aperture: float, noise: float, number: int
 ) -> Picture:
-    """Return an image as a camera with a wide lens and a sensor gives it.
+    """Return an image of a wide lens and a sensor; equal frame numbers give equal noise.
 
-    Parameters
-    ----------
-    focus
-        Point (3,) [m] that is sharp.
-    aperture
-        Diameter of the lens [m]; 0: everything is sharp.
-    noise
-        Standard deviation of the shot noise [share of white]. Displayed values are about the square root of light, so
-        it is the same for dark and bright pixels. 0: none.
-    number
-        Number of the frame: equal numbers give equal noise.
+    `focus` (3,) [m] is sharp; `aperture` is the diameter of the lens [m]. `noise` is the standard deviation of shot
+    noise [share of white]: displayed values are about the square root of light, so it is equal for dark and bright.
     """
     if aperture == 0.0 and noise == 0.0:
         return picture
     colour = picture.colour
     if aperture > 0.0:
-        colour = blur_by_depth(
-            colour, picture.depth, camera.K[0, 0] * aperture, float(camera.to_camera_frame(focus)[2])
-        )
+        sharp = float(camera.to_camera_frame(focus)[2])
+        colour = blur_by_depth(colour, picture.depth, camera.K[0, 0] * aperture, sharp)
     if noise > 0.0:
         random = np.random.default_rng(number)
         noisy = colour + np.float32(255.0 * noise) * random.standard_normal(colour.shape, np.float32)

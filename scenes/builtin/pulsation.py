@@ -1,12 +1,10 @@
 """Heartbeat and breath lift the open brain under a ball that rests on it."""
 
-from dataclasses import replace
-
 from sim.effects import Bonded, Elasticity, Held, Pulsation, ToolContact
 
 from ..script.scene import PALPATION, Scene
 from ..script.tool_paths import lay
-from ..script.viewpoint import NATURAL_APPEARANCE
+from ..script.viewpoint import Appearance
 
 SCENE = Scene(
     "pulsation",
@@ -14,5 +12,5 @@ SCENE = Scene(
     lay(depth=0.5e-3, rise=1.0),
     duration=6.0,
     effects=(Elasticity(), Held(), Bonded(), Pulsation(), ToolContact((PALPATION.shape,))),
-    look=replace(NATURAL_APPEARANCE, instrument="forceps"),
+    look=Appearance(natural=True, instrument="forceps"),
 )

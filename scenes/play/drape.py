@@ -68,16 +68,13 @@ def fold_cloth(
     arm = fine.interpolate(corners) - site.origin
     height = compute_folds(np.linalg.norm(arm, axis=1) - hole, np.arctan2(arm @ site.up, arm @ site.right))
     at = replace(fine, depth=-FOLD_HEIGHT * height, highest=1.1 * FOLD_HEIGHT).place(corners)
-    shade = 0.9 + 0.35 * height
-    return at, fine.triangles, list_border(fine.triangles), np.clip(shade[:, None] * DRAPE_COLOUR, 0.0, 1.0)
+    return at, fine.triangles, list_border(fine.triangles), (0.9 + 0.35 * height[:, None]) * DRAPE_COLOUR
 
 
 def list_border(triangles: np.ndarray) -> np.ndarray:
     """List the edges (k, 2) of one triangle only."""
-    edges, count = np.unique(
-        np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2), axis=0, return_counts=True
-    )
-    return edges[count == 1]
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    return edges[trimesh.grouping.group_rows(edges, require_count=1)]
 
 
 def compute_folds(beyond: np.ndarray, angle: np.ndarray) -> np.ndarray:

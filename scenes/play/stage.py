@@ -30,7 +30,7 @@ from ..script.tool import Blade, Probe
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
 from .drape import DRAPE_DEPTH, build_drape
 from .fine_cortex import FineCortex, build_fine_cortex
-from .instruments import Part, build_instrument
+from .instruments import build_instrument
 from .observer import Sees
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
@@ -170,16 +170,12 @@ class Stage:
 
     def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
-        if pose is None or self._instrument is None:
-            return self._list_layers(positions, self.compute_corners(pose))
-        parts = (part.build_layer("tool", TOOL, pose) for part in self._instrument)
-        return [*self._list_layers(positions, None), *parts]
-
-    @property
-    def _instrument(self) -> tuple[Part, ...] | None:
-        """Visual shape of the tool; None for the simple one."""
         tool, look = self.scene.tool, self.scene.look
-        return build_instrument(tool, look.instrument) if look.natural and isinstance(tool, Probe | Blade) else None
+        if pose is None or not look.natural or not isinstance(tool, Probe | Blade):
+            return self._list_layers(positions, self.compute_corners(pose))
+        parts = build_instrument(tool, look.instrument, TOOL)
+        placed = (replace(part, vertices=part.vertices @ pose[:3, :3].T + pose[:3, 3]) for part in parts)
+        return [*self._list_layers(positions, None), *placed]
 
     def compute_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
         """Corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
