@@ -30,7 +30,7 @@ SPATULA_THICKNESS = 1.1e-3  # Thickness of a spatula's strip above the blade [m]
 SPATULA_STEP = 0.7e-3  # Distance between the sections of that strip [m].
 # Lengths [m] along a spatula's strip, and its angles above the blade there [rad]: up over the bone's edge, then away.
 SPATULA_ANGLES = (0.0, 5.5e-3, 16e-3, 30e-3), (0.0, 1.38, 1.38, 0.7)
-# Shapes of an instrument: colour, wide axis, and stations of a sweep [mm] from the centre of its ball (see `sweep`).
+# Shapes of an instrument: colour, wide axis, and stations [mm] from the centre of its ball (see `build_sweep`).
 RIBS = [(0.0, 0.0, 48.0 + 0.8 * k, 2.5 + 0.15 * (-1) ** k, 2.5 + 0.15 * (-1) ** k) for k in range(65)]
 NECK = [(0.0, 0.0, z, radius, radius) for z, radius in ((0.0, 1.1), (14.0, 1.1), (37.0, 1.5), (44.0, 2.5))]
 TINES = [
@@ -62,7 +62,7 @@ SHAPES = {
 }
 
 
-def sweep(profile: np.ndarray, stations: np.ndarray, wide: Sequence[float]) -> trimesh.Trimesh:
+def build_sweep(profile: np.ndarray, stations: np.ndarray, wide: Sequence[float]) -> trimesh.Trimesh:
     """Sweep a profile along a smooth centre line: a closed surface [m], with edges that are shaded as sharp.
 
     Parameters
@@ -76,11 +76,11 @@ def sweep(profile: np.ndarray, stations: np.ndarray, wide: Sequence[float]) -> t
     """
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(stations[:, :3], axis=0), axis=1)))
     rows = 1e-3 * PchipInterpolator(way, stations)(np.linspace(0.0, way[-1], int(way[-1] / STATION_STEP) + 1))
-    return loft(profile * rows[:, None, 3:], rows[:, :3], wide)
+    return build_loft(profile * rows[:, None, 3:], rows[:, :3], wide)
 
 
-def loft(profiles: np.ndarray, centre: np.ndarray, wide: Sequence[float]) -> trimesh.Trimesh:
-    """Join profiles (n, k, 2) [m] at the points (n, 3) [m] of a centre line; otherwise as `sweep`."""
+def build_loft(profiles: np.ndarray, centre: np.ndarray, wide: Sequence[float]) -> trimesh.Trimesh:
+    """Join profiles (n, k, 2) [m] at the points (n, 3) [m] of a centre line; otherwise as `build_sweep`."""
     tangent = normalise_vectors(np.gradient(centre, axis=0))
     normal = normalise_vectors(np.cross(tangent, wide))
     rings = centre[:, None] + profiles @ np.stack([np.cross(normal, tangent), normal], axis=1)
@@ -98,7 +98,7 @@ def build_instrument(tool: Probe | Blade, kind: BallInstrument, number: int) -> 
     if isinstance(tool, Blade):
         return (build_metal([build_spatula(tool)], [STEEL], number, BLADE_LIGHT),)
     lift = np.array([0.0, 0.0, 1e3 * tool.radius, 0.0, 0.0])
-    meshes = [sweep(CIRCLE, stations + lift, wide) for _, wide, stations in SHAPES[kind]]
+    meshes = [build_sweep(CIRCLE, stations + lift, wide) for _, wide, stations in SHAPES[kind]]
     colours, (unit, triangles) = [colour for colour, *_ in SHAPES[kind]], build_sphere(4)
     if kind == "dissector":
         ball = trimesh.Trimesh(tool.radius * unit + 1e-3 * lift[:3], triangles)
@@ -138,4 +138,4 @@ def build_spatula(blade: Blade) -> trimesh.Trimesh:
     below[..., 0] += np.sign(np.cos(turn).round(9)) * (wide - thick)[:, None]
     over = np.linspace(1.0, -1.0, 9)[1:-1]
     above = np.stack([wide[:, None] * over, -0.3 * thick[:, None] * (1.0 - over**2)], axis=2)
-    return loft(np.concatenate([below, above], axis=1), np.stack([0.0 * y, y, z], axis=1), (-1.0, 0.0, 0.0))
+    return build_loft(np.concatenate([below, above], axis=1), np.stack([0.0 * y, y, z], axis=1), (-1.0, 0.0, 0.0))
