@@ -22,8 +22,8 @@ BLADE_LIGHT = 1.5, 40.0  # Gloss and shininess of a flat blade: satin.
 # Bright bands of the surroundings that metal reflects: direction in the tool's frame, and cosines of normals to it.
 REFLECTED, BANDS = np.array([0.6, 0.69, 0.4]), (-0.2, 0.6)
 SHARP_ANGLE = np.radians(40.0)  # Angle between faces above which their edge is shaded as sharp [rad].
-STATION_STEP = 0.4  # Distance between the sections of a sweep [mm].
-CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
+SECTIONS = 5  # Number of sections of a sweep from station to station.
+CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
 FIBRE_DEPTH = 0.2e-3  # Largest depth of the relief of a cotton ball [m].
 SPATULA_BEND = 4e-3  # Radius of the bend at the end of a spatula's blade [m].
 SPATULA_THICKNESS = 1.1e-3  # Thickness of a spatula's strip above the blade [m].
@@ -31,7 +31,7 @@ SPATULA_STEP = 0.7e-3  # Distance between the sections of that strip [m].
 # Lengths [m] along a spatula's strip, and its angles above the blade there [rad]: up over the bone's edge, then away.
 SPATULA_ANGLES = (0.0, 5.5e-3, 16e-3, 30e-3), (0.0, 1.38, 1.38, 0.7)
 # Shapes of an instrument: colour, wide axis, and stations [mm] from the centre of its ball (see `build_sweep`).
-RIBS = [(0.0, 0.0, 48.0 + 0.8 * k, 2.5 + 0.15 * (-1) ** k, 2.5 + 0.15 * (-1) ** k) for k in range(65)]
+RIBS = [(0.0, 0.0, 48.0 + 1.6 * k, 2.5 + 0.12 * (-1) ** k, 2.5 + 0.12 * (-1) ** k) for k in range(33)]
 NECK = [(0.0, 0.0, z, radius, radius) for z, radius in ((0.0, 1.1), (14.0, 1.1), (37.0, 1.5), (44.0, 2.5))]
 TINES = [
     (colour, (1.0, 0.0, 0.0), [(x, side * y, z, wide, thick) for x, y, z, wide, thick in stations])
@@ -75,7 +75,8 @@ def build_sweep(profile: np.ndarray, stations: np.ndarray, wide: Sequence[float]
         Direction (3,) of the wide axis, not parallel to the centre line.
     """
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(stations[:, :3], axis=0), axis=1)))
-    rows = 1e-3 * PchipInterpolator(way, stations)(np.linspace(0.0, way[-1], int(way[-1] / STATION_STEP) + 1))
+    at = np.interp(np.arange(0.0, len(way) - 0.9, 1.0 / SECTIONS), np.arange(len(way)), way)
+    rows = 1e-3 * PchipInterpolator(way, stations)(at)
     return build_loft(profile * rows[:, None, 3:], rows[:, :3], wide)
 
 
