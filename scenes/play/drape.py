@@ -30,8 +30,7 @@ def build_drape(site: CraniotomyFrame, number: int, folded: bool) -> Layer:
     `number` is its segmentation id. If `folded`, it is cloth with soft folds, which begin at the edge of the hole.
     """
     mesh = site.anatomy.mesh
-    normals = compute_vertex_normals(mesh.nodes, mesh.surface)
-    lifted = mesh.nodes + DRAPE_HEIGHT * normals
+    lifted = mesh.nodes + DRAPE_HEIGHT * compute_vertex_normals(mesh.nodes, mesh.surface)
     # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
     far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
     outside = np.where(far, site.radius, site.compute_axis_distance(mesh.nodes) - HOLE_RATIO * site.clearance)

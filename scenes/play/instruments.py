@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -115,7 +116,7 @@ def build_metal(
     meshes: Sequence[trimesh.Trimesh], colours: Sequence[Sequence[float]], number: int, light: tuple[float, float]
 ) -> Layer:
     """Join meshes of polished metal, each with its colour; light: gloss and shininess."""
-    whole = trimesh.util.concatenate(meshes)
+    whole = cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
     along = np.asarray(whole.vertex_normals) @ REFLECTED
     bands = np.exp(-(((along[:, None] - BANDS) / 0.15) ** 2)).sum(axis=1, keepdims=True)
     colour = np.repeat(np.array(colours), [len(mesh.vertices) for mesh in meshes], axis=0) * (0.75 + 0.75 * bands)
