@@ -63,7 +63,7 @@ OWNERS = {
         *["sim/runtime/views.py", "surrogate/regressors/baselines.py", "scenes/episodes/reading/torch_dataset.py"],
     },
     "sklearn": {"surrogate/regressors/baselines.py"},
-    "trimesh": {"scenes/script/tool.py"},
+    "trimesh": {"scenes/script/tool.py", "scenes/play/instruments.py", "scenes/play/drape.py"},
     "isal": {"scenes/episodes/png.py"},
     "meshio": {"sim/bodies/meshfile.py"},
     "gymnasium": {f"scenes/gym/{of}.py" for of in ["environment", "observation", "registration"]},

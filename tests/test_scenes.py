@@ -8,7 +8,8 @@ import trimesh
 from theatres import PUSHING, on_template, small, template_theatre
 
 from ar.optics.camera import project_cv2
-from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage, clip_surface
+from scenes.play.drape import clip_surface
+from scenes.play.stage import CORTEX, DRAPE, TOOL, Stage
 from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.head_pose import HeadPose
 from scenes.script.scene import SCENES, find_scene

@@ -15,11 +15,12 @@ from ar.overlay.styles import STYLES
 from scenes.cli import main
 from scenes.play.checks import measure
 from scenes.play.deformers import open_theatre
+from scenes.play.drape import DRAPE_COLOUR
 from scenes.play.frame_text import annotate
 from scenes.play.observer import ELLIPSOID_COLOUR
 from scenes.play.player import measure_gauge
 from scenes.play.scene_costs import add_cost_label
-from scenes.play.stage import CORTEX_COLOUR, DRAPE, DRAPE_COLOUR, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
+from scenes.play.stage import CORTEX_COLOUR, DRAPE, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.viewpoint import OBLIQUE_VIEWPOINT
 from sim.geometry.surface import is_enclosing

@@ -88,8 +88,8 @@ def test_walls_of_a_cavity_have_no_gyri():
 
 def test_data_sets_keep_the_plain_look(stage):
     theatre = template_theatre()
-    assert not PLAIN_APPEARANCE.gyri and not Appearance(vessels=3).gyri
-    assert {name for name in SCENES if not find_scene(name).look.gyri} == {"microscope"}
+    assert not PLAIN_APPEARANCE.natural and not Appearance(vessels=3).natural
+    assert {name for name in SCENES if not find_scene(name).look.natural} == {"microscope"}
     plain = Stage(replace(small(), look=PLAIN_APPEARANCE), theatre.site, theatre.intensity)
     layer = plain.build_visible(theatre.anatomy.mesh.nodes)
     assert layer.solid is not None

@@ -112,7 +112,7 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
     Raises
     ------
     ValueError
-        Two layers with one id.
+        Two layers of different names with one id.
 
     Examples
     --------
@@ -134,7 +134,7 @@ class Renderer:
     """
 
     def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:
-        """Copy the layers to a Warp device; ValueError if two have one id."""
+        """Copy the layers to a Warp device; ValueError if two of different names have one id."""
         load(device, shade.module, place.module)
         self.device, self.stack = device, Stack(layers, device)
         self.light, self.lamp_camera = as_light(lamp), lamp.build_camera()

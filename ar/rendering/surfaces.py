@@ -185,10 +185,10 @@ class Stack:
     """
 
     def __init__(self, layers: Sequence[Layer], device: str) -> None:
-        """Copy the layers to a device; ValueError if two have one id."""
-        ids = [layer.id for layer in layers]
-        if len(set(ids)) < len(ids):
-            raise ValueError(f"layers have the ids {ids}: give each its own.")
+        """Copy the layers to a device; ValueError if two of different names have one id."""
+        ids = {(layer.name, layer.id) for layer in layers}
+        if len({number for _, number in ids}) < len(ids):
+            raise ValueError(f"layers have the names and ids {sorted(ids)}: give each name its own id.")
         layers = sorted(layers, key=lambda layer: not layer.still)
         starts = np.cumsum([0, *(len(layer.vertices) for layer in layers)])
         parts = [layer.triangles + start for layer, start in zip(layers, starts[:-1], strict=True)]

@@ -8,7 +8,7 @@ from ..script.observation_models import PointObservation
 from ..script.scene import Bounds, Scene
 from ..script.tool import Probe
 from ..script.tool_paths import press
-from ..script.viewpoint import Viewpoint
+from ..script.viewpoint import Appearance, Viewpoint
 
 BRAIN = Material("linear", young=1800.0, poisson=0.49)  # Softer than the default, unknown to the estimate.
 TUMOUR = Material("linear", young=3200.0, poisson=0.49)  # Stiffer than the brain, unknown to the estimate.
@@ -22,6 +22,7 @@ SCENE = Scene(
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Bonded(), ToolForce()),
     observation_model=PointObservation(),
     viewpoint=Viewpoint(width=800, height=600),
+    look=Appearance(natural=True, instrument="forceps"),
     # The tumour moves little more than the rigid error: in four frames 43 % of the motion is removed.
     bounds=Bounds(overlap=0.75, error=2e-3, removed=0.3),
 )

@@ -4,6 +4,7 @@ from sim.effects import Bonded, Elasticity, Held, Pulsation, ToolContact
 
 from ..script.scene import PALPATION, Scene
 from ..script.tool_paths import lay
+from ..script.viewpoint import Appearance
 
 SCENE = Scene(
     "pulsation",
@@ -11,4 +12,5 @@ SCENE = Scene(
     lay(depth=0.5e-3, rise=1.0),
     duration=6.0,
     effects=(Elasticity(), Held(), Bonded(), Pulsation(), ToolContact((PALPATION.shape,))),
+    look=Appearance(natural=True, instrument="forceps"),
 )

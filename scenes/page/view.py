@@ -9,6 +9,7 @@ from ar.page.browser import Browser
 from ar.page.parts import ScenePicture, SceneSurface, SceneViewpoint, Sign
 from ar.page.slices import HALF_VIEW, OUTSIDE_GREY, PLANES, VIEW_SIDE, resample_view
 
+from ..play.drape import cut_hole
 from ..play.observer import ELLIPSOID_COLOUR, SPHERE, SPHERE_FACES
 from ..play.player import Frame, Player
 from ..play.stage import TOOL_COLOUR, TRUTH_COLOUR, TUMOUR_COLOUR, Stage
@@ -70,7 +71,7 @@ def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndar
 
 def build_edge(stage: Stage) -> SceneSurface:
     """Build a ring of bone round the craniotomy."""
-    site, (points, _, rim) = stage.site, stage.hole
+    site, (points, _, rim) = stage.site, cut_hole(stage.site)
     near = points[rim] + DRAPE_HEIGHT * site.axis
     away = near - site.origin
     away -= (away @ site.axis)[..., None] * site.axis

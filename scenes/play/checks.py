@@ -234,7 +234,7 @@ def _is_finite(frame: Frame) -> bool:
 def _is_carried(player: Player, frame: Frame) -> bool:
     """Return True if the visible cortex moves as the FEM surface in which it is embedded."""
     stage = player.stage.select_stage(frame.loads)
-    if not stage.scene.look.gyri:
+    if not stage.scene.look.natural:
         return True
     surface, at = stage.fine.surface, player.compute_positions(frame.deformation)[stage.fine.vertices]
     away = surface.place(at) - surface.interpolate(at)

@@ -30,6 +30,7 @@ class VesselSettings:
     depth_below: float = 14e-3  # Depth of the voxels below the centre of the craniotomy [m].
     trunk_count: int = 14  # Number of vessels that enter at the border.
     max_width: float = 0.8e-3  # Largest width of a vessel [m].
+    min_trunk_ratio: float = 0.5  # Smallest width of a vessel at the border relative to the largest.
     min_width: float = 0.2e-3  # Width at which a vessel ends [m].
     step: float = 0.2e-3  # Step of a vessel's path [m].
     branch_probability: float = 0.05  # Probability of a branch in each step.
@@ -87,7 +88,9 @@ def sample_vessel_paths(
     count = settings.trunk_count
     angles = 2.0 * np.pi * (np.arange(count) + random.uniform(0.0, 0.7, count)) / count
     rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
-    ends = list(zip(rim, angles + np.pi, settings.max_width * random.uniform(0.5, 1.0, count), strict=True))
+    ends = list(
+        zip(rim, angles + np.pi, settings.max_width * random.uniform(settings.min_trunk_ratio, 1.0, count), strict=True)
+    )
     points, widths = [], []
     while ends:
         at, way, width = ends.pop()

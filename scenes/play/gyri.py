@@ -48,8 +48,8 @@ class GyriSettings:
     crown_height: float = 0.9e-3  # Height of a gyrus' rounded crown [m].
     vein_radius: float = 0.65e-3  # Largest radius of a vein [m].
     vein_length: float = 12e-3  # Smallest length of a vein [m].
-    artery_width: float = 0.5e-3  # Largest width of an artery [m].
-    branch_width: float = 0.7e-3  # Largest width of a vein on a gyrus [m].
+    artery_width: float = 0.95e-3  # Largest width of an artery [m].
+    branch_width: float = 0.9e-3  # Largest width of a vein on a gyrus [m].
     roughness: float = 0.02e-3  # Standard deviation of the relief of the pia [m].
 
 
@@ -92,11 +92,11 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
     def sample_vessels(trunks: int, width: float, tortuosity: float) -> np.ndarray:
         """Opacity (n, n) of vessels that branch."""
         thin = replace(
-            VESSELS, trunk_count=trunks, max_width=width, min_width=0.12e-3, turn_deviation=0.08,
-            branch_probability=0.018, width_factor=0.9975, mottle_contrast=0.0,
+            VESSELS, trunk_count=trunks, max_width=width, min_trunk_ratio=0.25, min_width=0.16e-3, turn_deviation=0.08,
+            branch_probability=0.03, width_factor=0.9955, branch_width_ratio=0.62, mottle_contrast=0.0,
         )  # fmt: skip
         found = compute_vessel_absorption(np.linspace(-half, half, count), random, thin)
-        return warp(found / thin.max_absorption, 1.6e-3, tortuosity)
+        return np.clip(1.5 * warp(found / thin.max_absorption, 1.6e-3, tortuosity) - 0.2, 0.0, 1.0)
 
     fluid = _read_fluid(site, intensity, half, count // COARSE_STEP)
     field = _solve_swift_hohenberg(random, fluid, GYRI.wavelength / MAP_SPACING / COARSE_STEP)
@@ -120,7 +120,7 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
     top = crown + 0.3e-3 - np.sqrt(np.maximum(radius**2 - away**2, 0.0))
     depth += vein * np.minimum(top - depth, 0.0)
 
-    artery, branch = sample_vessels(7, GYRI.artery_width, 0.6e-3), sample_vessels(4, GYRI.branch_width, 0.4e-3)
+    artery, branch = sample_vessels(9, GYRI.artery_width, 0.6e-3), sample_vessels(4, GYRI.branch_width, 0.4e-3)
     depth = gaussian_filter(np.maximum(depth - 0.15e-3 * np.maximum(artery, branch), 0.0), 0.8)
     network = np.exp(-((smooth(0.5e-3) / 0.22) ** 2)) * np.clip(0.6 + 0.4 * smooth(4e-3), 0.0, 1.0)
     colour = GYRUS_COLOUR * (1.0 + 0.02 * smooth(5e-3) + 0.02 * smooth(0.5e-3))[..., None]

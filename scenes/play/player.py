@@ -227,7 +227,7 @@ class Player:
         stage, camera = self.stage.select_stage(loads), self.get_camera(float(loads.times[0]))
         drawn = stage.plain if self.style == "rings" else stage  # rings lie on the FEM surface
         pose, estimate = None if held is None else held.pose, None
-        picture = drawn.render_view(camera, positions, pose, self.coarse)
+        picture = drawn.render_view(camera, positions, pose, self.coarse, number)
         if stage.observer is not None:
             estimate = stage.observer.estimate(number, positions, stage.compute_corners(pose))
         seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds  # without rendering

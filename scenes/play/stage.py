@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ar.optics.camera import Camera
 from ar.overlay.legend import LegendNames
 from ar.overlay.styles import Opening
+from ar.rendering.camera_effects import add_camera_effects
 from ar.rendering.embedding import EmbeddedSurface, build_embedded_surface
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.real_image import add_vignette, scale_picture
@@ -22,11 +24,13 @@ from sim.effects import SkullContact
 from sim.loads import Loads, Resected
 
 from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
-from ..script.framing import DRAPE_HEIGHT
 from ..script.observation_models import StereoObservation
 from ..script.scene import Scene
+from ..script.tool import Blade, Probe
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
+from .drape import DRAPE_DEPTH, build_drape
 from .fine_cortex import FineCortex, build_fine_cortex
+from .instruments import build_instrument
 from .observer import Sees
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
@@ -35,7 +39,6 @@ NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", COTTON: "cotton", GLOVE
 """Names of the visible layers: the tumour is never visible."""
 
 CORTEX_COLOUR = (0.86, 0.60, 0.54)  # Colour of the cortex (RGB, 0 to 1).
-DRAPE_COLOUR = (0.16, 0.36, 0.42)  # Colour of the drape (RGB, 0 to 1).
 TOOL_COLOUR = (0.78, 0.80, 0.83)  # Colour of the tool (RGB, 0 to 1).
 # Lines that eyes without red or green tell apart, and see on cortex and drape: tests/test_scenes_checks.py.
 TUMOUR_COLOUR = (0.20, 0.94, 0.42)
@@ -60,7 +63,6 @@ TUMOUR_DEPTH = 0.03e-3  # Depth of that outline below the rounded facets [m]: it
 TUMOUR_HEIGHT = 0.06e-3  # Largest height of that outline above the facets [m]: coarse meshes stay visible as such.
 RELIEF_EDGE = 1.0e-3  # Largest edge of the cortex of `relief` [m].
 TUMOUR_EDGE = 1.8e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
-DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
 DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
 
 
@@ -117,7 +119,7 @@ class Stage:
     @cached_property
     def plain(self) -> Stage:
         """The stage with the FEM surface as its cortex."""
-        return replace(self, scene=replace(self.scene, look=replace(self.scene.look, gyri=False)))
+        return replace(self, scene=replace(self.scene, look=replace(self.scene.look, natural=False)))
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -148,7 +150,7 @@ class Stage:
         If the brain separates from the skull, the surface beyond the drape's hole is rendered below it. The drape
         follows the scan's surface, and a sliding gyrus would penetrate it.
         """
-        layer = self._build_fine(positions) if self.scene.look.gyri else self._visible.build_layer(positions)
+        layer = self._build_fine(positions) if self.scene.look.natural else self._visible.build_layer(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
             return layer
         beyond = self.site.compute_axis_distance(layer.vertices) - HOLE_RATIO * self.site.clearance
@@ -178,7 +180,12 @@ class Stage:
 
     def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
-        return self._list_layers(positions, self.compute_corners(pose))
+        tool, look = self.scene.tool, self.scene.look
+        if pose is None or not look.natural or not isinstance(tool, Probe | Blade):
+            return self._list_layers(positions, self.compute_corners(pose))
+        parts = build_instrument(tool, look.instrument, TOOL)
+        placed = (replace(part, vertices=part.vertices @ pose[:3, :3].T + pose[:3, 3]) for part in parts)
+        return [*self._list_layers(positions, None), *placed]
 
     def compute_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
         """Corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
@@ -198,22 +205,31 @@ class Stage:
 
     def render(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None) -> Picture:
         """Render the image of `layers` by a camera."""
-        return self.render_tool_corners(camera, positions, self.compute_corners(pose))
+        return self._draw(camera, self.build_layers(positions, pose))
 
-    def render_view(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool) -> Picture:
-        """Return the same in the round field of the scene's microscope; if `coarse`, of half the resolution."""
-        picture = self.render(_halve_resolution(camera) if coarse else camera, positions, pose)
+    def render_view(
+        self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool, number: int = 0
+    ) -> Picture:
+        """Return frame `number` with the look's camera effects in the round field of the scene's microscope.
+
+        If `coarse`, it has half the resolution.
+        """
+        seen_by, look = _halve_resolution(camera) if coarse else camera, self.scene.look
+        picture = self.render(seen_by, positions, pose)
+        picture = add_camera_effects(picture, seen_by, self.site.origin, look.aperture, look.noise, number)
         if self.scene.viewpoint.field is not None:
             picture = add_vignette(picture, self.scene.viewpoint.field)
         return scale_picture(picture, camera.width, camera.height) if coarse else picture
 
     def render_tool_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
         """Return the same, of a tool by its corners (t, 3) [m]."""
-        layers = self._list_layers(positions, corners)
-        count = len(layers)
-        if count not in self._renderers:
-            self._renderers[count] = Renderer(layers, self.lamp, self.device)
-        return self._renderers[count].render(camera, [layer.vertices for layer in layers if not layer.still])
+        return self._draw(camera, self._list_layers(positions, corners))
+
+    def _draw(self, camera: Camera, layers: Sequence[Layer]) -> Picture:
+        counts = tuple(len(layer.triangles) for layer in layers)
+        if counts not in self._renderers:
+            self._renderers[counts] = Renderer(layers, self.lamp, self.device)
+        return self._renderers[counts].render(camera, [layer.vertices for layer in layers if not layer.still])
 
     @cached_property
     def _squares(self) -> Squares:
@@ -224,8 +240,8 @@ class Stage:
         return build_finger(self.site, self.scene.look.finger or 0.0)
 
     @cached_property
-    def _renderers(self) -> dict[int, Renderer]:
-        """Renderers by the number of layers: with a tool and without."""
+    def _renderers(self) -> dict[tuple[int, ...], Renderer]:
+        """Renderers by the triangle counts of the layers: with a tool and without."""
         return {}
 
     def build_tumour(self, positions: np.ndarray) -> Layer:
@@ -317,63 +333,11 @@ class Stage:
         return Solid(values, np.linalg.inv(self.intensity.affine), DARK_SHARES, RELIEF_DEPTH)
 
     @cached_property
-    def hole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The surface lifted off the brain, with a round hole over the open cortex, as of `clip_surface`."""
-        mesh, site = self.site.anatomy.mesh, self.site
-        normals = compute_vertex_normals(mesh.nodes, mesh.surface)
-        lifted = mesh.nodes + DRAPE_HEIGHT * normals
-        # # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
-        far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
-        outside = np.where(far, site.radius, site.compute_axis_distance(mesh.nodes) - HOLE_RATIO * site.clearance)
-        return clip_surface(lifted, mesh.surface, outside)
-
-    @cached_property
     def _drape(self) -> Layer:
-        """The surface lifted off the brain, with a wall round its hole."""
-        site, (points, triangles, rim) = self.site, self.hole
-        # The wall has its own vertices: normals shared with the drape would round its edge off.
-        low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis
-        corner = len(points) + np.arange(4 * len(rim)).reshape(-1, 4)  # two upper, two lower, of every edge
-        wall = np.concatenate([corner[:, [0, 1, 3]], corner[:, [0, 3, 2]]])
-        points = np.concatenate([points, np.concatenate([points[rim], low], axis=1).reshape(-1, 3)])
-        return Layer("drape", DRAPE, points, np.concatenate([triangles, wall]), DRAPE_COLOUR, gloss=0.05, still=True)
+        return build_drape(self.site, DRAPE, self.scene.look.natural)
 
 
 @lru_cache(maxsize=2)
 def _halve_resolution(camera: Camera) -> Camera:
     """Return a camera with half the pixels along each side, the same object for the same camera."""
     return camera.scale(0.5)
-
-
-def clip_surface(
-    points: np.ndarray, triangles: np.ndarray, value: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
-
-    points (V, 3), triangles (F, 3), value (V,). Triangles that the zero line crosses are cut along it.
-    """
-    positive = value[triangles] > 0.0
-    whole = triangles[positive.all(axis=1)]
-    mixed = triangles[positive.any(axis=1) & ~positive.all(axis=1)]
-    added, pieces, rim = [], [], []
-    for corners in mixed:
-        inside = value[corners] > 0.0
-        # Turn the triangle so that the lone corner comes first.
-        lone = int(np.argmax(inside) if inside.sum() == 1 else np.argmin(inside))
-        a, b, c = np.roll(corners, -lone)
-        cuts = []
-        for other in (b, c):
-            share = value[a] / (value[a] - value[other])
-            cuts.append(len(points) + len(added))
-            added.append((1.0 - share) * points[a] + share * points[other])
-        if value[a] > 0.0:
-            pieces.append([[a, cuts[0], cuts[1]]])
-        else:
-            pieces.append([[cuts[0], b, c], [cuts[0], c, cuts[1]]])
-        rim.append(cuts)
-    parts = [whole, *(np.array(piece) for piece in pieces)]
-    return (
-        np.concatenate([points, *(point[None] for point in added)]),
-        np.concatenate(parts),
-        np.array(rim).reshape(-1, 2),
-    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -36,6 +36,9 @@ class Cottonoid:
     angle: float = 0.0
 
 
+BallInstrument = Literal["dissector", "forceps", "suction"]
+
+
 @dataclass(frozen=True)
 class Appearance:
     """Light, colour and occluders of the cortex.
@@ -54,9 +57,21 @@ class Appearance:
         Cottonoids on the cortex.
     finger
         Direction in the tangent plane of a gloved finger that reaches over the opening's edge [rad]; None: no finger.
-    gyri
-        True: gyri, sulci and vessels on a fine surface just below the FEM surface, instead of scan and `vessels`.
-        False: the FEM surface itself, as in data sets.
+    natural
+        True: gyri, sulci and vessels on a fine surface just below the FEM surface, instead of scan and `vessels`;
+        a drape with folds, and instruments with their shapes. False: the FEM surface itself and simple tools, as in
+        data sets.
+    instrument
+        In the natural look, the instrument of a `Probe`: "dissector" ends in a steel ball; "forceps", of bipolar
+        coagulation, and "suction", a tube, have a ball of cotton at their tips.
+    aperture, noise
+        Diameter of the camera's lens [m], which blurs what is nearer or farther than the open cortex; standard
+        deviation of its shot noise [share of white]. 0: none.
+
+    Raises
+    ------
+    InputError
+        An unknown instrument; an aperture or a noise that is not a number >= 0.
     """
 
     lamp: float = 1.0
@@ -66,12 +81,23 @@ class Appearance:
     vessels: int | None = None
     cottonoids: tuple[Cottonoid, ...] = ()
     finger: float | None = None
-    gyri: bool = False
+    natural: bool = False
+    instrument: BallInstrument = "dissector"
+    aperture: float = 0.0
+    noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.instrument not in get_args(BallInstrument):
+            known = ", ".join(get_args(BallInstrument))
+            raise InputError(f"there is no instrument {self.instrument!r} for a ball: choose one of {known}.")
+        for name in ("aperture", "noise"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise InputError(f"an appearance has {name} {getattr(self, name)}: give a number >= 0.")
 
 
 PLAIN_APPEARANCE = Appearance()
 """Look of data sets: the FEM surface, with the scan as its texture."""
-NATURAL_APPEARANCE = Appearance(gyri=True)
+NATURAL_APPEARANCE = Appearance(natural=True)
 """Default look of scenes."""
 
 

@@ -1,0 +1,53 @@
+"""Depth of field and shot noise of a camera, applied to rendered colours; depth and segmentation stay as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import warp as wp
+
+from ..optics.camera import Camera
+from .renderer import Picture
+
+BLURS = (0.0, 0.7, 1.4, 2.8, 5.6, 11.2)  # Standard deviations of the blurred images that are blended [pixel].
+
+
+def add_camera_effects(
+    picture: Picture, camera: Camera, focus: np.ndarray, aperture: float, noise: float, number: int
+) -> Picture:
+    """Return an image of a wide lens and a sensor; equal frame numbers give equal noise.
+
+    `focus` (3,) [m] is sharp; `aperture` is the diameter of the lens [m]. `noise` is the standard deviation of shot
+    noise [share of white]: displayed values are about the square root of light, so it is equal for dark and bright.
+    """
+    if aperture == 0.0 and noise == 0.0:
+        return picture
+    colour = picture.colour
+    if aperture > 0.0:
+        sharp = float(camera.to_camera_frame(focus)[2])
+        colour = blur_by_depth(colour, picture.depth, camera.K[0, 0] * aperture, sharp)
+    if noise > 0.0:
+        random = np.random.default_rng(number)
+        noisy = colour + np.float32(255.0 * noise) * random.standard_normal(colour.shape, np.float32)
+        colour = np.clip(np.rint(noisy), 0.0, 255.0).astype(np.uint8)
+    drawn = picture.drawn
+    return Picture(replace(drawn, colour=wp.array(colour[None], dtype=wp.vec3ub, device=drawn.colour.device)))
+
+
+def blur_by_depth(colour: np.ndarray, depth: np.ndarray, strength: float, focus: float) -> np.ndarray:
+    """Blur colours (H, W, 3) uint8 by their depth (H, W) [m]; 0 is far away.
+
+    The circle of confusion has the diameter strength |1 / depth - 1 / focus| [pixel] (Potmesil, Chakravarty 1981):
+    `strength` is focal length [pixel] times aperture [m]. A Gaussian has half of its radius as standard deviation.
+    """
+    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0.0)
+    spread = cv2.GaussianBlur(np.minimum(0.25 * strength * np.abs(inverse - 1.0 / focus), BLURS[-1]), (0, 0), 2.0)
+    level = np.interp(spread, BLURS, np.arange(len(BLURS))).astype(np.float32)
+    out = np.zeros(colour.shape, np.float32)
+    for k, blur in enumerate(BLURS):
+        share = np.maximum(1.0 - np.abs(level - k), 0.0)[..., None]
+        if share.any():
+            out += share * (cv2.GaussianBlur(colour, (0, 0), blur) if blur > 0.0 else colour)
+    return np.rint(out).astype(np.uint8)

@@ -1,0 +1,126 @@
+"""Surgical drape with a hole over the open cortex: plain, or as cloth with folds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+
+from ar.rendering.embedding import build_embedded_surface
+from ar.rendering.layer import Layer, compute_vertex_normals
+
+from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
+from ..script.framing import DRAPE_HEIGHT
+
+DRAPE_COLOUR = (0.16, 0.36, 0.42)  # Colour of the drape (RGB, 0 to 1).
+DRAPE_DEPTH = 8.0e-3  # Depth of the drape's wall below the brain [m].
+CLOTH_EDGE = 0.8e-3  # Largest edge of a triangle of cloth near the hole [m].
+CLOTH_GROWTH = 0.35  # Growth of the largest edge with the distance from the hole, beyond `CLOTH_WIDTH`.
+CLOTH_WIDTH = 30e-3  # Width of the ring of cloth round the hole with the smallest edges [m].
+SMOOTHING_STEPS = 20  # Number of smoothing steps of the drape.
+FOLD_COUNTS = (9, 14)  # Numbers of folds round the hole of two sets, of which the higher is seen.
+FOLD_HEIGHT = 4.5e-3  # Height of the folds [m].
+FOLD_START = 9e-3  # Distance from the hole at which the folds have their height [m].
+
+
+def build_drape(site: CraniotomyFrame, number: int, folded: bool) -> Layer:
+    """Build the surface lifted off the brain, with a round hole over the open cortex, and a wall round the hole.
+
+    `number` is its segmentation id. If `folded`, it is cloth with soft folds, which begin at the edge of the hole.
+    """
+    points, triangles, rim = cut_hole(site)
+    colour = np.broadcast_to(DRAPE_COLOUR, points.shape)
+    if folded:
+        points, triangles, rim, colour = fold_cloth(site, points, triangles)
+    # The wall has its own vertices: normals shared with the drape would round its edge off.
+    low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis
+    corner = len(points) + np.arange(4 * len(rim)).reshape(-1, 4)  # two upper, two lower, of every edge
+    wall = np.concatenate([corner[:, [0, 1, 3]], corner[:, [0, 3, 2]]])
+    points = np.concatenate([points, np.concatenate([points[rim], low], axis=1).reshape(-1, 3)])
+    colour = np.concatenate([colour, np.broadcast_to(DRAPE_COLOUR, (4 * len(rim), 3))])
+    return Layer("drape", number, points, np.concatenate([triangles, wall]), colour, gloss=0.05, still=True)
+
+
+def cut_hole(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the surface lifted off the brain, with a round hole over the open cortex, as of `clip_surface`."""
+    mesh = site.anatomy.mesh
+    lifted = mesh.nodes + DRAPE_HEIGHT * compute_vertex_normals(mesh.nodes, mesh.surface)
+    # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
+    far = (mesh.nodes - site.origin) @ site.axis > 2.0 * site.radius
+    outside = np.where(far, site.radius, site.compute_axis_distance(mesh.nodes) - HOLE_RATIO * site.clearance)
+    return clip_surface(lifted, mesh.surface, outside)
+
+
+def fold_cloth(
+    site: CraniotomyFrame, points: np.ndarray, triangles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Refine and fold a drape: points (n, 3) [m], triangles (m, 3), edges (k, 2) of the hole, and colours (n, 3)."""
+    corners, triangles = np.unique(points[triangles].reshape(-1, 3).round(9), axis=0, return_inverse=True)
+    hole = HOLE_RATIO * site.clearance
+
+    def target(places: np.ndarray) -> np.ndarray:
+        beyond = np.linalg.norm(places - site.origin, axis=1) - hole - CLOTH_WIDTH
+        return CLOTH_EDGE + CLOTH_GROWTH * np.maximum(beyond, 0.0)
+
+    smooth = trimesh.Trimesh(corners, triangles.reshape(-1, 3), process=False)
+    rim = np.unique(list_border(smooth.faces))
+    trimesh.smoothing.filter_taubin(smooth, iterations=SMOOTHING_STEPS)  # cloth spans sulci
+    smooth.vertices[rim] = corners[rim]
+    corners = np.asarray(smooth.vertices)
+    fine = build_embedded_surface(corners, triangles.reshape(-1, 3), target)
+    arm = fine.interpolate(corners) - site.origin
+    height = compute_folds(np.linalg.norm(arm, axis=1) - hole, np.arctan2(arm @ site.up, arm @ site.right))
+    at = replace(fine, depth=-FOLD_HEIGHT * height, highest=1.1 * FOLD_HEIGHT).place(corners)
+    return at, fine.triangles, list_border(fine.triangles), (0.9 + 0.35 * height[:, None]) * DRAPE_COLOUR
+
+
+def list_border(triangles: np.ndarray) -> np.ndarray:
+    """List the edges (k, 2) of one triangle only."""
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    return edges[trimesh.grouping.group_rows(edges, require_count=1)]
+
+
+def compute_folds(beyond: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Compute the height (n,) of folds, 0 to 1, at distances beyond the hole [m] and angles about its axis [rad]."""
+    rise, away = np.clip(beyond / FOLD_START, 0.0, 1.0), beyond / 15e-3
+    folds = []
+    for count, start in zip(FOLD_COUNTS, (0.0, 2.0), strict=True):
+        bend = 1.8 * np.sin(2.0 * angle + 1.0 + start) + 1.5 * np.sin(3.0 * angle - 0.8 * away + start) + 0.5 * away
+        size = 0.7 + 0.3 * np.sin(4.0 * angle + 0.9 * away + 2.0 * start)
+        folds.append(size * (0.5 + 0.5 * np.cos(count * angle + bend)) ** 3)
+    return rise**2 * (3.0 - 2.0 * rise) * np.maximum(*folds)
+
+
+def clip_surface(
+    points: np.ndarray, triangles: np.ndarray, value: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
+
+    points (V, 3), triangles (F, 3), value (V,). Triangles that the zero line crosses are cut along it.
+    """
+    positive = value[triangles] > 0.0
+    whole = triangles[positive.all(axis=1)]
+    mixed = triangles[positive.any(axis=1) & ~positive.all(axis=1)]
+    added, pieces, rim = [], [], []
+    for corners in mixed:
+        inside = value[corners] > 0.0
+        # Turn the triangle so that the lone corner comes first.
+        lone = int(np.argmax(inside) if inside.sum() == 1 else np.argmin(inside))
+        a, b, c = np.roll(corners, -lone)
+        cuts = []
+        for other in (b, c):
+            share = value[a] / (value[a] - value[other])
+            cuts.append(len(points) + len(added))
+            added.append((1.0 - share) * points[a] + share * points[other])
+        if value[a] > 0.0:
+            pieces.append([[a, cuts[0], cuts[1]]])
+        else:
+            pieces.append([[cuts[0], b, c], [cuts[0], c, cuts[1]]])
+        rim.append(cuts)
+    parts = [whole, *(np.array(piece) for piece in pieces)]
+    return (
+        np.concatenate([points, *(point[None] for point in added)]),
+        np.concatenate(parts),
+        np.array(rim).reshape(-1, 2),
+    )
