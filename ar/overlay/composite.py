@@ -1,7 +1,5 @@
 """Composition of the hidden surface into the camera image, registered to it, and never over the tool."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

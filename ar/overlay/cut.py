@@ -4,8 +4,6 @@ The plane contains the camera's centre, so that it appears in the image as a lin
 is in the plane.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """Distances of points and pixels from a closed surface by a tree of its triangles, on any device; rings of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """Distance of a tool from a hidden surface: a line, and the number next to the tip."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

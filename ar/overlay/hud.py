@@ -1,7 +1,5 @@
 """Text in the image: a number next to an object, a panel in a corner."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -1,7 +1,5 @@
 """Legend of the overlay's lines in a corner of the image, and the scale of its tint."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Arguments of `composite`: lines and text in addition to a hidden surface, and the cover over it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

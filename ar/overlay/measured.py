@@ -1,7 +1,5 @@
 """Measuring styles of an image: rings on the ground, a cross-section in an inset, the scale of a tint."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Outlines of visible surfaces: projection into the image, drawing, and detection in an image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Styles of drawing a hidden surface, and the ground it is seen through."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """Placement of text in an image: the free place closest to the desired one."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -5,8 +5,6 @@ element. So no window shape and no client can misalign the two. The 3-D view is 
 `ar.page.style` holds the layout.
 """
 
-from __future__ import annotations
-
 import threading
 import time as clock
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ place: image, controls and tabs work, and only the 3-D view is unavailable. Wher
 the 3-D view is drawn a few times a second, so that the image keeps its rate.
 """
 
-from __future__ import annotations
-
 import gzip
 import re
 from functools import lru_cache

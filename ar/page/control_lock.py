@@ -1,7 +1,5 @@
 """Clients of a page: which of them has control, what they set, and the line and the buttons of each."""
 
-from __future__ import annotations
-
 import time as clock
 from collections.abc import Callable, Collection
 from dataclasses import dataclass

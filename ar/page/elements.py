@@ -6,8 +6,6 @@ browser would show new text next to an old image. Therefore both are hidden unti
 Tabs, keys and names of controls exist only in the client's browser: the server does not receive them.
 """
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Sequence

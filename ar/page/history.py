@@ -1,7 +1,5 @@
 """Chart of the last seconds: readings over time as lines, each with its error as a band."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence

@@ -3,8 +3,6 @@
 Messages are untrusted. Those passed on are encoded again from the checked values: nothing else gets through.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Annotated

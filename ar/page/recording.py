@@ -1,7 +1,5 @@
 """Recording of the page's recent images as a video, and the button that records it."""
 
-from __future__ import annotations
-
 import base64
 import tempfile
 import threading

@@ -1,7 +1,5 @@
 """3-D view of a page: surfaces, light, labels, camera, and the panel next to it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

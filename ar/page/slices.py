@@ -1,7 +1,5 @@
 """Slices of a scan through a point: axial, coronal and sagittal, with the surfaces that their planes cut."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ content. In a wide window the controls have two columns, so that all are visible
 rules and shows image and controls in one docked panel.
 """
 
-from __future__ import annotations
-
 from .client_page import NO_WEBGL_CLASS
 from .elements import ASIDE, DETAILS, HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 

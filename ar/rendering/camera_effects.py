@@ -1,7 +1,5 @@
 """Depth of field and shot noise of a camera, applied to rendered colours; depth and segmentation stay as they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """Fine surface embedded in a coarse one: constant barycentric weights, and depths below it along its normals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Surfaces to render, with their appearance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rasteriser for cameras with a lens: each pixel is tested at its undistorted position."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Multi-threaded CPU kernels: Warp runs a kernel on the calling thread, so each thread gets a band of the image."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Reference for tests of the rasteriser: the same result by casting one ray per pixel into a BVH."""
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

@@ -1,7 +1,5 @@
 """Real and enlarged images instead of rendered ones, and the round field of view of an operating microscope."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """Renderer: from surfaces, a camera and a lamp to a lit image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

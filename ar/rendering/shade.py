@@ -1,7 +1,5 @@
 """Colour of visible points under the lamp: deferred shading in Warp, one launch for all images."""
 
-from __future__ import annotations
-
 import warp as wp
 
 from .lens_rasteriser import pixel_at

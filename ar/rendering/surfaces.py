@@ -1,7 +1,5 @@
 """Layers as one surface on a device: fixed topology, appearance and textures, separate from moving vertices."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache, partial
 

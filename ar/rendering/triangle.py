@@ -1,7 +1,5 @@
 """Triangle in homogeneous pixel coordinates, for kernels: its edges, bounding box and barycentric weights."""
 
-from __future__ import annotations
-
 import warp as wp
 
 

@@ -1,7 +1,5 @@
 """Computations behind a page that report their progress: costs of the effects, refined error."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Comparison of a page's deformers with the finite elements: of what is shown, and of time against accuracy."""
 
-from __future__ import annotations
-
 import time as clock
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Controls of the page, labelled for users."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plot of error against time of the deformers on the loads that were shown, as an SVG."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from html import escape
 

@@ -1,7 +1,5 @@
 """The page comes alive: a scripted or hand-set tool, any deformer, and the finite elements checking it behind."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time as clock

@@ -1,7 +1,5 @@
 """Switches of a scene's effects, with the time that each costs and how far it moves the tumour."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from html import escape

@@ -1,7 +1,5 @@
 """Refinement of the error of the load that a page shows, by an ensemble of that load."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

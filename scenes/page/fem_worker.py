@@ -1,7 +1,5 @@
 """FEM thread of a page: it solves the newest frame, to show it or to compare a model with it."""
 
-from __future__ import annotations
-
 import threading
 import time as clock
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Requests of a page's visitors, and the line that says who of them has the tool."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Deformers of a scene on a page: trained models, and FEM, which runs in its own threads."""
 
-from __future__ import annotations
-
 import threading
 import time as clock
 from contextlib import nullcontext

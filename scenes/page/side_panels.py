@@ -1,7 +1,5 @@
 """Side panels of the page's 3-D view: slices of the scan around the tumour, and recent readings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Text of the page, as HTML: scene, anatomy, result and its reliability."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from html import escape
 

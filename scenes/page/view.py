@@ -1,7 +1,5 @@
 """3-D view of a page: surfaces, orientation labels, and camera."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ar.overlay.hud import draw_orientation_labels

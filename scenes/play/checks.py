@@ -1,7 +1,5 @@
 """Verification of a scene's images: metrics of every frame, and their limits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 

@@ -1,7 +1,5 @@
 """Details drawn on the open cortex: vessels, squares of cotton that move with it, and a gloved finger."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Anatomy with its scan, and the deformers available for it, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache

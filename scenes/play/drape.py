@@ -1,7 +1,5 @@
 """Surgical drape with a hole over the open cortex: plain, or as cloth with folds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

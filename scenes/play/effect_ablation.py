@@ -1,7 +1,5 @@
 """Cost and influence of each effect of a scene: the scene is solved with and without it, frame by frame."""
 
-from __future__ import annotations
-
 import gc
 import os
 import time as clock

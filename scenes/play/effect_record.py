@@ -1,7 +1,5 @@
 """Recorded cost and influence of a scene's effects, stored next to the anatomy."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Fine visual surface of the cortex: gyri, sulci and vessels embedded in the FEM surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Text of a frame: what acts, and both errors: of the model, and of the tumour in the patient."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

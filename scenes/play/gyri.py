@@ -5,8 +5,6 @@ below the surface in the scan attracts its troughs, so a scan that shows sulci p
 without a scan leaves the pattern to chance. It works for every anatomy, and always gives gyri of natural width.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Detection of a frame's overlay in its pixels: outline, numbers, and parts that are not seen through cortex."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ar.optics.camera import Camera

@@ -1,7 +1,5 @@
 """Surgical instruments as visual shapes: their contact shape where they touch tissue, and a modelled upper part."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import cast

@@ -1,7 +1,5 @@
 """Tissue of a scene's regions, given the tissue that the models of its anatomy were trained on."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The loop: a scripted tool, a deformer and a camera make one frame after the other."""
 
-from __future__ import annotations
-
 import time as clock
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace

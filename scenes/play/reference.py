@@ -1,7 +1,5 @@
 """FEM solution of every frame of a scene: the reference for drawn frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Frames asked for in any order, of a run in which each is found from another one near it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar

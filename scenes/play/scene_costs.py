@@ -1,7 +1,5 @@
 """Costs of a frame, by stage: on the panel of its image, and for all scenes on one sheet."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

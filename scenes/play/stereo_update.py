@@ -1,7 +1,5 @@
 """Observation of the open cortex from a stereo pair: points with their positions in the scan, or a point cloud."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast

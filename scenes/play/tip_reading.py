@@ -1,7 +1,5 @@
 """Distance from tool tip to tumour that is displayed at the tool, with its error bound."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Notice about a task that takes a noticeable time."""
 
-from __future__ import annotations
-
 import threading
 import time as clock
 from collections.abc import Callable
