@@ -27,6 +27,13 @@ def test_craniotomy_of_the_template_has_60000_triangles(stage):
     assert 60_000 <= whole[fine.surface.triangles].all(axis=1).sum() < 90_000
 
 
+def test_scenes_of_a_patient_share_cortex_and_drape(stage):
+    other = replace(stage, scene=find_scene("draw"))
+    rest = stage.anatomy.mesh.nodes
+    drapes = [one.build_layers(rest, None)[1] for one in (stage, other, stage.plain)]
+    assert other.fine is stage.fine and drapes[0] is drapes[1] is not drapes[2]
+
+
 def test_visual_displacement_is_the_fem_surface_displacement(stage):
     rest, fine = stage.anatomy.mesh.nodes, stage.fine
     shift = np.array([1e-3, -2e-3, 3e-3])

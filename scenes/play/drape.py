@@ -1,6 +1,7 @@
 """Surgical drape with a hole over the open cortex: plain, or as cloth with folds."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import trimesh
@@ -22,10 +23,12 @@ FOLD_HEIGHT = 4.5e-3  # Height of the folds [m].
 FOLD_START = 9e-3  # Distance from the hole at which the folds have their height [m].
 
 
+@lru_cache(maxsize=4)
 def build_drape(site: CraniotomyFrame, number: int, folded: bool) -> Layer:
     """Build the surface lifted off the brain, with a round hole over the open cortex, and a wall round the hole.
 
-    `number` is its segmentation id. If `folded`, it is cloth with soft folds, which begin at the edge of the hole.
+    `number` is its segmentation id. If `folded`, it is cloth with soft folds, which begin at the edge of the hole. All
+    scenes of a patient share the result.
     """
     points, triangles, rim = cut_hole(site)
     colour = np.broadcast_to(DRAPE_COLOUR, points.shape)

@@ -297,18 +297,14 @@ class Stage:
 
     @cached_property
     def _visible(self) -> Cortex:
-        return self._build_cortex(self._list_visible())
-
-    def _list_visible(self) -> np.ndarray:
-        """List the surface triangles (S, 3) of open cortex and edge."""
-        mesh = self.anatomy.mesh
-        away = np.linalg.norm(mesh.nodes[mesh.surface] - self.site.origin, axis=2).min(axis=1)
-        return mesh.surface[away < self.site.radius + RIM_DISTANCE]
+        return self._build_cortex(_list_visible(self.site, self.anatomy))
 
     @cached_property
     def fine(self) -> FineCortex:
         """Fine surface that embeds gyri and vessels in the visible FEM surface."""
-        return build_fine_cortex(self.site, self.anatomy.mesh, self._list_visible(), self.intensity)
+        if self.left is None:
+            return _build_whole_cortex(self.site, self.intensity)
+        return build_fine_cortex(self.site, self.anatomy.mesh, _list_visible(self.site, self.anatomy), self.intensity)
 
     def _build_cortex(self, surface: np.ndarray) -> Cortex:
         """Triangles (S, 3) of the mesh's surface that wear the scan."""
@@ -335,6 +331,19 @@ class Stage:
     @cached_property
     def _drape(self) -> Layer:
         return build_drape(self.site, DRAPE, self.scene.look.natural)
+
+
+def _list_visible(site: CraniotomyFrame, anatomy: Anatomy) -> np.ndarray:
+    """List the surface triangles (S, 3) of open cortex and edge."""
+    mesh = anatomy.mesh
+    away = np.linalg.norm(mesh.nodes[mesh.surface] - site.origin, axis=2).min(axis=1)
+    return mesh.surface[away < site.radius + RIM_DISTANCE]
+
+
+@lru_cache(maxsize=2)
+def _build_whole_cortex(site: CraniotomyFrame, intensity: Intensity | None) -> FineCortex:
+    """Build the fine cortex of a body without resection, the same object for all scenes of a patient."""
+    return build_fine_cortex(site, site.anatomy.mesh, _list_visible(site, site.anatomy), intensity)
 
 
 @lru_cache(maxsize=2)
