@@ -38,7 +38,8 @@ lint: $(STAMP)
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/basedpyright
 
-# The anatomy, its models and its locator that ship with the package: some minutes on a graphics card, an hour on two cores.
+# The anatomy, its models and its locator that ship with the package. The poses of the spatula take longest: 15 minutes on 32 cores
+# with `--device cpu,cpu,...`; all else takes an hour on two cores.
 template: $(STAMP)
 	$(VENV)/bin/sulcus anatomy --out scenes/data/template.vtu --force
 	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --count 5000 --out build/template.h5
