@@ -168,14 +168,14 @@ class TestCamera:
 def test_the_cortex_wears_the_scan(template):
     scene = small()
     assert template.intensity is not None
-    plain, dressed = (Stage(scene, template.site, scan) for scan in (None, template.intensity))
+    plain, dressed = (Stage(scene, template.site, scan).plain for scan in (None, template.intensity))
     rest = template.anatomy.mesh.nodes
-    assert plain.build_cortex(rest).solid is None
-    layer = dressed.build_cortex(rest + 0.001)
+    assert plain.build_visible(rest).solid is None
+    layer = dressed.build_visible(rest + 0.001)
     assert layer.solid is not None and layer.rest is not None
     # Read at the material points, 2 mm under the surface, wherever they are now.
-    assert np.allclose(layer.rest, dressed.build_cortex(rest).rest)
-    depth = np.linalg.norm(layer.rest - dressed.build_cortex(rest).vertices, axis=1)
+    assert np.allclose(layer.rest, dressed.build_visible(rest).rest)
+    depth = np.linalg.norm(layer.rest - dressed.build_visible(rest).vertices, axis=1)
     assert np.allclose(depth, 2e-3)
 
 

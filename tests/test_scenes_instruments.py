@@ -8,7 +8,7 @@ import pytest
 from theatres import small, template_theatre
 
 from ar.rendering.camera_effects import add_camera_effects, blur_by_depth
-from scenes.play.instruments import build_instrument
+from scenes.play.instruments import build_instrument, has_instrument
 from scenes.play.stage import DRAPE, TOOL, Stage
 from scenes.script.tool import Blade, Probe
 from scenes.script.viewpoint import Appearance, BallInstrument
@@ -46,6 +46,18 @@ def test_spatula_is_the_blade_where_it_touches(blade):
     assert away[vertices[:, 2] < blade.edge].max() < 1e-6  # the bend stays inside as well
 
 
+def test_unusual_tools_are_drawn_as_they_are(stage):
+    class Mine(Probe):
+        """A shape of its own."""
+
+    assert has_instrument(Probe(3e-3)) and has_instrument(Blade())
+    for tool in (Mine(7e-3), Probe(2e-3), Blade(8e-3, 8e-3, 3.5e-3), Blade(4e-3, 20e-3, 2e-3), None):
+        assert not has_instrument(tool)
+    own = replace(stage, scene=replace(stage.scene, tool=Mine(7e-3)))
+    layer = own.build_layers(stage.anatomy.mesh.nodes, np.eye(4))[-1]
+    assert np.array_equal(layer.vertices, Mine(7e-3).mesh.vertices)
+
+
 def test_plain_look_has_the_simple_tool_and_drape(stage):
     rest, tool = stage.anatomy.mesh.nodes, stage.scene.tool
     simple, natural = (each.build_layers(rest, np.eye(4)) for each in (stage.plain, stage))
@@ -77,6 +89,6 @@ def test_camera_effects_are_repeatable_and_keep_depth(stage):
     wide = replace(stage.scene, look=replace(stage.scene.look, aperture=0.02, noise=0.01))
     shown = replace(stage, scene=wide).render_view(camera, rest, None, False, 1)
     assert not np.array_equal(shown.colour, sharp.colour) and np.array_equal(shown.depth, sharp.depth)
-    for wrong in ({"aperture": -1.0}, {"noise": np.nan}, {"instrument": "hammer"}):
+    for wrong in ({"aperture": -1.0}, {"aperture": "0.02"}, {"noise": np.nan}, {"instrument": "hammer"}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             Appearance(**wrong)

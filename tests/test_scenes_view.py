@@ -60,4 +60,8 @@ def test_the_3d_view_has_craniotomy_scan_and_planes(theatre):
     planes = [part for part in build_surroundings(stage) if isinstance(part, ScenePicture)]
     assert [plane.name for plane in planes] == ["axial", "coronal", "sagittal"]
     assert 0.05 < max((plane.colour[..., 3] > 0).mean() for plane in planes) < 0.55
-    assert not any(isinstance(part, ScenePicture) for part in build_surroundings(replace(stage, intensity=None)))
+    for intensity, count in ((stage.intensity, 3), (None, 0)):  # a texture of vessels is no scan
+        drawn = replace(stage.scene, look=replace(stage.scene.look, vessels=3))
+        found = build_surroundings(replace(stage, scene=drawn, intensity=intensity))[-3:]
+        same = [np.array_equal(a.colour, b.colour) for a, b in zip(found, planes, strict=True) if hasattr(a, "colour")]
+        assert same == [True] * count

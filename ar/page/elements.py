@@ -87,7 +87,7 @@ CAPTION = (  # Text under the slices.
     "outline, by the named source (none: not known). White: tool in the slice; ring: tip outside the slice."
 )
 VIEW_KEY = (  # Legend of the 3-D view: colour and meaning.
-    ("#33f06b", "tumour now"), ("#f5f5eb", "tumour in the scan"), ("#ffd8a8", "edge of the craniotomy"),
+    ("#33f06b", "tumour now"), ("#f5f5eb", "tumour in the scan"), ("#eddbb8", "edge of the craniotomy"),
 )  # fmt: skip
 # Image of one pixel: loading it runs the script, which an element's HTML alone would not.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="

@@ -9,6 +9,7 @@ import warp as wp
 from ..optics.camera import Camera
 from .renderer import Picture
 
+MIN_FOCUS = 1e-3  # Smallest distance in focus [m].
 BLURS = (0.0, 0.7, 1.4, 2.8, 5.6, 11.2)  # Standard deviations of the blurred images that are blended [pixel].
 
 
@@ -41,7 +42,9 @@ def blur_by_depth(colour: np.ndarray, depth: np.ndarray, strength: float, focus:
     `strength` is focal length [pixel] times aperture [m]. A Gaussian has half of its radius as standard deviation.
     """
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0.0)
-    spread = cv2.GaussianBlur(np.minimum(0.25 * strength * np.abs(inverse - 1.0 / focus), BLURS[-1]), (0, 0), 2.0)
+    spread = cv2.GaussianBlur(
+        np.minimum(0.25 * strength * np.abs(inverse - 1.0 / max(focus, MIN_FOCUS)), BLURS[-1]), (0, 0), 2.0
+    )
     level = np.interp(spread, BLURS, np.arange(len(BLURS))).astype(np.float32)
     out = np.zeros(colour.shape, np.float32)
     for k, blur in enumerate(BLURS):

@@ -1,4 +1,4 @@
-"""A palpation ball touches the cortex near the tumour and draws it aside."""
+"""A suction tube with a ball of cotton touches the cortex near the tumour and draws it aside."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""A palpation ball slides across the cortex over the tumour with steady force."""
+"""Forceps with a ball of cotton slide across the cortex over the tumour with steady force."""
 
 from ..script.scene import Scene
 from ..script.tool_paths import slide

@@ -72,7 +72,7 @@ def draw_slices_through(stage: Stage, cut: Cut, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above; of no tip, the middle's."""
     shape = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
     middle = 0.5 * (shape.vertices.min(axis=0) + shape.vertices.max(axis=0))
-    return draw_slices(stage.scan, cut.tip if through == TIP and cut.tip is not None else middle, cut)
+    return draw_slices(stage.anatomical_scan, cut.tip if through == TIP and cut.tip is not None else middle, cut)
 
 
 def _scale_value(value: float | None, by: float) -> float | None:

@@ -21,7 +21,6 @@ STALE_COLOUR = (0.45, 0.45, 0.45)
 BRAIN_COLOUR = (0.50, 0.38, 0.36)  # Colour of the inside of the brain's far side: its near side would hide the rest.
 CORTEX_COLOURS = (0.80, 0.53, 0.47), (0.45, 0.15, 0.16)  # Colours of crowns, and of sulci with their vessels.
 CORTEX_NAMES = "cortex", "sulci"  # Names of these parts.
-DARK_SHARE = 0.6  # Brightness of a sulcus as a share of the brightest crown.
 EDGE_COLOUR, EDGE_WIDTH = (0.93, 0.86, 0.72), 2.5e-3
 """Colour and width [m] of the ring of bone round the craniotomy."""
 SCAN_COLOUR = (0.96, 0.96, 0.92)  # Colour of the tumour in the scan.
@@ -60,11 +59,8 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
 
 def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Split the open cortex at `positions` (V, 3) [m] into bright crowns and dark sulci: name, vertices, triangles."""
-    relief = stage.relief
-    at, triangles = relief.surface.place(positions[relief.vertices]), relief.surface.triangles
-    dark = relief.colour[triangles].mean(axis=(1, 2)) < DARK_SHARE * relief.colour.mean(axis=1).max()
-    parts = (np.unique(triangles[some], return_inverse=True) for some in (~dark, dark))
-    return [(name, at[used], faces) for name, (used, faces) in zip(CORTEX_NAMES, parts, strict=True)]
+    at = stage.relief.surface.place(positions[stage.relief.vertices])
+    return [(name, at[used], faces) for name, (used, faces) in zip(CORTEX_NAMES, stage.relief_parts, strict=True)]
 
 
 def build_edge(stage: Stage) -> SceneSurface:
@@ -81,7 +77,7 @@ def build_edge(stage: Stage) -> SceneSurface:
 def build_surroundings(stage: Stage) -> list[Sign | ScenePicture]:
     """Build what stays in place: orientation letters round the brain, and planes of the scan behind the tumour."""
     found: list[Sign | ScenePicture] = [*list_orientation_labels(stage.site)]
-    scan, middle = stage.scan, stage.tumour_at_rest.vertices.mean(axis=0)
+    scan, middle = stage.anatomical_scan, stage.tumour_at_rest.vertices.mean(axis=0)
     for plane in PLANES if scan is not None else ():
         assert scan is not None
         grey = resample_view(plane, scan, middle)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import cast
+from typing import TypeGuard, cast
 
 import numpy as np
 import trimesh
@@ -24,6 +24,7 @@ SHARP_ANGLE = np.radians(40.0)  # Angle between faces above which their edge is 
 SECTIONS = 5  # Number of sections of a sweep from station to station.
 CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
 FIBRE_DEPTH = 0.2e-3  # Largest depth of the relief of a cotton ball [m].
+MIN_BALL_RADIUS = 2.9e-3  # Radius below which forceps and suction would not reach their ball [m].
 SPATULA_BEND = 4e-3  # Radius of the bend at the end of a spatula's blade [m].
 SPATULA_THICKNESS = 1.1e-3  # Thickness of a spatula's strip above the blade [m].
 SPATULA_STEP = 0.7e-3  # Distance between the sections of that strip [m].
@@ -90,6 +91,13 @@ def build_loft(profiles: np.ndarray, centre: np.ndarray, wide: Sequence[float]) 
     sides = [np.stack(each, axis=-1).reshape(-1, 3) for each in ((a, b, b + around), (a, b + around, a + around))]
     faces = np.concatenate([*sides, fan[:, ::-1], fan + around * (count - 1)])
     return trimesh.graph.smooth_shade(trimesh.Trimesh(rings.reshape(-1, 3), faces, process=False), SHARP_ANGLE)
+
+
+def has_instrument(tool: object) -> TypeGuard[Probe | Blade]:
+    """Return True if a tool is drawn as an instrument: a ball or blade of usual size, not a user's own shape."""
+    if type(tool) is Blade:
+        return tool.length > 4.0 * tool.edge + 2.0 * SPATULA_BEND and tool.width > 4.0 * tool.edge
+    return type(tool) is Probe and tool.radius >= MIN_BALL_RADIUS
 
 
 @lru_cache(maxsize=8)

@@ -26,11 +26,10 @@ from sim.loads import Loads, Resected
 from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
 from ..script.observation_models import StereoObservation
 from ..script.scene import Scene
-from ..script.tool import Blade, Probe
 from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
 from .drape import DRAPE_DEPTH, build_drape
 from .fine_cortex import FineCortex, build_fine_cortex
-from .instruments import build_instrument
+from .instruments import build_instrument, has_instrument
 from .observer import Sees
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
@@ -61,6 +60,7 @@ READING_DEPTH = 2.0e-3
 RIM_DISTANCE = 10e-3
 TUMOUR_DEPTH = 0.03e-3  # Depth of that outline below the rounded facets [m]: it cuts corners of the mesh off.
 TUMOUR_HEIGHT = 0.06e-3  # Largest height of that outline above the facets [m]: coarse meshes stay visible as such.
+DARK_SHARE = 0.6  # Brightness of a sulcus as a share of the brightest crown.
 RELIEF_EDGE = 1.0e-3  # Largest edge of the cortex of `relief` [m].
 TUMOUR_EDGE = 1.8e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
 DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of the drape's wall.
@@ -140,10 +140,6 @@ class Stage:
         turned = Rotation.from_rotvec(look.turn * site.axis).apply(lamp.position - site.origin)
         return replace(lamp, position=site.origin + turned, strength=look.lamp, ambient=look.ambient)
 
-    def build_cortex(self, positions: np.ndarray) -> Layer:
-        """Return the open cortex at `positions` (V, 3) [m]."""
-        return self._cortex.build_layer(positions)
-
     def build_visible(self, positions: np.ndarray) -> Layer:
         """Build the open cortex, and the cortex just under the bone's edge, which becomes visible if the brain shifts.
 
@@ -172,6 +168,14 @@ class Stage:
         return replace(fine, surface=replace(fine.surface, triangles=fine.surface.triangles[seen]))
 
     @cached_property
+    def relief_parts(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """Bright crowns and dark sulci of `relief`: its vertices (n,), and triangles (m, 3) of them."""
+        triangles, colour = self.relief.surface.triangles, self.relief.colour
+        dark = colour[triangles].mean(axis=(1, 2)) < DARK_SHARE * colour.mean(axis=1).max()
+        crowns, sulci = (np.unique(triangles[some], return_inverse=True) for some in (~dark, dark))
+        return crowns, sulci
+
+    @cached_property
     def brain(self) -> Layer:
         """The closed part of the brain's surface, at rest."""
         mesh, craniotomy = self.anatomy.mesh, self.anatomy.craniotomy
@@ -181,7 +185,7 @@ class Stage:
     def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
         """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
         tool, look = self.scene.tool, self.scene.look
-        if pose is None or not look.natural or not isinstance(tool, Probe | Blade):
+        if pose is None or not look.natural or not has_instrument(tool):
             return self._list_layers(positions, self.compute_corners(pose))
         parts = build_instrument(tool, look.instrument, TOOL)
         placed = (replace(part, vertices=part.vertices @ pose[:3, :3].T + pose[:3, 3]) for part in parts)
@@ -292,10 +296,6 @@ class Stage:
         return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=TUMOUR_HEIGHT)
 
     @cached_property
-    def _cortex(self) -> Cortex:
-        return self._build_cortex(self.anatomy.open_surface)
-
-    @cached_property
     def _visible(self) -> Cortex:
         return self._build_cortex(_list_visible(self.site, self.anatomy))
 
@@ -323,6 +323,11 @@ class Stage:
             seed = model.seed
         if seed is not None:
             return add_vessels(self.intensity, self.site, seed, DARK_SHARES, RELIEF_DEPTH)
+        return self.anatomical_scan
+
+    @cached_property
+    def anatomical_scan(self) -> Solid | None:
+        """The scan of the whole head as a solid texture, if there is one."""
         if self.intensity is None:
             return None
         values = self.intensity.apply_window(self.site.anatomy.mesh)

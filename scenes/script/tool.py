@@ -73,9 +73,9 @@ class Probe:
     radius
         Radius of the ball, and of its footprint on the tissue [m].
     shaft
-        Radius of the shaft [m].
+        Radius of the shaft [m], in the plain look.
     length
-        Length of the shaft [m].
+        Length of the shaft [m], in the plain look.
     lean, turn
         Angle between the shaft and the outward normal, and azimuth of the shaft about the normal [rad]: 0 is away
         from the line of sight.
@@ -136,7 +136,7 @@ class Blade:
     edge
         Radius of the edge [m]; the blade is twice as thick.
     arm
-        Length of the arm [m].
+        Length of the arm [m], in the plain look.
     """
 
     width: float = 0.012

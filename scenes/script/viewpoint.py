@@ -91,8 +91,9 @@ class Appearance:
             known = ", ".join(get_args(BallInstrument))
             raise InputError(f"there is no instrument {self.instrument!r} for a ball: choose one of {known}.")
         for name in ("aperture", "noise"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise InputError(f"an appearance has {name} {getattr(self, name)}: give a number >= 0.")
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0.0 <= value < np.inf):
+                raise InputError(f"an appearance has {name} {value!r}: give a number >= 0.")
 
 
 PLAIN_APPEARANCE = Appearance()
