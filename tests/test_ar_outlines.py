@@ -329,7 +329,7 @@ def test_the_panel_is_a_copy_in_its_corner():
 @pytest.mark.parametrize(
     ("attempt", "reason"),
     [
-        (lambda: render(camera(), [cortex(), cortex()], LAMP), "ids"),
+        (lambda: render(camera(), [cortex(), replace(cortex(), name="drape")], LAMP), "own id"),
         (lambda: replace(cortex(), id=0), "id"),
         (lambda: replace(cortex(), rest=np.zeros((900, 3))), "solid"),
         (lambda: replace(cortex(), colour=np.zeros((5, 3))), "colour"),
