@@ -48,6 +48,7 @@ template: $(STAMP)
 	$(VENV)/bin/sulcus train build/gym.h5 --learners contact-gp --out scenes/data/template.gym.npz --force
 	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --pose-control --scene spatula --count 640 --batch 5 --out build/spatula.h5
 	$(VENV)/bin/sulcus train build/spatula.h5 --learners gp,svr,ann --out scenes/data/template.spatula.npz --force
+	$(VENV)/bin/sulcus effects --out scenes/data/template.effects.json
 	$(MAKE) locator
 
 # What locates the template's tumour in scenes: up to 13 minutes on two cores.

@@ -1,6 +1,7 @@
 """What each effect costs and changes, and the list of scenes with its sheet."""
 
 import json
+import re
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -11,11 +12,14 @@ import warp as wp
 from theatres import short, sinking, theatre_of
 
 from scenes.cli import main
-from scenes.play.effect_ablation import ALL, list_device_arrays, measure_effects, remove_effect, run
+from scenes.play.effect_ablation import ALL, build_record, list_device_arrays, measure_effects, remove_effect, run
+from scenes.play.effect_record import read_effect_records
 from scenes.script.scene import find_scene
 from sim.bodies.meshfile import write_anatomy
+from sim.deformation import Outcome
 from sim.effects import Gravity, Held
 from sim.errors import InputError
+from sim.fem import Fem
 
 pytestmark = pytest.mark.usefixtures("ours_alone")
 
@@ -111,6 +115,14 @@ def test_a_frame_that_is_not_answered_is_a_sentence(theatre):
         run(theatre, scene, 1)
 
 
+def test_unphysical_frames_are_counted(small_theatre, monkeypatch):
+    solve, inverted = Fem.deform, (Outcome.INVERTED,)
+    monkeypatch.setattr(Fem, "deform", lambda *args, **named: replace(solve(*args, **named), outcome=inverted))
+    rows = list(measure_effects(small_theatre, short(), 3, ["ToolForce"]))
+    assert [(row.effect, row.unphysical) for row in rows] == [(ALL, 3), ("ToolForce", 3)]
+    assert build_record(small_theatre, short(), rows, 3, "").unphysical == 6
+
+
 def test_bytes_are_those_of_arrays_that_live():
     before = list_device_arrays()
     array = wp.zeros(1_000_000, dtype=wp.float32, device="cpu")
@@ -131,3 +143,25 @@ def test_the_command_tells_rows(theatre, anatomy, printed, capsys):
     assert "| effect | ms a frame | MB on the device | tumour mm | cortex mm |" in error
     assert main(["effects", "brain_shift", "--anatomy", anatomy, "--every", "0"]) == 2
     assert "give a whole number" in capsys.readouterr().err
+
+
+HOPELESS = """
+from dataclasses import replace
+from scenes.builtin.press import SCENE as press
+SCENE = replace(press, name="hopeless", accuracy=replace(press.accuracy, outer=1, inner=1, steps=0))
+"""
+
+
+def test_a_scene_that_is_not_solved_does_not_end_the_command(small_box, tmp_path, capsys):
+    write_anatomy(tmp_path / "small.vtu", small_box)
+    (tmp_path / "hopeless.py").write_text(HOPELESS)
+    record, where = tmp_path / "small.effects.json", ["--anatomy", str(tmp_path / "small.vtu"), "--device", "cpu"]
+    asked = ["effects", str(tmp_path / "hopeless.py"), "press", *where, "--every", "60", "--out", str(record)]
+    assert main([*asked, "--json"]) == 1
+    out, error = capsys.readouterr()
+    failed, solved = json.loads(out)["scenes"]
+    assert out.count("\n") == 1 and failed["scene"] == "hopeless" and solved["scene"] == "press"
+    assert "is not solved" in failed["error"] and f"hopeless: {failed['error']}" in error
+    found = read_effect_records(record)
+    assert list(found) == ["press"] and list(found["press"].effects) == [ALL, "ToolForce"]
+    assert re.fullmatch(rf"{wp.get_device('cpu').name} / \S.*, solver threads: [12]", found["press"].machine)

@@ -8,10 +8,10 @@ import pytest
 from theatres import short, template_theatre
 
 from scenes.page.background_study import BackgroundStudy
-from scenes.page.effect_costs import EFFECT_COSTS, build_effect_fold, format_switch, measure_costs
+from scenes.page.effect_costs import EFFECT_COSTS, METRICS, build_effect_fold, format_switch, measure_costs
 from scenes.page.requests import Requests
 from scenes.play.effect_ablation import ALL, AblationRow, build_record, list_switchable_effects
-from scenes.play.effect_record import SUFFIX, read_effect_records, write_effect_record
+from scenes.play.effect_record import FORMAT, SUFFIX, read_effect_records, write_effect_record
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.shipped_files import get_template_path
 from scenes.script.tool_paths import Touch
@@ -37,9 +37,9 @@ def test_each_effect_of_a_scene_is_measured(theatre):
     costs.start()
     costs.thread.join(120.0)
     assert len(shown) == 2 + len(list_switchable_effects(scene, theatre.anatomy)) == 3
-    assert shown[-1]["ToolForce"].startswith("push of the tool: +") and shown[1]["ToolForce"].endswith("not measured")
+    assert shown[-1]["ToolForce"].startswith("push of the tool: +") and list(shown[1]) == [EFFECT_COSTS]
     notes = [said[EFFECT_COSTS] for said in shown]
-    assert "1 more are being measured" in notes[1] and "being measured" not in notes[2]
+    assert "left to measure: 1" in notes[1] and "left to measure: 0" in notes[2] and METRICS in notes[2]
     assert "All effects together: " in notes[2] and "Always on: elastic tissue, fixed base of the brain" in notes[2]
 
 
@@ -66,18 +66,32 @@ def test_a_record_is_shown_of_the_same_scene_and_anatomy_alone(template, theatre
 
 def test_a_record_is_written_and_read(theatre, tmp_path):
     path = tmp_path / "box.effects.json"
-    found = build_record(theatre, short(), ROWS, 2)
+    lost = AblationRow("Gravity", refused="it <moves>.", unphysical=2)
+    found = build_record(theatre, short(), (*ROWS, lost), 2, "a machine")
     write_effect_record(path, found)
     write_effect_record(path, replace(found, scene="other"))
     read = read_effect_records(path)
-    assert list(read) == [found.scene, "other"] and read["other"].effects == {
-        ALL: [240.04, 4.3],
-        "ToolForce": [180.0, 4.25],
-    }
-    assert "core" in found.machine and found.day == read["other"].day
+    assert list(read) == [found.scene, "other"] and read[found.scene] == found
+    assert found.effects == {ALL: (240.04, 4.3), "ToolForce": (180.0, 4.25), "Gravity": (None, None)}
+    note = words_of(replace(theatre, effect_records=read), short())[EFFECT_COSTS]
+    assert "2 frames have inverted" in note and "Not solvable without gravity and fluid: it &lt;moves&gt;." in note
+    assert format_switch("Gravity", found.effects) == "gravity and fluid: cannot be disabled"
     assert format_switch("ToolForce", found.effects) == "push of the tool: +180 ms, 4.25 mm"
-    stored = json.loads(path.read_text())
-    stored["scenes"][1]["effects"]["ToolForce"][0] = float("nan")
-    path.write_text(json.dumps(stored))
-    with pytest.raises(InputError, match="not finite"):
+
+
+PAIRS = [1.0], [240, None], [[1, 2], [3, 4]], [True, False], [1e300, 1], [1, float("nan")], ["1", "2"]
+BAD = (
+    *(({"effects": {"ToolForce": pair}}, "not finite") for pair in PAIRS), ({"effects": [[1, 2]]}, "damaged"),
+    *(({"frames": frames}, "frames must be") for frames in (None, 0, 2.5, True)), ({"unphysical": -1}, "unphysical"),
+    ({"mark": 5}, "damaged"), ({"machine": None}, "damaged"), ({"machine": "\ud800"}, "UTF-8|damaged"),
+    ({"refused": {"Gravity": 1}}, "damaged"), ({"effects": {ALL: 5}}, "damaged"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "reason"), BAD)
+def test_a_damaged_record_is_rejected(tmp_path, change, reason):
+    path = tmp_path / "box.effects.json"
+    good = {"scene": "press", "mark": "1", "day": "2026", "machine": "m", "frames": 3, "effects": {ALL: [1, 2]}}
+    path.write_text(json.dumps({"format": FORMAT, "scenes": [good | change]}))
+    with pytest.raises(InputError, match=f"({reason}).*Delete it"):
         read_effect_records(path)

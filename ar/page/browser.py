@@ -289,9 +289,9 @@ class Browser:
         self.note(f"control {label}", lambda: self.controls.assign(control, value, wanted))
 
     def rename(self, label: str, words: str) -> None:
-        """Show other words for a control."""
-        control = self.controls.handles[label]
-        self.note(f"words {label}", lambda: setattr(control, "label", words))
+        """Show other words for a control; an unknown label is ignored, as of a scene shown before."""
+        if (control := self.controls.handles.get(label)) is not None:
+            self.note(f"words {label}", lambda: setattr(control, "label", words))
 
     def write(self, label: str, words: str) -> None:
         """Replace the words (HTML) of a note; an empty note is hidden."""

@@ -1,26 +1,21 @@
 """`sulcus effects`: what each effect of a scene costs and changes."""
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
 
 from sim.arguments import check_at_least
+from sim.errors import InputError
+from sim.runtime.threads import choose_threads
 
 from ..options.outputs import check_output_path
-from ..options.shared_options import add_anatomy, add_device, add_json
+from ..options.shared_options import add_anatomy, add_device, add_json, to_json_line
 from ..options.theatre_options import add_trajectory, build_requested_scene
 from ..options.tissue_options import add_model_tissue
 
-COLUMN_TITLES = (
-    "effect",
-    "ms a frame",
-    "MB on the device",
-    "tumour mm",
-    "cortex mm",
-    "",
-)  # Column titles of the table.
+# Column titles of the table.
+COLUMN_TITLES = "effect", "ms a frame", "MB on the device", "tumour mm", "cortex mm", ""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,12 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve each scene with and without each effect."""
+    """Solve each scene with and without each effect. Returns 1 if a scene is not solved."""
     from tqdm import tqdm
 
     from ..play.deformers import open_theatre
     from ..play.effect_ablation import build_record, list_switchable_effects, measure_effects
-    from ..play.effect_record import read_effect_records, write_effect_record
+    from ..play.effect_record import format_unphysical, read_effect_records, write_effect_record
     from ..script.scene import SCENES
 
     check_at_least("--every", args.every, 1)
@@ -55,22 +50,39 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_output_path(args.out, ".json", resumed=True)
         read_effect_records(args.out)
-    table = sys.stderr if args.json else sys.stdout
+    table, reports = sys.stderr if args.json else sys.stdout, []
     for scene in scenes:
-        who, acting = theatre.describe_deformer("fem", scene), scene.get_effects_on(theatre.anatomy)
-        some = None if args.out is None else list_switchable_effects(scene, theatre.anatomy)
-        print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
-        print(f"| {' | '.join(COLUMN_TITLES)} |\n|{'---|' * len(COLUMN_TITLES)}", file=table)
         found = []
-        with tqdm(total=1 + len(acting if some is None else some), unit="effect", leave=False, file=sys.stderr) as bar:
-            for row in measure_effects(theatre, scene, args.every, some):
-                found.append(row)
-                figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
-                cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
-                bar.write(f"| {' | '.join([row.effect, *cells, row.refused])} |", file=table)
-                bar.update()
+        try:
+            who, acting = theatre.describe_deformer("fem", scene), scene.get_effects_on(theatre.anatomy)
+            some = None if args.out is None else list_switchable_effects(scene, theatre.anatomy)
+            print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
+            print(f"| {' | '.join(COLUMN_TITLES)} |\n|{'---|' * len(COLUMN_TITLES)}", file=table)
+            total = 1 + len(acting if some is None else some)
+            with tqdm(total=total, unit="effect", leave=False, file=sys.stderr) as bar:
+                for row in measure_effects(theatre, scene, args.every, some):
+                    found.append(row)
+                    figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
+                    cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
+                    remark = row.refused or format_unphysical(row.unphysical)
+                    bar.write(f"| {' | '.join([row.effect, *cells, remark])} |", file=table)
+                    bar.update()
+        except InputError as error:
+            print(f"{args.program}: {scene.name}: {error}", file=sys.stderr)
+            reports.append({"scene": scene.name, "error": str(error)})
+            continue
+        reports.append({"scene": scene.name, "solver": who, "effects": [asdict(row) for row in found]})
         if args.out is not None:
-            write_effect_record(args.out, build_record(theatre, scene, found, args.every))
-        if args.json:
-            print(json.dumps({"scene": scene.name, "solver": who, "effects": [asdict(row) for row in found]}))
-    return 0
+            hardware = _describe_hardware(args.device, len(theatre.anatomy.mesh.tets))
+            write_effect_record(args.out, build_record(theatre, scene, found, args.every, hardware))
+    if args.json:
+        print(to_json_line(reports[0] if len(args.scenes) == 1 else {"scenes": reports}))
+    return int(any("error" in report for report in reports))
+
+
+def _describe_hardware(device: str, elements: int) -> str:
+    """Return the device, the processor and the number of threads of the solver's loops."""
+    from ..analysis.measurement import describe_machine
+
+    names = describe_machine(device).partition(";")[0].rpartition(",")[0]  # without versions and all cores
+    return f"{names}, solver threads: {choose_threads(elements)}"

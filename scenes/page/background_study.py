@@ -43,7 +43,8 @@ class BackgroundStudy:
                         return
                     self.show(words)
         except InputError as error:
-            self.show(f'<p class="warn">{escape(str(error))}</p>')
+            if not self.closed.is_set():
+                self.show(f'<p class="warn">{escape(str(error))}</p>')
 
 
 def build_studies(

@@ -7,7 +7,8 @@ from html import escape
 from ar.page.parts import Fold, Note, Toggle
 
 from ..play.deformers import PatientSetup
-from ..play.effect_ablation import ALL, list_switchable_effects, measure_effects
+from ..play.effect_ablation import ALL, build_record, list_switchable_effects, measure_effects
+from ..play.effect_record import EffectRecord, format_unphysical
 from ..script.scene import Scene
 from .requests import Requests
 from .text import describe_effect
@@ -16,8 +17,12 @@ EFFECT_COSTS = "cost of the effects"
 """Label of the note on the effects' costs."""
 EFFECT_FOLD = "physics effects: time per frame, tumour motion"  # Label of the folder of switches.
 SOLVED_FRAMES = 8  # Number of frames of the script that are solved with and without each effect.
-# Hint of an effect's switch.
-HINT = "switch this effect on or off; FEM time per frame that it adds, and how far it moves the tumour"
+# Metrics of the figures on a switch.
+METRICS = (
+    "median FEM time per frame that it adds [ms], and maximum over the frames of the mean displacement of the tumour "
+    "that it causes [mm]"
+)
+HINT = f"switch this effect on or off; {METRICS}"  # Hint of an effect's switch.
 MEASURE_HINT = "solves the scene with and without each effect, in the background"  # Hint of the measuring switch.
 
 Figures = Mapping[str, tuple[float | None, float | None]]
@@ -33,7 +38,7 @@ def build_effect_fold(theatre: PatientSetup, scene: Scene, wish: Requests, measu
         for name in list_switchable_effects(scene, theatre.anatomy)
     )
     source = "" if record is None else f"Recorded on {record.day} with {record.machine}, {record.frames} frames"
-    said = format_costs(theatre, scene, figures, source or "The costs are not measured for this scene and anatomy")
+    said = format_costs(theatre, scene, record, source or "The costs are not measured for this scene and anatomy")
     costs = Toggle(
         "measure costs", False, lambda on: measure() if on else None, "measure on this machine", MEASURE_HINT
     )
@@ -41,7 +46,7 @@ def build_effect_fold(theatre: PatientSetup, scene: Scene, wish: Requests, measu
 
 
 def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str]]:
-    """Yield the words of the switches and of the note (HTML), by label, whenever an effect is measured.
+    """Yield the words of an effect's switch and of the note (HTML), by label, whenever an effect is measured.
 
     Raises
     ------
@@ -49,30 +54,41 @@ def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str
         See `measure_effects`.
     """
     names, every = list_switchable_effects(scene, theatre.anatomy), max(1, len(scene.times) // SOLVED_FRAMES)
-    figures = dict[str, tuple[float | None, float | None]]()
+    rows = []
     yield {EFFECT_COSTS: "<p>The scene is solved with and without each effect...</p>"}
     for row in measure_effects(theatre, scene, every, names):
-        figures[row.effect] = row.milliseconds, row.tumour_mm
-        left = len(names) + 1 - len(figures)
-        source = f"Measured on this machine, {len(scene.times[::every])} frames"
-        source += f"; {left} more are being measured" if left else ""
-        words = {name: format_switch(name, figures) for name in names}
-        yield words | {EFFECT_COSTS: format_costs(theatre, scene, figures, source)}
+        rows.append(row)
+        record = build_record(theatre, scene, rows, every, "this machine")
+        left = len(names) + 1 - len(rows)
+        source = f"Measured on {record.machine}, {record.frames} frames; effects left to measure: {left}"
+        words = {name: format_switch(name, record.effects) for name in names if name == row.effect}
+        yield words | {EFFECT_COSTS: format_costs(theatre, scene, record, source)}
 
 
 def format_switch(name: str, figures: Figures) -> str:
     """Return the words of an effect's switch: its name, the time that it adds and the motion that it causes."""
     milliseconds, motion = figures.get(name, (None, None))
     if milliseconds is None or motion is None:
-        return f"{describe_effect(name)}: {'not solvable without' if name in figures else 'not measured'}"
+        return f"{describe_effect(name)}: {'cannot be disabled' if name in figures else 'not measured'}"
     return f"{describe_effect(name)}: {milliseconds:+.0f} ms, {motion:.2f} mm"
 
 
-def format_costs(theatre: PatientSetup, scene: Scene, figures: Figures, source: str) -> str:
-    """Describe the source of the figures, the whole scene, and the effects that are always on (HTML)."""
-    milliseconds, motion = figures.get(ALL, (None, None))
-    whole = "" if milliseconds is None else f" All effects together: {milliseconds:.0f} ms, {motion:.2f} mm."
+def format_costs(theatre: PatientSetup, scene: Scene, record: EffectRecord | None, source: str) -> str:
+    """Describe the source and metrics of the figures, the whole scene, and effects that are always on (HTML)."""
+    said = [source] if record is None else [source, f"Of each effect: {METRICS}", *_list_findings(record)]
     switchable = list_switchable_effects(scene, theatre.anatomy)
     kinds = (type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy))
     fixed = ", ".join(describe_effect(name) for name in kinds if name not in switchable)
-    return f"<p>{escape(source)}.{whole} Always on: {escape(fixed)}.</p>"
+    return f"<p>{escape('. '.join([*said, f'Always on: {fixed}']))}.</p>"
+
+
+def _list_findings(record: EffectRecord) -> Iterator[str]:
+    milliseconds, motion = record.effects.get(ALL, (None, None))
+    if milliseconds is not None:
+        yield f"All effects together: {milliseconds:.0f} ms, {motion:.2f} mm"
+    if record.unphysical:
+        yield format_unphysical(record.unphysical)
+    for name, (cost, _) in record.effects.items():
+        if cost is None:
+            reason = record.refused.get(name, "").rstrip(".")
+            yield f"Not solvable without {describe_effect(name)}" + (f": {reason}" if reason else "")

@@ -1,7 +1,6 @@
 """Cost and influence of each effect of a scene: the scene is solved with and without it, frame by frame."""
 
 import gc
-import os
 import time as clock
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -10,12 +9,10 @@ from datetime import date
 import numpy as np
 import warp as wp
 
-from sim.accuracy import LIVE
 from sim.anatomy import Anatomy
 from sim.deformation import Deformer, Outcome
 from sim.effects import Bonded, Effect, Elasticity, Held, Slide
 from sim.errors import InputError
-from sim.runtime.device import find_device
 
 from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
@@ -24,7 +21,7 @@ from .effect_record import EffectRecord
 from .stage import Stage
 
 WARM_UP = 2  # Number of frames that are not timed: kernels are loaded.
-UNPHYSICAL = Outcome.INVERTED, Outcome.OVERSTRAINED  # Equilibria that are measured, too.
+UNPHYSICAL = Outcome.INVERTED, Outcome.OVERSTRAINED  # Equilibria that are measured and counted.
 ALL = "all"  # Name of the run with all effects.
 
 
@@ -32,12 +29,14 @@ ALL = "all"  # Name of the run with all effects.
 class AblationRun:
     """FEM solutions of a scene's frames: displacements (F, V, 3) [m], NaN for resected vertices, and their cost.
 
-    `milliseconds`: median per frame; `held`: size [bytes] of the device arrays kept from frame to frame.
+    `milliseconds`: median per frame; `held`: size [bytes] of the device arrays kept from frame to frame; `unphysical`:
+    number of frames with inverted or overstrained tetrahedra.
     """
 
     displacement: np.ndarray
     milliseconds: float
     held: int
+    unphysical: int
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class AblationRow:
 
     Values: time per frame [ms]; memory kept on the device [MB]; maximum over frames of the mean displacement of the
     tumour's and the open cortex's vertices [mm]. `refused` is the reason why the effect cannot be removed: then
-    there are no values.
+    there are no values. `unphysical`: number of such frames of the run without the effect; `ALL`: of the full scene.
     """
 
     effect: str
@@ -55,6 +54,7 @@ class AblationRow:
     tumour_mm: float | None = None
     cortex_mm: float | None = None
     refused: str = ""
+    unphysical: int = 0
 
 
 def list_switchable_effects(scene: Scene, anatomy: Anatomy) -> list[str]:
@@ -100,13 +100,16 @@ def measure_effects(
         yield _build_row(theatre, name, whole, less)
 
 
-def build_record(theatre: PatientSetup, scene: Scene, rows: Sequence[AblationRow], every: int) -> EffectRecord:
-    """Build the record of measured effects of a scene, of which each `every`-th frame was solved."""
-    device = find_device(theatre.device, LIVE.precision)
-    machine = wp.get_device(device.name).name if device.on_cuda else f"a CPU of {os.cpu_count()} cores"
+def build_record(
+    theatre: PatientSetup, scene: Scene, rows: Sequence[AblationRow], every: int, machine: str
+) -> EffectRecord:
+    """Build the record of measured effects of a scene, of which each `every`-th frame was solved on a `machine`."""
     figures = {row.effect: (row.milliseconds, row.tumour_mm) for row in rows}
     frames = len(scene.times[::every])
-    return EffectRecord(scene.name, theatre.compute_mark(scene), str(date.today()), machine, frames, figures)
+    return EffectRecord(
+        scene.name, theatre.compute_mark(scene), str(date.today()), machine, frames, figures,
+        sum(row.unphysical for row in rows), {row.effect: row.refused for row in rows if row.refused},
+    )  # fmt: skip
 
 
 def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
@@ -115,23 +118,24 @@ def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
     Raises
     ------
     InputError
-        A body without fixed nodes, or a frame without a good solution.
+        A body without fixed nodes, or a frame that is not in equilibrium. Unphysical equilibria are counted.
     """
     before = list_device_arrays()  # freed meanwhile or not, they are not the scene's
     fem = theatre.build_fem(scene, scene.accuracy, live=True)
     times = scene.times[::every].tolist()
-    found, seconds = _solve_frames(fem, scene, theatre.site, times)
+    found, seconds, unphysical = _solve_frames(fem, scene, theatre.site, times)
     wp.synchronize()
     earlier = {id(array) for array in before}
     held = sum(array.capacity for array in list_device_arrays() if id(array) not in earlier)
-    return AblationRun(np.stack(found), 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :])), held)
+    milliseconds = 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :]))
+    return AblationRun(np.stack(found), milliseconds, held, unphysical)
 
 
 def _solve_frames(
     fem: Deformer, scene: Scene, site: CraniotomyFrame, times: list[float]
-) -> tuple[list[np.ndarray], list[float]]:
-    """Displacements (V, 3) [m], NaN of what was cut out, and seconds of each frame."""
-    last, found, seconds, stage = None, [], [], Stage(scene, site)
+) -> tuple[list[np.ndarray], list[float], int]:
+    """Displacements (V, 3) [m], NaN of what was cut out, and seconds of each frame; number of unphysical frames."""
+    last, found, seconds, unphysical, stage = None, [], [], 0, Stage(scene, site)
     for time in times:
         loads = scene.build_loads(site, scene.path(time), time)
         wp.synchronize()
@@ -139,9 +143,10 @@ def _solve_frames(
         last = fem.deform(loads, start=last)
         seconds.append(clock.perf_counter() - begun)
         found.append(np.where(stage.select_stage(loads).anatomy.orphaned[:, None], np.nan, last.displacement[0]))
+        unphysical += last.outcome[0] in UNPHYSICAL
         if not last.outcome[0].good and last.outcome[0] not in UNPHYSICAL:
             raise InputError(f"the frame at {time:.2f} s is not solved: {last.outcome[0].value}")
-    return found, seconds
+    return found, seconds, unphysical
 
 
 def list_device_arrays() -> list[wp.array]:
@@ -163,4 +168,5 @@ def _build_row(theatre: PatientSetup, name: str, whole: AblationRun, less: Ablat
         1e-6 * (whole.held - less.held),
         apart(anatomy.tumour_nodes),
         apart(np.unique(anatomy.open_surface)),
+        unphysical=less.unphysical,
     )

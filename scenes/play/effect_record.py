@@ -2,10 +2,9 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
@@ -13,6 +12,7 @@ from sim.runtime.outside_files import read_as
 
 FORMAT = "sulcus effects 1"  # Name and version of the file format.
 SUFFIX = ".effects.json"  # Ending of the file, next to the anatomy.
+MAX_FIGURE = 1e7  # Upper bound on the size of every number in a file [ms, mm, frames].
 REMEDY = "Delete it, and measure again by `sulcus effects --out`."  # Remedy for a file that cannot be read.
 
 
@@ -22,7 +22,8 @@ class EffectRecord:
 
     `mark`: fingerprint of the scene, see `scenes.script.uncertainty.mark_of`; `day`: ISO 8601; `machine` in words.
     `effects`, by class name: FEM time per frame that an effect adds [ms], and how far it moves the tumour [mm]; None:
-    not solvable without it. `all`: time and motion of the whole scene.
+    not solvable without it, `refused` has the reason. `all`: time and motion of the whole scene. `unphysical`: number
+    of frames with inverted or overstrained tetrahedra, in the solutions with and without each effect.
     """
 
     scene: str
@@ -31,6 +32,14 @@ class EffectRecord:
     machine: str
     frames: int
     effects: Mapping[str, tuple[float | None, float | None]]
+    unphysical: int = 0
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+
+def format_unphysical(count: int) -> str:
+    """Describe a number of unphysical frames; empty for none."""
+    frames = f"{count} frame has" if count == 1 else f"{count} frames have"
+    return f"{frames} inverted or overstrained tetrahedra" if count else ""
 
 
 def read_effect_records(path: Path) -> dict[str, EffectRecord]:
@@ -45,11 +54,27 @@ def read_effect_records(path: Path) -> dict[str, EffectRecord]:
         return {}
     with read_as(path, "costs of effects", REMEDY):
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
-        rows = [EffectRecord(**row) for row in stored["scenes"]]
-        figures = [one for row in rows for pair in row.effects.values() for one in pair if one is not None]
-        if stored["format"] != FORMAT or not np.isfinite(figures).all():
-            raise InputError(f"its format is not {FORMAT!r}, or a figure is not finite. {REMEDY}")
-        return {row.scene: row for row in rows}
+        if stored["format"] != FORMAT:
+            raise InputError(f"its format is not {FORMAT!r}. {REMEDY}")
+        return {row.scene: row for row in map(_read_row, stored["scenes"])}
+
+
+def _read_row(row: dict[str, Any]) -> EffectRecord:
+    scene, mark, day, machine = (row[key] for key in ("scene", "mark", "day", "machine"))
+    frames, unphysical, refused = row["frames"], row.get("unphysical", 0), dict(row.get("refused", {}))
+    "".join((scene, mark, day, machine, *refused, *refused.values())).encode()  # fails for a value that is not text
+    if any(type(count) is not int for count in (frames, unphysical)) or not 1 <= frames < MAX_FIGURE > unphysical >= 0:
+        raise InputError(f"frames must be an integer >= 1, unphysical an integer >= 0. {REMEDY}")
+    effects = {name: _read_pair(pair) for name, pair in row["effects"].items()}
+    return EffectRecord(scene, mark, day, machine, frames, effects, unphysical, refused)
+
+
+def _read_pair(pair: Any) -> tuple[float | None, float | None]:
+    if pair == [None, None]:
+        return None, None
+    if len(pair) != 2 or not all(type(one) in (int, float) and abs(one) < MAX_FIGURE for one in pair):
+        raise InputError(f"a figure is not finite: an effect has two below {MAX_FIGURE:g}, or two nulls. {REMEDY}")
+    return float(pair[0]), float(pair[1])
 
 
 def write_effect_record(path: Path, found: EffectRecord) -> None:
