@@ -7,7 +7,7 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 
 # Lines of the packages and of their tests. Nobody reads more than this: a feature that exceeds it deletes something.
 # Lower a number when lines have gone. Raise it only with the reason in the commit.
-MOST = {"packages": 82_265, "tests": 52_792}
+MOST = {"packages": 82_345, "tests": 52_880}
 
 
 def lines(paths):

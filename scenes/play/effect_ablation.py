@@ -97,6 +97,9 @@ def measure_effects(
         except InputError as error:
             yield AblationRow(name, refused=str(error))
             continue
+        if less.unphysical > whole.unphysical:
+            yield AblationRow(name, refused=f"{less.unphysical} frames have inverted or overstrained tetrahedra")
+            continue
         yield _build_row(theatre, name, whole, less)
 
 
