@@ -138,8 +138,7 @@ class PatientSetup:
         """Find the reason why each trained model does not support a scene, by name; None if it does.
 
         A model supports only the effects, the tissue and the element that it was trained on. None is the reference with
-        which
-        an estimate is compared.
+        which an estimate is compared.
         """
         if scene.observation_model is not None:
             return dict.fromkeys(self.models, TRUTH_TEXT)
@@ -358,8 +357,6 @@ def open_theatre(
     scan = to_intensity_path(path)
     models = load_models(path, body) if model is None else load(Path(model), body)
     intensity = read_intensity(scan) if scan.is_file() else None
-    uncertainties, records = (
-        read_uncertainties(to_uncertainty_path(path)),
-        read_effect_records(path.with_suffix(SUFFIX)),
-    )
+    uncertainties = read_uncertainties(to_uncertainty_path(path))
+    records = read_effect_records(path.with_suffix(SUFFIX))
     return PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties, effect_records=records)

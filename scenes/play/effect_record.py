@@ -8,7 +8,7 @@ from typing import Any
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import parse_json, read_as
 
 FORMAT = "sulcus effects 1"  # Name and version of the file format.
 SUFFIX = ".effects.json"  # Ending of the file, next to the anatomy.
@@ -53,10 +53,7 @@ def read_effect_records(path: Path) -> dict[str, EffectRecord]:
     if not path.is_file():
         return {}
     with read_as(path, "costs of effects", REMEDY):
-        stored = json.loads(path.read_text(encoding="utf-8-sig"))
-        if stored["format"] != FORMAT:
-            raise InputError(f"its format is not {FORMAT!r}. {REMEDY}")
-        return {row.scene: row for row in map(_read_row, stored["scenes"])}
+        return {row.scene: row for row in map(_read_row, parse_json(path, FORMAT, REMEDY)["scenes"])}
 
 
 def _read_row(row: dict[str, Any]) -> EffectRecord:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import parse_json, read_as
 
 from .craniotomy_frame import CraniotomyFrame
 from .priors import PRIORS, REGISTRATION, SEGMENTATION
@@ -21,6 +21,7 @@ FORMAT = "sulcus uncertainty 1"  # Name and version of the file format.
 LEVEL = 0.95
 """Probability level of every printed bound."""
 SUFFIX = ".uncertainty.json"  # Ending of the file, next to the anatomy.
+REMEDY = "Delete it, and compute it again by `sulcus uncertainty`."  # Remedy for a file that cannot be read.
 SURROGATE = "surrogate"  # Name of a contributor.
 LISTS = ("times", "worst", "middle", "moved")  # Fields that are lists over the times, in every file.
 MIN_MOTION = 0.1e-3  # Smallest motion of a scene that an error is in proportion to [m].
@@ -217,11 +218,8 @@ def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
     """
     if not path.is_file():
         return {}
-    with read_as(path, "uncertainties", "Delete it, and compute it again by `sulcus uncertainty`."):
-        stored = json.loads(path.read_text(encoding="utf-8-sig"))
-        if stored.get("format") != FORMAT:
-            raise InputError(f"its format is not {FORMAT!r}: delete it, and compute it again by `sulcus uncertainty`.")
-        return {name: _read(row) for name, row in stored["scenes"].items()}
+    with read_as(path, "uncertainties", REMEDY):
+        return {name: _read(row) for name, row in parse_json(path, FORMAT, REMEDY)["scenes"].items()}
 
 
 def _read(row: dict) -> Uncertainty:

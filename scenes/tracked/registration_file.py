@@ -11,7 +11,7 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.file_limits import MAX_COORDINATE
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import parse_json, read_as, to_path
 
 FORMAT = "sulcus registration 1"  # Name and version of the file format.
 REMEDY = "Make one by `sulcus register`."  # Remedy in error messages.
@@ -40,9 +40,7 @@ def read_registration(path: str | Path) -> Registration:
     with read_as(path, "a registration", REMEDY):
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"is larger than a registration. {REMEDY}")
-        stored = json.loads(path.read_text(encoding="utf-8-sig"))
-        if stored.get("format") != FORMAT:
-            raise InputError(f"its format is not {FORMAT!r}. {REMEDY}")
+        stored = parse_json(path, FORMAT, REMEDY)
         T, covariance, centre = (
             np.array(stored[name], float) for name in ("T_patient_scan_mm", "covariance", "centre_mm")
         )

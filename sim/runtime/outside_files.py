@@ -1,10 +1,12 @@
 """Reading of files from outside: every failure becomes an error message of one sentence."""
 
+import json
 import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +59,20 @@ def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
         raise InputError(f"{path}: is locked: another program has it open for writing. {LOCK_REMEDY}") from error
     except (Exception, SystemExit) as error:  # a damaged file may cause any exception
         raise InputError(f"{path}: cannot be read as {kind}: {_describe_reason(error)}. {remedy}") from error
+
+
+def parse_json(path: Path, version: str, remedy: str) -> Any:
+    """Parse a JSON file that states its `format`; call it in a block of `read_as`.
+
+    Raises
+    ------
+    InputError
+        Another format than `version`.
+    """
+    stored = json.loads(path.read_text(encoding="utf-8-sig"))
+    if stored.get("format") != version:
+        raise InputError(f"its format is not {version!r}. {remedy}")
+    return stored
 
 
 def _describe_reason(error: BaseException) -> str:
