@@ -7,6 +7,7 @@ import pytest
 from theatres import small
 from visitor import report, wait_for
 
+from ar.page.elements import build_tabs
 from ar.page.parts import ScenePicture
 from scenes.page.fem_worker import FemWorker
 from scenes.page.view import FEM_COLOUR, STALE_COLOUR, build_page_bodies, build_surroundings
@@ -57,6 +58,8 @@ def test_the_3d_view_has_craniotomy_scan_and_planes(theatre):
     assert away.min() == pytest.approx(hole, rel=0.05) and away.max() < hole + 3e-3
     assert len(bodies["cortex"].triangles) > len(bodies["sulci"].triangles) > 0
     assert np.array_equal(bodies["scan"].vertices, stage.tumour_at_rest.vertices)
+    legend = build_tabs(bodies=list(bodies.values())).partition('<p class="key">')[2].partition("</p>")[0]
+    assert 'rgb(20% 94% 42%)">&#9632;</b> tumour now</span>' in legend and legend.count("<span>") == 3
     planes = [part for part in build_surroundings(stage) if isinstance(part, ScenePicture)]
     assert [plane.name for plane in planes] == ["axial", "coronal", "sagittal"]
     assert 0.05 < max((plane.colour[..., 3] > 0).mean() for plane in planes) < 0.55

@@ -96,7 +96,7 @@ class Browser:
         self.wanted: Shown = self.shown
         self.coded, self.sent = to_data_url(blank), 0
         self.sight = gui.add_html(build_image_element(0, self.coded, ""))
-        gui.add_html(build_tabs(KEYS if playback.frames else LIVE_KEYS))
+        gui.add_html(build_tabs(KEYS if playback.frames else LIVE_KEYS, bodies))
         self.beside = gui.add_html("")
         # Function that draws slices and charts, if not yet sent; earliest time to send them [s].
         self.drawn: Callable[[], tuple[np.ndarray, str]] | None = None

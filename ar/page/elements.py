@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from ..overlay.hud import BREAK_PATTERN
-from .parts import Key
+from .parts import Key, SceneSurface
 
 JPEG_QUALITY = 88  # JPEG quality of images on the page, 0 to 100.
 PICTURE, SAID, NEXT = "sulcus-picture", "sulcus-said", "sulcus-next"
@@ -86,9 +86,6 @@ CAPTION = (  # Text under the slices.
     "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: 95 % error of its "
     "outline, by the named source (none: not known). White: tool in the slice; ring: tip outside the slice."
 )
-VIEW_KEY = (  # Legend of the 3-D view: colour and meaning.
-    ("#33f06b", "tumour now"), ("#f5f5eb", "tumour in the scan"), ("#eddbb8", "edge of the craniotomy"),
-)  # fmt: skip
 # Image of one pixel: loading it runs the script, which an element's HTML alone would not.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 
@@ -135,8 +132,8 @@ if (!window.sulcusKeys) {
 """
 
 
-def build_tabs(keys: Sequence[Key] = KEYS) -> str:
-    """Build the element with the tabs, empty places for slices and charts, and the list of keys."""
+def build_tabs(keys: Sequence[Key] = KEYS, bodies: Sequence[SceneSurface] = ()) -> str:
+    """Build the element with the tabs, a legend of bodies, places for slices and charts, and the list of keys."""
     tabs = "".join(
         f'<input type="radio" name="{ASIDE}" id="{name}"{" checked" if number == 0 else ""}>'
         f'<label for="{name}">{words}</label>'
@@ -147,11 +144,15 @@ def build_tabs(keys: Sequence[Key] = KEYS) -> str:
     listed = ", ".join(f"'{key.name}'" for key in keys)
     script = escape(" ".join(SCRIPT.replace("KEYS", listed, 1).replace("HELP", HELP).split()))
     opens = f"document.getElementById('{HELP}').showModal()"
-    key = "".join(f'<span><b style="color: {colour}">&#9632;</b> {words}</span>' for colour, words in VIEW_KEY)
+    legend = "".join(
+        f'<span><b style="color: rgb({" ".join(f"{c:.0%}" for c in body.colour)})">&#9632;</b> {body.meaning}</span>'
+        for body in reversed(bodies)
+        if body.meaning
+    )
     return (
         f'<div id="{ASIDE}">{tabs}<input type="checkbox" id="{DETAILS}" aria-label="details of the result">'
         f'<button type="button" aria-label="list of keys" onclick="{opens}">keys</button>'
-        f'<p class="key">{key}</p>'
+        f'<p class="key">{legend}</p>'
         f'<div class="shown"><div id="{SLICES}"></div><p>{CAPTION}</p></div>'
         f'<div class="shown"><div id="{HISTORY}"></div></div>'
         f'<dialog id="{HELP}" aria-label="keys"><table>{rows}</table>'

@@ -13,6 +13,7 @@ import numpy as np
 class SceneSurface:
     """Surface in the 3-D view: vertices (V, 3) [m], triangles (F, 3), colour (3,) sRGB in [0, 1].
 
+    The legend has the colour with the `meaning`, if there is one.
     The browser computes normals again for each update: some 5,000 vertices for all bodies together stay fluent.
     """
 
@@ -23,6 +24,7 @@ class SceneSurface:
     opacity: float = 1.0
     wireframe: bool = False
     side: Literal["front", "back", "double"] = "double"
+    meaning: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,7 @@ FEM_COLOUR = TRUTH_COLOUR  # Colour of the FEM tumour.
 STALE_COLOUR = (0.45, 0.45, 0.45)
 """Colour of the FEM tumour while it belongs to another load than the one shown."""
 BRAIN_COLOUR = (0.50, 0.38, 0.36)  # Colour of the inside of the brain's far side: its near side would hide the rest.
-CORTEX_COLOURS = (0.80, 0.53, 0.47), (0.45, 0.15, 0.16)  # Colours of crowns, and of sulci with their vessels.
-CORTEX_NAMES = "cortex", "sulci"  # Names of these parts.
+CORTEX_COLOURS = {"cortex": (0.80, 0.53, 0.47), "sulci": (0.45, 0.15, 0.16)}  # Colours of crowns and sulci.
 EDGE_COLOUR, EDGE_WIDTH = (0.93, 0.86, 0.72), 2.5e-3
 """Colour and width [m] of the ring of bone round the craniotomy."""
 SCAN_COLOUR = (0.96, 0.96, 0.92)  # Colour of the tumour in the scan.
@@ -50,17 +49,17 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
     brain, scan, cortex = stage.brain, stage.tumour_at_rest, split_cortex(stage, stage.site.anatomy.mesh.nodes)
     return [
         SceneSurface("brain", brain.vertices, brain.triangles, BRAIN_COLOUR, side="back"),
-        *(SceneSurface(*part, colour) for part, colour in zip(cortex, CORTEX_COLOURS, strict=True)),
+        *(SceneSurface(*part, CORTEX_COLOURS[part[0]]) for part in cortex),
         build_edge(stage),
-        SceneSurface("scan", scan.vertices, scan.triangles, SCAN_COLOUR, side="back"),
-        SceneSurface("tumour", scan.vertices, scan.triangles, TUMOUR_COLOUR),
+        SceneSurface("scan", scan.vertices, scan.triangles, SCAN_COLOUR, side="back", meaning="tumour in the scan"),
+        SceneSurface("tumour", scan.vertices, scan.triangles, TUMOUR_COLOUR, meaning="tumour now"),
     ]
 
 
 def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Split the open cortex at `positions` (V, 3) [m] into bright crowns and dark sulci: name, vertices, triangles."""
     at = stage.relief.surface.place(positions[stage.relief.vertices])
-    return [(name, at[used], faces) for name, (used, faces) in zip(CORTEX_NAMES, stage.relief_parts, strict=True)]
+    return [(name, at[used], faces) for name, (used, faces) in zip(CORTEX_COLOURS, stage.relief_parts, strict=True)]
 
 
 def build_edge(stage: Stage) -> SceneSurface:
@@ -71,7 +70,8 @@ def build_edge(stage: Stage) -> SceneSurface:
     away -= (away @ site.axis)[..., None] * site.axis
     far = near + EDGE_WIDTH * away / np.linalg.norm(away, axis=2, keepdims=True)
     corners = 4 * np.arange(len(rim))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])
-    return SceneSurface("edge", np.concatenate([near, far], axis=1).reshape(-1, 3), corners.reshape(-1, 3), EDGE_COLOUR)
+    vertices, triangles = np.concatenate([near, far], axis=1).reshape(-1, 3), corners.reshape(-1, 3)
+    return SceneSurface("edge", vertices, triangles, EDGE_COLOUR, meaning="edge of the craniotomy")
 
 
 def build_surroundings(stage: Stage) -> list[Sign | ScenePicture]:
