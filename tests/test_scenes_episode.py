@@ -197,7 +197,7 @@ class TestEpisode:
     @pytest.mark.parametrize(("size", "most"), [(40_000, 4), (150_000, 7)])
     def test_a_full_disk_is_a_sentence(self, theatre, tmp_path, size, most, monkeypatch):
         """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
-        # As if there had been room at first.
+        # The check before the start finds enough space.
         monkeypatch.setattr("scenes.episodes.episode.check_disk_space", lambda *asked: None)
         drawn, play = [], player(theatre, short(), "linear")
         with files_below(size), pytest.raises(InputError, match=r"press\.h5: cannot be written \(File too large\)"):

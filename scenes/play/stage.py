@@ -297,7 +297,12 @@ class Stage:
 
     @cached_property
     def _visible(self) -> Cortex:
-        return self._build_cortex(_list_visible(self.site, self.anatomy))
+        vertices, triangles = np.unique(_list_visible(self.site, self.anatomy), return_inverse=True)
+        at = self.anatomy.mesh.nodes[vertices]
+        colour = np.array(CORTEX_COLOUR) * self.scene.look.tint
+        return Cortex(
+            vertices, triangles, at - READING_DEPTH * compute_vertex_normals(at, triangles), self.scan, colour
+        )
 
     @cached_property
     def fine(self) -> FineCortex:
@@ -305,15 +310,6 @@ class Stage:
         if self.left is None:
             return _build_whole_cortex(self.site, self.intensity)
         return build_fine_cortex(self.site, self.anatomy.mesh, _list_visible(self.site, self.anatomy), self.intensity)
-
-    def _build_cortex(self, surface: np.ndarray) -> Cortex:
-        """Triangles (S, 3) of the mesh's surface that wear the scan."""
-        vertices, triangles = np.unique(surface, return_inverse=True)
-        at = self.anatomy.mesh.nodes[vertices]
-        colour = np.array(CORTEX_COLOUR) * self.scene.look.tint
-        return Cortex(
-            vertices, triangles, at - READING_DEPTH * compute_vertex_normals(at, triangles), self.scan, colour
-        )
 
     @cached_property
     def scan(self) -> Solid | None:
