@@ -327,6 +327,15 @@ def _build_law_term(
     from .terms.elasticity import ElasticTerm
 
     law = build_functions(tissues)
+    if carries == "springs":
+        from .terms.laws.springs import LAW, compute_spring_coefficients
+
+        if tissues[0].prony or swelling is not None:
+            raise InputError("springs compute neither relaxation nor pulsation: use finite elements.")
+        lame = np.array([tissue.lame for tissue in tissues])[which]
+        return ElasticTerm(
+            f"springs for {law.name}", LAW, elements, compute_spring_coefficients(lame, elements.gradient), lame, device
+        )
     lame = np.array([get_portion(tissue, carries) for tissue in tissues])[which]
     coefficients = collect_coefficients(tissues, carries)[which]
     name = f"elasticity {law.name}" if carries == "whole" else f"elasticity {law.name} of {carries}"

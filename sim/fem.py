@@ -18,12 +18,13 @@ from .arguments import check_at_least, check_vertex_numbers
 from .compile import check_causes, compile_problem
 from .deformation import Cost, Deformation, check_start, join_deformations
 from .diagnostics.deformed_tissue import Diagnostics
-from .discretisation.footprint import ContactSurface
+from .discretisation.footprint import ContactSurface, compute_push_reactions
 from .discretisation.inverted_elements import Inversion
 from .discretisation.problem import Problem
 from .discretisation.space import discretise
 from .discretisation.term import Cases
 from .effects import Effect, Elasticity
+from .elements import OTHER_METHODS
 from .errors import InputError
 from .linalg.preconditioner import choose_preconditioner
 from .linalg.rest_solver import RestStiffnessSolver
@@ -339,7 +340,7 @@ class Fem:
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
         on_footprint = self.problem.constraint.compute_footprint_force(held) if displaced else None
         touching = [term.compute_reaction(found.u) for term in self.problem.barriers]
-        reaction = np.concatenate([self._compute_reactions(cases.loads, on_footprint), *touching], axis=1)
+        reaction = np.concatenate([compute_push_reactions(self._skin, cases.loads, on_footprint), *touching], axis=1)
         nodes = np.arange(len(self._anatomy.mesh.nodes)) if at is None else at
         if at is None and len(self.space.edges):
             whole = unstack_columns(self.problem.device, found.u, np.arange(self.space.count))
@@ -365,22 +366,12 @@ class Fem:
             source=self.description,
         )
 
-    def _compute_reactions(self, loads: Loads, on_footprint: np.ndarray | None) -> np.ndarray:
-        """Return force and moment about its point that each tool exerts [N, N m]: (B, tools, 6)."""
-        rows = []
-        for cause in loads.causes:
-            if isinstance(cause, Pushed | Displaced):
-                force = cause.force if isinstance(cause, Pushed) else on_footprint
-                assert force is not None
-                force = force if isinstance(cause, Pushed) else force.T
-                arm = self._skin.press(cause.point, cause.footprint).compute_centres() - cause.point
-                rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
-        return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))
-
     reading, series = build_reading, compute_series  # Former names, for one release.
 
 
 def describe_solver(element: str, effects: Iterable[Effect]) -> str:
     """Return the description of the element and the tissue, for results, images and files."""
     tissue = next((str(effect) for effect in effects if isinstance(effect, Elasticity)), "no elasticity")
+    if element in OTHER_METHODS:
+        return f"{OTHER_METHODS[element]} ({tissue})"
     return f"finite elements ({element}; {tissue})"

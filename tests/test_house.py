@@ -29,7 +29,7 @@ ORDER = (
     {"sim.local_solvers"},
     {"sim.strategy"},
     {"sim.fem"},
-    {"sim.resected_fem", "sim.contact_pressure", "sim.debonding"},
+    {"sim.resected_fem", "sim.contact_pressure", "sim.debonding", "sim.families"},
     {"surrogate.array_functions"},
     {"surrogate.data", "surrogate.regressors"},
     {"surrogate.model"},

@@ -13,6 +13,7 @@ import scipy.sparse as sp
 import warp as wp
 
 from ..errors import InputError
+from ..loads import Displaced, Loads, Pushed
 from ..runtime.device import Device, find_device, forward_kernel
 
 # Triangles per search thread, and candidates per reduction thread.
@@ -374,3 +375,19 @@ def _press(
         wp.atomic_add(weight, table[s, a], c, scale * share[a])
         moment += share[a] * position[table[s, a]]
     wp.atomic_add(sums, c, scale * wp.vec4d(m[0], moment[0], moment[1], moment[2]))
+
+
+def compute_push_reactions(skin: ContactSurface, loads: Loads, displacing: np.ndarray | None = None) -> np.ndarray:
+    """Compute force and moment about its point that each tool exerts [N, N m]: (B, tools, 6).
+
+    `displacing` (3, B) [N] are the forces of `Displaced` loads.
+    """
+    rows = []
+    for cause in loads.causes:
+        if isinstance(cause, Pushed | Displaced):
+            force = cause.force if isinstance(cause, Pushed) else displacing
+            assert force is not None
+            force = force if isinstance(cause, Pushed) else force.T
+            arm = skin.press(cause.point, cause.footprint).compute_centres() - cause.point
+            rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
+    return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))

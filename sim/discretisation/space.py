@@ -6,7 +6,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 import scipy.sparse as sp
 
-from ..elements import ELEMENTS, RECOMMENDED
+from ..elements import ELEMENTS, OTHER_METHODS, RECOMMENDED
 from ..errors import InputError
 from ..geometry.surface import normalise_vectors
 from ..geometry.tetmesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, compute_row_keys
@@ -84,6 +84,8 @@ class Discretisation:
         """
         if self.element == "p1":
             return (ElementPart(build_linear_elements(self.mesh, chosen), "whole"),)
+        if self.element == "springs":
+            return (ElementPart(build_linear_elements(self.mesh, chosen), "springs"),)
         if self.element == "p2":
             return (ElementPart(build_quadratic_elements(self.nodes, self.table, chosen), "whole"),)
         edges, nodes = _build_smoothed_elements(self.mesh, chosen.tobytes())
@@ -155,7 +157,7 @@ def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
         An unknown type; a linear type on a mesh with mid-edge nodes.
     """
     element = recommend_element(mesh) if element is None else element
-    if element not in tuple(ELEMENTS):  # tuple, since `element` may be unhashable
+    if element not in (*ELEMENTS, *OTHER_METHODS):  # tuple, since `element` may be unhashable
         raise InputError(f"no element is called {element!r}: choose one of {', '.join(ELEMENTS)}.")
     none = np.zeros((0, 2), np.int32)
     if mesh.middles is not None:

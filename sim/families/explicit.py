@@ -1,0 +1,87 @@
+"""Total Lagrangian explicit dynamics (TLED), damped to the static equilibrium.
+
+Miller, Joldes, Lance, Wittek 2007, Commun. Numer. Meth. Engng 23:121-134: undeformed shape gradients, lumped mass,
+central differences. Joldes, Wittek, Miller 2011, Int. J. Numer. Meth. Biomed. Engng 27:173-185: mass scaling, and
+damping by the lowest eigenvalue in the motion.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.problem import Problem
+from ..discretisation.space import Discretisation
+from ..effects import Elasticity
+from ..runtime.views import run_in_order, to_host, to_library, view
+from .relaxation import Relaxation
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Number and size of the time steps.
+
+    Parameters
+    ----------
+    most, every
+        Largest number of steps; steps between two tests of convergence.
+    fraction
+        Step as a fraction of the critical one in the undeformed state; compressed tissue is stiffer.
+    lowest
+        Lowest eigenvalue at the start, relative to the highest.
+    """
+
+    most: int = 4000
+    every: int = 25
+    fraction: float = 0.7
+    lowest: float = 1e-3
+
+
+TOLERANCE = 1e-3  # Relative residual of convergence.
+
+
+def prepare(
+    problem: Problem, space: Discretisation, tissue: Elasticity, settings: Steps = Steps()
+) -> Callable[[int], tuple[wp.array, int]]:
+    """Return the function that relaxes a number of load cases: displacements (3N, b) [m] and steps.
+
+    Masses are sums of rows of the undeformed stiffness, so that no eigenvalue of M^-1 K exceeds 1 (Gershgorin).
+    """
+    device = problem.device
+    mass = to_library(device, np.asarray(abs(problem.rest_curvature()).sum(axis=1)).reshape(-1, 1))
+    step = 2.0 * settings.fraction
+
+    def relax(count: int) -> tuple[wp.array, int]:
+        u, before, last = (device.allocate(problem.rows, count) for _ in range(3))
+        x, old, place = view(u), view(before), view(last)
+        force, lowest = 0.0 * place, np.full(count, settings.lowest)
+        for done in range(1, settings.most + 1):
+            gradient = problem.gradient(u)
+            problem.constraint.project(gradient)
+            damping = to_library(device, 2.0 * np.sqrt(lowest) * step)
+            with run_in_order(device):
+                g = view(gradient)
+                if done % settings.every == 0:
+                    moved = x - place
+                    change, motion = (to_host((moved * other).sum(0)) for other in (g - force, mass * moved))
+                    known = (change > 0.0) & (change < motion)
+                    lowest = np.where(known, change / np.where(known, motion, 1.0), lowest)
+                    place[:], force = x, g
+                new = x + ((2.0 - damping) * (x - old) - 2.0 * step**2 * g / mass) / (2.0 + damping)
+                old[:], x[:] = x, new
+            if done % settings.every == 0 and _is_done(problem, u):
+                return u, done
+        return u, settings.most
+
+    return relax
+
+
+def _is_done(problem: Problem, u: wp.array) -> bool:
+    """Return True if no load case is finite and above the tolerance."""
+    _, free, scale = problem.residual(u)
+    finite = np.isfinite(free) & np.isfinite(scale)
+    return bool((~finite | (free <= TOLERANCE * scale)).all())
+
+
+EXPLICIT = Relaxation("smoothed", prepare, TOLERANCE)

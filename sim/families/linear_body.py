@@ -1,0 +1,106 @@
+"""LinearBody of a linear deformation model: fixed vertices, loaded vertices and Lamé parameters."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..anatomy import Anatomy
+from ..discretisation.rigid_modes import check_fixed
+from ..effects import Bonded, Effect, Elasticity, Held, NodalForce, ToolForce
+from ..errors import InputError
+from ..geometry.tetmesh import TetMesh
+from ..material import Tissue
+
+SUPPORTED = (Elasticity, Held, Bonded, ToolForce, NodalForce)
+"""Effects that models outside the finite elements compute: forces on tissue that is fixed to bone."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearBody:
+    """Elastic body with fixed vertices under forces on its free surface.
+
+    Parameters
+    ----------
+    anatomy
+        Mesh of V vertices.
+    tissue
+        Tissue of the regions.
+    fixed
+        Mask (V,) of vertices that do not move.
+    acting
+        Vertices (a,), ascending, of the surface that is not fixed: forces act on these.
+    lame
+        Lamé parameters mu, lambda [Pa] at small strain, by region label.
+    """
+
+    anatomy: Anatomy
+    tissue: Elasticity
+    fixed: np.ndarray
+    acting: np.ndarray
+    lame: Mapping[int, tuple[float, float]]
+
+
+def check_effects(name: str, effects: Iterable[Effect]) -> Elasticity:
+    """Return the tissue, if a family called `name` supports all effects.
+
+    Raises
+    ------
+    InputError
+        Another effect, tissue that relaxes, or no tissue.
+    """
+    effects = tuple(effects)
+    for effect in effects:
+        if not isinstance(effect, SUPPORTED):
+            names = ", ".join(kind.__name__ for kind in SUPPORTED)
+            raise InputError(
+                f"{name} does not compute {type(effect).__name__}, only {names}: use finite elements (--deformer fem)."
+            )
+    tissue = next((effect for effect in effects if isinstance(effect, Elasticity)), None)
+    if tissue is None:
+        raise InputError("no effect resists deformation: add Elasticity.")
+    if any(law is not None and law.prony for law in (tissue.default, *tissue.regions.values())):
+        raise InputError(f"{name} does not compute tissue that relaxes: remove its Prony series.")
+    return tissue
+
+
+def build_body(name: str, anatomy: Anatomy, effects: Iterable[Effect]) -> LinearBody:
+    """Return the body of a family called `name`.
+
+    Raises
+    ------
+    InputError
+        Effects that are not supported; a region without tissue; vertices fixed in some directions only; too few fixed
+        vertices.
+    """
+    effects = tuple(effects)
+    tissue = check_effects(name, effects)
+    fixed = anatomy.fixed.copy() if any(isinstance(effect, Held) for effect in effects) else anatomy.fixed & False
+    if any(isinstance(effect, Bonded) for effect in effects):
+        fixed |= (anatomy.slide_normal != 0.0).any(axis=1)[:, None]
+    check_fixed(anatomy.mesh, fixed, np.zeros_like(anatomy.slide_normal))
+    if (fixed.any(axis=1) != fixed.all(axis=1)).any():
+        raise InputError(f"{name} requires vertices that are fixed in all directions or in none: use finite elements.")
+    still = fixed.all(axis=1) | anatomy.orphaned
+    acting = np.setdiff1d(anatomy.mesh.surface, np.flatnonzero(still))
+    lame = {int(label): _get_tissue(tissue, int(label)).lame for label in np.unique(anatomy.mesh.region)}
+    return LinearBody(anatomy, tissue, still, acting, lame)
+
+
+def get_lame(tissue: Elasticity, mesh: TetMesh) -> np.ndarray:
+    """Return the Lamé parameters mu, lambda (T, 2) [Pa] of the tetrahedra of a mesh.
+
+    Raises
+    ------
+    InputError
+        A region without tissue.
+    """
+    labels, place = np.unique(mesh.region, return_inverse=True)
+    return np.array([_get_tissue(tissue, int(label)).lame for label in labels])[place]
+
+
+def _get_tissue(tissue: Elasticity, label: int) -> Tissue:
+    law = tissue.get_law(label)
+    if law is None:
+        raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
+    return law

@@ -1,0 +1,74 @@
+"""Families of deformation models by name, after Table 1 of Tonutti, Gras, Yang 2017."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from ..accuracy import TRAIN, Accuracy
+from ..anatomy import Anatomy
+from ..deformation import Deformer, Outcome
+from ..effects import Effect
+from ..errors import InputError
+
+FAMILIES = {
+    "kelvinlets": "regularised Kelvinlets: motions of an infinite body, brought back at fixed vertices",
+    "thin-plate": "thin-plate spline that continues the motion of the surface",
+    "lattice": "free-form lattice of B-splines that continues the motion of the surface",
+    "mass-spring": "springs along edges and volumes of tetrahedra, to equilibrium",
+    "xpbd": "the same springs by position-based dynamics with a fixed number of iterations",
+    "condensed": "linear finite elements, condensed to a compliance table",
+    "explicit": "total Lagrangian explicit finite elements, damped to the equilibrium",
+}
+"""Descriptions by name; the finite elements of `Fem` are the reference."""
+
+ELEMENTS_BY_FAMILY = {"mass-spring": "springs"}
+"""Families that `Fem` solves, and their element: these compute every effect."""
+
+
+def build_family(
+    name: str, anatomy: Anatomy, effects: Iterable[Effect], device: str = "auto", accuracy: Accuracy = TRAIN
+) -> Deformer:
+    """Return a deformation model of one of `FAMILIES`.
+
+    `device` and `accuracy` are as of `Fem`. Models with a table compute on the CPU; only the mass-spring
+    model uses `accuracy`.
+
+    Raises
+    ------
+    InputError
+        An unknown name, effects that the family does not compute, and input that `Fem` rejects.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scenes import get_template_path
+    >>> from sim import BRAIN, build_family, build_push_effects, open_cortex, push, read_anatomy
+    >>> anatomy = read_anatomy(get_template_path())
+    >>> place = open_cortex(anatomy).place(right_mm=0, up_mm=0)
+    >>> model = build_family("condensed", anatomy, build_push_effects(anatomy, BRAIN))
+    >>> result = model.deform(push(place.point, 0.1 * place.inward, footprint=7e-3), at=anatomy.tumour_nodes)
+    >>> print(f"{1e3 * np.linalg.norm(result.displacement[0].mean(axis=0)):.1f} mm; {result.outcome[0].name}")
+    0.5 mm; CONVERGED
+    """
+    if name not in tuple(FAMILIES):
+        raise InputError(f"no family of models is called {name!r}: choose one of {', '.join(FAMILIES)}.")
+    if name in ELEMENTS_BY_FAMILY:
+        from ..fem import Fem
+
+        return Fem(anatomy, effects, accuracy, device, element=ELEMENTS_BY_FAMILY[name])
+    if name in ("explicit", "xpbd"):
+        from .explicit import EXPLICIT
+        from .relaxation import RelaxationModel
+        from .xpbd import XPBD
+
+        return RelaxationModel(name, anatomy, effects, EXPLICIT if name == "explicit" else XPBD, device)
+    from . import condensed, geometric
+    from .linear_model import LinearModel
+
+    respond = {
+        "condensed": condensed.compute_response,
+        "kelvinlets": geometric.compute_kelvinlet_response,
+        "lattice": geometric.compute_lattice_response,
+        "thin-plate": geometric.compute_thin_plate_response,
+    }[name]
+    return LinearModel(name, anatomy, effects, respond, Outcome.CONVERGED if name == "condensed" else Outcome.GUESSED)

@@ -1,0 +1,185 @@
+"""Extended position-based dynamics (XPBD) of a mass-spring model, with a fixed number of iterations, as in games.
+
+Macklin, Muller, Chentanez 2016, "XPBD: position-based simulation of compliant constrained dynamics", equations 17 and
+18, with the springs and the volumes of `laws.springs` as constraints.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from ..discretisation.element import build_linear_elements
+from ..discretisation.problem import Problem
+from ..discretisation.space import Discretisation
+from ..effects import Elasticity
+from ..geometry.tetmesh import EDGES
+from ..runtime.device import Device, forward_kernel
+from ..terms.laws.invariants import cofactor
+from ..terms.laws.springs import compute_spring_coefficients
+from .linear_body import get_lame
+from .relaxation import Relaxation
+
+
+@dataclass(frozen=True)
+class Substeps:
+    """Time steps of the motion.
+
+    Parameters
+    ----------
+    count, iterations
+        Number of time steps, and of iterations in each.
+    step
+        Duration of a step [s].
+    kept
+        Fraction of the velocity that a step keeps.
+    density
+        Density of the tissue [kg/m^3].
+    """
+
+    count: int = 200
+    iterations: int = 1
+    step: float = 1e-3
+    kept: float = 0.95
+    density: float = 1040.0
+
+
+TOLERANCE = 1e-2  # Relative residual of convergence.
+
+
+@cache
+def build_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
+    """Build the kernels that move vertices and that solve the constraints of tetrahedra, for a scalar type."""
+    scalar, vec, mat = device.scalar, device.vector, device.matrix
+
+    @forward_kernel(module="unique")
+    def move(
+        acceleration: wp.array2d(dtype=scalar),
+        step: scalar,
+        kept: scalar,
+        # outputs
+        u: wp.array2d(dtype=scalar),
+        before: wp.array2d(dtype=scalar),
+    ):
+        """Predict the position: u += kept (u - u-) + h^2 a."""
+        i, c = wp.tid()
+        now = u[i, c]
+        u[i, c] = now + kept * (now - before[i, c]) + step * step * acceleration[i, c]
+        before[i, c] = now
+
+    @wp.func
+    def place(u: wp.array2d(dtype=scalar), node: int, c: int):
+        return vec(u[3 * node, c], u[3 * node + 1, c], u[3 * node + 2, c])
+
+    @wp.func
+    def shift(u: wp.array2d(dtype=scalar), node: int, c: int, by: vec):
+        for k in range(3):
+            u[3 * node + k, c] += by[k]
+
+    @forward_kernel(module="unique")
+    def solve(
+        order: wp.array(dtype=wp.int32),
+        table: wp.array2d(dtype=wp.int32),
+        ends: wp.array2d(dtype=wp.int32),
+        nodes: wp.array(dtype=vec),
+        gradient: wp.array(dtype=mat),
+        inverse: wp.array(dtype=scalar),
+        compliance: wp.array2d(dtype=scalar),
+        # outputs
+        u: wp.array2d(dtype=scalar),
+        multiplier: wp.array3d(dtype=scalar),
+    ):
+        """Change the multiplier m of the constraints C of a tetrahedron, six lengths and a volume, and its positions.
+
+        dm = (-C - a m) / (sum of w |grad C|^2 + a), dx = w grad C dm, with compliance a over the time step squared.
+        """
+        t, c = wp.tid()
+        e = order[t]
+        for k in range(6):
+            i = int(table[e, ends[k, 0]])
+            j = int(table[e, ends[k, 1]])
+            L = nodes[j] - nodes[i]
+            l = L + place(u, j, c) - place(u, i, c)
+            size = wp.length(l)
+            a = compliance[e, k]
+            w = inverse[i] + inverse[j]
+            if w > scalar(0.0) and size > scalar(0.0):
+                change = -(size - wp.length(L) + a * multiplier[e, k, c]) / (w + a)
+                multiplier[e, k, c] += change
+                shift(u, i, c, -(inverse[i] * change / size) * l)
+                shift(u, j, c, (inverse[j] * change / size) * l)
+        F = wp.identity(n=3, dtype=scalar)
+        G = gradient[e]
+        origin = place(u, table[e, 0], c)
+        for k in range(3):
+            F += wp.outer(place(u, table[e, k + 1], c) - origin, G[k])
+        cof = cofactor(F)
+        soft = compliance[e, 6]
+        first = vec()
+        total = scalar(soft)
+        for k in range(3):
+            way = cof * G[k]
+            first -= way
+            total += inverse[table[e, k + 1]] * wp.length_sq(way)
+        total += inverse[table[e, 0]] * wp.length_sq(first)
+        step = -(wp.determinant(F) - scalar(1.0) + soft * multiplier[e, 6, c]) / total
+        multiplier[e, 6, c] += step
+        shift(u, table[e, 0], c, inverse[table[e, 0]] * step * first)
+        for k in range(3):
+            shift(u, table[e, k + 1], c, inverse[table[e, k + 1]] * step * (cof * G[k]))
+
+    return move, solve
+
+
+def prepare(
+    problem: Problem, space: Discretisation, tissue: Elasticity, settings: Substeps = Substeps()
+) -> Callable[[int], tuple[wp.array, int]]:
+    """Return the function that moves a number of load cases: displacements (3N, b) [m] and iterations."""
+    device, mesh = problem.device, space.mesh
+    elements = build_linear_elements(mesh, np.ones(len(mesh.tets), bool))
+    numbers = compute_spring_coefficients(get_lame(tissue, mesh), elements.gradient)
+    mass = np.bincount(mesh.tets.ravel(), np.repeat(0.25 * settings.density * mesh.volumes, 4), len(mesh.nodes))
+    free = ~problem.constraint.fixed.all(axis=1) & (mass > 0.0)
+    inverse = np.where(free, 1.0 / np.maximum(mass, 1e-12), 0.0)
+    stiffness = mesh.volumes[:, None] * np.column_stack([np.repeat(numbers[:, :1], 6, axis=1), numbers[:, 1]])
+    inputs = [
+        device.upload(mesh.tets, wp.int32),
+        device.upload(EDGES, wp.int32),
+        device.upload(mesh.nodes, device.vector),
+        device.upload(elements.gradient[:, 0, 1:], device.matrix),
+        device.upload(inverse),
+        device.upload(1.0 / (np.maximum(stiffness, 1e-12) * settings.step**2)),
+    ]
+    colours = [device.upload(tets, wp.int32) for tets in group_tetrahedra(mesh.tets)]
+    move, solve = build_kernels(device)
+
+    def relax(count: int) -> tuple[wp.array, int]:
+        u, before = device.allocate(problem.rows, count), device.allocate(problem.rows, count)
+        multiplier = device.allocate(len(mesh.tets), 7, count)
+        acceleration = device.upload(-np.repeat(inverse, 3)[:, None] * problem.gradient(u).numpy())
+        numbers = [acceleration, device.scalar(settings.step), device.scalar(settings.kept)]
+        for _ in range(settings.count):
+            device.launch(move, u.shape, numbers, [u, before])
+            multiplier.zero_()
+            for order in settings.iterations * colours:
+                device.launch(solve, (len(order), count), [order, *inputs], [u, multiplier])
+        return u, settings.count * settings.iterations
+
+    return relax
+
+
+def group_tetrahedra(tets: np.ndarray) -> list[np.ndarray]:
+    """Return groups of tetrahedra (T, 4) in which no two share a vertex, by the greedy rule."""
+    used = np.zeros(tets.max() + 1, object)
+    colour = np.empty(len(tets), int)
+    for number, nodes in enumerate(tets.tolist()):
+        taken = used[nodes[0]] | used[nodes[1]] | used[nodes[2]] | used[nodes[3]]
+        lowest = int(~taken & (taken + 1))
+        colour[number] = lowest.bit_length() - 1
+        used[nodes] |= lowest
+    return [np.flatnonzero(colour == each) for each in range(colour.max() + 1)]
+
+
+XPBD = Relaxation("springs", prepare, TOLERANCE)

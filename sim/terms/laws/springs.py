@@ -1,0 +1,106 @@
+"""Mass-spring model: springs along the edges of tetrahedra, and their volume.
+
+A body of equal springs in all directions has Lamé parameters mu = lambda = sum k L^2 / (15 V), so Poisson's ratio 1/4
+(Cauchy's relation). So the six springs of a tetrahedron have k = 15 mu V / sum L^2; in a regular one this is 0.118 E L,
+while Lloyd, Szekely, Harders 2007, IEEE Trans. Vis. Comput. Graph. 13:1081-1094, find 0.113 E L by comparison with a
+finite element. The volume preserving energy of Teschner et al. 2004, "A versatile and robust model for geometrically
+complex deformable solids", has the missing stiffness, lambda - mu:
+
+    psi = sum of k (l - L)^2 / (2 V) + (lambda - mu)/2 (J - 1)^2
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ...errors import InputError
+from .invariants import cofactor_change, cofactor_excess, volume_change
+from .law import Law
+
+
+@wp.func
+def edge(c: Any, number: int):
+    """Return the undeformed edge [m] of a number from 0 to 5: 01, 02, 03, 12, 13, 23."""
+    first = wp.vector(c[2], c[3], c[4])
+    second = wp.vector(c[5], c[6], c[7])
+    third = wp.vector(c[8], c[9], c[10])
+    if number == 0:
+        return first
+    if number == 1:
+        return second
+    if number == 2:
+        return third
+    if number == 3:
+        return second - first
+    if number == 4:
+        return third - first
+    return third - second
+
+
+@wp.func
+def elongation(H: Any, L: Any):
+    """Return l - L [m] of an undeformed edge L: (2 L.HL + |HL|^2) / (l + L), without cancellation."""
+    h = H * L
+    two = type(L[0])(2.0)
+    return (two * wp.dot(L, h) + wp.dot(h, h)) / (wp.length(L + h) + wp.length(L))
+
+
+@wp.func
+def energy(H: Any, c: Any):
+    """Return psi [Pa]."""
+    j = volume_change(H)
+    psi = c[1] * j * j
+    for number in range(6):
+        longer = elongation(H, edge(c, number))
+        psi += c[0] * longer * longer
+    return psi / type(j)(2.0)
+
+
+@wp.func
+def stress(H: Any, c: Any):
+    """Return P [Pa] = sum of k/V (l - L)/l FL (x) L + (lambda - mu) j cof F."""
+    identity = wp.identity(n=3, dtype=type(c[0]))
+    P = c[1] * volume_change(H) * (identity + cofactor_excess(H))
+    for number in range(6):
+        L = edge(c, number)
+        moved = L + H * L
+        P += c[0] * elongation(H, L) / wp.length(moved) * wp.outer(moved, L)
+    return P
+
+
+@wp.func
+def stress_change(H: Any, D: Any, c: Any):
+    """Return dP [Pa] for dF = D, with d[(l - L)/l FL] = (l - L)/l DL + L (FL.DL) / l^3 FL."""
+    identity = wp.identity(n=3, dtype=type(c[0]))
+    cof = identity + cofactor_excess(H)
+    dP = c[1] * (wp.ddot(cof, D) * cof + volume_change(H) * cofactor_change(identity + H, D))
+    for number in range(6):
+        L = edge(c, number)
+        moved, way = L + H * L, D * L
+        l = wp.length(moved)
+        along = wp.length(L) * wp.dot(moved, way) / (l * l * l)
+        dP += c[0] * wp.outer(elongation(H, L) / l * way + along * moved, L)
+    return dP
+
+
+LAW = Law("springs", energy, stress, stress_change)
+
+
+def compute_spring_coefficients(lame: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Return k/V [Pa/m^2], lambda - mu [Pa] and three edges [m] (T, 11) of tetrahedra with mu, lambda (T, 2) [Pa].
+
+    gradient (T, 1, 4, 3) [1/m] of their linear shape functions.
+
+    Raises
+    ------
+    InputError
+        Poisson's ratio below 1/4, which springs cannot have.
+    """
+    mu, lam = lame.T
+    if (lam < mu * (1.0 - 1e-9)).any():
+        raise InputError("a mass-spring model has Poisson's ratio 0.25 or more: increase nu, or use finite elements.")
+    edges = np.linalg.inv(gradient[:, 0, 1:]).transpose(0, 2, 1)
+    others = edges[:, [1, 2, 2]] - edges[:, [0, 0, 1]]
+    square = (edges**2).sum(axis=(1, 2)) + (others**2).sum(axis=(1, 2))
+    return np.column_stack([15.0 * mu / square, lam - mu, edges.reshape(-1, 9)])
