@@ -6,7 +6,7 @@ from dataclasses import asdict
 import msgspec
 
 from scenes.commands.report import QUICK_COUNTS
-from scenes.report.finite_elements import FemVariant
+from scenes.report.finite_elements import FamilySpec, FemVariant
 from scenes.report.learner import LearnerSpec
 from scenes.report.reference import solve_beyond, solve_reference
 from scenes.report.row import ReportRow
@@ -19,7 +19,13 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
-SPECS = (FemVariant("FEM"), FemVariant("linear law", law="linear"), LearnerSpec("linear"))
+SPECS = (
+    FemVariant("FEM"),
+    FemVariant("linear law", law="linear"),
+    LearnerSpec("linear"),
+    FamilySpec("condensed"),
+    FamilySpec("thin-plate"),
+)
 
 
 def nothing(count):

@@ -1,11 +1,12 @@
 """Charts: what is drawn lies where it belongs, and what cannot be drawn is refused."""
 
+import re
 import sys
 
 import numpy as np
 import pytest
 
-from scenes.analysis.loglog_chart import HEIGHT, PALE_OPACITY, WIDTH, ChartPanel, Curve, Dot, draw_panels
+from scenes.analysis.loglog_chart import HEIGHT, PALE_OPACITY, WIDTH, ChartPanel, Curve, Dot, draw_panels, draw_svg
 from scenes.cli import main
 
 FULL = np.array([31, 119, 180])
@@ -79,6 +80,16 @@ def test_a_pale_dot_without_room_has_no_name():
 
     assert changed(picture("horse", ""), picture("", "")) < 20 * changed(picture("horse", "", 1), picture("", "", 1))
     assert changed(picture("horse", "tiger"), picture("horse", ""))
+
+
+def test_dots_of_an_svg_show_their_hints_and_the_front():
+    dots = tuple(Dot(f"row {k}", "g", 10.0**k, 10.0**-k, hint=f"<{k}> ms", y_range=(1e-3, 10.0)) for k in range(3))
+    bare, text = (
+        draw_svg(ChartPanel("t", "x", "y", dots=dots, front=front)) for front in ((), ((1.0, 1.0), (10.0, 0.1)))
+    )
+    assert text.startswith("<svg") and "http" not in text.split("</defs>")[0]
+    assert re.findall(r'<g id="dot-\d"><title>([^<]*)</title>', text) == [f"&lt;{k}&gt; ms" for k in range(3)]
+    assert text.count("<path") == bare.count("<path") + 1
 
 
 def test_a_panel_has_its_size():

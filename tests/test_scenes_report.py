@@ -16,6 +16,7 @@ from scenes.report.page import Section, write_report
 from scenes.report.row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow
 from sim.accuracy import REFERENCE, TRAIN
 from sim.effects import build_push_effects
+from sim.families.registry import build_family
 from sim.fem import Fem
 from surrogate.data.dataset import read_dataset
 from surrogate.data.splits import leave_sectors_out
@@ -77,14 +78,35 @@ def test_numbers_are_those_recomputed_by_hand(study, page, study_box):
 
 def test_the_page_needs_nothing_but_itself(page, study_rows):
     text = (page / "index.html").read_text()
-    assert not re.search(r"https?:|<script|<link|@import|url\(", text)
+    assert not re.search(r"https?:|<script|<link|@import|url\((?!#)", text)
     sources = re.findall(r'src="([^"]{0,30})', text)
-    assert len(sources) == 3 + 3 and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert len(sources) == 5 and all(source.startswith("data:image/png;base64,") for source in sources)
     for words in ("not measured", "model difference", "About &lt;this&gt;."):
         assert words in text
-    assert text.index("<img") < text.index("<table"), "error against time comes first"
+    assert text.count("<svg") == 6 and text.index("<svg") < text.index("<table"), "error against time comes first"
+    assert "<title>condensed, other mechanics: mean" in text, "a row shows where the pointer rests"
     for row in study_rows[:3]:
         assert read_png(page / "pictures" / row.picture).std() > 5.0
+
+
+def test_rows_of_families_have_each_loads_error_and_outcome(study, study_rows, study_box):
+    """The table against elements to a small tolerance: of the same tissue, but linear."""
+    fem, _, learner, condensed, plate = study_rows
+    nodes = np.union1d(study.patch.nodes, study_box.tumour_nodes)
+    effects = build_push_effects(study_box, TISSUE)
+    truth = Fem(study_box, effects, REFERENCE, "cpu", element="p2").deform(study.played, at=nodes).displacement
+    found = build_family("condensed", study_box, effects, "cpu").deform(study.played, at=nodes).displacement
+    distance = 1e3 * np.linalg.norm(found - truth, axis=2)
+    for name, part in (("load_mm", study_box.tumour_nodes), ("cortex_mm", study.patch.nodes)):
+        wanted = distance[:, np.isin(nodes, part)].mean(axis=1)
+        assert np.allclose(getattr(condensed, name), wanted, rtol=1e-3)
+    assert condensed.reference.mm.mean == pytest.approx(np.mean(condensed.load_mm))
+    assert fem.reference.mm.mean < plate.reference.mm.mean
+    assert sum(condensed.outcomes.values()) == sum(fem.outcomes.values()) == len(study.played)
+    assert set(plate.outcomes) <= {"GUESSED", "INVERTED", "OVERSTRAINED"}
+    assert learner.cortex_mm == () and len(learner.load_mm) == len(study.played)
+    assert condensed.preparation == condensed.set_up > 0.0 and condensed.adapt > 0.0
+    assert condensed.central_ms[0] <= condensed.median <= condensed.central_ms[1]
 
 
 @pytest.mark.parametrize("fine", [False, True])

@@ -1,13 +1,17 @@
 """Charts with logarithmic axes, drawn by matplotlib as arrays of pixels."""
 
+import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
 from sim.runtime.optional_packages import require_extra
 
 with require_extra("report", "a chart needs"):
+    from matplotlib import rc_context
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -36,20 +40,26 @@ class Curve:
 
 @dataclass(frozen=True)
 class Dot:
-    """Point (x, y), both positive, with a label, in the colour of its group; or pale."""
+    """Point (x, y), both positive, with a label, in the colour of its group; or pale.
+
+    `y_range`: ends of a vertical bar; `hint`: text that appears where the pointer rests on the dot.
+    """
 
     name: str
     group: str
     x: float
     y: float
     pale: bool = False
+    y_range: tuple[float, float] | None = None
+    hint: str = ""
 
 
 @dataclass(frozen=True)
 class ChartPanel:
     """One pair of axes: title, what they show, curves, dots, and `marks`: labelled vertical lines.
 
-    size: width and height [pixel]; y_range: limits of the axis (default: those of the data and a margin).
+    size: width and height [pixel]; y_range: limits of the axis (default: those of the data and a margin); front:
+    points that a stepped line joins.
     """
 
     title: str
@@ -60,6 +70,7 @@ class ChartPanel:
     dots: tuple[Dot, ...] = ()
     size: tuple[int, int] = (WIDTH, HEIGHT)
     y_range: tuple[float, float] | None = None
+    front: tuple[tuple[float, float], ...] = ()
 
 
 def draw_panels(panels: Sequence[ChartPanel]) -> np.ndarray:
@@ -75,8 +86,38 @@ def draw_panels(panels: Sequence[ChartPanel]) -> np.ndarray:
     return np.hstack([_draw_panel(panel) for panel in panels])
 
 
+def draw_svg(panel: ChartPanel) -> str:
+    """Return a panel as an SVG element for HTML, whose dots show their `hint`.
+
+    Raises
+    ------
+    ValueError
+        No point that is positive.
+    """
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "sulcus"}), io.StringIO() as file:
+        canvas = _build_canvas(panel)
+        canvas.draw()
+        canvas.figure.set_layout_engine("none")  # names and axes stay where this resolution has them
+        canvas.figure.savefig(file, format="svg", metadata={"Date": None})
+        text = file.getvalue()
+    text = re.sub(
+        r"<metadata>.*?</metadata>|\sxmlns(:xlink)?=\"[^\"]*\"", "", text[text.index("<svg") :], flags=re.DOTALL
+    )
+    for number, dot in enumerate(panel.dots):
+        mark = f'<g id="dot-{number}">'
+        text = text.replace(mark, f"{mark}<title>{escape(dot.hint or dot.name)}</title>", 1)
+    return text
+
+
 def _draw_panel(panel: ChartPanel) -> np.ndarray:
+    canvas = _build_canvas(panel)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _build_canvas(panel: ChartPanel) -> FigureCanvasAgg:
     pairs = [point for curve in panel.curves for point in curve.points] + [(dot.x, dot.y) for dot in panel.dots]
+    pairs += [(dot.x, y) for dot in panel.dots for y in dot.y_range or ()]
     points = np.array(pairs, float).reshape(-1, 2)
     if not len(points) or not (points > 0.0).all():
         raise ValueError(f"{panel.title}: logarithmic axes show positive numbers, and at least one point.")
@@ -90,7 +131,7 @@ def _draw_panel(panel: ChartPanel) -> np.ndarray:
         axis.set_minor_formatter("{x:g}")
     axes.grid(which="both", color="0.9")
     axes.set_axisbelow(True)
-    for x, name in panel.marks:
+    for x, name in (mark for mark in panel.marks if x_range[0] < mark[0] < x_range[1]):
         axes.axvline(x, color=NAME_GREY, linestyle="--", linewidth=1.0)
         axes.annotate(name, (x, 0.0), (5, 8), ("data", "axes fraction"), "offset points", color=NAME_GREY, size="small")
     for curve in panel.curves:
@@ -98,23 +139,20 @@ def _draw_panel(panel: ChartPanel) -> np.ndarray:
     groups = {group: f"C{number}" for number, group in enumerate({dot.group: 0 for dot in panel.dots})}
     for group, colour in groups.items():
         axes.plot([], [], "o", color=colour, markersize=DOT_DIAMETER, label=group)
-    for dot in sorted(panel.dots, key=lambda dot: not dot.pale):  # pale ones first, so that they cover nothing
-        axes.plot(
-            dot.x,
-            dot.y,
-            "o",
-            color=groups[dot.group],
-            markersize=DOT_DIAMETER,
-            markeredgewidth=0,
-            alpha=PALE_OPACITY if dot.pale else 1,
-        )
+    if panel.front:
+        axes.step(*np.array(sorted(panel.front)).T, where="post", color=NAME_GREY, linewidth=1.0, zorder=1)
+    for number, dot in sorted(enumerate(panel.dots), key=lambda each: not each[1].pale):  # pale ones are covered
+        colour, opacity = groups[dot.group], PALE_OPACITY if dot.pale else 1.0
+        if dot.y_range:
+            axes.vlines(dot.x, *dot.y_range, color=colour, linewidth=1.0, alpha=0.6 * opacity)
+        (drawn,) = axes.plot(dot.x, dot.y, "o", color=colour, markersize=DOT_DIAMETER, markeredgewidth=0, alpha=opacity)
+        drawn.set_gid(f"dot-{number}")
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize="small")
     if panel.dots:
         canvas.draw()
         _name(axes, panel.dots)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return canvas
 
 
 def _name(axes: Axes, dots: Sequence[Dot]) -> None:

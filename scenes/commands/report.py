@@ -78,7 +78,13 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
     from ..report.adaptation import build_debulked_study, simulate_debulked
     from ..report.page import Section, write_report
     from ..report.reference import solve_beyond, solve_reference
-    from ..report.rows import list_all_combinations, list_learner_specs, list_one_factor_variants, measure_rows
+    from ..report.rows import (
+        list_all_combinations,
+        list_family_specs,
+        list_learner_specs,
+        list_one_factor_variants,
+        measure_rows,
+    )
     from ..report.study import ReportStudy
 
     several = parse_device_names(args.device)
@@ -100,6 +106,7 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
     for study in studies:
         specs = (
             *(list_all_combinations(study) if args.full else list_one_factor_variants(study, not args.quick)),
+            *list_family_specs(),
             *list_learner_specs(),
         )
         after = 0 if args.quick else len(study.dataset.loads) + len(study.dataset.unit_good)

@@ -1,5 +1,6 @@
-"""Row of a FEM variant: each test load alone, from rest, on this mesh or another."""
+"""Rows of finite elements and of other families: each test load alone, from rest."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,9 +12,11 @@ from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.refine import refine
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, build_template_subject
+from sim.deformation import Deformer, Outcome
 from sim.discretisation.footprint import find_nearest_on
 from sim.effects import Elasticity, build_push_effects
 from sim.errors import InputError
+from sim.families.registry import build_family
 from sim.fem import Fem
 from sim.geometry.locate import locate
 from sim.loads import Loads, Pushed
@@ -21,11 +24,26 @@ from sim.material import Material, Tissue
 
 from ..analysis.measurement import time_work
 from .adaptation import debulk_tumour
-from .row import DIFFERENCE, ERROR, TOLERANCE_ALONE, ReportRow, compare_with_reference, summarise_times
+from .row import (
+    DIFFERENCE,
+    ERROR,
+    TOLERANCE_ALONE,
+    ReportRow,
+    compare_with_reference,
+    compute_load_errors,
+    summarise_times,
+)
 from .study import ReportStudy
 
 OWN_MESH, HALVED_MESH = "own", "halved"  # Meshes: that of the data; with every edge halved.
 STANDARD_TOLERANCE = 1e-4  # Solver tolerance of data sets.
+GEOMETRY, SPRINGS, MECHANICS = "geometry", "springs", "other mechanics"  # Kinds of families.
+KINDS = {
+    **dict.fromkeys(("kelvinlets", "thin-plate", "lattice"), GEOMETRY),
+    **dict.fromkeys(("mass-spring", "xpbd"), SPRINGS),
+    **dict.fromkeys(("boundary-elements", "condensed", "explicit", "element-free"), MECHANICS),
+}
+"""Kind of each family, which has one colour in a plot."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +68,13 @@ class FemVariant:
         return Accuracy(tolerance=self.tolerance, precision=self.precision or precision)
 
 
+@dataclass(frozen=True)
+class FamilySpec:
+    """One of `FAMILIES`, on the mesh of the data set."""
+
+    name: str
+
+
 def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, np.ndarray]:
     """Return the row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
 
@@ -58,36 +83,60 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
     InputError
         Input that `Fem` rejects; a law that the data's tissue has no constants for.
     """
-    body, own = find_body(study, spec.mesh), study.anatomy
+    body = find_body(study, spec.mesh)
     fem, set_up = time_work(_build_fem, study, spec, body)
     loads = study.played if spec.mesh == OWN_MESH else move_pushes_onto(body, study.played)
-    located = locate(body.mesh, own.mesh.nodes[own.tumour_nodes])
-    fem.deform(loads.select(np.array([0])))  # kernels are compiled or loaded at their first launch
-    fields, good, seconds = [], [], []
-    for row in range(len(loads)):
-        result, spent = time_work(fem.deform, loads.select(np.array([row])))
-        seconds.append(spent)
-        fields.append(located.read(result.displacement)[0])
-        good.append(result.outcome[0].good)
-    field = np.array(fields)
     row = ReportRow(
-        spec.name,
-        "finite elements",
-        against=describe_difference(study, spec),
-        reference=compare_with_reference(study, field, np.array(good), own.tumour_nodes),
-        failed=good.count(False),
-        set_up=set_up,
-        plan=fem.plan.explain(),
-        adapt=_measure_adaptation(study, spec, loads.select(np.array([0]))),
+        spec.name, "finite elements", against=describe_difference(study, spec), set_up=set_up, plan=fem.plan.explain()
+    )
+    row, field = _measure_loads(study, row, fem, loads)
+    debulked = debulk_tumour(body)
+    adapt = time_work(lambda: _build_fem(study, spec, debulked).deform(loads.select(np.array([0]))))[1]
+    return replace(row, adapt=adapt), field
+
+
+def measure_family(study: ReportStudy, spec: FamilySpec) -> tuple[ReportRow, np.ndarray]:
+    """Return the row of a family, and displacements (n, k, 3) [m] as `measure_elements`.
+
+    Raises
+    ------
+    InputError
+        Tissue or anatomy that the family rejects.
+    """
+
+    def build(body: Anatomy) -> Deformer:
+        return build_family(spec.name, body, build_push_effects(body, study.get_tissue_on(body)), study.device)
+
+    model, set_up = time_work(build, study.anatomy)
+    row, field = _measure_loads(study, ReportRow(spec.name, KINDS[spec.name], set_up=set_up), model, study.played)
+    debulked, first = debulk_tumour(study.anatomy), study.played.select(np.array([0]))
+    return replace(row, adapt=time_work(lambda: build(debulked).deform(first, at=debulked.tumour_nodes))[1]), field
+
+
+def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: Loads) -> tuple[ReportRow, np.ndarray]:
+    """Return the row with errors and times of the loads, one by one, and displacements (n, k, 3) [m] of the tumour."""
+    own, drawn = study.anatomy, study.drawn
+    same = model.anatomy is own
+    located = None if same else locate(model.anatomy.mesh, own.mesh.nodes[drawn])
+    reliable = isinstance(model, Fem)
+    model.deform(loads.select(np.array([0])), at=drawn if same else None)  # kernels are compiled at their first launch
+    fields, outcomes, seconds = [], [], []
+    for number in range(len(loads)):
+        result, spent = time_work(model.deform, loads.select(np.array([number])), None, drawn if same else None)
+        seconds.append(spent)
+        fields.append(result.displacement[0] if located is None else located.read(result.displacement)[0])
+        outcomes.append(result.outcome[0])
+    field, tumour = np.array(fields), np.isin(drawn, own.tumour_nodes)
+    good = np.array([outcome.good if reliable else outcome is not Outcome.NOT_FINITE for outcome in outcomes])
+    row = replace(
+        row,
+        reference=compare_with_reference(study, field[:, tumour], good, own.tumour_nodes),
+        failed=int((~good).sum()),
+        outcomes=dict(Counter(outcome.name for outcome in outcomes)),
+        **compute_load_errors(study, field, good, drawn),
         **summarise_times(seconds),
     )
-    return row, field
-
-
-def _measure_adaptation(study: ReportStudy, spec: FemVariant, load: Loads) -> float:
-    """Return the seconds from the debulked body to its first solution, with compiled kernels."""
-    body = debulk_tumour(find_body(study, spec.mesh))
-    return time_work(lambda: _build_fem(study, spec, body).deform(load))[1]
+    return row, field[:, tumour]
 
 
 def _build_fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:

@@ -14,7 +14,7 @@ from surrogate.training.train import train
 from ..analysis.measurement import time_work
 from .adaptation import build_debulked_study, read_simulation_seconds
 from .reference import get_solutions_beyond
-from .row import ErrorFigures, ReportRow, compare_with_reference, compute_figures, summarise_times
+from .row import ErrorFigures, ReportRow, compare_with_reference, compute_figures, compute_load_errors, summarise_times
 from .study import ReportStudy, measure_series_seconds
 
 MIN_LOADS = 64  # Smallest number of training loads of a learning curve.
@@ -67,6 +67,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
         spec.name,
         "learnt",
         reference=compare_with_reference(study, field, np.ones(len(field), bool), nodes),
+        **compute_load_errors(study, field, np.ones(len(field), bool), nodes),
         own_fem={name: figures for name, (figures, _) in sets.items() if figures is not None},
         flagged={name: share for name, (_, share) in sets.items()},
         covered=covered,

@@ -2,85 +2,22 @@
 
 import json
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ar.screen import write_png
+from sim.deformation import Outcome
 from sim.runtime.atomic_files import write_atomically
-from surrogate.evaluation.choose import find_pareto_front
 from surrogate.model.held_out import MIN_LOADS_FOR_P999
 
-from ..analysis.loglog_chart import ChartPanel, Curve, Dot, draw_panels
+from ..analysis.loglog_chart import draw_panels, draw_svg
 from ..analysis.measurement import write_table
-from .row import ERROR, TOLERANCE_ALONE, ErrorFigures, ReportRow
+from .charts import CHARTS, find_front, format_number
+from .row import ERROR, ErrorFigures, ReportRow
 
-SIZE = (880, 560)  # Width and height of a chart [pixel].
-DIFFERENT_LAW = "another law: model difference"  # Name of the group of rows with another material law.
-TIME_LABEL = "milliseconds a load, one at a time"  # Label of the time axis.
-Place = tuple[float, float]
-
-
-def find_front(rows: Sequence[ReportRow]) -> frozenset[str]:
-    """Names of the rows that no other equals or beats in both milliseconds and mean distance from the reference.
-
-    Only errors count: another law is none, and the reference's own elements have none of their mesh.
-    """
-    return find_pareto_front(_collect_points((row, row.reference) for row in rows if row.against == ERROR))
-
-
-def plot_error_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
-    """Plot error against time, (H, W, 3) uint8; rows off the Pareto front are pale. None without rows.
-
-    Rows that show only their tolerance would be far below all others, and are omitted.
-    """
-    places = _collect_points((row, row.reference) for row in rows if row.against != TOLERANCE_ALONE)
-    group = {row.name: row.family if row.against == ERROR else DIFFERENT_LAW for row in rows}
-    title = "Error against time: full colour where no other row is both faster and nearer"
-    return _scatter(title, "mean distance from the reference at the tumour [mm]", places, group, find_front(rows))
-
-
-def plot_learners_against_time(rows: Sequence[ReportRow]) -> np.ndarray | None:
-    """Plot the learning error against time, (H, W, 3) uint8; None without learners."""
-    places = _collect_points((row, row.own_fem.get("discs")) for row in rows)
-    title = "What learning lost, against time: distance from its own finite elements, left-out discs"
-    group = {row.name: row.family for row in rows}
-    return _scatter(
-        title, "mean distance from its own finite elements at the tumour [mm]", places, group, find_pareto_front(places)
-    )
-
-
-def plot_error_against_solves(rows: Sequence[ReportRow]) -> np.ndarray | None:
-    """Error against the number of training loads, (H, W, 3) uint8; None without learners."""
-    curves = tuple(
-        Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
-    )
-    y = "mean distance from its own finite elements on left-out discs [mm]"
-    return draw_panels([ChartPanel("Error against solves", "training loads", y, curves, size=SIZE)]) if curves else None
-
-
-def _collect_points(found: Iterable[tuple[ReportRow, ErrorFigures | None]]) -> dict[str, Place]:
-    """Milliseconds a load and mean distance [mm] by name, where both are there and can stand on logarithmic axes."""
-    return {
-        row.name: (row.median, figures.mm.mean)
-        for row, figures in found
-        if row.median is not None and figures is not None and figures.mm.mean > 0.0
-    }
-
-
-def _scatter(
-    title: str, y: str, places: Mapping[str, Place], group: Mapping[str, str], best: frozenset[str]
-) -> np.ndarray | None:
-    dots = tuple(Dot(name, group[name], *place, pale=name not in best) for name, place in places.items())
-    return draw_panels([ChartPanel(title, TIME_LABEL, y, dots=dots, size=SIZE)]) if dots else None
-
-
-# Functions that draw the charts, by name.
-PLOTS = {"time": plot_error_against_time, "learners": plot_learners_against_time, "solves": plot_error_against_solves}
 SETS = {  # Descriptions of the sets of test loads.
     "discs": "whole discs of cortex left out",
     "sectors": "whole sectors of direction left out",
@@ -99,6 +36,8 @@ th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
 tr.front td:first-child { font-weight: bold; } tr.pale td { color: #777; } img { max-width: 100%; }
 figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption { font-size: 13px; }
 .wide { overflow-x: auto; }
+figure.chart { width: 880px; max-width: 100%; } figure.chart svg { width: 100%; height: auto; }
+summary { cursor: pointer; margin: 0.5em 0; }
 """
 NOTES = (  # Paragraphs below the tables.
     "Two errors are given. The error relative to the reference is the accuracy of a row. The error relative to "
@@ -140,11 +79,11 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
     bodies = []
     for section in sections:
         plots = []
-        for kind, plot in PLOTS.items():
-            picture = plot(section.rows)
-            if picture is not None:
-                write_png(folder / f"{section.name}-{kind}.png", picture)
-                plots.append(folder / f"{section.name}-{kind}.png")
+        for kind, build in CHARTS.items():
+            chart = build(section.rows)
+            if chart is not None:
+                write_png(folder / f"{section.name}-{kind}.png", draw_panels([chart]))
+                plots.append(f"<figure class=chart>{draw_svg(chart)}</figure>")
         write_table(folder / f"{section.name}.csv", [dict(_flatten(asdict(row))) for row in section.rows])
         bodies.append(_format_section(section, folder, plots))
     with write_atomically(folder / "report.json", ".json") as partial:
@@ -158,11 +97,10 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
         )
 
 
-def _format_section(section: Section, folder: Path, plots: Sequence[Path]) -> str:
+def _format_section(section: Section, folder: Path, plots: Sequence[str]) -> str:
     measured = [row for row in section.rows if row.reference is not None]
     learnt = [row for row in section.rows if row.own_fem]
     about = "".join(f"<p>{escape(sentence)}</p>" for sentence in section.about)
-    first, *others = [_embed_image(plot, plot.stem) for plot in plots] or [""]
     pictures = [
         f"<figure>{_embed_image(folder / 'pictures' / row.picture, row.name)}"
         f"<figcaption>{escape(row.name)}</figcaption></figure>"
@@ -170,18 +108,42 @@ def _format_section(section: Section, folder: Path, plots: Sequence[Path]) -> st
         if row.picture
     ]
     return (
-        f"<h2>{escape(section.name)}</h2>{first}{about}"
-        f"<h3>Against the reference</h3>{_format_reference_table(section)}"
+        f"<h2>{escape(section.name)}</h2>{''.join(plots)}{_format_summary(section.rows)}{about}"
+        f"<details><summary>All numbers against the reference</summary>{_format_reference_table(section)}</details>"
         + (
-            f"<h3>Against its own finite elements</h3>{_format_own_fem_table(learnt)}{''.join(others)}"
+            f"<details><summary>Learners against their own finite elements</summary>{_format_own_fem_table(learnt)}"
+            "</details>"
             if learnt
             else ""
         )
-        + f"<h3>By tenths of the force</h3>{_format_force_table(measured, learnt)}"
-        "<h3>Worst cases</h3><p>The tumour as the row has it, and dashed in yellow where the reference has it; a pixel "
-        "is about 0.1 mm.</p>"
+        + "<h3>Worst cases</h3><p>The tumour as the row has it, and dashed in yellow where the reference has it; a "
+        "pixel is about 0.1 mm.</p>"
         f"{''.join(pictures)}{_format_plans(measured)}"
     )
+
+
+SUMMARY_HEADS = (
+    "model", "kind", "mean error mm", "% of the motion", "median ms", "preparation s", "resection known after s",
+    "memory GiB", "reliable loads",
+)  # fmt: skip
+"""Column titles of the table of models."""
+
+
+def _format_summary(rows: Sequence[ReportRow]) -> str:
+    """Return one line for each model: accuracy, time, preparation, adaptability, memory, outcomes."""
+    best = find_front(rows)
+    lines = []
+    for row in rows:
+        if row.reference is None or row.against != ERROR:
+            continue
+        reliable = sum(count for name, count in row.outcomes.items() if Outcome[name].good)
+        costs = (row.median, row.preparation, row.adapt, row.memory)
+        cells = (
+            row.name, row.family, *map(format_number, (row.reference.mm.mean, row.reference.percent.mean, *costs)),
+            f"{reliable} of {sum(row.outcomes.values())}" if row.outcomes else "",
+        )  # fmt: skip
+        lines.append(("front" if row.name in best else "", cells))
+    return _format_table(SUMMARY_HEADS, lines) if lines else ""
 
 
 def _format_plans(rows: Sequence[ReportRow]) -> str:
@@ -209,9 +171,9 @@ def _format_reference_table(section: Section) -> str:
         short = "" if row.solving is not None or row.loads is None else " of fitting"
         cost = (row.median, row.p99, row.bare, row.set_up, row.memory, row.card)
         cells = (
-            row.name, row.against, _count(row), *_spread(row.reference), *map(_format_number, cost),
+            row.name, row.against, _count(row), *_spread(row.reference), *map(format_number, cost),
             _format_solves(row),
-            "" if row.inside is None else str(row.inside), _format_number(minutes) + short, _format_adaptation(row),
+            "" if row.inside is None else str(row.inside), format_number(minutes) + short, _format_adaptation(row),
         )  # fmt: skip
         lines.append(("front" if row.name in best else "", cells))
     return _format_table(heads, lines)
@@ -221,9 +183,9 @@ def _format_adaptation(row: ReportRow) -> str:
     if row.adapt is None:
         return "not measured"
     return (
-        _format_number(row.adapt)
+        format_number(row.adapt)
         if row.adapted is None
-        else f"{_format_number(row.adapt)} ({_format_number(row.adapted.mm.mean)})"
+        else f"{format_number(row.adapt)} ({format_number(row.adapted.mm.mean)})"
     )
 
 
@@ -263,33 +225,12 @@ def _share(share: float | None) -> str:
     return "" if share is None else f"{100.0 * share:.0f} %"
 
 
-def _format_force_table(measured: Sequence[ReportRow], learnt: Sequence[ReportRow]) -> str:
-    """Return the errors of learners relative to their own FEM, over more loads."""
-    lines = [(row.name, "reference", row.reference) for row in measured]
-    lines += [(row.name, "own FEM", row.own_fem["discs"]) for row in learnt if "discs" in row.own_fem]
-    most = max((len(figures.tenths) for *_, figures in lines if figures), default=0)
-    heads = ("mean mm (largest)", "from", *(f"{k + 1}" for k in range(most)))
-    table = [
-        ("", (name, against, *(f"{_format_number(t.mean)} ({_format_number(t.largest)})" for t in figures.tenths)))
-        for name, against, figures in lines
-        if figures
-    ]
-    return _format_table(heads, table)
-
-
 def _spread(figures: ErrorFigures | None) -> tuple[str, ...]:
     if figures is None:
         return ("",) * len(SPREAD_HEADS)
     worst = figures.worst
     values = (*asdict(figures.mm).values(), worst.mean, worst.p95, worst.p999, *asdict(figures.percent).values())
-    return tuple("\N{EN DASH}" if value is None else _format_number(value) for value in values)
-
-
-def _format_number(value: float | None) -> str:
-    """Three digits, as people write them."""
-    if value is None:
-        return ""
-    return "< 0.0001" if 0.0 < value < 1e-4 else f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
+    return tuple("\N{EN DASH}" if value is None else format_number(value) for value in values)
 
 
 def _format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:

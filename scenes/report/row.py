@@ -97,11 +97,28 @@ def compare_with_reference(
     return compute_figures(result[rows], truth.displacement[rows][:, known], study.played.select(rows))
 
 
+def compute_load_errors(study: ReportStudy, result: np.ndarray, good: np.ndarray, nodes: np.ndarray) -> dict[str, Any]:
+    """Compute the mean distance of each test load from the reference [mm] at vertices `nodes` (k,), in two parts.
+
+    `load_mm`: at the tumour; `cortex_mm`: at the open cortex, empty if `nodes` lacks it. As `compare_with_reference`.
+    """
+    truth = get_reference(study)
+    rows = np.flatnonzero(good & truth.good)
+    parts = {"load_mm": study.anatomy.tumour_nodes, "cortex_mm": study.patch.nodes}
+    distance = 1e3 * np.linalg.norm(result[rows] - truth.displacement[rows][:, np.isin(study.drawn, nodes)], axis=2)
+    known = np.intersect1d(study.drawn, nodes)
+    return {
+        name: tuple(distance[:, np.isin(known, part)].mean(axis=1).tolist()) if np.isin(part, known).all() else ()
+        for name, part in parts.items()
+    }
+
+
 def summarise_times(seconds: Sequence[float]) -> dict[str, Any]:
     """Summarise the wall times of single loads [s]."""
     ms = 1e3 * np.array(seconds)
     p99 = float(np.percentile(ms, 99.0)) if len(ms) >= MIN_LOADS_FOR_P99 else None
-    return {"median": float(np.median(ms)), "p99": p99, "timed": len(ms)}
+    low, high = np.percentile(ms, [2.5, 97.5]).tolist()
+    return {"median": float(np.median(ms)), "p99": p99, "timed": len(ms), "central_ms": (low, high)}
 
 
 @dataclass(frozen=True)
@@ -124,10 +141,14 @@ class ReportRow:
         Share of each set that it marks as extrapolated.
     covered
         Share of the loads of "discs" and "beyond" whose largest error is within the bound at 0.95.
+    load_mm, cortex_mm
+        Mean distance from the reference of each compared load [mm], at the tumour and at the open cortex.
     failed
         Test loads without a solution; they are excluded from all figures.
-    median, p99
-        Time per load [ms], one at a time; p99 only for at least 1,000.
+    outcomes
+        Numbers of test loads by the name of their `Outcome`.
+    median, p99, central_ms
+        Time per load [ms], one at a time; p99 only for at least 1,000; range of the central 95 %.
     bare
         Time per load [ms] of the trained model alone in NumPy: no bound, no limits, same kind of code for all.
     timed
@@ -164,9 +185,13 @@ class ReportRow:
     own_fem: Mapping[str, ErrorFigures] = field(default_factory=dict)
     flagged: Mapping[str, float] = field(default_factory=dict)
     covered: Mapping[str, float] = field(default_factory=dict)
+    load_mm: tuple[float, ...] = ()
+    cortex_mm: tuple[float, ...] = ()
     failed: int = 0
+    outcomes: Mapping[str, int] = field(default_factory=dict)
     median: float | None = None
     p99: float | None = None
+    central_ms: tuple[float, float] | None = None
     bare: float | None = None
     timed: int = 0
     set_up: float | None = None
@@ -183,3 +208,10 @@ class ReportRow:
     curve: tuple[tuple[int, ErrorFigures], ...] = ()
     plan: tuple[str, ...] = ()
     picture: str | None = None
+
+    @property
+    def preparation(self) -> float | None:
+        """Time before the first load [s], if known: set-up, or solves and training."""
+        if self.learning is None:
+            return self.set_up
+        return None if self.solving is None else self.learning + self.solving

@@ -18,6 +18,7 @@ import numpy as np
 
 from sim.accuracy import MIN_TOLERANCE, Precision
 from sim.errors import InputError
+from sim.families.registry import FAMILIES
 from sim.geometry.tetmesh import compute_digest
 from sim.material import LAWS
 from sim.runtime.atomic_files import write_atomically
@@ -27,13 +28,23 @@ from sim.runtime.threads import limit_to_one_thread
 from surrogate.training.train import LEARNERS
 
 from ..analysis.measurement import measure_peak_memory, watch_gpu_memory
-from .finite_elements import HALVED_MESH, OWN_MESH, STANDARD_TOLERANCE, FemVariant, get_law_name, measure_elements
+from .finite_elements import (
+    HALVED_MESH,
+    OWN_MESH,
+    STANDARD_TOLERANCE,
+    FamilySpec,
+    FemVariant,
+    get_law_name,
+    measure_elements,
+    measure_family,
+)
 from .learner import LearnerSpec, measure_learner
 from .row import ReportRow
 from .study import ReportStudy
 
-Spec = FemVariant | LearnerSpec
-FAMILY_NAMES = {FemVariant: "finite elements", LearnerSpec: "learnt"}  # Names of families by type.
+Spec = FemVariant | FamilySpec | LearnerSpec
+FAMILY_NAMES = {FemVariant: "finite elements", FamilySpec: "other families", LearnerSpec: "learnt"}
+"""Names of kinds of rows by type."""
 
 
 def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
@@ -51,9 +62,10 @@ def measure_row(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
     `ReportRow.state` gives the reason for a missing one.
     """
     try:
-        if isinstance(spec, FemVariant):
+        if not isinstance(spec, LearnerSpec):
             with watch_gpu_memory(study.device) as taken:
-                row, field = measure_elements(study, spec)
+                of_elements = isinstance(spec, FemVariant)
+                row, field = measure_elements(study, spec) if of_elements else measure_family(study, spec)
             row = replace(row, card=max(taken) / 2**30 or None)
         else:
             row, field = _measure_on_one_core(study, spec)
@@ -113,6 +125,11 @@ def list_all_combinations(study: ReportStudy) -> tuple[FemVariant, ...]:
     )
 
 
+def list_family_specs() -> tuple[FamilySpec, ...]:
+    """One for each of `FAMILIES`."""
+    return tuple(FamilySpec(name) for name in FAMILIES)
+
+
 def list_learner_specs() -> tuple[LearnerSpec, ...]:
     """One for each learner of `surrogate`."""
     return tuple(LearnerSpec(name) for name in LEARNERS)
@@ -152,7 +169,7 @@ def measure_rows(
     beside = cores >= 2 * CORES and (study.on_card if on_card is None else on_card)
     stopped, groups = Event(), []
     for kind, alike in groupby(specs, type):
-        together = 1 if kind is FemVariant else max(1, cores // CORES - beside)
+        together = 1 if kind is not LearnerSpec else max(1, cores // CORES - beside)
         measuring = run or partial(measure_in_process, BoundedSemaphore(together))
         ahead = together if cores >= CORES else 0
         groups.append(_run_ahead(partial(_get_row, study, measuring), list(alike), ahead))

@@ -1,0 +1,152 @@
+"""Charts of the report, one question each."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from surrogate.evaluation.choose import find_pareto_front
+
+from ..analysis.loglog_chart import ChartPanel, Curve, Dot
+from .row import ERROR, TOLERANCE_ALONE, ErrorFigures, ReportRow
+
+SIZE = (880, 560)  # Width and height of a chart [pixel].
+DIFFERENT_LAW = "another law: model difference"  # Name of the group of rows with another material law.
+ERROR_LABEL = "mean distance from the reference at the tumour [mm]"  # Label of the error axes.
+MARKS = ((60.0, "1 minute"), (600.0, "10 minutes"), (3600.0, "1 hour"))  # Times on the axes of preparation [s].
+Place = tuple[float, float]
+
+
+def find_front(rows: Sequence[ReportRow]) -> frozenset[str]:
+    """Names of the rows that no other equals or beats in both milliseconds and mean distance from the reference.
+
+    Only errors count: another law is none, and the reference's own elements have none of their mesh.
+    """
+    return find_pareto_front({row.name: place for row in rows if row.against == ERROR and (place := _place_time(row))})
+
+
+def _place_time(row: ReportRow) -> Place | None:
+    return _place(row.median, row.reference)
+
+
+def _place(x: float | None, figures: ErrorFigures | None) -> Place | None:
+    """Return x and the mean distance [mm], if both can stand on logarithmic axes."""
+    return None if not x or figures is None or not figures.mm.mean > 0.0 else (x, figures.mm.mean)
+
+
+def build_error_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
+    """Build the chart of error against time; bars are the central 95 % of the loads. None without rows.
+
+    Rows that show only their tolerance would be far below all others, and are omitted.
+    """
+    return _scatter(rows, "Which model is most accurate in the time available?", "milliseconds a load", _place_time)
+
+
+def build_preparation_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
+    """Build the chart of error against the time before the first load; None without rows."""
+    title = "How accurate is a model of a new patient after this time?"
+    chart = _scatter(rows, title, "seconds before the first load", lambda row: _place(row.preparation, row.reference))
+    return chart and replace(chart, marks=MARKS)
+
+
+def build_adaptation_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
+    """Build the chart of error against the time until a model knows a resection; None without rows."""
+    title = "How long until a model knows that tissue was removed?"
+    return _scatter(rows, title, "seconds until the first load", lambda row: _place(row.adapt, row.reference))
+
+
+def build_cortex_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
+    """Build the chart of the error at the open cortex, which a camera sees; None without rows."""
+
+    def place(row: ReportRow) -> Place | None:
+        mean = float(np.mean(row.cortex_mm)) if row.cortex_mm else 0.0
+        return (row.median, mean) if row.median and mean > 0.0 else None
+
+    chart = _scatter(rows, "And at the open cortex, that the camera sees?", "milliseconds a load", place)
+    return chart and replace(chart, y="mean distance from the reference at the open cortex [mm]")
+
+
+def build_force_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
+    """Build the chart of the error against the force, for the rows of the front; None without rows."""
+    best = find_front(rows)
+    curves = tuple(
+        Curve(
+            row.name, tuple((0.5 * (t.least + t.greatest), t.percent) for t in row.reference.tenths if t.percent > 0.0)
+        )
+        for row in rows
+        if row.name in best and row.reference
+    )
+    title = "Small and surgical forces: error of the models on the front"
+    return (
+        ChartPanel(title, "force [N]", "mean distance in % of the motion", tuple(curves), size=SIZE) if curves else None
+    )
+
+
+def build_learning_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
+    """Build the chart of a learner's error against the number of training loads; None without learners."""
+    curves = tuple(
+        Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
+    )
+    y = "mean distance from its own finite elements on left-out discs [mm]"
+    title = "How many simulated loads does a learner require?"
+    return ChartPanel(title, "training loads", y, curves, size=SIZE) if curves else None
+
+
+def _scatter(
+    rows: Sequence[ReportRow], title: str, x: str, find: Callable[[ReportRow], Place | None]
+) -> ChartPanel | None:
+    """Build a chart of rows at the places found; rows off the Pareto front are pale, and the front is drawn."""
+    places = {row.name: place for row in rows if row.against != TOLERANCE_ALONE and (place := find(row))}
+    best = find_pareto_front(
+        {row.name: places[row.name] for row in rows if row.name in places and row.against == ERROR}
+    )
+    dots = tuple(
+        Dot(
+            row.name,
+            row.family if row.against == ERROR else DIFFERENT_LAW,
+            *places[row.name],
+            pale=row.name not in best,
+            y_range=_find_central_range(row.load_mm),
+            hint=_describe(row),
+        )
+        for row in rows
+        if row.name in places
+    )
+    front = tuple(places[name] for name in best)
+    return ChartPanel(title, x, ERROR_LABEL, dots=dots, size=SIZE, front=front) if dots else None
+
+
+def _find_central_range(load_mm: Sequence[float]) -> tuple[float, float] | None:
+    """Return the range of the central 95 % of loads, if it can stand on a logarithmic axis."""
+    low, high = np.percentile(load_mm, [2.5, 97.5]).tolist() if load_mm else (0.0, 0.0)
+    return (low, high) if low > 0.0 else None
+
+
+def _describe(row: ReportRow) -> str:
+    """Describe a row in one line, for its dot."""
+    assert row.reference is not None
+    error = f"mean {format_number(row.reference.mm.mean)} mm ({format_number(row.reference.percent.mean)} %)"
+    loads = (
+        f", median of {len(row.load_mm)} loads {format_number(float(np.median(row.load_mm)))} mm" if row.load_mm else ""
+    )
+    parts = (("", "ms", row.median), ("preparation ", "s", row.preparation), ("resection known after ", "s", row.adapt))
+    times = "; ".join(f"{name}{format_number(value)} {unit}" for name, unit, value in parts if value is not None)
+    return f"{row.name}, {row.family}: {error}{loads}; {times}"
+
+
+# Functions that build the charts, by name.
+CHARTS = {
+    "time": build_error_chart,
+    "preparation": build_preparation_chart,
+    "adaptation": build_adaptation_chart,
+    "force": build_force_chart,
+    "cortex": build_cortex_chart,
+    "learning": build_learning_chart,
+}
+
+
+def format_number(value: float | None) -> str:
+    """Three digits, as people write them."""
+    if value is None:
+        return ""
+    return "< 0.0001" if 0.0 < value < 1e-4 else f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"
