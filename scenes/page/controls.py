@@ -46,14 +46,14 @@ def build_controls(
     site: CraniotomyFrame,
     deformers: tuple[str, ...],
     requests: Requests,
-    set_control: Callable[[str], None],
-    move_tool: Callable[..., None],
+    set_mode: Callable[[str], None],
+    move: Callable[..., None],
     effects: Fold,
     refine: Callable[[], None],
 ) -> list[Slider | Dropdown | Toggle | Fold | Note]:
     """Build all controls of a scene that these deformers support.
 
-    `set_control` receives the control mode of the tool, `move_tool` values of its touch, as `Requests.take_over` does;
+    `set_mode` receives the control mode of the tool, `move` values of its touch, as `Requests.take_over` does;
     `effects` are the switches of the effects; `refine` starts the refinement of the error.
     """
     cameras = "scene default", STATIC_CAMERA, *PATHS
@@ -62,7 +62,7 @@ def build_controls(
         requests.set(path="" if name == cameras[0] else name)
 
     models = {describe_deformer(name): name for name in deformers}
-    tool_controls = [] if scene.tool is None else build_tool_controls(scene, site, requests, set_control, move_tool)
+    tool_controls = [] if scene.tool is None else build_tool_controls(scene, site, requests, set_mode, move)
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
     return [
         Dropdown("scene", scenes, scene.name, lambda name: requests.set(scene=name), hint="what deforms the brain"),
@@ -124,14 +124,12 @@ def build_camera_sliders(scene: Scene, site: CraniotomyFrame, requests: Requests
     tilt = np.degrees(np.arccos(np.clip(-offset @ site.axis / distance, -1.0, 1.0)))
     return (
         Slider(
-            "camera tilt [deg]", -60.0, 60.0, 1.0, round(float(tilt)),
-            lambda value: requests.set(tilt=-np.radians(value)), words="tilt [deg]",
-            hint="angle between the line of sight and the axis of the craniotomy",
+            "camera tilt [deg]", -60.0, 60.0, 1.0, round(float(tilt)), lambda deg: requests.set(tilt=-np.radians(deg)),
+            words="tilt [deg]", hint="angle between the line of sight and the axis of the craniotomy",
         ),
         Slider(
             "camera distance [mm]", 150.0, 600.0, 10.0, round(1e3 * distance, -1),
-            lambda value: requests.set(distance=1e-3 * value), words="distance [mm]",
-            hint="a smaller distance magnifies",
+            lambda mm: requests.set(distance=1e-3 * mm), words="distance [mm]", hint="a smaller distance magnifies",
         ),
     )  # fmt: skip
 
@@ -144,11 +142,7 @@ def is_animated(scene: Scene, site: CraniotomyFrame) -> bool:
 
 
 def build_tool_controls(
-    scene: Scene,
-    site: CraniotomyFrame,
-    requests: Requests,
-    set_control: Callable[[str], None],
-    move_tool: Callable[..., None],
+    scene: Scene, site: CraniotomyFrame, requests: Requests, set_mode: Callable[[str], None], move: Callable[..., None]
 ) -> list[Slider | Dropdown]:
     """Build the controls of the tool (control mode, position, direction) and of the slices, in patient directions."""
     assert scene.tool is not None
@@ -159,7 +153,7 @@ def build_tool_controls(
     directions = (("right", "x", sides["right"]), ("up", "y", sides["top"]))
     positions = (
         Slider(
-            f"place {name} [mm]", -limit, limit, 0.5, 0.0, lambda value, axis=axis: move_tool(**{axis: 1e-3 * value}),
+            f"place {name} [mm]", -limit, limit, 0.5, 0.0, lambda value, axis=axis: move(**{axis: 1e-3 * value}),
             f"{name}, to {side} [mm]", limit_hint,
         )
         for name, axis, side in directions
@@ -167,13 +161,13 @@ def build_tool_controls(
     tilts = (
         Slider(
             f"direction {name} [deg]", -MAX_TILT, MAX_TILT, 1.0, 0.0,
-            lambda value, name=name: move_tool(**{name: np.radians(value)}), f"tilt {name}, to {side} [deg]", tilt_hint,
+            lambda value, name=name: move(**{name: np.radians(value)}), f"tilt {name}, to {side} [deg]", tilt_hint,
         )
         for name, _, side in directions
     )  # fmt: skip
     return [
-        Dropdown("tool", (SCRIPT, HAND), SCRIPT, set_control, hint=MANUAL_HINT),
-        build_strength_slider(scene, requests, move_tool),
+        Dropdown("tool", (SCRIPT, HAND), SCRIPT, set_mode, hint=MANUAL_HINT),
+        build_strength_slider(scene, requests, move),
         *positions,
         *tilts,
         build_slice_control(requests.through, lambda name: requests.set(through=name)),
@@ -184,12 +178,11 @@ def to_slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
     """Values of the tool's sliders at a touch, by their labels."""
     strength = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
     positions = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
-    angles = zip(("right", "up"), np.degrees(touch.tilt), strict=True)
-    tilts = {f"direction {name} [deg]": angle for name, angle in angles}
+    tilts = {f"direction {key} [deg]": np.degrees(tilt) for key, tilt in zip(("right", "up"), touch.tilt, strict=True)}
     return {label: round(float(value), 2) for label, value in (strength | positions | tilts).items()}
 
 
-def build_strength_slider(scene: Scene, requests: Requests, move_tool: Callable[..., None]) -> Slider:
+def build_strength_slider(scene: Scene, requests: Requests, move: Callable[..., None]) -> Slider:
     """Build the slider of the force, or of the depth of a posed tool."""
     touch = requests.touch
     if scene.posed:
@@ -197,13 +190,8 @@ def build_strength_slider(scene: Scene, requests: Requests, move_tool: Callable[
         high = max(MAX_DEPTH, round(1e3 * scene.max_depth, 1))
         current = min(max(1e3 * touch.depth, low), high)
         hint = "how far the tool is beyond where it just touches; negative: in the air"
-        return Slider("depth [mm]", low, high, 0.1, current, lambda value: move_tool(depth=1e-3 * value), hint=hint)
+        return Slider("depth [mm]", low, high, 0.1, current, lambda value: move(depth=1e-3 * value), hint=hint)
+    current = min(touch.force, MAX_FORCE)
     return Slider(
-        "force [N]",
-        0.0,
-        MAX_FORCE,
-        0.01,
-        min(touch.force, MAX_FORCE),
-        lambda value: move_tool(force=value),
-        hint="how hard it pushes",
+        "force [N]", 0.0, MAX_FORCE, 0.01, current, lambda value: move(force=value), hint="how hard it pushes"
     )

@@ -29,7 +29,7 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
     parts += [_draw_text(LEFT - 5, at + 4, f"{value:g}", "end") for value, at in y_ticks]
     grid = [f"M{at:.0f} {TOP}V{HEIGHT - BOTTOM}" for _, at in x_ticks]
     grid += [f"M{LEFT} {at:.0f}H{WIDTH - RIGHT}" for _, at in y_ticks]
-    placed: list[tuple[float, float]] = []  # of labels
+    placed: list[tuple[float, float]] = []
     for row, x, y in zip(rows, xs, ys, strict=True):
         label_y = y + 4.0
         while any(abs(label_y - v) < LABEL_HEIGHT and abs(x - u) < LABEL_WIDTH for u, v in placed):
@@ -65,11 +65,10 @@ def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[floa
     low, high = np.floor(np.log10(min(values))), np.ceil(np.log10(max(values)))
     span = max(high - low, 1.0)
 
-    def to_position(value: float) -> float:
+    def locate(value: float) -> float:
         return float(start + (end - start) * (np.log10(value) - low) / span)
 
-    ticks = 10.0 ** np.arange(low, low + span + 0.5)
-    return [to_position(value) for value in values], [(tick, to_position(tick)) for tick in ticks]
+    return [locate(x) for x in values], [(tick, locate(tick)) for tick in 10.0 ** np.arange(low, low + span + 0.5)]
 
 
 def _draw_text(x: float, y: float, text: str, anchor: str) -> str:

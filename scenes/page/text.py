@@ -197,9 +197,8 @@ def format_tumour_trust(error: TumourError) -> str:
         text += f" ({error.registration_words})"
     if error.observed is None:
         return f"<p>{text}{caveat or f'; the largest part is {escape(error.largest)}'}.</p>"
-    if error.prior is not None:
-        text += f"; without cortex observation {hud.bound_words(error.prior, 1)}{caveat}"
-    return f"<p>{text}.</p>"
+    prior = "" if error.prior is None else f"; without cortex observation {hud.bound_words(error.prior, 1)}{caveat}"
+    return f"<p>{text}{prior}.</p>"
 
 
 def report(

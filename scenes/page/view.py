@@ -58,9 +58,8 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
 
 def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Split the open cortex at `positions` (V, 3) [m] into bright crowns and dark sulci: name, vertices, triangles."""
-    vertices = stage.relief.surface.place(positions[stage.relief.vertices])
-    parts = zip(CORTEX_COLOURS, stage.relief_parts, strict=True)
-    return [(name, vertices[used], faces) for name, (used, faces) in parts]
+    points = stage.relief.surface.place(positions[stage.relief.vertices])
+    return [(name, points[used], faces) for name, (used, faces) in zip(CORTEX_COLOURS, stage.relief_parts, strict=True)]
 
 
 def build_edge(stage: Stage) -> SceneSurface:
@@ -93,12 +92,8 @@ def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
     """Return the patient's sides round the brain."""
     nodes = site.anatomy.mesh.nodes
     centre, half_size = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + LETTER_DISTANCE
-    axes = zip(("RL", "AP", "SI"), np.diag(half_size), strict=True)
-    return [
-        Sign(letter, centre + sign * axis)
-        for letters, axis in axes
-        for letter, sign in zip(letters, (1, -1), strict=True)
-    ]
+    offsets = np.kron(np.diag(half_size), [[1.0], [-1.0]])
+    return [Sign(letter, centre + offset) for letter, offset in zip("RLAPSI", offsets, strict=True)]
 
 
 def choose_viewpoint(site: CraniotomyFrame) -> SceneViewpoint:
