@@ -104,10 +104,10 @@ def test_a_verdict_is_the_error_in_millimetres(theatre):
             found = whole.deformer.deform(loads, at=at)
             return replace(found, displacement=found.displacement + [0.0, 0.2e-3, 0.0])
 
-    found = compare_with_fem(FemResult(3, loads, answer, 0.5), replace(whole, deformer=Off()), own=False)
-    said = format_comparison(found, stale=False, waits="")
+    found = compare_with_fem(FemResult(3, loads, answer, 0.5), replace(whole, deformer=Off()), is_fem=False)
+    said = format_comparison(found, stale=False, waiting_text="")
     assert "difference from FEM: mean 0.200, maximum 0.200 mm; tip to tumour " in said
     tip = whole.draw_frame(3, whole.get_touch(3), loads, answer, 0.0).distance
     assert f"tip to tumour {1e3 * tip:.1f} mm, tumour moved " in said and "FEM 500 ms" in said
     assert " mm (FEM, without its position error; " in said
-    assert format_comparison(found, stale=True, waits="").startswith('<p class="stale">previous load: ')
+    assert format_comparison(found, stale=True, waiting_text="").startswith('<p class="stale">previous load: ')

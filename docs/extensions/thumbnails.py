@@ -119,7 +119,7 @@ def _push_by_pose(ax, it):
 
 
 def _read_episode(ax, it):
-    near = np.where(it.last["depth"] > 0.0, (0.25 - it.last["depth"]) / 0.1, 0.0)
+    near = np.where(it.last["depth"] > 0.0, (0.31 - it.last["depth"]) / 0.08, 0.0)
     depth = 255 * plt.get_cmap("viridis")(near)[..., :3]
     draw_image(ax, np.vstack([np.hstack([kind[0], kind[-1]]) for kind in (it.last["colour"], depth.astype(np.uint8))]))
 

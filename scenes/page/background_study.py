@@ -20,9 +20,9 @@ from .requests import Requests
 class BackgroundStudy:
     """Computation in a thread, again at each start; `show` receives what `work` yields, or its failure (HTML)."""
 
-    def __init__(self, work: Callable[[], Iterator[Any]], turn: threading.Lock, show: Callable[[Any], None]) -> None:
-        """Prepare the study; it holds the lock `turn`, so that no other solver is built meanwhile."""
-        self.work, self.turn, self.show = work, turn, show
+    def __init__(self, work: Callable[[], Iterator[Any]], lock: threading.Lock, show: Callable[[Any], None]) -> None:
+        """Prepare the study; it holds `lock`, so that no other solver is built meanwhile."""
+        self.work, self.lock, self.show = work, lock, show
         self.closed, self.thread = threading.Event(), threading.Thread()
 
     def start(self) -> None:
@@ -37,32 +37,32 @@ class BackgroundStudy:
 
     def _run(self) -> None:
         try:
-            with self.turn:
-                for words in self.work():
+            with self.lock:
+                for result in self.work():
                     if self.closed.is_set():
                         return
-                    self.show(words)
+                    self.show(result)
         except InputError as error:
             if not self.closed.is_set():
                 self.show(f'<p class="warn">{escape(str(error))}</p>')
 
 
 def build_studies(
-    theatre: PatientSetup, scene: Scene, wish: Requests, turn: threading.Lock, page: Callable[[], Browser]
+    theatre: PatientSetup, scene: Scene, requests: Requests, lock: threading.Lock, get_browser: Callable[[], Browser]
 ) -> tuple[BackgroundStudy, ...]:
-    """Build the studies of a scene's effects and of the requested load, which `page` shows."""
+    """Build the studies of a scene's effects and of the requested load, which the page of `get_browser` shows."""
 
     def refine() -> Iterator[str]:
-        number, _, touch, _ = wish.read_current()
+        number, _, touch, _ = requests.read_current()
         time = float(scene.times[number])
-        registered = replace(scene, registration=wish.registration or scene.registration)
-        return refine_error(theatre, registered, touch or scene.path(time), time)
+        registered_scene = replace(scene, registration=requests.registration or scene.registration)
+        return refine_error(theatre, registered_scene, touch or scene.path(time), time)
 
-    def show_costs(said: Mapping[str, str] | str) -> None:
-        for label, words in ({EFFECT_COSTS: said} if isinstance(said, str) else said).items():
-            (page().write if label == EFFECT_COSTS else page().rename)(label, words)
+    def show_costs(texts: Mapping[str, str] | str) -> None:
+        for label, text in ({EFFECT_COSTS: texts} if isinstance(texts, str) else texts).items():
+            (get_browser().write if label == EFFECT_COSTS else get_browser().rename)(label, text)
 
     return (
-        BackgroundStudy(lambda: measure_costs(theatre, scene), turn, show_costs),
-        BackgroundStudy(refine, turn, lambda said: page().write(REFINED_ERROR, said)),
+        BackgroundStudy(lambda: measure_costs(theatre, scene), lock, show_costs),
+        BackgroundStudy(refine, lock, lambda texts: get_browser().write(REFINED_ERROR, texts)),
     )

@@ -40,56 +40,56 @@ class Comparison:
     distance: float | None = None
 
 
-def compare_with_fem(truth: FemResult, player: Player, own: bool, shown: Deformation | None = None) -> Comparison:
+def compare_with_fem(truth: FemResult, player: Player, is_fem: bool, shown: Deformation | None = None) -> Comparison:
     """Compare a deformer with an FEM solution, for the same loads.
 
     `shown` is the deformer's solution of these loads, if it depends on previous ones.
     """
     nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
     motion = float(np.linalg.norm(truth.deformation.restrict(nodes).displacement[0], axis=1).mean())
-    error = None
-    if not own:
-        error = compute_distances(truth, player, shown or player.deformer.deform(truth.loads, at=nodes))
-    off = (None, None) if error is None else (float(error.mean()), float(error.max()))
+    distances = None
+    if not is_fem:
+        distances = compute_distances(truth, player, shown or player.deformer.deform(truth.loads, at=nodes))
+    mean_and_max = (None, None) if distances is None else (float(distances.mean()), float(distances.max()))
     pushed = truth.loads.get_all(Pushed)
     lift = compute_lift(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
-    gauge = measure_tip_distance(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
-    distance = None if gauge is None else gauge.distance
+    tip = measure_tip_distance(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
+    distance = None if tip is None else tip.distance
     return Comparison(
-        truth.number, truth.seconds, describe_outcome(truth.deformation.outcome[0]), motion, *off, distance
+        truth.number, truth.seconds, describe_outcome(truth.deformation.outcome[0]), motion, *mean_and_max, distance
     )
 
 
 def compute_distances(truth: FemResult, player: Player, shown: Deformation) -> np.ndarray:
     """Return the distance (n,) [m] of each tumour node in a solution from its position by FEM."""
     nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
-    both = (one.restrict(nodes).displacement[0] for one in (truth.deformation, shown))
-    return np.linalg.norm(np.subtract(*both), axis=1)
+    displacements = (solution.restrict(nodes).displacement[0] for solution in (truth.deformation, shown))
+    return np.linalg.norm(np.subtract(*displacements), axis=1)
 
 
-def format_comparison(judged: Comparison | None, stale: bool, waits: str, own: str = FEM_SHOWN) -> str:
+def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: str, fem_text: str = FEM_SHOWN) -> str:
     """Format the comparison; that of a previous load is greyed and marked, with the state of the FEM solver.
 
-    `own` is the text for a solution by FEM itself.
+    `fem_text` is the text for a solution by FEM itself.
     """
-    if judged is None:
-        return f'<p class="stale">{escape(waits)}</p>'
-    said = own
-    if judged.mean is not None and judged.largest is not None:
-        said = f"difference from FEM: mean {1e3 * judged.mean:.3f}, maximum {1e3 * judged.largest:.3f} mm"
-    tip = "" if judged.distance is None else f"tip to tumour {format_millimetres(judged.distance)}, "
-    tail = f"{tip}tumour moved {1e3 * judged.motion:.2f} mm (FEM, without its position error"
-    tail += f"; frame {judged.number}, FEM {1e3 * judged.seconds:.0f} ms"
-    tail += f", {judged.doubt})" if judged.doubt else ")"
+    if comparison is None:
+        return f'<p class="stale">{escape(waiting_text)}</p>'
+    result = fem_text
+    if comparison.mean is not None and comparison.largest is not None:
+        result = f"difference from FEM: mean {1e3 * comparison.mean:.3f}, maximum {1e3 * comparison.largest:.3f} mm"
+    distance = "" if comparison.distance is None else f"tip to tumour {format_millimetres(comparison.distance)}, "
+    details = f"{distance}tumour moved {1e3 * comparison.motion:.2f} mm (FEM, without its position error"
+    details += f"; frame {comparison.number}, FEM {1e3 * comparison.seconds:.0f} ms"
+    details += f", {comparison.doubt})" if comparison.doubt else ")"
     if stale:
-        return f'<p class="stale">previous load: {said}; {tail}. {escape(waits)}</p>'
-    return f"<p>{said}; {tail}</p>"
+        return f'<p class="stale">previous load: {result}; {details}. {escape(waiting_text)}</p>'
+    return f"<p>{result}; {details}</p>"
 
 
-def describe_change(truth: FemResult, player: Player, shown: Deformation, off: Sequence[str]) -> str:
+def describe_change(truth: FemResult, player: Player, shown: Deformation, disabled: Sequence[str]) -> str:
     """Describe the tumour's distance from its position under all effects, for a solution without some."""
     mean = 1e3 * float(compute_distances(truth, player, shown).mean())
-    return f"<p>without {escape(', '.join(off))} the tumour moves {mean:.2f} mm differently</p>"
+    return f"<p>without {escape(', '.join(disabled))} the tumour moves {mean:.2f} mm differently</p>"
 
 
 @dataclass
@@ -104,7 +104,7 @@ class PageState:
     goal: tuple | None = None
     asked: tuple | None = None
     shown: FemResult | None = None
-    rests: bool = False
+    shows_undeformed: bool = False
     look: Look | None = None
     load: str = ""
     frame: Frame | None = None
@@ -113,9 +113,9 @@ class PageState:
     coarse: bool = False
     picture: np.ndarray | None = None
     truth: FemResult | None = None
-    own: FemResult | None = None
-    by: tuple | None = None
-    judged: Comparison | None = None
+    shown_fem: FemResult | None = None
+    compared_deformer: tuple | None = None
+    comparison: Comparison | None = None
     stale: bool | None = None
     plan: tuple[str, ...] | None = None
     still_time: float = 0.5
@@ -158,16 +158,16 @@ class AccuracyTimeTable:
     """Milliseconds and mean distance from the finite elements, by deformer and load."""
 
     def __init__(self) -> None:
-        self._took: dict[str, dict[str, float]] = {}
-        self._missed: dict[str, dict[str, float]] = {}
+        self._times: dict[str, dict[str, float]] = {}
+        self._errors: dict[str, dict[str, float]] = {}
 
     def record_time(self, name: str, load: str, seconds: float) -> None:
         """Record the time of a deformer for a load, named by its stamp."""
-        _keep(self._took.setdefault(name, {}), load, 1e3 * seconds)
+        _store_recent(self._times.setdefault(name, {}), load, 1e3 * seconds)
 
     def record_error(self, name: str, load: str, metres: float) -> None:
         """Record the error of a deformer for a load, relative to the converged FEM solution."""
-        _keep(self._missed.setdefault(name, {}), load, 1e3 * metres)
+        _store_recent(self._errors.setdefault(name, {}), load, 1e3 * metres)
 
     @property
     def rows(self) -> list[ComparisonRow]:
@@ -176,23 +176,23 @@ class AccuracyTimeTable:
         If all of them were shown some of the same loads, only those count, and the rows are ranked. Otherwise each row
         uses its own loads, without ranking: medians over different loads are not comparable.
         """
-        known = {name: self._took.get(name, {}).keys() & missed.keys() for name, missed in self._missed.items()}
-        known = {name: loads for name, loads in known.items() if loads}
-        common = set.intersection(*map(set, known.values())) if len(known) > 1 else set()
-        places = {name: self._place(name, common or loads) for name, loads in known.items()}
-        best = find_pareto_front(places) if common else None
+        loads_of = {name: self._times.get(name, {}).keys() & missed.keys() for name, missed in self._errors.items()}
+        loads_of = {name: loads for name, loads in loads_of.items() if loads}
+        common_loads = set.intersection(*map(set, loads_of.values())) if len(loads_of) > 1 else set()
+        medians = {name: self._compute_medians(name, common_loads or loads) for name, loads in loads_of.items()}
+        best = find_pareto_front(medians) if common_loads else None
         return [
-            ComparisonRow(name, *place, len(common or known[name]), None if best is None else name in best)
-            for name, place in sorted(places.items(), key=lambda item: item[1])
+            ComparisonRow(name, *pair, len(common_loads or loads_of[name]), None if best is None else name in best)
+            for name, pair in sorted(medians.items(), key=lambda item: item[1])
         ]
 
-    def _place(self, name: str, loads: set[str]) -> tuple[float, float]:
-        took, missed = self._took[name], self._missed[name]
-        return float(np.median([took[load] for load in loads])), float(np.median([missed[load] for load in loads]))
+    def _compute_medians(self, name: str, loads: set[str]) -> tuple[float, float]:
+        times, errors = self._times[name], self._errors[name]
+        return float(np.median([times[load] for load in loads])), float(np.median([errors[load] for load in loads]))
 
 
-def _keep(numbers: dict[str, float], load: str, value: float) -> None:
-    """Note the newest value of a load, and forget the load that was noted longest ago."""
+def _store_recent(numbers: dict[str, float], load: str, value: float) -> None:
+    """Store the newest value of a load, and drop the load that was stored first."""
     numbers.pop(load, None)
     numbers[load] = value
     if len(numbers) > MAX_RECENT_LOADS:

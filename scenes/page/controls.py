@@ -44,93 +44,92 @@ MANUAL_HINT = "Moving a slider switches to manual control; automatic returns to 
 def build_controls(
     scene: Scene,
     site: CraniotomyFrame,
-    names: tuple[str, ...],
-    wish: Requests,
-    give: Callable[[str], None],
-    take: Callable[..., None],
+    deformers: tuple[str, ...],
+    requests: Requests,
+    set_mode: Callable[[str], None],
+    move: Callable[..., None],
     effects: Fold,
     refine: Callable[[], None],
 ) -> list[Slider | Dropdown | Toggle | Fold | Note]:
     """Build all controls of a scene that these deformers support.
 
-    `give` receives who gets the tool, `take` numbers of its touch, as `Requests.take_over` does; `effects` are the
-    switches of the effects; `refine` starts the refinement of the error.
+    `set_mode` receives the control mode of the tool, `move` values of its touch, as `Requests.take_over` does;
+    `effects` are the switches of the effects; `refine` starts the refinement of the error.
     """
     cameras = "scene default", STATIC_CAMERA, *PATHS
 
-    def film(name: str) -> None:
-        wish.set(path="" if name == cameras[0] else name)
+    def set_path(name: str) -> None:
+        requests.set(path="" if name == cameras[0] else name)
 
-    models = {describe_deformer(name): name for name in names}
-    slices = build_slice_control(wish.through, lambda name: wish.set(through=name))
-    hand = [] if scene.tool is None else [*build_tool_controls(scene, site, wish, give, take), slices]
+    models = {describe_deformer(name): name for name in deformers}
+    tool_controls = [] if scene.tool is None else build_tool_controls(scene, site, requests, set_mode, move)
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
     return [
-        Dropdown("scene", scenes, scene.name, lambda name: wish.set(scene=name), hint="what deforms the brain"),
+        Dropdown("scene", scenes, scene.name, lambda name: requests.set(scene=name), hint="what deforms the brain"),
         Dropdown(
             "deformer",
             tuple(models),
-            describe_deformer(wish.deformer),
-            lambda words: wish.set(deformer=models[words]),
+            describe_deformer(requests.deformer),
+            lambda label: requests.set(deformer=models[label]),
             "model",
             "FEM solves every load; the fast models were trained on FEM",
         ),
-        add_overlay_controls(wish.style, lambda style: wish.set(style=style)),
-        Dropdown("camera", cameras, wish.path or cameras[0], film, hint="motion of the camera"),
-        *hand[:1],
+        add_overlay_controls(requests.style, lambda style: requests.set(style=style)),
+        Dropdown("camera", cameras, requests.path or cameras[0], set_path, hint="motion of the camera"),
+        *tool_controls[:1],
         effects,
-        *hand[1:],
-        build_registration_control(scene, wish),
+        *tool_controls[1:],
+        build_registration_control(scene, requests),
         Toggle("refine the error", False, lambda on: refine() if on else None, hint=REFINE_HINT),
         Note(REFINED_ERROR),
-        Fold("camera position", build_camera_sliders(scene, site, wish)),
+        Fold("camera position", build_camera_sliders(scene, site, requests)),
         Note(PLAN),
         Note(OWN_FILM, OWN_VIDEO_NOTE),
     ]
 
 
-def add_overlay_controls(now: Style, choose: Callable[[Style], None]) -> Dropdown:
+def add_overlay_controls(current: Style, choose: Callable[[Style], None]) -> Dropdown:
     """Build the choice of overlay styles."""
-    styles: dict[str, Style] = {words: style for style, words in STYLES.items()}
+    styles: dict[str, Style] = {label: style for style, label in STYLES.items()}
     return Dropdown(
         "overlay",
         tuple(styles),
-        STYLES[now],
-        lambda words: choose(styles[words]),
+        STYLES[current],
+        lambda label: choose(styles[label]),
         hint="style of the overlay",
         key=STYLE_KEY,
     )
 
 
-def build_registration_control(scene: Scene, wish: Requests) -> Dropdown:
+def build_registration_control(scene: Scene, requests: Requests) -> Dropdown:
     """Build the choice of the registration of the scan to the patient."""
     names: dict[str, Registration] = {describe_registration(size): name for name, size in REGISTRATIONS.items()}
-    now = describe_registration(REGISTRATIONS[wish.registration or scene.registration])
+    current = describe_registration(REGISTRATIONS[requests.registration or scene.registration])
     hint = "error of the scan's registration to the patient; it is part of the error of the tumour's position"
-    return Dropdown("registration", tuple(names), now, lambda words: wish.set(registration=names[words]), hint=hint)
+    return Dropdown("registration", tuple(names), current, lambda key: requests.set(registration=names[key]), hint=hint)
 
 
-def build_slice_control(now: str, choose: Callable[[str], None]) -> Dropdown:
+def build_slice_control(current: str, choose: Callable[[str], None]) -> Dropdown:
     """Build the choice of slice positions."""
     places = TUMOUR_MIDDLE, TIP
     hint = "position of the scan slices (tab slices)"
-    return Dropdown("slices", places, now or places[0], choose, hint=hint)
+    return Dropdown("slices", places, current or places[0], choose, hint=hint)
 
 
-def build_camera_sliders(scene: Scene, site: CraniotomyFrame, wish: Requests) -> tuple[Slider, Slider]:
+def build_camera_sliders(scene: Scene, site: CraniotomyFrame, requests: Requests) -> tuple[Slider, Slider]:
     """Build the sliders of the camera's tilt and distance, at the scene's own."""
     camera = scene.viewpoint.build_camera(site)
-    away = camera.centre - scene.viewpoint.find_target(site)
-    length = float(np.linalg.norm(away))
-    tilt = np.degrees(np.arccos(np.clip(-away @ site.axis / length, -1.0, 1.0)))
+    offset = camera.centre - scene.viewpoint.find_target(site)
+    distance = float(np.linalg.norm(offset))
+    tilt = np.degrees(np.arccos(np.clip(-offset @ site.axis / distance, -1.0, 1.0)))
     return (
         Slider(
-            "camera tilt [deg]", -60.0, 60.0, 1.0, round(float(tilt)), lambda value: wish.set(tilt=-np.radians(value)),
+            "camera tilt [deg]", -60.0, 60.0, 1.0, round(float(tilt)), lambda deg: requests.set(tilt=-np.radians(deg)),
             words="tilt [deg]", hint="angle between the line of sight and the axis of the craniotomy",
         ),
         Slider(
-            "camera distance [mm]", 150.0, 600.0, 10.0, round(1e3 * length, -1),
-            lambda value: wish.set(distance=1e-3 * value), words="distance [mm]", hint="a smaller distance magnifies",
+            "camera distance [mm]", 150.0, 600.0, 10.0, round(1e3 * distance, -1),
+            lambda mm: requests.set(distance=1e-3 * mm), words="distance [mm]", hint="a smaller distance magnifies",
         ),
     )  # fmt: skip
 
@@ -143,60 +142,56 @@ def is_animated(scene: Scene, site: CraniotomyFrame) -> bool:
 
 
 def build_tool_controls(
-    scene: Scene, site: CraniotomyFrame, wish: Requests, give: Callable[[str], None], take: Callable[..., None]
+    scene: Scene, site: CraniotomyFrame, requests: Requests, set_mode: Callable[[str], None], move: Callable[..., None]
 ) -> list[Slider | Dropdown]:
-    """Build the controls of the tool: who holds it, and its position within the opening, in patient directions."""
+    """Build the controls of the tool (control mode, position, direction) and of the slices, in patient directions."""
     assert scene.tool is not None
-    room = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
+    limit = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
     sides = name_bearings(scene.viewpoint.build_camera(site).T_camera_world[:3, :3])
-    stops = "limited by the edge of the craniotomy"
-    against = "direction of the push: tilt from the surface normal"
-    ways = (("right", "x", sides["right"]), ("up", "y", sides["top"]))
-    places = (
+    limit_hint = "limited by the edge of the craniotomy"
+    tilt_hint = "direction of the push: tilt from the surface normal"
+    directions = (("right", "x", sides["right"]), ("up", "y", sides["top"]))
+    positions = (
         Slider(
-            f"place {way} [mm]", -room, room, 0.5, 0.0, lambda value, axis=axis: take(**{axis: 1e-3 * value}),
-            f"{way}, to {side} [mm]", stops,
+            f"place {name} [mm]", -limit, limit, 0.5, 0.0, lambda value, axis=axis: move(**{axis: 1e-3 * value}),
+            f"{name}, to {side} [mm]", limit_hint,
         )
-        for way, axis, side in ways
+        for name, axis, side in directions
     )  # fmt: skip
     tilts = (
         Slider(
-            f"direction {way} [deg]", -MAX_TILT, MAX_TILT, 1.0, 0.0,
-            lambda value, way=way: take(**{way: np.radians(value)}), f"tilt {way}, to {side} [deg]", against,
+            f"direction {name} [deg]", -MAX_TILT, MAX_TILT, 1.0, 0.0,
+            lambda value, name=name: move(**{name: np.radians(value)}), f"tilt {name}, to {side} [deg]", tilt_hint,
         )
-        for way, _, side in ways
+        for name, _, side in directions
     )  # fmt: skip
     return [
-        Dropdown("tool", (SCRIPT, HAND), SCRIPT, give, hint=MANUAL_HINT),
-        build_strength_slider(scene, wish, take),
-        *places,
+        Dropdown("tool", (SCRIPT, HAND), SCRIPT, set_mode, hint=MANUAL_HINT),
+        build_strength_slider(scene, requests, move),
+        *positions,
         *tilts,
+        build_slice_control(requests.through, lambda name: requests.set(through=name)),
     ]
 
 
 def to_slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
     """Values of the tool's sliders at a touch, by their labels."""
-    strong = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
-    places = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
-    tilts = {f"direction {way} [deg]": np.degrees(tilt) for way, tilt in zip(("right", "up"), touch.tilt, strict=True)}
-    return {label: round(float(value), 2) for label, value in (strong | places | tilts).items()}
+    strength = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
+    positions = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
+    tilts = {f"direction {key} [deg]": np.degrees(tilt) for key, tilt in zip(("right", "up"), touch.tilt, strict=True)}
+    return {label: round(float(value), 2) for label, value in (strength | positions | tilts).items()}
 
 
-def build_strength_slider(scene: Scene, wish: Requests, take: Callable[..., None]) -> Slider:
+def build_strength_slider(scene: Scene, requests: Requests, move: Callable[..., None]) -> Slider:
     """Build the slider of the force, or of the depth of a posed tool."""
-    touch = wish.touch
+    touch = requests.touch
     if scene.posed:
         low = -1e3 * IDLE_HEIGHT
         high = max(MAX_DEPTH, round(1e3 * scene.max_depth, 1))
-        now = min(max(1e3 * touch.depth, low), high)
+        current = min(max(1e3 * touch.depth, low), high)
         hint = "how far the tool is beyond where it just touches; negative: in the air"
-        return Slider("depth [mm]", low, high, 0.1, now, lambda value: take(depth=1e-3 * value), hint=hint)
+        return Slider("depth [mm]", low, high, 0.1, current, lambda value: move(depth=1e-3 * value), hint=hint)
+    current = min(touch.force, MAX_FORCE)
     return Slider(
-        "force [N]",
-        0.0,
-        MAX_FORCE,
-        0.01,
-        min(touch.force, MAX_FORCE),
-        lambda value: take(force=value),
-        hint="how hard it pushes",
+        "force [N]", 0.0, MAX_FORCE, 0.01, current, lambda value: move(force=value), hint="how hard it pushes"
     )

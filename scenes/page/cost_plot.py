@@ -19,44 +19,44 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
     if not rows:
         return ""
     if rows[0].best is not None:
-        what = f"the same {_format_load_count(rows[0].loads)}; bold: no other is both faster and more accurate"
+        load_text = f"the same {_format_load_count(rows[0].loads)}; bold: no other is both faster and more accurate"
     else:
-        what = "the loads up to now" if len(rows) == 1 else "different loads: not comparable"
-    across, ticks = _scale([row.milliseconds for row in rows], LEFT, WIDTH - RIGHT)
-    along, levels = _scale([max(row.millimetres, MIN_ERROR) for row in rows], HEIGHT - BOTTOM, TOP)
-    ends = {ticks[-1][0]: "end"}  # the last label stays inside
-    parts = [_draw_text(x, HEIGHT - BOTTOM + 12, f"{value:g}", ends.get(value, "middle")) for value, x in ticks]
-    parts += [_draw_text(LEFT - 5, place + 4, f"{value:g}", "end") for value, place in levels]
-    grid = [f"M{place:.0f} {TOP}V{HEIGHT - BOTTOM}" for _, place in ticks]
-    grid += [f"M{LEFT} {place:.0f}H{WIDTH - RIGHT}" for _, place in levels]
+        load_text = "the loads up to now" if len(rows) == 1 else "different loads: not comparable"
+    xs, x_ticks = _scale([row.milliseconds for row in rows], LEFT, WIDTH - RIGHT)
+    ys, y_ticks = _scale([max(row.millimetres, MIN_ERROR) for row in rows], HEIGHT - BOTTOM, TOP)
+    anchors = {x_ticks[-1][0]: "end"}  # the last label stays inside
+    parts = [_draw_text(x, HEIGHT - BOTTOM + 12, f"{value:g}", anchors.get(value, "middle")) for value, x in x_ticks]
+    parts += [_draw_text(LEFT - 5, at + 4, f"{value:g}", "end") for value, at in y_ticks]
+    grid = [f"M{at:.0f} {TOP}V{HEIGHT - BOTTOM}" for _, at in x_ticks]
+    grid += [f"M{LEFT} {at:.0f}H{WIDTH - RIGHT}" for _, at in y_ticks]
     placed: list[tuple[float, float]] = []
-    for row, x, y in zip(rows, across, along, strict=True):
-        low = y + 4.0
-        while any(abs(low - other) < LABEL_HEIGHT and abs(x - at) < LABEL_WIDTH for at, other in placed):
-            low += 2.0
-        placed.append((x, low))
-        right = x > 0.6 * WIDTH
-        label = _draw_text(x + (-7 if right else 7), low, _name(row), "end" if right else "start")
+    for row, x, y in zip(rows, xs, ys, strict=True):
+        label_y = y + 4.0
+        while any(abs(label_y - v) < LABEL_HEIGHT and abs(x - u) < LABEL_WIDTH for u, v in placed):
+            label_y += 2.0
+        placed.append((x, label_y))
+        is_right = x > 0.6 * WIDTH
+        label = _draw_text(x + (-7 if is_right else 7), label_y, _format_name(row), "end" if is_right else "start")
         parts.append(
             f"<g{' class=best' if row.best else ''}><title>{escape(describe_row(row))}</title>"
             f'<circle cx="{x:.0f}" cy="{y:.0f}" r="4"/>{label}</g>'
         )
-    words = "; ".join(map(describe_row, rows))
+    description = "; ".join(map(describe_row, rows))
     return (
-        f'<svg class="cost" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(words)}">'
+        f'<svg class="cost" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(description)}">'
         f'<path d="{"".join(grid)}"/>{"".join(parts)}{_draw_text(WIDTH - RIGHT, HEIGHT - 4, "time [ms]", "end")}'
         f"{_draw_text(2, HEIGHT - 4, 'error [mm]', 'start')}</svg>"
-        f'<p class="dim">Mean error relative to FEM against time, medians over {what}.</p>'
+        f'<p class="dim">Mean error relative to FEM against time, medians over {load_text}.</p>'
     )
 
 
 def describe_row(row: ComparisonRow) -> str:
     """Describe the time and the error of a deformer."""
     error = f"{row.millimetres:.3f}" if row.millimetres >= MIN_ERROR else f"under {MIN_ERROR:.3f}"
-    return f"{_name(row)}: {row.milliseconds:.1f} ms, error {error} mm, {_format_load_count(row.loads)}"
+    return f"{_format_name(row)}: {row.milliseconds:.1f} ms, error {error} mm, {_format_load_count(row.loads)}"
 
 
-def _name(row: ComparisonRow) -> str:
+def _format_name(row: ComparisonRow) -> str:
     return "FEM (reference)" if row.name == "fem" else row.name
 
 
@@ -65,15 +65,15 @@ def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[floa
     low, high = np.floor(np.log10(min(values))), np.ceil(np.log10(max(values)))
     span = max(high - low, 1.0)
 
-    def place(value: float) -> float:
+    def locate(value: float) -> float:
         return float(start + (end - start) * (np.log10(value) - low) / span)
 
-    return [place(value) for value in values], [(ten, place(ten)) for ten in 10.0 ** np.arange(low, low + span + 0.5)]
+    return [locate(x) for x in values], [(tick, locate(tick)) for tick in 10.0 ** np.arange(low, low + span + 0.5)]
 
 
-def _draw_text(x: float, y: float, words: str, anchor: str) -> str:
+def _draw_text(x: float, y: float, text: str, anchor: str) -> str:
     """Return a text of the plot."""
-    return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}">{escape(words)}</text>'
+    return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 
 def _format_load_count(loads: int) -> str:

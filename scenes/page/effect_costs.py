@@ -29,20 +29,20 @@ Figures = Mapping[str, tuple[float | None, float | None]]
 """Time [ms] and motion [mm] of the effects by class name, as in `EffectRecord`."""
 
 
-def build_effect_fold(theatre: PatientSetup, scene: Scene, wish: Requests, measure: Callable[[], None]) -> Fold:
+def build_effect_fold(theatre: PatientSetup, scene: Scene, requests: Requests, measure: Callable[[], None]) -> Fold:
     """Build the switches of a scene's effects with their recorded costs; `measure` starts a measurement."""
     record = theatre.find_effect_record(scene)
     figures: Figures = {} if record is None else record.effects
     switches = (
-        Toggle(name, True, partial(wish.switch, name), format_switch(name, figures), HINT)
+        Toggle(name, True, partial(requests.switch, name), format_switch(name, figures), HINT)
         for name in list_switchable_effects(scene, theatre.anatomy)
     )
     source = "" if record is None else f"Recorded on {record.day} with {record.machine}, {record.frames} frames"
-    said = format_costs(theatre, scene, record, source or "The costs are not measured for this scene and anatomy")
-    costs = Toggle(
+    note = format_costs(theatre, scene, record, source or "The costs are not measured for this scene and anatomy")
+    measure_switch = Toggle(
         "measure costs", False, lambda on: measure() if on else None, "measure on this machine", MEASURE_HINT
     )
-    return Fold(EFFECT_FOLD, (*switches, costs, Note(EFFECT_COSTS, said, plain=True)), opened=True)
+    return Fold(EFFECT_FOLD, (*switches, measure_switch, Note(EFFECT_COSTS, note, plain=True)), opened=True)
 
 
 def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str]]:
@@ -59,10 +59,10 @@ def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str
     for row in measure_effects(theatre, scene, every, names):
         rows.append(row)
         record = build_record(theatre, scene, rows, every, "this machine")
-        left = len(names) + 1 - len(rows)
-        source = f"Measured on {record.machine}, {record.frames} frames; effects left to measure: {left}"
-        words = {name: format_switch(name, record.effects) for name in names if name == row.effect}
-        yield words | {EFFECT_COSTS: format_costs(theatre, scene, record, source)}
+        remaining = len(names) + 1 - len(rows)
+        source = f"Measured on {record.machine}, {record.frames} frames; effects left to measure: {remaining}"
+        switch_text = {name: format_switch(name, record.effects) for name in names if name == row.effect}
+        yield switch_text | {EFFECT_COSTS: format_costs(theatre, scene, record, source)}
 
 
 def format_switch(name: str, figures: Figures) -> str:
@@ -75,11 +75,11 @@ def format_switch(name: str, figures: Figures) -> str:
 
 def format_costs(theatre: PatientSetup, scene: Scene, record: EffectRecord | None, source: str) -> str:
     """Describe the source and metrics of the figures, the whole scene, and effects that are always on (HTML)."""
-    said = [source] if record is None else [source, f"Of each effect: {METRICS}", *_list_findings(record)]
+    sentences = [source] if record is None else [source, f"Of each effect: {METRICS}", *_list_findings(record)]
     switchable = list_switchable_effects(scene, theatre.anatomy)
-    kinds = (type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy))
-    fixed = ", ".join(describe_effect(name) for name in kinds if name not in switchable)
-    return f"<p>{escape('. '.join([*said, f'Always on: {fixed}']))}.</p>"
+    names = (type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy))
+    always_on = ", ".join(describe_effect(name) for name in names if name not in switchable)
+    return f"<p>{escape('. '.join([*sentences, f'Always on: {always_on}']))}.</p>"
 
 
 def _list_findings(record: EffectRecord) -> Iterator[str]:

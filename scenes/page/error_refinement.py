@@ -23,16 +23,16 @@ def refine_error(theatre: PatientSetup, scene: Scene, touch: Touch, time: float,
     InputError
         See `solve_nominal` and `estimate_uncertainty`.
     """
-    held, draws = replace(scene, path=lambda time: touch), sample_priors(count, 0)
+    static_scene, samples = replace(scene, path=lambda time: touch), sample_priors(count, 0)
     yield "<p>The load is solved for sampled patients...</p>"
-    still, found = solve_nominal(theatre, held), list[Answer]()
-    for result in solve_ensemble(theatre, held, draws):
-        found.append(result)
-        yield f"<p>{len(found)} of {count} sampled patients are solved.</p>"
-    refined = estimate_uncertainty(theatre, held, still, draws, found)
+    nominal, solutions = solve_nominal(theatre, static_scene), list[Answer]()
+    for result in solve_ensemble(theatre, static_scene, samples):
+        solutions.append(result)
+        yield f"<p>{len(solutions)} of {count} sampled patients are solved.</p>"
+    refined = estimate_uncertainty(theatre, static_scene, nominal, samples, solutions)
     error = refined.evaluate(time, 0.0, scene.registration)
-    moved = format_unbroken(refined.read(refined.moved, time), error.moved)
+    motion = format_unbroken(refined.read(refined.moved, time), error.moved)
     yield (
-        f"<p>Refined for this load, from {count} sampled patients: the tumour moves {moved}.</p>"
+        f"<p>Refined for this load, from {count} sampled patients: the tumour moves {motion}.</p>"
         f"{format_tumour_trust(error)}"
     )

@@ -15,7 +15,7 @@ from ..play.replay import ReplaySession
 from ..script.scene import Scene
 from ..script.tool_paths import Touch
 
-Question = tuple[int, Touch | None]
+FrameRequest = tuple[int, Touch | None]
 """A frame's number, and the hand's touch if it has the tool."""
 
 
@@ -30,7 +30,7 @@ class FemResult:
     loads: Loads
     deformation: Deformation
     seconds: float
-    asked: Question | None = None
+    asked: FrameRequest | None = None
 
 
 class FemWorker:
@@ -42,15 +42,15 @@ class FemWorker:
     its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.
     """
 
-    def __init__(self, theatre: PatientSetup, scene: Scene, turn: threading.Lock) -> None:
-        """Start the thread; it holds the lock `turn` while it builds the solver: only one is built at a time."""
-        self.newest: Question | None = None
+    def __init__(self, theatre: PatientSetup, scene: Scene, build_lock: threading.Lock) -> None:
+        """Start the thread; it holds `build_lock` while it builds the solver: only one is built at a time."""
+        self.newest: FrameRequest | None = None
         self.truth: FemResult | None = None
         self.failure: Exception | None = None
-        self.refused: Question | None = None
+        self.refused: FrameRequest | None = None
         self.player: Player | None = None
         self.plan: tuple[str, ...] = ()
-        self.turn = turn
+        self.build_lock = build_lock
         self.closed = threading.Event()
         self.wake = threading.Condition()
         self.thread = threading.Thread(target=self._serve, args=(theatre, scene), name="fem", daemon=True)
@@ -61,28 +61,28 @@ class FemWorker:
 
         Nothing is solved twice: the request may be the one in progress, or the last one that was solved.
         """
-        truth, question = self.truth, (number, touch)
+        result, request = self.truth, (number, touch)
         with self.wake:
-            if truth is not None and truth.asked == question and truth.number == number:
+            if result is not None and result.asked == request and result.number == number:
                 self.newest = None
-            elif self.newest != question:
-                self.newest = question
+            elif self.newest != request:
+                self.newest = request
                 self.wake.notify_all()
 
     def drop(self) -> None:
-        """Take the question back: nothing is solved after the step in hand."""
+        """Withdraw the request: nothing is solved after the current step."""
         with self.wake:
             self.newest = None
 
-    def wait_newer(self, question: Question, seen: FemResult | None, seconds: float) -> FemResult | None:
-        """Wait up to `seconds` for a solution of a question, or on the way to it, other than `seen`; None after it."""
+    def wait_newer(self, request: FrameRequest, previous: FemResult | None, seconds: float) -> FemResult | None:
+        """Wait up to `seconds` for a solution of a request or on the way to it, not `previous`; None after that."""
 
-        def found() -> FemResult | None:
-            truth = self.truth
-            return truth if truth is not None and truth.asked == question and truth is not seen else None
+        def find_newer() -> FemResult | None:
+            result = self.truth
+            return result if result is not None and result.asked == request and result is not previous else None
 
         with self.wake:
-            return self.wake.wait_for(found, seconds)
+            return self.wake.wait_for(find_newer, seconds)
 
     def stop_soon(self) -> None:
         """Ask for no more after the solve in hand, and do not wait for it."""
@@ -98,40 +98,40 @@ class FemWorker:
     def _serve(self, theatre: PatientSetup, scene: Scene) -> None:
         enter_background()
         try:
-            self._solve_questions(theatre, scene)
+            self._solve_requests(theatre, scene)
         except Exception as error:  # the page says it; the thread's own report goes to the terminal
             self.failure = error
             if not isinstance(error, InputError):
                 raise
 
-    def _solve_questions(self, theatre: PatientSetup, scene: Scene) -> None:
+    def _solve_requests(self, theatre: PatientSetup, scene: Scene) -> None:
         session = None
-        while (question := self._wait_for_question()) is not None:
+        while (request := self._wait_for_request()) is not None:
             if session is None:
                 session = self._prepare_session(theatre, scene)
                 continue
-            begun, (asked, touch) = clock.perf_counter(), question
+            start, (requested, touch) = clock.perf_counter(), request
             try:
-                number, answer = session.approach_frame(asked, touch)
-                loads, took = session.player.build_loads(number, touch), clock.perf_counter() - begun
-                self.truth = FemResult(number, loads, answer, took, question)
+                number, deformation = session.approach_frame(requested, touch)
+                loads, seconds = session.player.build_loads(number, touch), clock.perf_counter() - start
+                self.truth = FemResult(number, loads, deformation, seconds, request)
                 self.failure = self.refused = None
             except InputError as error:
-                number, self.failure, self.refused = asked, error, question
+                number, self.failure, self.refused = requested, error, request
             with self.wake:
-                if self.newest == question and number == asked:
+                if self.newest == request and number == requested:
                     self.newest = None
                 self.wake.notify_all()
 
-    def _wait_for_question(self) -> Question | None:
-        """Return the newest question, once there is one; None at the end."""
+    def _wait_for_request(self) -> FrameRequest | None:
+        """Return the newest request, once there is one; None at the end."""
         with self.wake:
             self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)
             return None if self.closed.is_set() else self.newest
 
     def _prepare_session(self, theatre: PatientSetup, scene: Scene) -> ReplaySession | None:
         """Return the finite elements; None where they are not wanted any more when it is their turn."""
-        with self.turn:
+        with self.build_lock:
             if self.closed.is_set() or self.newest is None:
                 return None
             session = ReplaySession(theatre.build_player("fem", scene))

@@ -93,25 +93,25 @@ class Requests:
                 self.number = (number + 1) % frames
 
 
-def describe_holder(visitor: int, holder: int | None, here: Collection[int]) -> str:
+def describe_holder(client: int, holder: int | None, connected: Collection[int]) -> str:
     """Describe who controls the tool, for one client.
 
     Parameters
     ----------
-    visitor
+    client
         Number of the client that reads the text.
     holder
         Number of the client that took the tool last; None if the script moves the tool.
-    here
+    connected
         Numbers of the connected clients.
     """
     if holder is None:
-        held = "Automatic playback"
-    elif holder == visitor:
-        held = "**You control the tool**"
-    elif holder in here:
-        held = f"Visitor {holder} controls the tool"
+        text = "Automatic playback"
+    elif holder == client:
+        text = "**You control the tool**"
+    elif holder in connected:
+        text = f"Visitor {holder} controls the tool"
     else:
-        held = f"Visitor {holder}, who controlled the tool, has left: it stays in place"
-    many = len(here)
-    return held if many < 2 else f"{held}; {many} visitors, you are number {visitor}"
+        text = f"Visitor {holder}, who controlled the tool, has left: it stays in place"
+    count = len(connected)
+    return text if count < 2 else f"{text}; {count} visitors, you are number {client}"

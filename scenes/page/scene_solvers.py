@@ -16,7 +16,7 @@ from ..play.stage import Stage
 from ..script.camera_paths import PATHS
 from ..script.scene import Scene
 from .comparison import AccuracyTimeTable, compute_distances
-from .fem_worker import FemResult, FemWorker, Question
+from .fem_worker import FemResult, FemWorker, FrameRequest
 from .requests import Look
 
 ALL_ACTIVE: frozenset[str] = frozenset()
@@ -29,118 +29,119 @@ class SceneSolvers:
     `playable` is true if one of them is ready to compute.
     """
 
-    def __init__(self, theatre: PatientSetup, scene: Scene, deformer: str, turn: threading.Lock) -> None:
-        """Start with the `deformer` of that name. FEM solvers are built one at a time, under the lock `turn`.
+    def __init__(self, theatre: PatientSetup, scene: Scene, deformer: str, build_lock: threading.Lock) -> None:
+        """Start with the `deformer` of that name. FEM solvers are built one at a time, under `build_lock`.
 
         Raises
         ------
         InputError
             A deformer that does not support the scene.
         """
-        self.theatre, self.turn = theatre, turn
+        self.theatre, self.build_lock = theatre, build_lock
         # Not on a GPU: rendering while a solver's thread records a CUDA graph would be recorded, too.
         self.stages = {ALL_ACTIVE: replace(theatre.build_stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
-        self.filmed: dict[tuple, Stage] = {}
+        self.camera_stages: dict[tuple, Stage] = {}
         self.last: dict[str, Deformation] = {}
         self.sessions: dict[str, ReplaySession] = {}
         self.solvers: dict[frozenset[str], FemWorker] = {}
         # FEM worker that computes the next displayed solution, and its request.
-        self.seeking: tuple[FemWorker, Question] | None = None
+        self.pending: tuple[FemWorker, FrameRequest] | None = None
         self.playable = deformer != "fem"
         if self.playable:
             self.get_player(deformer)
 
-    def get_stage(self, off: frozenset[str] = ALL_ACTIVE) -> Stage:
+    def get_stage(self, disabled: frozenset[str] = ALL_ACTIVE) -> Stage:
         """Return the stage of the scene without some effects, of the tissue that it has with them."""
-        if off not in self.stages:
+        if disabled not in self.stages:
             scene = self.stages[ALL_ACTIVE].scene
             for effect in scene.get_effects_on(self.theatre.anatomy):
-                scene = remove_effect(scene, effect) if type(effect).__name__ in off else scene
-            self.stages[off] = replace(self.stages[ALL_ACTIVE], scene=scene)
-        return self.stages[off]
+                scene = remove_effect(scene, effect) if type(effect).__name__ in disabled else scene
+            self.stages[disabled] = replace(self.stages[ALL_ACTIVE], scene=scene)
+        return self.stages[disabled]
 
-    def get_worker(self, off: frozenset[str] = ALL_ACTIVE) -> FemWorker:
+    def get_worker(self, disabled: frozenset[str] = ALL_ACTIVE) -> FemWorker:
         """Return the finite elements of the scene without some effects."""
-        if off not in self.solvers:
-            self.solvers[off] = FemWorker(self.theatre, self.get_stage(off).scene, self.turn)
-        return self.solvers[off]
+        if disabled not in self.solvers:
+            self.solvers[disabled] = FemWorker(self.theatre, self.get_stage(disabled).scene, self.build_lock)
+        return self.solvers[disabled]
 
-    def get_player(self, name: str, off: frozenset[str] = ALL_ACTIVE) -> Player:
+    def get_player(self, name: str, disabled: frozenset[str] = ALL_ACTIVE) -> Player:
         """Return the player of the scene without some effects: a trained model, or FEM with a solution."""
-        if (name, off) not in self.players:
-            stage = self.get_stage(off)
+        if (name, disabled) not in self.players:
+            stage = self.get_stage(disabled)
             if name == "fem":
-                solved = self.get_worker(off).player
-                assert solved is not None
-                deformer = solved.deformer
+                fem_player = self.get_worker(disabled).player
+                assert fem_player is not None
+                deformer = fem_player.deformer
             else:
                 deformer = self._build_trained(name, stage.scene)
-            self.players[name, off] = self.theatre.build_player_of(stage, deformer)
-        return self.players[name, off]
+            self.players[name, disabled] = self.theatre.build_player_of(stage, deformer)
+        return self.players[name, disabled]
 
-    def get_player_with_camera(self, name: str, off: frozenset[str], look: Look) -> Player:
+    def get_player_with_camera(self, name: str, disabled: frozenset[str], look: Look) -> Player:
         """Return the same, with the camera and the registration of a display style."""
-        player, key = self.get_player(name, off), (off, look.path, look.tilt, look.distance, look.registration)
+        player = self.get_player(name, disabled)
+        key = disabled, look.path, look.tilt, look.distance, look.registration
         if key[1:] == ("", None, None, None):
             return player
-        if key not in self.filmed:
+        if key not in self.camera_stages:
             scene = player.scene
-            view = scene.viewpoint
+            viewpoint = scene.viewpoint
             if look.path:
-                view = replace(view, path=PATHS[look.path](0) if look.path in PATHS else None)
+                viewpoint = replace(viewpoint, path=PATHS[look.path](0) if look.path in PATHS else None)
             if look.tilt is not None:
-                view = replace(view, tilt=look.tilt)
+                viewpoint = replace(viewpoint, tilt=look.tilt)
             if look.distance is not None:
-                view = replace(view, distance=look.distance)
-            scene = replace(scene, viewpoint=view, registration=look.registration or scene.registration)
+                viewpoint = replace(viewpoint, distance=look.distance)
+            scene = replace(scene, viewpoint=viewpoint, registration=look.registration or scene.registration)
             # Only the newest is kept: a slider passes through many.
-            self.filmed = {key: replace(player.stage, scene=scene)}
-        return replace(player, stage=self.filmed[key])
+            self.camera_stages = {key: replace(player.stage, scene=scene)}
+        return replace(player, stage=self.camera_stages[key])
 
     def _build_trained(self, name: str, scene: Scene) -> Deformer:
-        """Return a trained model. Its FEM fallback is built under `turn`, on the CPU like the stages."""
-        with self.turn if name == GUARDED else nullcontext():
+        """Return a trained model. Its FEM fallback is built under `build_lock`, on the CPU like the stages."""
+        with self.build_lock if name == GUARDED else nullcontext():
             return replace(self.theatre, device="cpu").build_deformer(name, scene)
 
-    def predict(self, name: str, question: Question) -> FemResult:
+    def predict(self, name: str, request: FrameRequest) -> FemResult:
         """Compute a trained model's solution; its FEM fallback starts from the last one.
 
         A model that integrates its tissue in time computes the previous frames first.
         """
-        begun, player = clock.perf_counter(), self.get_player(name)
+        start, player = clock.perf_counter(), self.get_player(name)
         if player.follows:
             session = self.sessions.setdefault(name, ReplaySession(player))
-            number, answer = session.approach_frame(*question)
-            while number != question[0]:
-                number, answer = session.approach_frame(*question)
-            return FemResult(number, player.build_loads(*question), answer, clock.perf_counter() - begun, question)
-        loads = player.build_loads(*question)
-        answer = self.last[name] = player.compute_deformation(loads, self.last.get(name))
-        return FemResult(question[0], loads, answer, clock.perf_counter() - begun, question)
+            number, deformation = session.approach_frame(*request)
+            while number != request[0]:
+                number, deformation = session.approach_frame(*request)
+            return FemResult(number, player.build_loads(*request), deformation, clock.perf_counter() - start, request)
+        loads = player.build_loads(*request)
+        deformation = self.last[name] = player.compute_deformation(loads, self.last.get(name))
+        return FemResult(request[0], loads, deformation, clock.perf_counter() - start, request)
 
-    def compare_models(self, truth: FemResult, tally: AccuracyTimeTable, skip: str) -> None:
+    def compare_models(self, reference: FemResult, table: AccuracyTimeTable, skip: str) -> None:
         """Record time and error of FEM and of each trained model but `skip`, for the load of an FEM solution."""
-        load, scene = compute_loads_digest(truth.loads), self.get_stage().scene
-        tally.record_time("fem", load, truth.deformation.cost.total)
-        tally.record_error("fem", load, 0.0)
+        digest, scene = compute_loads_digest(reference.loads), self.get_stage().scene
+        table.record_time("fem", digest, reference.deformation.cost.total)
+        table.record_error("fem", digest, 0.0)
         for name in self.theatre.select_models(scene):
             player = self.get_player(name)
             if name != skip and not player.follows:
-                shown = player.compute_deformation(truth.loads)
-                tally.record_time(name, load, shown.cost.total)
-                tally.record_error(name, load, float(compute_distances(truth, player, shown).mean()))
+                solution = player.compute_deformation(reference.loads)
+                table.record_time(name, digest, solution.cost.total)
+                table.record_error(name, digest, float(compute_distances(reference, player, solution).mean()))
 
     def solve(
-        self, off: frozenset[str], question: Question, seen: FemResult | None, patience: float
+        self, disabled: frozenset[str], request: FrameRequest, previous: FemResult | None, timeout: float
     ) -> FemResult | None:
         """Return the FEM solution of a frame, or of one on the way to it. The solver is started if necessary.
 
         Parameters
         ----------
-        seen
+        previous
             Solution that is already available.
-        patience
+        timeout
             Maximum time to wait for another [s]; None is returned after it.
 
         Raises
@@ -148,33 +149,33 @@ class SceneSolvers:
         Exception
             Any exception of the solver's thread.
         """
-        solver = self.get_worker(off)
-        if self.seeking != (solver, question):
-            self._seek(solver, question)
-        if solver.failure is not None and (solver.refused == question or not solver.thread.is_alive()):
-            self.seeking = None
-            if not solver.thread.is_alive():
-                del self.solvers[off]
-            raise solver.failure
-        truth = solver.wait_newer(question, seen, patience)
-        self.playable = self.playable or solver.player is not None
-        return truth
+        worker = self.get_worker(disabled)
+        if self.pending != (worker, request):
+            self._replace_pending(worker, request)
+        if worker.failure is not None and (worker.refused == request or not worker.thread.is_alive()):
+            self.pending = None
+            if not worker.thread.is_alive():
+                del self.solvers[disabled]
+            raise worker.failure
+        result = worker.wait_newer(request, previous, timeout)
+        self.playable = self.playable or worker.player is not None
+        return result
 
-    def _seek(self, solver: FemWorker, question: Question) -> None:
+    def _replace_pending(self, worker: FemWorker, request: FrameRequest) -> None:
         """Request the next displayed solution, and drop the previous request."""
-        if self.seeking is not None and self.seeking[0] is not solver:
-            self.seeking[0].drop()
-        self.seeking = solver, question
-        solver.ask(*question)
+        if self.pending is not None and self.pending[0] is not worker:
+            self.pending[0].drop()
+        self.pending = worker, request
+        worker.ask(*request)
 
     def stop_all(self) -> None:
         """Nothing more is wanted: what is under way ends with the step in hand."""
-        if self.seeking is not None:
-            self.seeking[0].drop()
-            self.seeking = None
+        if self.pending is not None:
+            self.pending[0].drop()
+            self.pending = None
 
     def stop_soon(self) -> list[FemWorker]:
         """Stop the finite elements, without waiting for the steps in hand; returns those that have one."""
-        for solver in self.solvers.values():
-            solver.stop_soon()
-        return [solver for solver in self.solvers.values() if solver.thread.is_alive()]
+        for worker in self.solvers.values():
+            worker.stop_soon()
+        return [worker for worker in self.solvers.values() if worker.thread.is_alive()]

@@ -34,46 +34,46 @@ def list_lines(scene: Scene) -> tuple[Line, ...]:
 def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
     """Build the readings, with errors, of a frame that is shown at a time [s], in the order of `list_lines`."""
     if scene.tool is None:
-        known = frame.estimate.location if frame.estimate is not None else None
-        error = frame.tumour_error.bound if known is None else known.p95
+        location = frame.estimate.location if frame.estimate is not None else None
+        error = frame.tumour_error.bound if location is None else location.p95
         return Sample(now, (1e3 * frame.moved,), (_scale_value(error, 1e3),))
     force, force_error = get_tool_force(frame.loads, frame.deformation)
     distance = _scale_value(frame.distance, 1e3), _scale_value(frame.distance_error, 1e3)
     return Sample(now, (distance[0], force), (distance[1], force_error))
 
 
-def get_tool_force(loads: Loads, answer: Deformation) -> tuple[float | None, float | None]:
+def get_tool_force(loads: Loads, deformation: Deformation) -> tuple[float | None, float | None]:
     """Return the tool force and its error [N]: a prescribed force has none; None: not known."""
     pushed = loads.get_all(Pushed)
     if pushed:
         return float(np.linalg.norm(pushed[0].force[0])), 0.0
-    if not answer.reaction.shape[1]:
+    if not deformation.reaction.shape[1]:
         return None, None
-    bound = float(answer.reaction_bound[0, 0])
-    known = answer.outcome[0].good and np.isfinite(bound)
-    return float(np.linalg.norm(answer.reaction[0, -1, :3])), bound if known else None
+    bound = float(deformation.reaction_bound[0, 0])
+    is_reliable = deformation.outcome[0].good and np.isfinite(bound)
+    return float(np.linalg.norm(deformation.reaction[0, -1, :3])), bound if is_reliable else None
 
 
 def render_slices(frame: Frame, player: Player, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 through the tumour's middle, or through the tool's tip where there is one."""
     stage, positions = player.stage.select_stage(frame.loads), player.estimate_positions(frame)
-    others, tool = [], player.scene.tool
+    other_layers, tool = [], player.scene.tool
     if tool is not None and frame.pose is not None:
-        corners = np.asarray(tool.mesh.vertices) @ frame.pose[:3, :3].T + frame.pose[:3, 3]
-        others.append(Layer("tool", TOOL, corners, np.asarray(tool.mesh.faces), TOOL_COLOUR))
+        vertices = np.asarray(tool.mesh.vertices) @ frame.pose[:3, :3].T + frame.pose[:3, 3]
+        other_layers.append(Layer("tool", TOOL, vertices, np.asarray(tool.mesh.faces), TOOL_COLOUR))
     if frame.estimate is not None:
-        others.append(replace(stage.build_reference(player.compute_positions(frame.deformation)), name="truth"))
-    now, before = stage.build_tumour(positions), stage.tumour_at_rest
-    cut = Cut(now, before, frame.tumour_error.bound, bool(frame.doubt), others, frame.tip)
+        other_layers.append(replace(stage.build_reference(player.compute_positions(frame.deformation)), name="truth"))
+    tumour, scan_tumour = stage.build_tumour(positions), stage.tumour_at_rest
+    cut = Cut(tumour, scan_tumour, frame.tumour_error.bound, bool(frame.doubt), other_layers, frame.tip)
     return draw_slices_through(player.stage, cut, through)
 
 
 def draw_slices_through(stage: Stage, cut: Cut, through: str) -> np.ndarray:
     """Three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above; of no tip, the middle's."""
-    shape = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
-    middle = 0.5 * (shape.vertices.min(axis=0) + shape.vertices.max(axis=0))
-    return draw_slices(stage.anatomical_scan, cut.tip if through == TIP and cut.tip is not None else middle, cut)
+    tumour = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
+    centre = 0.5 * (tumour.vertices.min(axis=0) + tumour.vertices.max(axis=0))
+    return draw_slices(stage.anatomical_scan, cut.tip if through == TIP and cut.tip is not None else centre, cut)
 
 
-def _scale_value(value: float | None, by: float) -> float | None:
-    return None if value is None or not np.isfinite(value) else by * value
+def _scale_value(value: float | None, factor: float) -> float | None:
+    return None if value is None or not np.isfinite(value) else factor * value

@@ -33,14 +33,14 @@ def build_page_bodies(stage: Stage) -> list[SceneSurface]:
     wire = SceneSurface("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
     bodies = [*build_brain(stage), wire]
     if stage.observer is not None:
-        middle = tumour.vertices.mean(axis=0)
+        centre = tumour.vertices.mean(axis=0)
         bodies.append(
-            SceneSurface("ellipsoid", middle + INITIAL_RADIUS * SPHERE, SPHERE_FACES, ELLIPSOID_COLOUR, wireframe=True)
+            SceneSurface("ellipsoid", centre + INITIAL_RADIUS * SPHERE, SPHERE_FACES, ELLIPSOID_COLOUR, wireframe=True)
         )
     if tool is not None:
         pose = tool.pose(site.origin - 0.02 * site.axis, site.axis, site.right)
-        at = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
-        bodies.append(SceneSurface("tool", at, tool.mesh.faces, TOOL_COLOUR))
+        vertices = tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        bodies.append(SceneSurface("tool", vertices, tool.mesh.faces, TOOL_COLOUR))
     return bodies
 
 
@@ -58,42 +58,42 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
 
 def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Split the open cortex at `positions` (V, 3) [m] into bright crowns and dark sulci: name, vertices, triangles."""
-    at = stage.relief.surface.place(positions[stage.relief.vertices])
-    return [(name, at[used], faces) for name, (used, faces) in zip(CORTEX_COLOURS, stage.relief_parts, strict=True)]
+    points = stage.relief.surface.place(positions[stage.relief.vertices])
+    return [(name, points[used], faces) for name, (used, faces) in zip(CORTEX_COLOURS, stage.relief_parts, strict=True)]
 
 
 def build_edge(stage: Stage) -> SceneSurface:
     """Build a ring of bone round the craniotomy."""
-    site, (points, _, rim) = stage.site, cut_hole(stage.site)
-    near = points[rim] + DRAPE_HEIGHT * site.axis
-    away = near - site.origin
-    away -= (away @ site.axis)[..., None] * site.axis
-    far = near + EDGE_WIDTH * away / np.linalg.norm(away, axis=2, keepdims=True)
-    corners = 4 * np.arange(len(rim))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])
-    vertices, triangles = np.concatenate([near, far], axis=1).reshape(-1, 3), corners.reshape(-1, 3)
+    site, (points, _, edge) = stage.site, cut_hole(stage.site)
+    inner = points[edge] + DRAPE_HEIGHT * site.axis
+    outward = inner - site.origin
+    outward -= (outward @ site.axis)[..., None] * site.axis
+    outer = inner + EDGE_WIDTH * outward / np.linalg.norm(outward, axis=2, keepdims=True)
+    corners = 4 * np.arange(len(edge))[:, None, None] + np.array([[0, 1, 3], [0, 3, 2]])
+    vertices, triangles = np.concatenate([inner, outer], axis=1).reshape(-1, 3), corners.reshape(-1, 3)
     return SceneSurface("edge", vertices, triangles, EDGE_COLOUR, meaning="edge of the craniotomy")
 
 
 def build_surroundings(stage: Stage) -> list[Sign | ScenePicture]:
     """Build what stays in place: orientation letters round the brain, and planes of the scan behind the tumour."""
-    found: list[Sign | ScenePicture] = [*list_orientation_labels(stage.site)]
-    scan, middle = stage.anatomical_scan, stage.tumour_at_rest.vertices.mean(axis=0)
+    surroundings: list[Sign | ScenePicture] = [*list_orientation_labels(stage.site)]
+    scan, centre = stage.anatomical_scan, stage.tumour_at_rest.vertices.mean(axis=0)
     for plane in PLANES if scan is not None else ():
         assert scan is not None
-        grey = resample_view(plane, scan, middle)
-        behind = (plane.compute_points(middle, VIEW_SIDE) - middle) @ stage.site.axis > 0.0
+        grey = resample_view(plane, scan, centre)
+        behind = (plane.compute_points(centre, VIEW_SIDE) - centre) @ stage.site.axis > 0.0
         colour = np.stack([grey, grey, grey, 255 * (behind & (grey != OUTSIDE_GREY)).astype(np.uint8)], axis=2)
         edges = (2.0 * HALF_VIEW * np.array(edge) for edge in (plane.right, plane.down))
-        found.append(ScenePicture(plane.name, colour, middle, *edges))
-    return found
+        surroundings.append(ScenePicture(plane.name, colour, centre, *edges))
+    return surroundings
 
 
 def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
     """Return the patient's sides round the brain."""
     nodes = site.anatomy.mesh.nodes
-    middle, half = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + LETTER_DISTANCE
-    ways = zip(("RL", "AP", "SI"), np.diag(half), strict=True)
-    return [Sign(word, middle + way) for (plus, minus), arm in ways for word, way in ((plus, arm), (minus, -arm))]
+    centre, half_size = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + LETTER_DISTANCE
+    offsets = np.kron(np.diag(half_size), [[1.0], [-1.0]])
+    return [Sign(letter, centre + offset) for letter, offset in zip("RLAPSI", offsets, strict=True)]
 
 
 def choose_viewpoint(site: CraniotomyFrame) -> SceneViewpoint:
@@ -116,10 +116,10 @@ def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
         browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
 
 
-def move_wire(browser: Browser, stage: Stage, truth: FemResult, player: Player) -> None:
+def move_wire(browser: Browser, stage: Stage, result: FemResult, player: Player) -> None:
     """Show where the finite elements, under all effects, have the tumour."""
-    seen = stage.select_stage(truth.loads).build_tumour(player.compute_positions(truth.deformation))
-    browser.move("finite elements", seen.vertices, seen.triangles)
+    tumour = stage.select_stage(result.loads).build_tumour(player.compute_positions(result.deformation))
+    browser.move("finite elements", tumour.vertices, tumour.triangles)
 
 
 def render_page_image(frame: Frame) -> np.ndarray:
