@@ -45,9 +45,9 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
-        help="deformation model: a trained one (linear, ann, svr, ...); fem; guarded: the best trained model with FEM "
-        "where it is unreliable; auto: chosen by --within-error or --within-time (default: the model with the smallest "
-        "error)",
+        help="deformation model: a trained one (linear, ann, svr, ...); fem; one of the `report` families; "
+        "guarded: the best trained model with FEM where it is unreliable; auto: chosen by --within-error or "
+        "--within-time (default: the model with the smallest error)",
     )
     parser.add_argument(
         "--guard", type=float, metavar="MM",

@@ -15,6 +15,7 @@ from sim.deformation import Deformation, Deformer, guess
 from sim.discretisation.space import recommend_element
 from sim.effects import Elasticity
 from sim.errors import InputError
+from sim.families.registry import FAMILIES, build_family
 from sim.fem import Fem, describe_solver
 from sim.loads import Loads
 from sim.resected_fem import OperatedFem, build_fem
@@ -176,7 +177,7 @@ class PatientSetup:
         A model of tissue that relaxes is used without guard, with its bound: see `_can_guard`.
         """
         name = self.select_best(scene)
-        if scene.deformer in self.select_models(scene):
+        if scene.deformer in (*self.select_models(scene), *FAMILIES):
             return scene.deformer
         return GUARDED if self._can_guard(scene) and get_reported_errors(self.models[name]).weak else name
 
@@ -194,7 +195,7 @@ class PatientSetup:
         if name == GUARDED:
             model, limit = self.models[self.select_best(scene)], 1e3 * self.limit_of(scene)
             return f"{model.source}; where its error may exceed {limit:g} mm, {solver}"
-        return solver if name == "fem" else self.models[name].source
+        return solver if name == "fem" else FAMILIES[name] if name in FAMILIES else self.models[name].source
 
     def build_fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | OperatedFem:
         """Build FEM for a scene's effects, tissue and element; for `live` see `Fem`."""
@@ -211,10 +212,12 @@ class PatientSetup:
         Raises
         ------
         InputError
-            An unknown name; a model that was trained with other effects, tissue or element.
+            An unknown name; a model that was trained with other effects, tissue or element; a family without an effect.
         """
         if name == "fem":
             return self.build_fem(scene, scene.accuracy, live=True)
+        if name in FAMILIES:
+            return build_family(name, self.anatomy, scene.get_effects_on(self.anatomy), self.device, scene.accuracy)
         allowed = ", ".join(self.list_deformers(scene))
         if name == GUARDED and self.select_models(scene) and not self._can_guard(scene):
             raise InputError(
@@ -231,7 +234,8 @@ class PatientSetup:
             )
         if name not in self.models:
             raise InputError(
-                f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the trained ones."
+                f"no deformer is called {name!r} here: choose one of {allowed}; `sulcus train` makes the trained ones. "
+                f"Other families: {', '.join(FAMILIES)}."
             )
         reason = self.list_rejections(scene)[name]
         if reason is not None:
