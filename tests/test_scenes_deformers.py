@@ -84,3 +84,17 @@ def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["passed"] and [row["scene"] for row in report["scenes"]] == list(PUSHING)
     assert "fem" not in [row["deformer"] for row in report["scenes"]]
+
+
+def test_a_scene_is_played_by_a_family_that_it_names(theatre):
+    scene = replace(find_scene("press"), deformer="condensed")
+    assert theatre.select_default(scene) == "condensed"
+    player = theatre.build_player("condensed", scene)
+    frame = next(player.play_frames())
+    assert frame.deformation.source.startswith("condensed (neo-hookean")
+    assert "model error relative to FEM: not known" in frame.head
+    assert theatre.describe_deformer("condensed", scene).startswith("linear finite elements")
+    with pytest.raises(InputError, match=r"condensed does not compute Slide.*--deformer fem"):
+        theatre.build_deformer("condensed", find_scene("sag"))
+    with pytest.raises(InputError, match=r"no deformer is called 'rocks'.*Other families: kelvinlets"):
+        theatre.build_deformer("rocks", scene)

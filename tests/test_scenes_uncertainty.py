@@ -269,7 +269,7 @@ class TestSaid:
             (
                 True, None, TumourError(4.11e-3, "E"),
                 [
-                    "surrogate error relative to FEM: not known",
+                    "model error relative to FEM: not known",
                     "tumour position error <= 4.2 mm (95 %), mainly E",
                 ],
             ),

@@ -8,6 +8,8 @@ import numpy as np
 from ar.overlay.composite import Overlaid
 from ar.overlay.hud import MAX_BOTTOM_WIDTH, bound_words, lay, round_up, wrap_line
 from sim.deformation import Deformation, Outcome
+from sim.elements import OTHER_METHODS
+from sim.families.registry import FAMILIES
 from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touching
 
 from ..script.uncertainty import REGISTRATION, TumourError
@@ -97,7 +99,7 @@ def format_errors(
     promised
         Error bound guaranteed by the model [m]; None if there is none.
     trained
-        True if a trained model computed the deformation, false if FEM.
+        True if another model than FEM computed the deformation.
     brief
         True for the short form, for a small image.
     """
@@ -105,12 +107,18 @@ def format_errors(
     return [*([format_model_error(promised, trained, brief)] if modelled else []), format_tumour_error(error, brief)]
 
 
+def is_of_other_family(deformation: Deformation) -> bool:
+    """Return True if neither finite elements nor a trained model, but another family of models computed a result."""
+    method = deformation.source.partition(" (")[0]
+    return method in FAMILIES or method in OTHER_METHODS.values()
+
+
 def format_model_error(promised: float | None, trained: bool, brief: bool = False) -> str:
     """Describe the error of the model relative to its FEM."""
     if not trained:
         return "FEM reference" if brief else "FEM reference (no surrogate)"
     if promised is None:
-        return "model: not known" if brief else "surrogate error relative to FEM: not known"
+        return "model: not known" if brief else "model error relative to FEM: not known"
     within = bound_words(promised, 2)
     return f"model <= {within}" if brief else f"surrogate error <= {within} (95 %, relative to FEM)"
 

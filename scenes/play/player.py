@@ -32,7 +32,7 @@ from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, compute_lift
 from ..script.uncertainty import NOT_KNOWN, MotionError, TumourError, Uncertainty
 from .cortex_layers import COTTON, GLOVE
-from .frame_text import annotate, describe_outcome, format_acting, format_errors
+from .frame_text import annotate, describe_outcome, format_acting, format_errors, is_of_other_family
 from .observer import TumourEstimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, SIMULATED, TOOL, Stage
 from .tip_reading import read_tip_distance
@@ -244,7 +244,7 @@ class Player:
         if estimate is None and error.moved is not None and not is_undeformed(deformation):
             moved = motion, error.moved
         band = 0.0 if estimate is not None else error.bound or 0.0
-        trained = find_first_model(self.deformer, deformation) is not None
+        trained = find_first_model(self.deformer, deformation) is not None or is_of_other_family(deformation)
         lines = format_errors(promised, error, trained, doubt, camera.width < NARROW_IMAGE_WIDTH)
         head = format_head_lines(lines, picture.segmentation == TOOL)
         remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.words
