@@ -22,6 +22,8 @@ ORDER = (
     {"sim.accuracy", "sim.loads", "sim.anatomy"},
     {"sim.fields"},
     {"sim.runtime", "sim.effects", "sim.deformation"},
+    {"sim.discretisation.element"},
+    {"sim.families.element_free"},
     {"sim.discretisation", "sim.terms.laws"},
     {"sim.terms", "sim.linalg", "sim.bodies", "sim.diagnostics"},
     {"sim.terms.contact", "sim.minimisers"},

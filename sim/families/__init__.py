@@ -1,0 +1,1 @@
+"""Discretisations other than finite elements."""
