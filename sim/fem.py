@@ -68,7 +68,7 @@ class Fem:
         Maximum load cases solved together; None: a device-dependent default. Quadratic elements with
         multigrid levels are solved one by one on the CPU.
     element
-        Element in `elements.ELEMENTS`; None: the recommended one, or p2 for a mesh with mid-edge nodes.
+        Name in `elements.ELEMENTS` or `OTHER_METHODS`; None: the recommended one, or p2 for a mesh with mid-edge nodes.
     live
         True if loads come one at a time. On the CPU the first takes one second more, others 1/3 to 2/3 of the time.
     avoid

@@ -25,8 +25,10 @@ ERRORS = {
     "lattice": None,
     "mass-spring": 0.35,
     "xpbd": 0.4,
+    "boundary-elements": 0.25,
     "condensed": 0.01,
     "explicit": 0.01,
+    "element-free": 0.25,
 }
 
 

@@ -77,6 +77,26 @@ def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.nd
     return Elements(table, gradient, weight, len(nodes), np.flatnonzero(chosen), table[:, :4])
 
 
+def pack_gradients(
+    domain: np.ndarray, node: np.ndarray, gradient: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sum gradients (m, 3) by domain (m,) and node (m,): `table`, `size` and `gradient` of `Elements`, one point each.
+
+    Domains are numbered from 0, without gaps.
+    """
+    most = np.int64(node.max(initial=0)) + 1
+    pair, place = np.unique(domain * most + node, return_inverse=True)
+    summed = np.column_stack([np.bincount(place.ravel(), gradient[:, k]) for k in range(3)])
+    domain, node = divmod(pair, most)
+    size = np.bincount(domain)
+    column = np.arange(len(pair)) - np.repeat(np.cumsum(size) - size, size)
+    table = np.zeros((len(size), size.max(initial=0)), np.int32)
+    table[domain, column] = node
+    spread = np.zeros((*table.shape, 3))
+    spread[domain, column] = summed
+    return table, size.astype(np.int32), spread[:, None]
+
+
 def compute_quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return quadratic shape functions (..., n) at barycentric points (..., d): L (2 L - 1) and 4 L_i L_j."""
     middle = 4.0 * corner[..., edges[:, 0]] * corner[..., edges[:, 1]]

@@ -40,9 +40,9 @@ def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Ker
 class Inversion:
     """Counter of tetrahedra that are inverted or collapsed at some quadrature point.
 
-    Linear tetrahedra have one point, quadratic ones eight. With smoothed strains, which are averages, single
-    tetrahedra are still tested. A tetrahedron with J below `collapsed` counts as collapsed, since round-off determines
-    the sign. `bounded`: the law's energy is infinite for inverted (averaged) deformation gradients.
+    Linear tetrahedra have one point, quadratic ones eight. With smoothed and element-free strains, which are averages,
+    single tetrahedra are still tested. A tetrahedron with J below `collapsed` counts as collapsed, since round-off
+    determines the sign. `bounded`: the law's energy is infinite for inverted (averaged) deformation gradients.
     """
 
     def __init__(self, space: Discretisation, device: Device, bounded: bool = False, collapsed: float = 1e-6):
@@ -53,7 +53,7 @@ class Inversion:
             if quadratic
             else build_linear_elements(space.mesh, every)
         )
-        self._telling = not (bounded and space.element == "smoothed")
+        self._telling = not (bounded and space.element in ("smoothed", "element-free"))
         self._device, self._collapsed = device, collapsed
         self._table = device.upload(elements.table, wp.int32)
         self._gradient = device.upload(elements.gradient, device.vector)

@@ -9,7 +9,7 @@ elements around a node, with a quarter of each, determines the volumetric respon
 import numpy as np
 
 from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
-from .element import Elements, build_linear_elements
+from .element import Elements, build_linear_elements, pack_gradients
 
 
 def build_edge_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
@@ -39,15 +39,8 @@ def _build_averaged_elements(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray,
     # Every corner of every tetrahedron of a domain adds its gradient to the domain's entry for that node.
     tet = np.repeat(np.arange(count), lent)
     gradient = (share / volume[domain])[:, None, None] * linear.gradient[tet, 0]
-    pair, place = np.unique(domain[:, None] * np.int64(linear.nodes) + linear.table[tet], return_inverse=True)
-    summed = np.column_stack([np.bincount(place.ravel(), gradient[..., k].ravel()) for k in range(3)])
-    domain, node = divmod(pair, linear.nodes)
-    size = np.bincount(domain)
-    column = np.arange(len(pair)) - np.repeat(np.cumsum(size) - size, size)
-    table = np.zeros((len(size), size.max(initial=0)), np.int32)
-    table[domain, column] = node
-    spread = np.zeros((*table.shape, 3))
-    spread[domain, column] = summed
+    every = np.repeat(domain.ravel(), linear.table.shape[1])
+    table, size, spread = pack_gradients(every, linear.table[tet].ravel(), gradient.reshape(-1, 3))
     owner = linear.owner[first // lent]
     marks = np.column_stack([vertices[first], mesh.region[owner]])
-    return Elements(table, spread[:, None], volume[:, None], linear.nodes, owner, marks, size.astype(np.int32))
+    return Elements(table, spread, volume[:, None], linear.nodes, owner, marks, size)

@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..geometry.surface import normalise_vectors
 from ..geometry.tetmesh import QUADRATIC_EDGES, TRIANGLE_EDGES, TetMesh, compute_row_keys
 from .element import Elements, build_linear_elements, build_quadratic_elements
+from .element_free import build_element_free
 from .smoothed import build_edge_elements, build_node_elements
 
 
@@ -88,8 +89,7 @@ class Discretisation:
             return (ElementPart(build_linear_elements(self.mesh, chosen), "springs"),)
         if self.element == "p2":
             return (ElementPart(build_quadratic_elements(self.nodes, self.table, chosen), "whole"),)
-        edges, nodes = _build_smoothed_elements(self.mesh, chosen.tobytes())
-        return ElementPart(edges, "shape"), ElementPart(nodes, "volume")
+        return _build_averaged_parts(self.mesh, self.element, chosen.tobytes())
 
     def extend_fixed(self, fixed: np.ndarray) -> np.ndarray:
         """Return the fixed components (N, 3) of all nodes from those of the mesh (V, 3).
@@ -135,10 +135,12 @@ class Discretisation:
 
 
 @lru_cache(2)  # shared by effects, tissues and diagnostics: 10 % of a locator's set-up on a GPU
-def _build_smoothed_elements(mesh: TetMesh, chosen: bytes) -> tuple[Elements, Elements]:
-    """Build edge and node elements over the `chosen` tetrahedra (T,), given as bytes of bool."""
+def _build_averaged_parts(mesh: TetMesh, element: str, chosen: bytes) -> tuple[ElementPart, ...]:
+    """Build smoothed or element-free elements over the `chosen` tetrahedra (T,), given as bytes of bool."""
     tets = np.frombuffer(chosen, bool)
-    return build_edge_elements(mesh, tets), build_node_elements(mesh, tets)
+    if element == "element-free":
+        return (ElementPart(build_element_free(mesh, tets), "whole"),)
+    return ElementPart(build_edge_elements(mesh, tets), "shape"), ElementPart(build_node_elements(mesh, tets), "volume")
 
 
 def recommend_element(mesh: TetMesh) -> str:
@@ -147,7 +149,7 @@ def recommend_element(mesh: TetMesh) -> str:
 
 
 def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
-    """Return the nodes and elements of type `element`, one of `ELEMENTS`, over a mesh.
+    """Return the nodes and elements of type `element`, one of `ELEMENTS` or `OTHER_METHODS`, over a mesh.
 
     None selects `recommend_element`.
 
@@ -158,7 +160,7 @@ def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
     """
     element = recommend_element(mesh) if element is None else element
     if element not in (*ELEMENTS, *OTHER_METHODS):  # tuple, since `element` may be unhashable
-        raise InputError(f"no element is called {element!r}: choose one of {', '.join(ELEMENTS)}.")
+        raise InputError(f"no element is called {element!r}: choose one of {', '.join((*ELEMENTS, *OTHER_METHODS))}.")
     none = np.zeros((0, 2), np.int32)
     if mesh.middles is not None:
         if element != "p2":

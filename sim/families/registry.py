@@ -16,12 +16,14 @@ FAMILIES = {
     "lattice": "free-form lattice of B-splines that continues the motion of the surface",
     "mass-spring": "springs along edges and volumes of tetrahedra, to equilibrium",
     "xpbd": "the same springs by position-based dynamics with a fixed number of iterations",
+    "boundary-elements": "boundary elements with Kelvin's solution: linear, brain and tumour as two regions",
     "condensed": "linear finite elements, condensed to a compliance table",
     "explicit": "total Lagrangian explicit finite elements, damped to the equilibrium",
+    "element-free": "total Lagrangian element-free Galerkin method with moving least squares",
 }
 """Descriptions by name; the finite elements of `Fem` are the reference."""
 
-ELEMENTS_BY_FAMILY = {"mass-spring": "springs"}
+ELEMENTS_BY_FAMILY = {"mass-spring": "springs", "element-free": "element-free"}
 """Families that `Fem` solves, and their element: these compute every effect."""
 
 
@@ -30,8 +32,8 @@ def build_family(
 ) -> Deformer:
     """Return a deformation model of one of `FAMILIES`.
 
-    `device` and `accuracy` are as of `Fem`. Models with a table compute on the CPU; only the mass-spring
-    model uses `accuracy`.
+    `device` and `accuracy` are as of `Fem`. Models with a table compute on the CPU; only the element-free and the
+    mass-spring model use `accuracy`.
 
     Raises
     ------
@@ -62,13 +64,15 @@ def build_family(
         from .xpbd import XPBD
 
         return RelaxationModel(name, anatomy, effects, EXPLICIT if name == "explicit" else XPBD, device)
-    from . import condensed, geometric
+    from . import boundary_elements, condensed, geometric
     from .linear_model import LinearModel
 
     respond = {
+        "boundary-elements": boundary_elements.compute_response,
         "condensed": condensed.compute_response,
         "kelvinlets": geometric.compute_kelvinlet_response,
         "lattice": geometric.compute_lattice_response,
         "thin-plate": geometric.compute_thin_plate_response,
     }[name]
-    return LinearModel(name, anatomy, effects, respond, Outcome.CONVERGED if name == "condensed" else Outcome.GUESSED)
+    solved = name in ("boundary-elements", "condensed")
+    return LinearModel(name, anatomy, effects, respond, Outcome.CONVERGED if solved else Outcome.GUESSED)

@@ -30,7 +30,8 @@ class Preconditioning:
         set-up 6.8 and 7.1 s; application 16 and 11 ms for one load case, 51 and 83 ms for eight. CUDA inverts what
         fits.
     max_smoothed_factorised
-        The same for smoothed strains, which couple neighbours of neighbours: their factor has more entries.
+        The same for smoothed and element-free strains, which couple neighbours of neighbours: their factor has more
+        entries.
     max_coarsest_nodes
         Maximum nodes, of six unknowns each, of the last level of algebraic multigrid, which is factorised.
     smoother
@@ -72,8 +73,9 @@ def choose_preconditioner(
             lifted = _build_corner_preconditioner(stiffness, space, constraint, device, settings)
             name = f"p-multigrid on {name_of(lifted.coarse)}"
             return TwoLevel(lifted, project_to_free(stiffness, constraint), device, name, settings.smoother)
-        if space.element == "smoothed" and problem.rows > settings.max_smoothed_factorised:
-            # Averaging reduces the stiffness, so that the coarse solver never overshoots.
+        if space.element in ("smoothed", "element-free") and problem.rows > settings.max_smoothed_factorised:
+            # Averaging reduces the stiffness, so that the coarse solver never overshoots. Element-free, it overshoots
+            # at nu >= 0.49; the cycle was positive definite up to 0.499.
             coarse = _build_solver(unsmoothed(step), constraint, space.nodes, device, settings)
             name = f"two levels on {name_of(coarse)}"
             fine = project_to_free(problem.rest_curvature(step), constraint)

@@ -22,9 +22,10 @@ from ..runtime.memory import (
     measure_free_bytes,
 )
 
-BYTES_PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900}
+BYTES_PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900, "element-free": 9_000}
 """Memory per node in single precision [bytes]: element tables and multigrid levels. The
-arrays were counted on the CPU, on 49,239 nodes (p1, smoothed) and 123,508 (p2), 2026-11-24."""
+arrays were counted on the CPU, on 49,239 nodes (p1, smoothed) and 123,508 (p2), 2026-11-24. Element-free: sizes of the
+tables and of the stiffness on 5,312 nodes."""
 FIXED_BYTES = 2**30
 """Memory of library buffers, kernels and the last multigrid level [bytes], approximate."""
 BUDGET = MemoryBudget()
