@@ -1,0 +1,1 @@
+"""Families of linear models: responses of the tissue to unit forces."""
