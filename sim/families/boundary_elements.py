@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import lu_factor, lu_solve
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..anatomy import describe_region
 from ..arguments import check_vertex_numbers
@@ -133,7 +133,7 @@ def compute_response(body: Body, nodes: np.ndarray) -> np.ndarray:
     for region in regions:
         boundary = np.unique(region.triangles)
         inner = np.intersect1d(nodes, np.setdiff1d(region.members, boundary))
-        nearest = boundary[cKDTree(region.nodes[boundary]).query(region.nodes[inner])[1]]
+        nearest = boundary[KDTree(region.nodes[boundary]).query(region.nodes[inner])[1]]
         parts = [
             pull @ tractions - motion @ solution[:moved] for motion, pull in region.integrate(inner, move[nearest])
         ]
@@ -165,7 +165,7 @@ def _build_regions(body: Body) -> tuple[list[_Region], np.ndarray, np.ndarray]:
             for each, factor in zip(turned, (3.0, -1.0, -1.0), strict=True)
         )
         displaced = _distribute(move[ends], np.ones(len(ends)), move.max() + 1)
-        members, loaded = np.unique(body.anatomy.mesh.tets[some]), sp.vstack([reaction, load], format="csr")
+        members, loaded = np.unique(body.anatomy.mesh.tets[some]), sp.csr_array(sp.vstack([reaction, load]))
         regions.append(_Region(surfaces.nodes, members, triangles, lame, displaced, loaded))
     return regions, move, pull
 
@@ -217,18 +217,16 @@ def _find_tissues(body: Body) -> list[tuple[np.ndarray, tuple[float, float]]]:
 
 def _check_places(body: Body, covered: np.ndarray, interface: np.ndarray) -> None:
     """Raise `InputError` if boundary elements cannot represent the fixed vertices or the forces."""
-    outside = np.isin(np.arange(len(body.fixed)), body.anatomy.mesh.surface)
-    inside = np.flatnonzero(body.fixed & ~outside & ~body.anatomy.orphaned)
-    for problem, vertices in (
-        ("fixed inside the body", inside), ("fixed at the tumour's surface", interface[body.fixed[interface]])
-    ):  # fmt: skip
-        if len(vertices):
-            raise InputError(
-                f"vertex {vertices[0]} is {problem} (and {len(vertices) - 1} more): boundary elements need vertices "
-                "that are fixed on the brain's outer surface only."
-            )
+    surface = np.isin(np.arange(len(body.fixed)), body.anatomy.mesh.surface)
+    inner = surface < ~body.anatomy.orphaned
+    inner[interface] = True
+    bad, acting = np.flatnonzero(body.fixed & inner), check_vertex_numbers("acting", body.acting, len(body.fixed))
+    if len(bad):
+        raise InputError(
+            f"vertex {bad[0]} (and {len(bad) - 1} more) is fixed inside the body or at the tumour's surface: boundary "
+            "elements need vertices that are fixed on the brain's outer surface only."
+        )
     if not len(covered):
         raise InputError("no surface triangle has three fixed vertices: fix a part of the surface.")
-    acting = check_vertex_numbers("acting", body.acting, len(body.fixed))
-    if len(np.unique(acting)) < len(acting) or (body.fixed | ~outside)[acting].any():
+    if len(np.unique(acting)) < len(acting) or (body.fixed | ~surface)[acting].any():
         raise InputError("acting has vertices twice, fixed or inside: forces act on distinct vertices of free surface.")
