@@ -24,21 +24,21 @@ class LinearBody:
     ----------
     anatomy
         Mesh of V vertices.
-    tissue
-        Tissue of the regions.
     fixed
         Mask (V,) of vertices that do not move.
     acting
         Vertices (a,), ascending, of the surface that is not fixed: forces act on these.
     lame
         Lamé parameters mu, lambda [Pa] at small strain, by region label.
+    tissue
+        Tissue of the regions.
     """
 
     anatomy: Anatomy
-    tissue: Elasticity
     fixed: np.ndarray
     acting: np.ndarray
     lame: Mapping[int, tuple[float, float]]
+    tissue: Elasticity
 
 
 def check_effects(name: str, effects: Iterable[Effect]) -> Elasticity:
@@ -84,7 +84,7 @@ def build_body(name: str, anatomy: Anatomy, effects: Iterable[Effect]) -> Linear
     still = fixed.all(axis=1) | anatomy.orphaned
     acting = np.setdiff1d(anatomy.mesh.surface, np.flatnonzero(still))
     lame = {int(label): _get_tissue(tissue, int(label)).lame for label in np.unique(anatomy.mesh.region)}
-    return LinearBody(anatomy, tissue, still, acting, lame)
+    return LinearBody(anatomy, still, acting, lame, tissue)
 
 
 def get_lame(tissue: Elasticity, mesh: TetMesh) -> np.ndarray:

@@ -1,0 +1,232 @@
+"""Direct boundary element method (BEM) of linear elasticity, for brain and tumour as two coupled regions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import lu_factor, lu_solve
+from scipy.spatial import KDTree
+
+from ..anatomy import describe_region
+from ..arguments import check_vertex_numbers
+from ..errors import InputError
+from ..geometry.surface import compute_vertex_areas
+from ..geometry.tetmesh import TRIANGLE_EDGES, compute_row_keys, find_single_faces
+from .kelvin_integrals import integrate_triangles
+from .linear_body import LinearBody
+
+CHUNK = 8  # Collocation points whose integrals are computed together.
+
+
+@dataclass(frozen=True, eq=False)
+class _Boundaries:
+    """Boundaries of all regions.
+
+    nodes (N, 3) [m], those of the mesh first, and which are fixed (N,); outward triangles (S, 3), the number of their
+    region (S,), and which are on the interface of brain and tumour (S,), and on the fixed surface (S,).
+    """
+
+    nodes: np.ndarray
+    fixed: np.ndarray
+    triangles: np.ndarray
+    region: np.ndarray
+    inner: np.ndarray
+    covered: np.ndarray
+
+    def refine(self) -> _Boundaries:
+        """Divide into four all triangles that are not fixed, or touch one that is not.
+
+        Vertices may lie on edges of undivided triangles: these are fixed, and tractions may be discontinuous.
+        """
+        marked = ~self.covered | np.isin(self.triangles, self.triangles[~self.covered]).any(axis=1)
+        kept, corners = self.triangles[~marked], self.triangles[marked]
+        edges, walls = (each[:, TRIANGLE_EDGES].reshape(-1, 2) for each in (corners, self.triangles[self.covered]))
+        _, first, place = np.unique(compute_row_keys(edges), return_index=True, return_inverse=True)
+        (a, b, c), (ab, bc, ca) = corners.T, len(self.nodes) + place.reshape(-1, 3).T
+        parts = np.array([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(2, 0, 1).reshape(-1, 3)
+        parent = np.append(np.flatnonzero(~marked), np.repeat(np.flatnonzero(marked), 4))
+        return _Boundaries(
+            np.vstack([self.nodes, self.nodes[edges[first]].mean(axis=1)]),
+            np.append(self.fixed, _is_among(edges[first], walls)),
+            np.vstack([kept, parts]),
+            *(each[parent] for each in (self.region, self.inner, self.covered)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Region:
+    """Region with one tissue.
+
+    members (n,) are its vertices, triangles (S, 3) its outward boundary by vertex numbers. `displaced` (u, 3 S) and
+    `loaded` (t, 3 S) sum over corners of triangles: unknown displacements; unknown tractions, then unit forces.
+    """
+
+    nodes: np.ndarray
+    members: np.ndarray
+    triangles: np.ndarray
+    lame: tuple[float, float]
+    displaced: sp.csr_array
+    loaded: sp.csr_array
+
+    @property
+    def poisson(self) -> float:
+        """Poisson's ratio."""
+        return self.lame[1] / (2.0 * sum(self.lame))
+
+    def integrate(self, vertices: np.ndarray, column: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Integrate over the boundary for loads at vertices (n,) of the region, a few at a time.
+
+        column (n,) is the unknown displacement of the nearest vertex on the boundary, -1 if that is fixed. Its
+        coefficient follows from a rigid motion, which has no tractions. Yields for p of the vertices the coefficients
+        H (3 p, 3 u) and G (3 p, 3 t) of Somigliana's identity: u = G t - H u inside, 0 = G t - H u on the boundary.
+        """
+        inside = ~np.isin(vertices, self.triangles)
+        for first in range(0, len(vertices), CHUNK):
+            some = slice(first, min(first + CHUNK, len(vertices)))
+            count = some.stop - first
+            corners = self.nodes[self.triangles] - self.nodes[vertices[some], None, None]
+            blocks = integrate_triangles(corners.reshape(-1, 3, 3), self.poisson)
+            blocks = blocks.reshape(count, -1, 2, 3, 9).transpose(2, 1, 3, 0, 4).reshape(2, -1, count, 9)
+            total = blocks[1].sum(axis=0) + inside[some, None] * np.eye(3).ravel()
+            motion, force = (
+                (matrix @ each.reshape(-1, 9 * count)).reshape(-1, count, 3, 3).transpose(1, 2, 0, 3)
+                for matrix, each in ((self.displaced, blocks[1]), (self.loaded, blocks[0] / self.lame[0]))
+            )
+            own = np.flatnonzero(column[some] >= 0)
+            motion[own, :, column[some][own]] -= total[own].reshape(-1, 3, 3)
+            yield motion.reshape(3 * count, -1), force.reshape(3 * count, -1)
+
+
+def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
+    """Return displacements (a, 3, n, 3) [m/N] of vertices `nodes` (n,) under unit forces at `body.acting` (a,).
+
+    The second axis is the force's direction. Collocation at the vertices of the boundary, with linear displacements
+    and tractions on its triangles (Brebbia & Dominguez 1992, ch. 4; James & Pai 1999 for simulated surgery).
+    Displacements are continuous and tractions in equilibrium between brain and tumour. Triangles of the
+    free surface and of the interface are divided into four. A unit force acts as the traction of the dual shape
+    function of its vertex, 3 N_a - N_b - N_c, which has the same force and moment (Wohlmuth 2000, eq. 3.2).
+
+    Raises
+    ------
+    InputError
+        More than one tissue in the brain or in the tumour, fixed vertices inside the body or at the tumour, no fixed
+        triangle, forces at vertices that are not on the free surface, vertices that the mesh does not have.
+    """
+    nodes = check_vertex_numbers("nodes", nodes, len(body.fixed))
+    regions, move, pull = _build_regions(body)
+    moved, pulled, loads = 3 * (move.max() + 1), 3 * (pull.max() + 1), 3 * len(body.acting)
+    matrix, load, row = np.empty((moved + pulled, moved + pulled), order="F"), np.empty((moved + pulled, loads)), 0
+    for region in regions:
+        vertices = np.unique(region.triangles)
+        vertices = vertices[(move[vertices] >= 0) | (pull[vertices] >= 0)]
+        for motion, traction in region.integrate(vertices, move[vertices]):
+            rows = slice(row, row + len(motion))
+            matrix[rows, :moved], matrix[rows, moved:], load[rows] = motion, -traction[:, :pulled], traction[:, pulled:]
+            row = rows.stop
+    solution = lu_solve(lu_factor(matrix, overwrite_a=True), load)
+    result = np.zeros((len(move), 3, loads))
+    result[move >= 0] = solution[:moved].reshape(-1, 3, loads)[move[move >= 0]]
+    tractions = np.vstack([solution[moved:], np.eye(loads)])
+    for region in regions:
+        boundary = np.unique(region.triangles)
+        inner = np.intersect1d(nodes, np.setdiff1d(region.members, boundary))
+        nearest = boundary[KDTree(region.nodes[boundary]).query(region.nodes[inner])[1]]
+        parts = [
+            pull @ tractions - motion @ solution[:moved] for motion, pull in region.integrate(inner, move[nearest])
+        ]
+        result[inner] = np.reshape(parts and np.vstack(parts), (len(inner), 3, loads))
+    return result[nodes].reshape(len(nodes), 3, -1, 3).transpose(2, 3, 0, 1)
+
+
+def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndarray]:
+    """Return the regions, and the numbers (N,) of the unknown displacement and traction of each vertex, or -1."""
+    parts = _find_tissues(body)
+    surfaces = _find_boundaries(body, [some for some, _ in parts]).refine()
+    count = len(surfaces.nodes)
+    move = _number(np.setdiff1d(surfaces.triangles, np.flatnonzero(surfaces.fixed)), count)
+    pull = _number(np.unique(surfaces.triangles[surfaces.covered | surfaces.inner]), count)
+    act, density = _number(np.asarray(body.acting), count), np.zeros(count)
+    areas = compute_vertex_areas(surfaces.nodes, surfaces.triangles[~surfaces.inner])
+    density[body.acting] = 1.0 / areas[body.acting]
+    regions = []
+    for number, (some, lame) in enumerate(parts):
+        triangles, inner, covered = (
+            each[surfaces.region == number] for each in (surfaces.triangles, surfaces.inner, surfaces.covered)
+        )
+        ends, inner, unknown = triangles.ravel(), np.repeat(inner, 3), np.repeat(inner | covered, 3)
+        sign = np.where(inner & (number == 0), -1.0, 1.0)
+        reaction = _distribute(np.where(unknown, pull[ends], -1), sign, pull.max() + 1)
+        turned = [np.roll(triangles, turn, axis=1).ravel() for turn in range(3)]
+        load = sum(
+            _distribute(np.where(inner, -1, act[each]), factor * density[each], len(body.acting))
+            for each, factor in zip(turned, (3.0, -1.0, -1.0), strict=True)
+        )
+        displaced = _distribute(move[ends], np.ones(len(ends)), move.max() + 1)
+        members, loaded = np.unique(body.anatomy.mesh.tets[some]), sp.csr_array(sp.vstack([reaction, load]))
+        regions.append(_Region(surfaces.nodes, members, triangles, lame, displaced, loaded))
+    return regions, move, pull
+
+
+def _find_boundaries(body: LinearBody, parts: list[np.ndarray]) -> _Boundaries:
+    """Return the boundaries of regions with the tetrahedra `parts`, each (T,) bool."""
+    mesh = body.anatomy.mesh
+    boundaries = [find_single_faces(mesh.tets[some]) for some in parts]
+    triangles = np.vstack(boundaries)
+    inner = ~_is_among(triangles, mesh.surface)
+    covered = body.fixed[triangles].all(axis=1) & ~inner
+    _check_places(body, triangles[covered], np.unique(triangles[inner]))
+    region = np.repeat(np.arange(len(parts)), [len(each) for each in boundaries])
+    return _Boundaries(mesh.nodes, body.fixed, triangles, region, inner, covered)
+
+
+def _number(vertices: np.ndarray, count: int) -> np.ndarray:
+    """Return the position (count,) of each vertex in `vertices`, -1 elsewhere."""
+    numbers = np.full(count, -1)
+    numbers[vertices] = np.arange(len(vertices))
+    return numbers
+
+
+def _distribute(row: np.ndarray, value: np.ndarray, count: int) -> sp.csr_array:
+    """Return the matrix (count, n) with `value` (n,) in `row` (n,) of each column, and nothing if the row is -1."""
+    some = np.flatnonzero(row >= 0)
+    return sp.csr_array((value[some], (row[some], some)), shape=(count, len(row)))
+
+
+def _is_among(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Mark (n,) the rows (n, k) of vertex numbers that are, in any order in the row, among others (m, k)."""
+    keys = compute_row_keys(np.vstack([rows, others]))
+    return np.isin(keys[: len(rows)], keys[len(rows) :])
+
+
+def _find_tissues(body: LinearBody) -> list[tuple[np.ndarray, tuple[float, float]]]:
+    """Return the tetrahedra (T,) and (mu, lambda) [Pa] of the brain and, if it differs, of the tumour."""
+    mesh, tissues = body.anatomy.mesh, []
+    for some in (~body.anatomy.in_tumour, body.anatomy.in_tumour):
+        labels = np.unique(mesh.region[some]).tolist()
+        if len({tuple(body.lame[label]) for label in labels}) > 1:
+            raise InputError(
+                f"{' and '.join(map(describe_region, labels))} have different tissues: boundary elements need one for "
+                "the tumour with its necrosis and one for all other regions."
+            )
+        tissues += [(some, tuple(body.lame[label])) for label in labels[:1]]
+    return tissues if len({lame for _, lame in tissues}) > 1 else [(np.ones_like(tissues[0][0]), tissues[0][1])]
+
+
+def _check_places(body: LinearBody, covered: np.ndarray, interface: np.ndarray) -> None:
+    """Raise `InputError` if boundary elements cannot represent the fixed vertices or the forces."""
+    surface = np.isin(np.arange(len(body.fixed)), body.anatomy.mesh.surface)
+    inner = surface < ~body.anatomy.orphaned
+    inner[interface] = True
+    bad, acting = np.flatnonzero(body.fixed & inner), check_vertex_numbers("acting", body.acting, len(body.fixed))
+    if len(bad):
+        raise InputError(
+            f"vertex {bad[0]} (and {len(bad) - 1} more) is fixed inside the body or at the tumour's surface: boundary "
+            "elements need vertices that are fixed on the brain's outer surface only."
+        )
+    if not len(covered):
+        raise InputError("no surface triangle has three fixed vertices: fix a part of the surface.")
+    if len(np.unique(acting)) < len(acting) or (body.fixed | ~surface)[acting].any():
+        raise InputError("acting has vertices twice, fixed or inside: forces act on distinct vertices of free surface.")
