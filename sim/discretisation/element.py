@@ -84,8 +84,8 @@ def pack_gradients(
 
     Domains are numbered from 0, without gaps.
     """
-    most = np.int64(node.max(initial=0)) + 1
-    pair, place = np.unique(domain * most + node, return_inverse=True)
+    most = int(node.max(initial=0)) + 1
+    pair, place = np.unique(domain.astype(np.int64) * most + node, return_inverse=True)
     summed = np.column_stack([np.bincount(place.ravel(), gradient[:, k]) for k in range(3)])
     domain, node = divmod(pair, most)
     size = np.bincount(domain)
