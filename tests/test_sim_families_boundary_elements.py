@@ -111,7 +111,7 @@ def test_response_is_nearly_reciprocal() -> None:
     between = compute_response(body, body.acting).swapaxes(1, 2)
     apart = ~np.eye(len(body.acting), dtype=bool)
     difference = between - between.transpose(1, 0, 3, 2)
-    assert 0.0 < np.linalg.norm(difference[apart]) < 0.03 * np.linalg.norm(between[apart])
+    assert 0.0 < np.linalg.norm(difference[apart]) < 0.05 * np.linalg.norm(between[apart])
 
 
 def test_nearly_incompressible_pieces_at_the_surface_are_finite() -> None:

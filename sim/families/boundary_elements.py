@@ -37,11 +37,12 @@ class _Boundaries:
     covered: np.ndarray
 
     def refine(self) -> _Boundaries:
-        """Divide into four all triangles that are not fixed, or touch one that is not.
+        """Divide into four the free surface, what touches it, and the interface if that does.
 
         Vertices may lie on edges of undivided triangles: these are fixed, and tractions may be discontinuous.
         """
-        marked = ~self.covered | np.isin(self.triangles, self.triangles[~self.covered]).any(axis=1)
+        marked = np.isin(self.triangles, self.triangles[~self.covered & ~self.inner]).any(axis=1)
+        marked |= self.inner & marked[self.inner].any()
         kept, corners = self.triangles[~marked], self.triangles[marked]
         edges, walls = (each[:, TRIANGLE_EDGES].reshape(-1, 2) for each in (corners, self.triangles[self.covered]))
         _, first, place = np.unique(compute_row_keys(edges), return_index=True, return_inverse=True)
@@ -101,7 +102,7 @@ def compute_response(body: Body, nodes: np.ndarray) -> np.ndarray:
     The second axis is the force's direction. Collocation at the vertices of the boundary, with linear displacements
     and tractions on its triangles (Brebbia & Dominguez 1992, ch. 4; James & Pai 1999 for simulated surgery).
     Displacements are continuous and tractions in equilibrium between brain and tumour. Triangles of the free surface
-    and of the interface are divided into four. A unit force acts as the traction of the dual shape function of its
+    are divided into four. A unit force acts as the traction of the dual shape function of its
     vertex, 3 N_a - N_b - N_c on each triangle, which has the same force and moment (Wohlmuth 2000).
 
     Raises
