@@ -41,8 +41,8 @@ class _Boundaries:
 
         Vertices may lie on edges of undivided triangles: these are fixed, and tractions may be discontinuous.
         """
-        marked = np.isin(self.triangles, self.triangles[~self.covered & ~self.inner]).any(axis=1)
-        marked |= self.inner & marked[self.inner].any()
+        marked = np.any(np.isin(self.triangles, self.triangles[~self.covered & ~self.inner]), axis=1)
+        marked = marked | (self.inner & np.any(marked[self.inner]))
         kept, corners = self.triangles[~marked], self.triangles[marked]
         edges, walls = (each[:, TRIANGLE_EDGES].reshape(-1, 2) for each in (corners, self.triangles[self.covered]))
         _, first, place = np.unique(compute_row_keys(edges), return_index=True, return_inverse=True)
