@@ -37,11 +37,12 @@ class _Boundaries:
     covered: np.ndarray
 
     def refine(self) -> _Boundaries:
-        """Divide into four all triangles that are not fixed, or touch one that is not.
+        """Divide into four the free surface, what touches it, and the interface if that does.
 
         Vertices may lie on edges of undivided triangles: these are fixed, and tractions may be discontinuous.
         """
-        marked = ~self.covered | np.isin(self.triangles, self.triangles[~self.covered]).any(axis=1)
+        marked = np.any(np.isin(self.triangles, self.triangles[~self.covered & ~self.inner]), axis=1)
+        marked = marked | (self.inner & np.any(marked[self.inner]))
         kept, corners = self.triangles[~marked], self.triangles[marked]
         edges, walls = (each[:, TRIANGLE_EDGES].reshape(-1, 2) for each in (corners, self.triangles[self.covered]))
         _, first, place = np.unique(compute_row_keys(edges), return_index=True, return_inverse=True)
@@ -71,11 +72,6 @@ class _Region:
     displaced: sp.csr_array
     loaded: sp.csr_array
 
-    @property
-    def poisson(self) -> float:
-        """Poisson's ratio."""
-        return self.lame[1] / (2.0 * sum(self.lame))
-
     def integrate(self, vertices: np.ndarray, column: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Integrate over the boundary for loads at vertices (n,) of the region, a few at a time.
 
@@ -88,7 +84,7 @@ class _Region:
             some = slice(first, min(first + CHUNK, len(vertices)))
             count = some.stop - first
             corners = self.nodes[self.triangles] - self.nodes[vertices[some], None, None]
-            blocks = integrate_triangles(corners.reshape(-1, 3, 3), self.poisson)
+            blocks = integrate_triangles(corners.reshape(-1, 3, 3), self.lame[1] / (2.0 * sum(self.lame)))
             blocks = blocks.reshape(count, -1, 2, 3, 9).transpose(2, 1, 3, 0, 4).reshape(2, -1, count, 9)
             total = blocks[1].sum(axis=0) + inside[some, None] * np.eye(3).ravel()
             motion, force = (
@@ -105,9 +101,9 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
 
     The second axis is the force's direction. Collocation at the vertices of the boundary, with linear displacements
     and tractions on its triangles (Brebbia & Dominguez 1992, ch. 4; James & Pai 1999 for simulated surgery).
-    Displacements are continuous and tractions in equilibrium between brain and tumour. Triangles of the
-    free surface and of the interface are divided into four. A unit force acts as the traction of the dual shape
-    function of its vertex, 3 N_a - N_b - N_c, which has the same force and moment (Wohlmuth 2000, eq. 3.2).
+    Displacements are continuous and tractions in equilibrium between brain and tumour. Triangles of the free surface
+    are divided into four. A unit force acts as the traction of the dual shape function of its
+    vertex, 3 N_a - N_b - N_c on each triangle, which has the same force and moment (Wohlmuth 2000).
 
     Raises
     ------
@@ -143,8 +139,13 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
 
 def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndarray]:
     """Return the regions, and the numbers (N,) of the unknown displacement and traction of each vertex, or -1."""
-    parts = _find_tissues(body)
-    surfaces = _find_boundaries(body, [some for some, _ in parts]).refine()
+    mesh, parts = body.anatomy.mesh, _find_tissues(body)
+    boundaries = [find_single_faces(mesh.tets[some]) for some, _ in parts]
+    triangles, region = np.vstack(boundaries), np.repeat(np.arange(len(parts)), [len(each) for each in boundaries])
+    inner = ~_is_among(triangles, mesh.surface)
+    covered = body.fixed[triangles].all(axis=1) & ~inner
+    _check_places(body, triangles[covered], np.unique(triangles[inner]))
+    surfaces = _Boundaries(mesh.nodes, body.fixed, triangles, region, inner, covered).refine()
     count = len(surfaces.nodes)
     move = _number(np.setdiff1d(surfaces.triangles, np.flatnonzero(surfaces.fixed)), count)
     pull = _number(np.unique(surfaces.triangles[surfaces.covered | surfaces.inner]), count)
@@ -165,21 +166,9 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
             for each, factor in zip(turned, (3.0, -1.0, -1.0), strict=True)
         )
         displaced = _distribute(move[ends], np.ones(len(ends)), move.max() + 1)
-        members, loaded = np.unique(body.anatomy.mesh.tets[some]), sp.csr_array(sp.vstack([reaction, load]))
+        members, loaded = np.unique(mesh.tets[some]), sp.csr_array(sp.vstack([reaction, load]))
         regions.append(_Region(surfaces.nodes, members, triangles, lame, displaced, loaded))
     return regions, move, pull
-
-
-def _find_boundaries(body: LinearBody, parts: list[np.ndarray]) -> _Boundaries:
-    """Return the boundaries of regions with the tetrahedra `parts`, each (T,) bool."""
-    mesh = body.anatomy.mesh
-    boundaries = [find_single_faces(mesh.tets[some]) for some in parts]
-    triangles = np.vstack(boundaries)
-    inner = ~_is_among(triangles, mesh.surface)
-    covered = body.fixed[triangles].all(axis=1) & ~inner
-    _check_places(body, triangles[covered], np.unique(triangles[inner]))
-    region = np.repeat(np.arange(len(parts)), [len(each) for each in boundaries])
-    return _Boundaries(mesh.nodes, body.fixed, triangles, region, inner, covered)
 
 
 def _number(vertices: np.ndarray, count: int) -> np.ndarray:

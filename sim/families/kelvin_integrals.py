@@ -1,11 +1,9 @@
 """Integrals of Kelvin's fundamental solution over triangles with linear shape functions."""
 
-from functools import cache
-
 import numpy as np
 import warp as wp
 
-from ..runtime.device import Device, find_device, forward_kernel
+from ..runtime.device import find_device, forward_kernel
 
 # Distance to a triangle's centroid, relative to that of its farthest corner, below which the triangle is subdivided.
 NEAR = 3.0
@@ -74,14 +72,9 @@ def integrate_kelvin(
             out[m, 1, k] += share[k] * pulled
 
 
-@cache
-def _find_host() -> Device:
-    return find_device("cpu", "float64")
-
-
 def _integrate(corners: np.ndarray, rule: tuple[np.ndarray, np.ndarray], poisson: float) -> np.ndarray:
     """Return `integrate_kelvin` (m, 2, 3, 3, 3) over triangles (m, 3, 3) [m] by a rule."""
-    device, out = _find_host(), wp.zeros((len(corners), 2, 3), dtype=wp.mat33d, device="cpu")
+    device, out = find_device("cpu", "float64"), wp.zeros((len(corners), 2, 3), dtype=wp.mat33d, device="cpu")
     points = device.upload(rule[0], wp.vec3d), device.upload(rule[1])
     device.launch(integrate_kelvin, (len(corners),), [device.upload(corners, wp.vec3d), *points, poisson], [out])
     return out.numpy()
