@@ -28,7 +28,7 @@ class Rows:
     def __init__(self, fail=""):
         self.fail, self.begun, self.now, self.most, self.lock = fail, [], {}, {}, threading.Lock()
 
-    def __call__(self, study, spec, picture):
+    def __call__(self, study, spec):
         kind = type(spec)
         with self.lock:
             self.begun.append(spec.name)
@@ -92,7 +92,7 @@ def test_a_row_has_its_turn_when_its_process_is_ready(study, tmp_path):
         yield
         turns.append("ends")
 
-    row = measure_in_process(turn(), study, FemVariant("FEM odd law", law="odd"), tmp_path / "odd.png")
+    row = measure_in_process(turn(), study, FemVariant("FEM odd law", law="odd"))
     assert turns == ["begins", "ends"] and "odd" in row.state and row.state != "measured"
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import make_box
-from studies import read_back
 
 from scenes.cli import main
 from scenes.commands.report import QUICK_COUNTS
-from scenes.report.page import Section, find_front, plot_error_against_time, write_report
+from scenes.report.charts import build_error_chart, find_front
+from scenes.report.page import Section, write_report
 from scenes.report.row import ReportRow, compute_distance_figures, summarise_times
 from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
@@ -41,14 +41,16 @@ def test_the_front_is_what_nobody_beats():
     rows += [row("slow", 10.0, 10.0), row("other law", 0.5, 0.5, "model difference")]
     rows += [ReportRow("none", "f", state="it has no bound")]
     assert find_front(rows) == {"fast", "near", "between"}
-    assert plot_error_against_time(rows).std() > 5.0 and plot_error_against_time(rows[-1:]) is None
+    chart = build_error_chart(rows)
+    assert {dot.name for dot in chart.dots if not dot.pale} == {"fast", "near", "between"}
+    assert len(chart.front) == 3 and build_error_chart(rows[-1:]) is None
 
 
 def test_times_are_milliseconds_and_p99_takes_a_thousand():
     seconds = 1e-3 * np.arange(1.0, 1001.0)
-    assert summarise_times(seconds) == pytest.approx(
-        {"median": 500.5, "p99": np.percentile(1e3 * seconds, 99), "timed": 1000}
-    )
+    found = summarise_times(seconds)
+    assert found.pop("central_ms") == pytest.approx((25.975, 975.025), rel=1e-3)
+    assert found == pytest.approx({"median": 500.5, "p99": np.percentile(1e3 * seconds, 99), "timed": 1000})
     assert summarise_times(seconds[:999])["p99"] is None
 
 
@@ -65,25 +67,18 @@ def test_every_figure_stands_under_its_head(tmp_path):
     )
     row = replace(row, loads=600, units=60, series=9000, inside=12, solving=180.0, learning=120.0, timed=1000)
     row = replace(row, bare=0.0125, reference=replace(one, worst=replace(one.worst, mean=7.5)))
-    solved = replace(row, name="FEM", plan=("First this.", "Then <that>."))
-    write_report(tmp_path, "a machine", [Section("data", (), (solved,))])
-    assert (
-        "<summary>FEM</summary><ul><li>First this.<li>Then &lt;that&gt;.</ul>" in (tmp_path / "index.html").read_text()
-    )
-    assert read_back(solved).plan == solved.plan
-    write_report(tmp_path, "a machine", [Section("data", (), (row,))])
-    assert "Which solvers" not in (tmp_path / "index.html").read_text()
+    row = replace(row, outcomes={"CONVERGED": 3, "INVERTED": 1}, adapt=70.0)
+    write_report(tmp_path, "a machine", [Section("data", (), (row, ReportRow("odd", "f", state="no <memory>")))])
+    text = (tmp_path / "index.html").read_text()
+    assert "<p>odd: no &lt;memory&gt;</p>" in text
     tables = [
         [re.findall("<t[hd]>(.*?)</t[hd]>", line) for line in table.split("</tr>")]
-        for table in re.findall("<table>(.*?)</table>", (tmp_path / "index.html").read_text(), re.S)
+        for table in re.findall("<table>(.*?)</table>", text, re.S)
     ]
     (heads, cells, *_), (others, *learnt, _), *_ = tables
+    asked = ("model", "median ms", "preparation s", "resection known after s", "memory GiB", "reliable loads")
     stated = dict(zip(heads, cells, strict=True))
-    asked = ("median ms", "model in NumPy ms", "set-up s", "memory GiB", "solves", "in discs", "minutes")
-    assert [stated[head] for head in asked] == [
-        "1.5", "0.0125", "3.5", "0.25", "600 + 60 unit + 9000 series", "12", "5",
-    ]  # fmt: skip
-    assert stated["worst vertex mm: mean"] == "7.5"
+    assert [stated[head] for head in asked] == ["svr", "1.5", "300", "70", "0.25", "3 of 4"]
     asked = ("loads of", "loads", "mean mm", "called extrapolated", "within 95 % bound")
     assert [[line[others.index(head)] for head in asked] for line in learnt] == [
         ["whole discs of cortex left out", "7", "0.1", "1 %", "94 %"],

@@ -68,14 +68,11 @@ def build_cortex_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
 
 def build_force_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
     """Build the chart of the error against the force, for the rows of the front; None without rows."""
-    best = find_front(rows)
-    curves = tuple(
-        Curve(
-            row.name, tuple((0.5 * (t.least + t.greatest), t.percent) for t in row.reference.tenths if t.percent > 0.0)
-        )
-        for row in rows
-        if row.name in best and row.reference
-    )
+    best, curves = find_front(rows), []
+    for row in rows:
+        if row.name in best and row.reference:
+            tenths = ((0.5 * (tenth.least + tenth.greatest), tenth.percent) for tenth in row.reference.tenths)
+            curves.append(Curve(row.name, tuple(place for place in tenths if min(place) > 0.0)))
     title = "Small and surgical forces: error of the models on the front"
     return (
         ChartPanel(title, "force [N]", "mean distance in % of the motion", tuple(curves), size=SIZE) if curves else None

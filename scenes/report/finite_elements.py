@@ -75,8 +75,8 @@ class FamilySpec:
     name: str
 
 
-def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, np.ndarray]:
-    """Return the row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
+def measure_elements(study: ReportStudy, spec: FemVariant) -> ReportRow:
+    """Measure the row of a FEM variant.
 
     Raises
     ------
@@ -89,14 +89,14 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> tuple[ReportRow, n
     row = ReportRow(
         spec.name, "finite elements", against=describe_difference(study, spec), set_up=set_up, plan=fem.plan.explain()
     )
-    row, field = _measure_loads(study, row, fem, loads)
+    row = _measure_loads(study, row, fem, loads)
     debulked = debulk_tumour(body)
     adapt = time_work(lambda: _build_fem(study, spec, debulked).deform(loads.select(np.array([0]))))[1]
-    return replace(row, adapt=adapt), field
+    return replace(row, adapt=adapt)
 
 
-def measure_family(study: ReportStudy, spec: FamilySpec) -> tuple[ReportRow, np.ndarray]:
-    """Return the row of a family, and displacements (n, k, 3) [m] as `measure_elements`.
+def measure_family(study: ReportStudy, spec: FamilySpec) -> ReportRow:
+    """Measure the row of a family.
 
     Raises
     ------
@@ -108,13 +108,13 @@ def measure_family(study: ReportStudy, spec: FamilySpec) -> tuple[ReportRow, np.
         return build_family(spec.name, body, build_push_effects(body, study.get_tissue_on(body)), study.device)
 
     model, set_up = time_work(build, study.anatomy)
-    row, field = _measure_loads(study, ReportRow(spec.name, KINDS[spec.name], set_up=set_up), model, study.played)
+    row = _measure_loads(study, ReportRow(spec.name, KINDS[spec.name], set_up=set_up), model, study.played)
     debulked, first = debulk_tumour(study.anatomy), study.played.select(np.array([0]))
-    return replace(row, adapt=time_work(lambda: build(debulked).deform(first, at=debulked.tumour_nodes))[1]), field
+    return replace(row, adapt=time_work(lambda: build(debulked).deform(first, at=debulked.tumour_nodes))[1])
 
 
-def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: Loads) -> tuple[ReportRow, np.ndarray]:
-    """Return the row with errors and times of the loads, one by one, and displacements (n, k, 3) [m] of the tumour."""
+def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: Loads) -> ReportRow:
+    """Return the row with errors and times of the loads, one by one."""
     own, drawn = study.anatomy, study.drawn
     same = model.anatomy is own
     located = None if same else locate(model.anatomy.mesh, own.mesh.nodes[drawn])
@@ -128,7 +128,7 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
         outcomes.append(result.outcome[0])
     field, tumour = np.array(fields), np.isin(drawn, own.tumour_nodes)
     good = np.array([outcome.good if reliable else outcome is not Outcome.NOT_FINITE for outcome in outcomes])
-    row = replace(
+    return replace(
         row,
         reference=compare_with_reference(study, field[:, tumour], good, own.tumour_nodes),
         failed=int((~good).sum()),
@@ -136,7 +136,6 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
         **compute_load_errors(study, field, good, drawn),
         **summarise_times(seconds),
     )
-    return row, field[:, tumour]
 
 
 def _build_fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:

@@ -27,8 +27,8 @@ class LearnerSpec:
     name: str
 
 
-def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.ndarray]:
-    """Return the row, and displacements (n, k, 3) [m] of the tumour's vertices under the played loads.
+def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
+    """Measure the row of a learner.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
     adapt, adapted = _measure_adaptation(study, spec)
     held_out = study.converged.select(np.flatnonzero(discs.test))
     bare = time_model_alone(model, held_out)
-    row = ReportRow(
+    return ReportRow(
         spec.name,
         "learnt",
         reference=compare_with_reference(study, field, np.ones(len(field), bool), nodes),
@@ -83,7 +83,6 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, n
         curve=tuple((count, each) for count, each in [*curve, (len(order), of_discs[0])] if each is not None),
         **summarise_times(time_single_loads(model, held_out, nodes, study.timed)),
     )
-    return row, field
 
 
 def list_counts(most: int) -> list[int]:

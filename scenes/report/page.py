@@ -1,7 +1,6 @@
 """The report as files: a page that needs nothing else, plots, a table for spreadsheets, and every number as JSON."""
 
 import json
-from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
@@ -34,34 +33,22 @@ table { border-collapse: collapse; font-size: 13px; margin: 1em 0; }
 th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top; white-space: nowrap; }
 th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
 tr.front td:first-child { font-weight: bold; } tr.pale td { color: #777; } img { max-width: 100%; }
-figure { display: inline-block; width: 370px; margin: 0 8px 12px 0; } figcaption { font-size: 13px; }
 .wide { overflow-x: auto; }
 figure.chart { width: 880px; max-width: 100%; } figure.chart svg { width: 100%; height: auto; }
 summary { cursor: pointer; margin: 0.5em 0; }
 """
 NOTES = (  # Paragraphs below the tables.
-    "Two errors are given. The error relative to the reference is the accuracy of a row. The error relative to "
-    "the FEM that it was trained on is the surrogate error. A row with another law than "
-    "the reference's has a model difference instead of an error. The reference's own elements with a looser tolerance "
-    "show only the error of that tolerance and are not plotted.",
-    "Distances are taken over every load and vertex of the tumour; % is of each load's motion, the mean displacement "
-    "of those vertices. A row in bold, or full colour, is Pareto-optimal in time and mean error.",
-    "Worst vertex: of each load the vertex with the largest distance; mean, p95 and p99.9 are over the loads. "
-    f"No p99.9 is given for fewer than {MIN_LOADS_FOR_P999:,} loads.",
-    "Solves: all FEM solutions used by a row: loads, linear responses to unit forces at nodes of the "
-    "cortex, and terms of the power series. In discs: those of the tumour under loads inside the held-out discs. "
-    "The linear responses of the cortex are included in all; the cortex is not compared. Minutes: duration of "
-    "these solves, on the machine that ran them, and of training.",
-    "Time: one load at a time, from the undeformed state, trained models on one core; median; p99 of at least 1,000. "
-    "It includes bound and limits; the time of the model alone is next to it. "
-    "Set-up, compilation and warm-up are excluded. Memory: peak resident size of the process that built and "
-    "ran the row; card: peak GPU memory.",
-    "Bounds are guaranteed for loads distributed like the training loads. Their coverage in held-out discs, and "
-    "outside the training range, is shown, but not guaranteed. The coverage in discs belongs to another model than "
-    "the other numbers of the row, because some of the loads calibrate its bounds.",
-    "Adapting: wall time until a result is available again after the central fifth of the tumour is removed. For "
-    "FEM: set-up and the first load; for a trained model: new solves and training. In brackets: "
-    "mean error after that [mm], on held-out discs, relative to FEM of the debulked body.",
+    "Error: mean distance from the reference over all compared loads and vertices of the tumour, and in % of each "
+    "load's motion; bars in the charts are the central 95 % of the loads. A bold row, or full colour, is "
+    "Pareto-optimal in time and error. Another law than the reference's is a model difference, not an error; the "
+    "reference's own elements with another tolerance show the error of that tolerance alone, and are in no chart.",
+    "Time: one load at a time, from the undeformed state, until the result with its bound; trained models on one core. "
+    "Preparation: set-up with compiled kernels, or simulation and training. Resection: time until the first load after "
+    "the central fifth of the tumour is removed; for a trained model new simulations and training.",
+    "Reliable loads: those whose outcome is reliable by the model itself. Geometry-based models never are. Bounds of "
+    "trained models hold for loads distributed like the training loads; elsewhere their coverage is shown, not "
+    f"guaranteed. No p99.9 is given for fewer than {MIN_LOADS_FOR_P999:,} loads. All numbers are in the CSV and JSON "
+    "files.",
 )
 
 
@@ -85,7 +72,7 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
                 write_png(folder / f"{section.name}-{kind}.png", draw_panels([chart]))
                 plots.append(f"<figure class=chart>{draw_svg(chart)}</figure>")
         write_table(folder / f"{section.name}.csv", [dict(_flatten(asdict(row))) for row in section.rows])
-        bodies.append(_format_section(section, folder, plots))
+        bodies.append(_format_section(section, plots))
     with write_atomically(folder / "report.json", ".json") as partial:
         partial.write_text(json.dumps({"machine": machine, "sections": [asdict(section) for section in sections]}))
     notes = "".join(f"<p>{escape(note)}</p>" for note in NOTES)
@@ -97,29 +84,14 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
         )
 
 
-def _format_section(section: Section, folder: Path, plots: Sequence[str]) -> str:
-    measured = [row for row in section.rows if row.reference is not None]
+def _format_section(section: Section, plots: Sequence[str]) -> str:
     learnt = [row for row in section.rows if row.own_fem]
     about = "".join(f"<p>{escape(sentence)}</p>" for sentence in section.about)
-    pictures = [
-        f"<figure>{_embed_image(folder / 'pictures' / row.picture, row.name)}"
-        f"<figcaption>{escape(row.name)}</figcaption></figure>"
-        for row in measured
-        if row.picture
-    ]
-    return (
-        f"<h2>{escape(section.name)}</h2>{''.join(plots)}{_format_summary(section.rows)}{about}"
-        f"<details><summary>All numbers against the reference</summary>{_format_reference_table(section)}</details>"
-        + (
-            f"<details><summary>Learners against their own finite elements</summary>{_format_own_fem_table(learnt)}"
-            "</details>"
-            if learnt
-            else ""
-        )
-        + "<h3>Worst cases</h3><p>The tumour as the row has it, and dashed in yellow where the reference has it; a "
-        "pixel is about 0.1 mm.</p>"
-        f"{''.join(pictures)}{_format_plans(measured)}"
+    missing = "".join(
+        f"<p>{escape(row.name)}: {escape(row.state)}</p>" for row in section.rows if row.reference is None
     )
+    own = f"<h3>Learners against their own finite elements</h3>{_format_own_fem_table(learnt)}" if learnt else ""
+    return f"<h2>{escape(section.name)}</h2>{''.join(plots)}{_format_summary(section.rows)}{missing}{about}{own}"
 
 
 SUMMARY_HEADS = (
@@ -144,60 +116,6 @@ def _format_summary(rows: Sequence[ReportRow]) -> str:
         )  # fmt: skip
         lines.append(("front" if row.name in best else "", cells))
     return _format_table(SUMMARY_HEADS, lines) if lines else ""
-
-
-def _format_plans(rows: Sequence[ReportRow]) -> str:
-    """Describe how the FEM rows solve a load."""
-    plans = []
-    for row in rows:
-        lines = "".join(f"<li>{escape(line)}" for line in row.plan)
-        if lines:
-            plans.append(f"<details><summary>{escape(row.name)}</summary><ul>{lines}</ul></details>")
-    return f"<h3>Which solvers finite elements try</h3>{''.join(plans)}" if plans else ""
-
-
-def _format_reference_table(section: Section) -> str:
-    best = find_front(section.rows)
-    heads = (
-        "row", "distance", "loads", *SPREAD_HEADS, "median ms", "p99", "model in NumPy ms", "set-up s", "memory GiB",
-        "card", "solves", "in discs", "minutes", "adapting s",
-    )  # fmt: skip
-    lines = []
-    for row in section.rows:
-        if row.state != "measured":
-            lines.append(("pale", (row.name, row.state, *[""] * (len(heads) - 2))))
-            continue
-        minutes = None if row.learning is None else (row.learning + (row.solving or 0.0)) / 60.0
-        short = "" if row.solving is not None or row.loads is None else " of fitting"
-        cost = (row.median, row.p99, row.bare, row.set_up, row.memory, row.card)
-        cells = (
-            row.name, row.against, _count(row), *_spread(row.reference), *map(format_number, cost),
-            _format_solves(row),
-            "" if row.inside is None else str(row.inside), format_number(minutes) + short, _format_adaptation(row),
-        )  # fmt: skip
-        lines.append(("front" if row.name in best else "", cells))
-    return _format_table(heads, lines)
-
-
-def _format_adaptation(row: ReportRow) -> str:
-    if row.adapt is None:
-        return "not measured"
-    return (
-        format_number(row.adapt)
-        if row.adapted is None
-        else f"{format_number(row.adapt)} ({format_number(row.adapted.mm.mean)})"
-    )
-
-
-def _format_solves(row: ReportRow) -> str:
-    """Format the number of FEM solves that a row used, by kind."""
-    kinds = ((row.loads, ""), (row.units, " unit"), (row.series, " series"))
-    return " + ".join(f"{count}{kind}" for count, kind in kinds if count)
-
-
-def _count(row: ReportRow) -> str:
-    loads = 0 if row.reference is None else row.reference.loads
-    return f"{loads}, {row.failed} failed" if row.failed else str(loads)
 
 
 def _format_own_fem_table(rows: Sequence[ReportRow]) -> str:
@@ -240,12 +158,6 @@ def _format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]
         f'<tr class="{kind}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>' for kind, cells in lines
     )
     return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
-
-
-def _embed_image(path: Path, words: str) -> str:
-    """Embed an image in the page."""
-    data = b64encode(path.read_bytes()).decode()
-    return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
 
 
 def _flatten(value: Any, name: str = "") -> Iterable[tuple[str, Any]]:

@@ -173,8 +173,6 @@ class ReportRow:
         Distances from the FEM that it was trained on, on the discs, by number of training loads.
     plan
         Description of the solvers that FEM tries for a load.
-    picture
-        PNG in the report's folder: the compared load with the largest distance from the reference.
     """
 
     name: str
@@ -207,7 +205,6 @@ class ReportRow:
     adapted: ErrorFigures | None = None
     curve: tuple[tuple[int, ErrorFigures], ...] = ()
     plan: tuple[str, ...] = ()
-    picture: str | None = None
 
     @property
     def preparation(self) -> float | None:

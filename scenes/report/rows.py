@@ -48,16 +48,15 @@ FAMILY_NAMES = {FemVariant: "finite elements", FamilySpec: "other families", Lea
 
 
 def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
-    """Import all modules that rows need, and start Warp silently; on a GPU also PyTorch and the renderer."""
+    """Import all modules that rows need, and start Warp silently; on a GPU also PyTorch."""
     find_device("auto", "float32")
     if study.on_card:
-        for name in ("torch", "scenes.report.worst_case_image"):
-            import_module(name)
+        import_module("torch")
     return study
 
 
-def measure_row(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
-    """Measure the row of a deformation model, and render its worst case.
+def measure_row(study: ReportStudy, spec: Spec) -> ReportRow:
+    """Measure the row of a deformation model.
 
     `ReportRow.state` gives the reason for a missing one.
     """
@@ -65,24 +64,16 @@ def measure_row(study: ReportStudy, spec: Spec, picture: Path) -> ReportRow:
         if not isinstance(spec, LearnerSpec):
             with watch_gpu_memory(study.device) as taken:
                 of_elements = isinstance(spec, FemVariant)
-                row, field = measure_elements(study, spec) if of_elements else measure_family(study, spec)
+                row = measure_elements(study, spec) if of_elements else measure_family(study, spec)
             row = replace(row, card=max(taken) / 2**30 or None)
         else:
-            row, field = _measure_on_one_core(study, spec)
+            row = _measure_on_one_core(study, spec)
     except InputError as error:
         return ReportRow(spec.name, FAMILY_NAMES[type(spec)], state=str(error))
-    row = replace(row, memory=measure_peak_memory())
-    # The time for images does not belong to the row.
-    from ar.screen import write_png
-
-    from .worst_case_image import render_worst
-
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    write_png(picture, render_worst(study, field))
-    return replace(row, picture=picture.name)
+    return replace(row, memory=measure_peak_memory())
 
 
-def _measure_on_one_core(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportRow, np.ndarray]:
+def _measure_on_one_core(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
     """Products this small take longer on several, and say less."""
     with limit_to_one_thread():
         return measure_learner(study, spec)
@@ -91,7 +82,7 @@ def _measure_on_one_core(study: ReportStudy, spec: LearnerSpec) -> tuple[ReportR
 ELEMENTS = ("p1", "smoothed", "p2")  # Compared finite elements.
 MESHES = {"2.5k": "2500", "17k": "17000"}  # Numbers of nodes of the compared meshes, by name.
 TOLERANCES = (1e-2, 1e-3, STANDARD_TOLERANCE, 1e-5, 1e-6)  # Compared solver tolerances.
-Run = Callable[[ReportStudy, Spec, Path], ReportRow]
+Run = Callable[[ReportStudy, Spec], ReportRow]
 CORES = 4  # Number of CPU cores per measured learner, which uses one; the others prepare the next process.
 
 
@@ -135,20 +126,14 @@ def list_learner_specs() -> tuple[LearnerSpec, ...]:
     return tuple(LearnerSpec(name) for name in LEARNERS)
 
 
-def measure_in_process(
-    turn: AbstractContextManager[object], study: ReportStudy, spec: Spec, picture: Path
-) -> ReportRow:
+def measure_in_process(turn: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
     """Measured in a process of its own, which starts at once and measures in its `turn`."""
     try:
         # Data that the study has already read stay here.
         with process_pool(["cpu"], prepare_rows, replace(study)) as children, turn:
-            return run_on_each(children, _measure, [(spec, picture)])[0]
+            return run_on_each(children, measure_row, [spec])[0]
     except LostError:
         return ReportRow(spec.name, FAMILY_NAMES[type(spec)], state="its process was killed, probably out of memory")
-
-
-def _measure(study: ReportStudy, task: tuple[Spec, Path]) -> ReportRow:
-    return measure_row(study, *task)
 
 
 def measure_rows(
@@ -208,7 +193,7 @@ def _get_row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
     digest = _compute_row_digest(study, spec)
     kept = _read_kept_row(path, digest)
     if kept is None:
-        kept = run(study, spec, study.folder / "pictures" / f"{stem}.png")
+        kept = run(study, spec)
         if kept.state == "measured":
             with write_atomically(path, ".json") as unfinished:
                 unfinished.write_text(json.dumps({"digest": digest, "row": asdict(kept)}))

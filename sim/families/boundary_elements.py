@@ -26,7 +26,8 @@ class _Boundaries:
     """Boundaries of all regions.
 
     nodes (N, 3) [m], those of the mesh first, and which are fixed (N,); outward triangles (S, 3), the number of their
-    region (S,), and which are on the interface of brain and tumour (S,), and on the fixed surface (S,).
+    region (S,), and which are on the interface of brain and tumour (S,), and on the fixed surface (S,). halves (N, 2):
+    ends of the edge whose midpoint a vertex is, or itself twice; origin (S, 3): corners before division.
     """
 
     nodes: np.ndarray
@@ -35,6 +36,8 @@ class _Boundaries:
     region: np.ndarray
     inner: np.ndarray
     covered: np.ndarray
+    halves: np.ndarray
+    origin: np.ndarray
 
     def refine(self) -> _Boundaries:
         """Divide into four the free surface, what touches it, and the interface if that does.
@@ -54,6 +57,8 @@ class _Boundaries:
             np.append(self.fixed, _is_among(edges[first], walls)),
             np.vstack([kept, parts]),
             *(each[parent] for each in (self.region, self.inner, self.covered)),
+            np.vstack([self.halves, edges[first]]),
+            self.triangles[parent],
         )
 
 
@@ -102,8 +107,8 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     The second axis is the force's direction. Collocation at the vertices of the boundary, with linear displacements
     and tractions on its triangles (Brebbia & Dominguez 1992, ch. 4; James & Pai 1999 for simulated surgery).
     Displacements are continuous and tractions in equilibrium between brain and tumour. Triangles of the free surface
-    are divided into four. A unit force acts as the traction of the dual shape function of its
-    vertex, 3 N_a - N_b - N_c on each triangle, which has the same force and moment (Wohlmuth 2000).
+    are divided into four. A unit force acts as the traction of the dual shape function of its vertex, 4 N_a - 1 on each
+    undivided triangle, which has the same force and moment, and the same work as nodal forces (Wohlmuth 2000).
 
     Raises
     ------
@@ -145,25 +150,40 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
     inner = ~_is_among(triangles, mesh.surface)
     covered = body.fixed[triangles].all(axis=1) & ~inner
     _check_places(body, triangles[covered], np.unique(triangles[inner]))
-    surfaces = _Boundaries(mesh.nodes, body.fixed, triangles, region, inner, covered).refine()
+    surfaces = _Boundaries(
+        mesh.nodes,
+        body.fixed,
+        triangles,
+        region,
+        inner,
+        covered,
+        np.arange(len(mesh.nodes)).repeat(2).reshape(-1, 2),
+        triangles,
+    ).refine()
     count = len(surfaces.nodes)
     move = _number(np.setdiff1d(surfaces.triangles, np.flatnonzero(surfaces.fixed)), count)
     pull = _number(np.unique(surfaces.triangles[surfaces.covered | surfaces.inner]), count)
     act, density = _number(np.asarray(body.acting), count), np.zeros(count)
-    areas = compute_vertex_areas(surfaces.nodes, surfaces.triangles[~surfaces.inner])
+    # A divided triangle has a quarter of the area.
+    areas = 4.0 * compute_vertex_areas(surfaces.nodes, surfaces.triangles[~surfaces.inner])
     density[body.acting] = 1.0 / areas[body.acting]
     regions = []
     for number, (some, lame) in enumerate(parts):
-        triangles, inner, covered = (
-            each[surfaces.region == number] for each in (surfaces.triangles, surfaces.inner, surfaces.covered)
+        triangles, inner, covered, origin = (
+            each[surfaces.region == number]
+            for each in (surfaces.triangles, surfaces.inner, surfaces.covered, surfaces.origin)
         )
         ends, inner, unknown = triangles.ravel(), np.repeat(inner, 3), np.repeat(inner | covered, 3)
         sign = np.where(inner & (number == 0), -1.0, 1.0)
         reaction = _distribute(np.where(unknown, pull[ends], -1), sign, pull.max() + 1)
-        turned = [np.roll(triangles, turn, axis=1).ravel() for turn in range(3)]
         load = sum(
-            _distribute(np.where(inner, -1, act[each]), factor * density[each], len(body.acting))
-            for each, factor in zip(turned, (3.0, -1.0, -1.0), strict=True)
+            _distribute(
+                np.where(inner, -1, act[np.repeat(corner, 3)]),
+                (4.0 * (surfaces.halves[ends] == np.repeat(corner, 3)[:, None]).mean(axis=1) - 1.0)
+                * density[np.repeat(corner, 3)],
+                len(body.acting),
+            )
+            for corner in origin.T
         )
         displaced = _distribute(move[ends], np.ones(len(ends)), move.max() + 1)
         members, loaded = np.unique(mesh.tets[some]), sp.csr_array(sp.vstack([reaction, load]))
