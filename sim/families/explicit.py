@@ -15,7 +15,7 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Elasticity
 from ..runtime.views import run_in_order, to_host, to_library, view
-from .relaxation import Relaxation
+from .models import Relaxation
 
 
 @dataclass(frozen=True)
