@@ -73,8 +73,8 @@ def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     count = np.ceil((high - low) / cell).astype(int) + 3
     knots = tuple(np.arange(-3.0, number + 1.0) for number in count)
     fit, read = (NdBSpline.design_matrix((points[some] - low) / cell, knots, 3) for some in (controls, nodes))
-    for weights in (fit, read):
-        weights.resize(weights.shape[0], count.prod())  # SciPy leaves out columns behind the last one in use
+    for weights, some in ((fit, controls), (read, nodes)):
+        weights.resize(len(some), count.prod())  # SciPy leaves out columns behind the last one in use
     rough = LaplacianNd(tuple(count)).tosparse()
     factor = splu(sp.csc_array(fit.T @ fit - SMOOTHING * rough))
     return _continue_surface(body, read @ factor.solve(fit[: len(body.acting)].T.toarray()))
