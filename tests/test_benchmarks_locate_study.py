@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.__main__ import main
 from benchmarks.studies import locate_twins
-from benchmarks.studies.kelvinlets import kelvinlets
 from benchmarks.studies.locate_rivals import kelvin_forces, oracle, rigid, springs, thin_plates
 from benchmarks.studies.locate_study import (
     ORACLE,
@@ -32,6 +31,7 @@ from sim.bodies.open_cortex import open_cortex
 from sim.bodies.refine import refine
 from sim.effects import Bonded, Elasticity, Held, NodalForce
 from sim.errors import InputError
+from sim.families.geometric import compute_kelvinlets
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.material import Material
@@ -60,7 +60,7 @@ def locator(body):
         0.0, 0.02, (len(labels), 3)
     )
     force = random.standard_normal((len(labels), 3))
-    shape = np.einsum("nivj,ni->nvj", kelvinlets(nodes, source, 25e-3), force)
+    shape = np.einsum("nivj,ni->nvj", compute_kelvinlets(nodes, source, 25e-3, 0.49), force)
     shape *= 1e-3 / np.sqrt((shape**2).sum(axis=2).mean(axis=1))[:, None, None]
     prior = MotionPrior(body, shape.astype(np.float32), *np.array(labels).T, centre=np.zeros((2, 3)))
     return Locator(prior, np.tile([[0.0, 3.0, -20.0, 0.0, 3.0], [3.0, 6.0, -10.0, 0.0, 3.0]], (20, 1)))
@@ -103,12 +103,12 @@ def test_thin_plates_go_on_linearly_and_smooth_noise_away(tumour):
 def test_kelvinlets_match_kelvin_far_and_are_symmetric():
     """Kelvin 1848: u = (1 / r) ((3 - 4 nu) I + r r^T / r^2) f / (16 pi mu (1 - nu)), times 4 pi mu."""
     nu, arm = 0.49, np.array([0.3, -0.2, 0.4])
-    found = kelvinlets(arm[None], np.zeros((1, 3)), spread=1e-4)[0, :, 0]
+    found = compute_kelvinlets(arm[None], np.zeros((1, 3)), 1e-4, nu)[0, :, 0]
     length = np.linalg.norm(arm)
     kelvin = ((3.0 - 4.0 * nu) * np.eye(3) + np.outer(arm, arm) / length**2) / (4.0 * (1.0 - nu) * length)
     assert found == pytest.approx(kelvin, rel=1e-5)
     points = np.random.default_rng(0).uniform(size=(5, 3))
-    whole = kelvinlets(points, points).reshape(15, 15)
+    whole = compute_kelvinlets(points, points, 10e-3, nu).reshape(15, 15)
     assert whole == pytest.approx(whole.T) and np.linalg.eigvalsh(whole).min() > 0.0
 
 
@@ -116,7 +116,7 @@ def test_forces_at_the_points_are_found_again(tumour):
     """All but what the ridge takes; forces that differ along each axis, so that no axis is mistaken for another."""
     rest = scatter_columns(12)
     force = np.random.default_rng(2).standard_normal((12, 3)) * [1e-5, 2e-5, 3e-5]
-    seen, there = (np.einsum("nivj,ni->vj", kelvinlets(at, rest), force) for at in (rest, tumour))
+    seen, there = (np.einsum("nivj,ni->vj", compute_kelvinlets(at, rest, 10e-3, 0.49), force) for at in (rest, tumour))
     found = kelvin_forces(tumour)(rest, seen)
     assert np.linalg.norm(found - there) < 0.05 * np.linalg.norm(there)
     twice, torn = np.concatenate([rest, rest[:1] + 1e-9]), np.zeros((13, 3))

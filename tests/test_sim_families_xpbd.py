@@ -9,7 +9,7 @@ from conftest import make_box
 from sim.accuracy import REFERENCE
 from sim.deformation import Outcome
 from sim.effects import build_push_effects
-from sim.families.relaxation import RelaxationModel
+from sim.families.models import RelaxationModel
 from sim.families.xpbd import XPBD, Substeps, group_tetrahedra, prepare
 from sim.fem import Fem
 from sim.loads import Loads, Pushed

@@ -16,7 +16,7 @@ from sim.loads import Loads, Nodal
 from sim.material import Material
 from sim.terms.laws.springs import LAW, compute_spring_coefficients
 
-vec11 = wp.types.vector(11, wp.float64)
+vec20 = wp.types.vector(20, wp.float64)
 REGULAR = TetMesh(
     1e-2 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]]), np.array([[0, 2, 1, 3]]), np.ones(1, int)
 )
@@ -25,7 +25,7 @@ LAME = np.array([[1000.0, 4000.0]])
 
 @wp.kernel(enable_backward=False)
 def evaluate(
-    H: wp.array(dtype=wp.mat33d), D: wp.array(dtype=wp.mat33d), c: vec11, energy: wp.array(dtype=wp.float64),
+    H: wp.array(dtype=wp.mat33d), D: wp.array(dtype=wp.mat33d), c: vec20, energy: wp.array(dtype=wp.float64),
     stress: wp.array(dtype=wp.mat33d), change: wp.array(dtype=wp.mat33d),
 ):  # fmt: skip
     i = wp.tid()
@@ -41,7 +41,7 @@ def coefficients(mesh=REGULAR, lame=LAME):
 def run(H, D):
     count = len(H)
     out = wp.zeros(count, wp.float64), wp.zeros(count, wp.mat33d), wp.zeros(count, wp.mat33d)
-    given = [wp.array(H, dtype=wp.mat33d), wp.array(D, dtype=wp.mat33d), vec11(*coefficients()[0])]
+    given = [wp.array(H, dtype=wp.mat33d), wp.array(D, dtype=wp.mat33d), vec20(*coefficients()[0])]
     wp.launch(evaluate, count, [*given, *out], device="cpu")
     return [each.numpy() for each in out]
 

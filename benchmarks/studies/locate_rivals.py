@@ -14,18 +14,18 @@ from sim.accuracy import REFERENCE
 from sim.anatomy import TUMOUR_LABEL, Anatomy
 from sim.compile import compile_problem
 from sim.effects import Elasticity, Held
+from sim.families.geometric import compute_kelvinlets
 from sim.geometry.closest_point import find_closest_points
 from sim.geometry.surface import compute_areas
-from sim.material import Material
+from sim.material import BRAIN, Material
 from sim.runtime.device import find_device
 from surrogate.locating.prior import MotionPrior
-
-from .kelvinlets import kelvinlets
 
 Rival = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Motion (q, 3) [m] of the tumour's vertices by points (n, 3) [m] at rest and how each was seen to move (n, 3) [m]."""
 # The ridge of forces, as a share of what the points' own forces do there.
 RIDGE = 1e-2
+SPREAD = 10e-3  # Radius over which a force of a Kelvinlet is spread [m].
 # Smoothings that leaving one point out chooses from, of coordinates in units of the points' spread.
 SMOOTHINGS = 10.0 ** np.arange(-6.0, 3.0)
 # Linear tissue, and a tumour twice as stiff; E in Pa.
@@ -83,7 +83,8 @@ def kelvin_forces(at: np.ndarray) -> Rival:
 
     def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
         size = 3 * len(rest)
-        own, there = (kelvinlets(places, rest).reshape(size, -1).T for places in (rest, at))
+        blocks = (compute_kelvinlets(places, rest, SPREAD, BRAIN.poisson) for places in (rest, at))
+        own, there = (block.reshape(size, -1).T for block in blocks)
         ridge = RIDGE * np.trace(own) / size
         force = np.linalg.solve(own.T @ own + ridge**2 * np.eye(size), own.T @ motion.ravel())
         return (there @ force).reshape(-1, 3)

@@ -31,7 +31,10 @@ def build_element_free(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     corner = tets[:, FACES].reshape(-1, 3)
     _, first, face = np.unique(compute_row_keys(corner), return_index=True, return_inverse=True)
     cell = np.repeat(np.arange(len(tets)), len(FACES))
-    inside = _mark_inner_faces(face, mesh.region[chosen][cell])
+    # Faces with a tetrahedron of the same region on both sides.
+    label = np.unique(mesh.region[chosen], return_inverse=True)[1][cell]
+    count, total, square = (np.bincount(face, label**power) for power in range(3))
+    inside = (count == 2) & (total**2 == 2.0 * square)
     across, corners = inside[face], corner[first]
     table, shape = np.full((len(first), 3 + MAX_SUPPORT), -1), np.zeros((len(first), 3 + MAX_SUPPORT))
     table[:, :3], shape[:, :3] = corners, np.where(inside, STABILISATION, 1.0)[:, None] / 3.0
@@ -66,13 +69,6 @@ def compute_shapes(points: np.ndarray, nodes: np.ndarray, used: np.ndarray) -> n
     basis = np.concatenate([np.ones((*square.shape, 1)), away], axis=2)
     moment = np.einsum("ma,mai,maj->mij", weight, basis, basis)
     return weight * np.einsum("mai,mi->ma", basis, np.linalg.pinv(moment, 1e-12, hermitian=True)[:, 0])
-
-
-def _mark_inner_faces(face: np.ndarray, region: np.ndarray) -> np.ndarray:
-    """Mark the faces with a tetrahedron of the same region on both sides, from face and region of each side."""
-    label = np.unique(region, return_inverse=True)[1]
-    count, total, square = (np.bincount(face, label**power) for power in range(3))
-    return (count == 2) & (total**2 == 2.0 * square)
 
 
 def _choose_supports(nodes: np.ndarray, tets: np.ndarray, links: sp.csr_array, corner: np.ndarray) -> np.ndarray:

@@ -56,7 +56,9 @@ class _Boundaries:
             np.vstack([self.nodes, self.nodes[edges[first]].mean(axis=1)]),
             np.append(self.fixed, _is_among(edges[first], walls)),
             np.vstack([kept, parts]),
-            *(each[parent] for each in (self.region, self.inner, self.covered)),
+            self.region[parent],
+            self.inner[parent],
+            self.covered[parent],
             np.vstack([self.halves, edges[first]]),
             self.triangles[parent],
         )
@@ -77,17 +79,17 @@ class _Region:
     displaced: sp.csr_array
     loaded: sp.csr_array
 
-    def integrate(self, vertices: np.ndarray, column: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def integrate(self, vertices: np.ndarray, column: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
         """Integrate over the boundary for loads at vertices (n,) of the region, a few at a time.
 
         column (n,) is the unknown displacement of the nearest vertex on the boundary, -1 if that is fixed. Its
-        coefficient follows from a rigid motion, which has no tractions. Yields for p of the vertices the coefficients
+        coefficient follows from a rigid motion, which has no tractions. Yields p of the vertices, and the coefficients
         H (3 p, 3 u) and G (3 p, 3 t) of Somigliana's identity: u = G t - H u inside, 0 = G t - H u on the boundary.
         """
         inside = ~np.isin(vertices, self.triangles)
         for first in range(0, len(vertices), CHUNK):
-            some = slice(first, min(first + CHUNK, len(vertices)))
-            count = some.stop - first
+            some = slice(first, first + CHUNK)
+            count = len(vertices[some])
             corners = self.nodes[self.triangles] - self.nodes[vertices[some], None, None]
             blocks = integrate_triangles(corners.reshape(-1, 3, 3), self.lame[1] / (2.0 * sum(self.lame)))
             blocks = blocks.reshape(count, -1, 2, 3, 9).transpose(2, 1, 3, 0, 4).reshape(2, -1, count, 9)
@@ -98,7 +100,7 @@ class _Region:
             )
             own = np.flatnonzero(column[some] >= 0)
             motion[own, :, column[some][own]] -= total[own].reshape(-1, 3, 3)
-            yield motion.reshape(3 * count, -1), force.reshape(3 * count, -1)
+            yield vertices[some], motion.reshape(3 * count, -1), force.reshape(3 * count, -1)
 
 
 def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
@@ -123,7 +125,7 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     for region in regions:
         vertices = np.unique(region.triangles)
         vertices = vertices[(move[vertices] >= 0) | (pull[vertices] >= 0)]
-        for motion, traction in region.integrate(vertices, move[vertices]):
+        for _, motion, traction in region.integrate(vertices, move[vertices]):
             rows = slice(row, row + len(motion))
             matrix[rows, :moved], matrix[rows, moved:], load[rows] = motion, -traction[:, :pulled], traction[:, pulled:]
             row = rows.stop
@@ -135,10 +137,8 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
         boundary = np.unique(region.triangles)
         inner = np.intersect1d(nodes, np.setdiff1d(region.members, boundary))
         nearest = boundary[KDTree(region.nodes[boundary]).query(region.nodes[inner])[1]]
-        parts = [
-            pull @ tractions - motion @ solution[:moved] for motion, pull in region.integrate(inner, move[nearest])
-        ]
-        result[inner] = np.reshape(parts and np.vstack(parts), (len(inner), 3, loads))
+        for some, motion, traction in region.integrate(inner, move[nearest]):
+            result[some] = (traction @ tractions - motion @ solution[:moved]).reshape(-1, 3, loads)
     return result[nodes].reshape(len(nodes), 3, -1, 3).transpose(2, 3, 0, 1)
 
 
@@ -176,14 +176,10 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
         ends, inner, unknown = triangles.ravel(), np.repeat(inner, 3), np.repeat(inner | covered, 3)
         sign = np.where(inner & (number == 0), -1.0, 1.0)
         reaction = _distribute(np.where(unknown, pull[ends], -1), sign, pull.max() + 1)
+        hats = [(surfaces.halves[ends] == each.repeat(3)[:, None]).mean(axis=1) for each in origin.T]
         load = sum(
-            _distribute(
-                np.where(inner, -1, act[np.repeat(corner, 3)]),
-                (4.0 * (surfaces.halves[ends] == np.repeat(corner, 3)[:, None]).mean(axis=1) - 1.0)
-                * density[np.repeat(corner, 3)],
-                len(body.acting),
-            )
-            for corner in origin.T
+            _distribute(np.where(inner, -1, act[each]), (4.0 * hat - 1.0) * density[each], len(body.acting))
+            for each, hat in zip(origin.T.repeat(3, axis=1), hats, strict=True)
         )
         displaced = _distribute(move[ends], np.ones(len(ends)), move.max() + 1)
         members, loaded = np.unique(mesh.tets[some]), sp.csr_array(sp.vstack([reaction, load]))

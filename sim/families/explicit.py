@@ -15,7 +15,7 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Elasticity
 from ..runtime.views import run_in_order, to_host, to_library, view
-from .relaxation import Relaxation
+from .models import Relaxation
 
 
 @dataclass(frozen=True)
@@ -70,18 +70,13 @@ def prepare(
                     place[:], force = x, g
                 new = x + ((2.0 - damping) * (x - old) - 2.0 * step**2 * g / mass) / (2.0 + damping)
                 old[:], x[:] = x, new
-            if done % settings.every == 0 and _is_done(problem, u):
-                return u, done
+            if done % settings.every == 0:
+                _, free, scale = problem.residual(u)
+                if not (np.isfinite(free + scale) & (free > TOLERANCE * scale)).any():
+                    return u, done
         return u, settings.most
 
     return relax
-
-
-def _is_done(problem: Problem, u: wp.array) -> bool:
-    """Return True if no load case is finite and above the tolerance."""
-    _, free, scale = problem.residual(u)
-    finite = np.isfinite(free) & np.isfinite(scale)
-    return bool((~finite | (free <= TOLERANCE * scale)).all())
 
 
 EXPLICIT = Relaxation("smoothed", prepare, TOLERANCE)

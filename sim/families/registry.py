@@ -60,12 +60,12 @@ def build_family(
         return Fem(anatomy, effects, accuracy, device, element=ELEMENTS_BY_FAMILY[name])
     if name in ("explicit", "xpbd"):
         from .explicit import EXPLICIT
-        from .relaxation import RelaxationModel
+        from .models import RelaxationModel
         from .xpbd import XPBD
 
         return RelaxationModel(name, anatomy, effects, EXPLICIT if name == "explicit" else XPBD, device)
     from . import boundary_elements, condensed, geometric
-    from .linear_model import LinearModel
+    from .models import LinearModel
 
     respond = {
         "boundary-elements": boundary_elements.compute_response,

@@ -17,10 +17,11 @@ from ..discretisation.space import Discretisation
 from ..effects import Elasticity
 from ..geometry.tetmesh import EDGES
 from ..runtime.device import Device, forward_kernel
+from ..runtime.views import run_in_order, to_library, view
 from ..terms.laws.invariants import cofactor
 from ..terms.laws.springs import compute_spring_coefficients
 from .linear_body import get_lame
-from .relaxation import Relaxation
+from .models import Relaxation
 
 
 @dataclass(frozen=True)
@@ -50,24 +51,9 @@ TOLERANCE = 1e-2  # Relative residual of convergence.
 
 
 @cache
-def build_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
-    """Build the kernels that move vertices and that solve the constraints of tetrahedra, for a scalar type."""
-    scalar, vec, mat = device.scalar, device.vector, device.matrix
-
-    @forward_kernel(module="unique")
-    def move(
-        acceleration: wp.array2d(dtype=scalar),
-        step: scalar,
-        kept: scalar,
-        # outputs
-        u: wp.array2d(dtype=scalar),
-        before: wp.array2d(dtype=scalar),
-    ):
-        """Predict the position: u += kept (u - u-) + h^2 a."""
-        i, c = wp.tid()
-        now = u[i, c]
-        u[i, c] = now + kept * (now - before[i, c]) + step * step * acceleration[i, c]
-        before[i, c] = now
+def build_kernel(device: Device) -> wp.Kernel:
+    """Build the kernel that solves the constraints of tetrahedra, for a scalar type."""
+    scalar, vec = device.scalar, device.vector
 
     @wp.func
     def place(u: wp.array2d(dtype=scalar), node: int, c: int):
@@ -84,7 +70,7 @@ def build_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
         table: wp.array2d(dtype=wp.int32),
         ends: wp.array2d(dtype=wp.int32),
         nodes: wp.array(dtype=vec),
-        gradient: wp.array(dtype=mat),
+        gradient: wp.array2d(dtype=vec),
         inverse: wp.array(dtype=scalar),
         compliance: wp.array2d(dtype=scalar),
         # outputs
@@ -111,26 +97,19 @@ def build_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
                 shift(u, i, c, -(inverse[i] * change / size) * l)
                 shift(u, j, c, (inverse[j] * change / size) * l)
         F = wp.identity(n=3, dtype=scalar)
-        G = gradient[e]
-        origin = place(u, table[e, 0], c)
-        for k in range(3):
-            F += wp.outer(place(u, table[e, k + 1], c) - origin, G[k])
+        for k in range(4):
+            F += wp.outer(place(u, table[e, k], c), gradient[e, k])
         cof = cofactor(F)
-        soft = compliance[e, 6]
-        first = vec()
-        total = scalar(soft)
-        for k in range(3):
-            way = cof * G[k]
-            first -= way
-            total += inverse[table[e, k + 1]] * wp.length_sq(way)
-        total += inverse[table[e, 0]] * wp.length_sq(first)
-        step = -(wp.determinant(F) - scalar(1.0) + soft * multiplier[e, 6, c]) / total
+        total = compliance[e, 6]
+        for k in range(4):
+            total += inverse[table[e, k]] * wp.length_sq(cof * gradient[e, k])
+        step = -(wp.determinant(F) - scalar(1.0) + compliance[e, 6] * multiplier[e, 6, c]) / total
         multiplier[e, 6, c] += step
-        shift(u, table[e, 0], c, inverse[table[e, 0]] * step * first)
-        for k in range(3):
-            shift(u, table[e, k + 1], c, inverse[table[e, k + 1]] * step * (cof * G[k]))
+        for k in range(4):
+            i = int(table[e, k])
+            shift(u, i, c, inverse[i] * step * (cof * gradient[e, k]))
 
-    return move, solve
+    return solve
 
 
 def prepare(
@@ -148,23 +127,24 @@ def prepare(
         device.upload(mesh.tets, wp.int32),
         device.upload(EDGES, wp.int32),
         device.upload(mesh.nodes, device.vector),
-        device.upload(elements.gradient[:, 0, 1:], device.matrix),
+        device.upload(elements.gradient[:, 0], device.vector),
         device.upload(inverse),
         device.upload(1.0 / (np.maximum(stiffness, 1e-12) * settings.step**2)),
     ]
     colours = [device.upload(tets, wp.int32) for tets in group_tetrahedra(mesh.tets)]
-    move, solve = build_kernels(device)
 
     def relax(count: int) -> tuple[wp.array, int]:
+        """Predict positions by u += kept (u - u-) + h^2 a, and solve the constraints, in every step."""
         u, before = device.allocate(problem.rows, count), device.allocate(problem.rows, count)
-        multiplier = device.allocate(len(mesh.tets), 7, count)
-        acceleration = device.upload(-np.repeat(inverse, 3)[:, None] * problem.gradient(u).numpy())
-        numbers = [acceleration, device.scalar(settings.step), device.scalar(settings.kept)]
+        multiplier, (x, old) = device.allocate(len(mesh.tets), 7, count), map(view, (u, before))
+        with run_in_order(device):
+            moved = -(settings.step**2) * to_library(device, np.repeat(inverse, 3)[:, None]) * view(problem.gradient(u))
         for _ in range(settings.count):
-            device.launch(move, u.shape, numbers, [u, before])
+            with run_in_order(device):
+                old[:], x[:] = x, x + settings.kept * (x - old) + moved
             multiplier.zero_()
             for order in settings.iterations * colours:
-                device.launch(solve, (len(order), count), [order, *inputs], [u, multiplier])
+                device.launch(build_kernel(device), (len(order), count), [order, *inputs], [u, multiplier])
         return u, settings.count * settings.iterations
 
     return relax

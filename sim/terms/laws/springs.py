@@ -22,20 +22,7 @@ from .law import Law
 @wp.func
 def edge(c: Any, number: int):
     """Return the undeformed edge [m] of a number from 0 to 5: 01, 02, 03, 12, 13, 23."""
-    first = wp.vector(c[2], c[3], c[4])
-    second = wp.vector(c[5], c[6], c[7])
-    third = wp.vector(c[8], c[9], c[10])
-    if number == 0:
-        return first
-    if number == 1:
-        return second
-    if number == 2:
-        return third
-    if number == 3:
-        return second - first
-    if number == 4:
-        return third - first
-    return third - second
+    return wp.vector(c[2 + 3 * number], c[3 + 3 * number], c[4 + 3 * number])
 
 
 @wp.func
@@ -88,7 +75,7 @@ LAW = Law("springs", energy, stress, stress_change)
 
 
 def compute_spring_coefficients(lame: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Return k/V [Pa/m^2], lambda - mu [Pa] and three edges [m] (T, 11) of tetrahedra with mu, lambda (T, 2) [Pa].
+    """Return k/V [Pa/m^2], lambda - mu [Pa] and six edges [m] (T, 20) of tetrahedra with mu, lambda (T, 2) [Pa].
 
     gradient (T, 1, 4, 3) [1/m] of their linear shape functions.
 
@@ -101,6 +88,5 @@ def compute_spring_coefficients(lame: np.ndarray, gradient: np.ndarray) -> np.nd
     if (lam < mu * (1.0 - 1e-9)).any():
         raise InputError("a mass-spring model has Poisson's ratio 0.25 or more: increase nu, or use finite elements.")
     edges = np.linalg.inv(gradient[:, 0, 1:]).transpose(0, 2, 1)
-    others = edges[:, [1, 2, 2]] - edges[:, [0, 0, 1]]
-    square = (edges**2).sum(axis=(1, 2)) + (others**2).sum(axis=(1, 2))
-    return np.column_stack([15.0 * mu / square, lam - mu, edges.reshape(-1, 9)])
+    edges = np.concatenate([edges, edges[:, [1, 2, 2]] - edges[:, [0, 0, 1]]], axis=1)
+    return np.column_stack([15.0 * mu / (edges**2).sum(axis=(1, 2)), lam - mu, edges.reshape(-1, 18)])

@@ -1,0 +1,239 @@
+"""Deformation models under forces: a table of linear responses, and steps that approach the equilibrium."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from threading import RLock
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..anatomy import Anatomy
+from ..arguments import check_vertex_numbers
+from ..compile import check_causes, compile_problem
+from ..deformation import Cost, Deformation, Outcome, join_deformations
+from ..diagnostics.stretch import Stretch
+from ..discretisation.footprint import ContactSurface, compute_push_reactions
+from ..discretisation.inverted_elements import Inversion
+from ..discretisation.problem import Problem
+from ..discretisation.space import Discretisation, discretise
+from ..discretisation.term import Cases
+from ..effects import Effect, Elasticity
+from ..errors import InputError
+from ..geometry.tetmesh import TetMesh
+from ..loads import Loads, Nodal, Pushed, check_field
+from ..minimisers.residual import measure_residual
+from ..runtime.columns import unstack_columns
+from ..runtime.device import Device, find_device
+from ..runtime.method_lock import lock_method
+from ..runtime.views import view
+from .linear_body import LinearBody, build_body, check_effects
+
+Respond = Callable[[LinearBody, np.ndarray], np.ndarray]
+"""Function (body, nodes (n,)) -> displacements (a, 3, n, 3) [m/N] of vertices under unit forces at `body.acting`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relaxation:
+    """Method that approaches the equilibrium.
+
+    Parameters
+    ----------
+    element
+        Element of `Discretisation`.
+    prepare
+        Function that returns the method for a problem: (number of load cases) -> displacements (3N, b) [m] and steps.
+    tolerance
+        Relative residual at which a load case counts as converged.
+    """
+
+    element: str
+    prepare: Callable[[Problem, Discretisation, Elasticity], Callable[[int], tuple[wp.array, int]]]
+    tolerance: float
+
+
+class _ForceModel(ABC):
+    """Deformation model under forces that measures the strain and inversion of elements `watched`."""
+
+    def __init__(self, anatomy: Anatomy, effects: Iterable[Effect], watched: Discretisation, device: Device):
+        self.anatomy, self.effects, self.lock = anatomy, tuple(effects), RLock()
+        self._surface = ContactSurface(anatomy.mesh.nodes, anatomy.mesh.surface, device)
+        self._stretch, self._inversion = Stretch(watched, device), Inversion(watched, device)
+
+    @lock_method
+    def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
+        """Return the displacement under every load case; `start` has no influence.
+
+        Raises
+        ------
+        InputError
+            Loads that no effect uses or the model does not compute; a vertex that the mesh lacks.
+        """
+        check_causes(self.effects, loads)
+        count = len(self.anatomy.mesh.nodes)
+        return self._deform(loads, np.arange(count) if at is None else check_vertex_numbers("at", at, count))
+
+    @abstractmethod
+    def _deform(self, loads: Loads, nodes: np.ndarray) -> Deformation:
+        """Return the deformation of `nodes` (n,)."""
+
+    def _measure(self, loads: Loads, u: wp.array, outcome: np.ndarray) -> dict[str, Any]:
+        """Return fields of a `Deformation` with displacements u (3N, b) [m] of the watched elements.
+
+        `outcome` (b,) is that of load cases without inverted or overstrained elements.
+        """
+        strains, inverted = self._stretch.measure(u), self._inversion.count(u)
+        outcome[self._stretch.is_beyond_range(strains["strained"])] = Outcome.OVERSTRAINED
+        outcome[inverted > 0] = Outcome.INVERTED
+        reaction = compute_push_reactions(self._surface, loads)
+        return {"outcome": tuple(outcome), "time": loads.times, "reaction": reaction, "inverted": inverted, **strains}
+
+
+class RelaxationModel(_ForceModel):
+    """Deformation model that approaches the equilibrium under forces from the undeformed state.
+
+    Its results are the states after the last step.
+
+    Parameters
+    ----------
+    name
+        Name of the family, for messages.
+    anatomy, effects, device, batch
+        Arguments of `Fem`; only forces on tissue that is fixed to bone.
+    method
+        Method that approaches the equilibrium.
+
+    Raises
+    ------
+    InputError
+        Effects that the method does not compute, and input that `Fem` rejects.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        anatomy: Anatomy,
+        effects: Iterable[Effect],
+        method: Relaxation,
+        device: str = "auto",
+        batch: int = 64,
+    ):
+        effects = tuple(effects)
+        tissue, on = check_effects(name, effects), find_device(device, "float64")
+        space = discretise(anatomy.mesh, method.element)
+        super().__init__(anatomy, effects, space, on)
+        self._source, self._batch, self._tolerance = f"{name} ({tissue})", batch, method.tolerance
+        self._problem = compile_problem(effects, anatomy, on, space, self._surface)
+        self._relax = method.prepare(self._problem, space, tissue)
+
+    def _deform(self, loads: Loads, nodes: np.ndarray) -> Deformation:
+        firsts = range(0, max(1, len(loads)), self._batch)
+        return join_deformations([self._solve(loads.select(slice(k, k + self._batch)), nodes) for k in firsts])
+
+    def _solve(self, loads: Loads, nodes: np.ndarray) -> Deformation:
+        begun, problem = time.perf_counter(), self._problem
+        problem.begin(Cases(loads, np.zeros(len(loads))))
+        u, steps = self._relax(len(loads))
+        residual = measure_residual(problem, u)
+        finite = np.isfinite(u.numpy()).all(axis=0) & np.isfinite(residual)
+        view(u)[:, np.flatnonzero(~finite)] = 0.0
+        outcome = np.full(len(loads), Outcome.BUDGET)
+        outcome[residual <= self._tolerance] = Outcome.CONVERGED
+        outcome[~finite] = Outcome.NOT_FINITE
+        return Deformation(
+            displacement=unstack_columns(problem.device, u, nodes),
+            nodes=nodes,
+            iterations=np.full(len(loads), steps),
+            residual=residual,
+            **self._measure(loads, u, outcome),
+            cost=Cost({"steps": time.perf_counter() - begun}),
+            source=self._source,
+        )
+
+
+class LinearModel(_ForceModel):
+    """Deformation model with a table of responses to unit forces at the free surface.
+
+    `inverted`, `stretch` and `strained` of its results count tetrahedra at the free surface and in the tumour only.
+
+    Parameters
+    ----------
+    name
+        Name of the family, for messages.
+    anatomy, effects
+        Arguments of `Fem`; only forces on tissue that is fixed to bone.
+    respond
+        Function that computes responses.
+    outcome
+        Outcome of load cases whose tissue is neither inverted nor strained too far.
+
+    Raises
+    ------
+    InputError
+        Input that `build_body` or `respond` rejects. `deform`: loads other than `Pushed` and `Nodal`; forces at
+        vertices inside the body.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        anatomy: Anatomy,
+        effects: Iterable[Effect],
+        respond: Respond,
+        outcome: Outcome = Outcome.CONVERGED,
+    ):
+        effects, mesh = tuple(effects), anatomy.mesh
+        self._body, self._name, self._good = build_body(name, anatomy, effects), name, outcome
+        self._respond = lru_cache(2)(lambda nodes: respond(self._body, np.frombuffer(nodes, np.int64)))
+        free = np.isin(mesh.tets, self._body.acting).any(axis=1) | anatomy.in_tumour
+        self._watched, table = np.unique(mesh.tets[free].astype(np.int64), return_inverse=True)
+        part = discretise(TetMesh(mesh.nodes[self._watched], table.reshape(-1, 4), mesh.region[free]), "p1")
+        super().__init__(anatomy, effects, part, find_device("cpu", "float64"))
+        self._respond(self._watched.tobytes())
+
+    def _deform(self, loads: Loads, nodes: np.ndarray) -> Deformation:
+        begun, force = time.perf_counter(), self._compute_forces(loads)
+        acting = np.flatnonzero(force.any(axis=(0, 2)))
+        watched = self._compute_motion(force, acting, self._watched)
+        known = np.isin(nodes, self._watched).all()
+        place = np.searchsorted(self._watched, nodes) if known else nodes
+        every = np.arange(len(self.anatomy.mesh.nodes))
+        u = self._surface.device.upload(watched.reshape(len(loads), -1).T)
+        return Deformation(
+            displacement=(watched if known else self._compute_motion(force, acting, every))[:, place],
+            nodes=nodes,
+            iterations=np.zeros(len(loads), int),
+            residual=np.full(len(loads), np.nan),
+            **self._measure(loads, u, np.full(len(loads), self._good)),
+            cost=Cost({"response": time.perf_counter() - begun}),
+            source=f"{self._name} ({self._body.tissue})",
+        )
+
+    def _compute_motion(self, force: np.ndarray, acting: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """Return displacements (B, n, 3) [m] of `nodes` under forces (B, a, 3) [N], nonzero at `acting` only."""
+        table = self._respond(nodes.tobytes())[acting]
+        return np.tensordot(force[:, acting], table, axes=2)
+
+    def _compute_forces(self, loads: Loads) -> np.ndarray:
+        """Return the forces (B, a, 3) [N] at `body.acting`; fixed vertices bear the rest."""
+        acting, count = self._body.acting, len(self.anatomy.mesh.nodes)
+        force = np.zeros((len(loads), len(acting), 3))
+        for cause in loads.causes:
+            if isinstance(cause, Pushed):
+                weight = self._surface.press(cause.point, cause.footprint).to_matrix(count)[:, acting]
+                force += weight.toarray()[:, :, None] * cause.force[:, None]
+            elif isinstance(cause, Nodal):
+                check_field("Nodal.force", cause.force, count)
+                inside = np.setdiff1d(np.flatnonzero(cause.force.any(axis=(0, 2)) & ~self._body.fixed), acting)
+                if len(inside):
+                    raise InputError(
+                        f"{self._name} computes forces on the free surface; vertex {inside[0]} lies inside: use finite "
+                        "elements (--deformer fem)."
+                    )
+                force += cause.force[:, acting]
+            else:
+                raise InputError(f"{self._name} does not compute {type(cause).__name__}: use finite elements.")
+        return force
