@@ -29,6 +29,7 @@ from .effects import (
     build_push_effects,
 )
 from .errors import InputError
+from .families.registry import FAMILIES, build_family
 from .fem import Fem
 from .geometry.tetmesh import MeshWarning, TetMesh
 from .loads import (
@@ -56,6 +57,7 @@ from .tools import Ball, Capsule, Core, OwnTool, Spatula
 __all__ = [
     "BRAIN",
     "DRAFT",
+    "FAMILIES",
     "LIVE",
     "MATERIALS",
     "REFERENCE",
@@ -115,6 +117,7 @@ __all__ = [
     "ToolForce",
     "Touching",
     "Tumour",
+    "build_family",
     "build_fem",
     "build_posture",
     "build_push_effects",
