@@ -27,7 +27,7 @@ def build_block(cells=(4, 4, 4), share=1e-3, tissues=(BRAIN, STIFF), inner=True)
     acting = np.flatnonzero(np.linalg.norm(mesh.nodes - [0.05, 0.05, 0.1], axis=1) < 0.03)
     acting = acting[mesh.nodes[acting, 2] > 0.1 - 1e-9]
     lame = {label: tissue.lame for label, tissue in enumerate(tissues, 1)}
-    return LinearBody(hold(mesh, fixed), fixed, acting, lame, Elasticity(tissues[0], {2: tissues[1]}))
+    return LinearBody(hold(mesh, fixed), fixed, acting, lame, Elasticity(tissues[0], {2: tissues[-1]}))
 
 
 def solve_fem(body, nodes, tissues):

@@ -118,7 +118,8 @@ def prepare(
     """Return the function that moves a number of load cases: displacements (3N, b) [m] and iterations."""
     device, mesh = problem.device, space.mesh
     elements = build_linear_elements(mesh, np.ones(len(mesh.tets), bool))
-    numbers = compute_spring_coefficients(get_lame(tissue, mesh), elements.gradient)
+    lame = get_lame(tissue, mesh)
+    numbers = compute_spring_coefficients(np.array([lame[label] for label in mesh.region.tolist()]), elements.gradient)
     mass = np.bincount(mesh.tets.ravel(), np.repeat(0.25 * settings.density * mesh.volumes, 4), len(mesh.nodes))
     free = ~problem.constraint.fixed.all(axis=1) & (mass > 0.0)
     inverse = np.where(free, 1.0 / np.maximum(mass, 1e-12), 0.0)
