@@ -22,49 +22,6 @@ CHUNK = 8  # Collocation points whose integrals are computed together.
 
 
 @dataclass(frozen=True, eq=False)
-class _Boundaries:
-    """Boundaries of all regions.
-
-    nodes (N, 3) [m], those of the mesh first, and which are fixed (N,); outward triangles (S, 3), the number of their
-    region (S,), and which are on the interface of brain and tumour (S,), and on the fixed surface (S,). halves (N, 2):
-    ends of the edge whose midpoint a vertex is, or itself twice; origin (S, 3): corners before division.
-    """
-
-    nodes: np.ndarray
-    fixed: np.ndarray
-    triangles: np.ndarray
-    region: np.ndarray
-    inner: np.ndarray
-    covered: np.ndarray
-    halves: np.ndarray
-    origin: np.ndarray
-
-    def refine(self) -> _Boundaries:
-        """Divide into four the free surface, what touches it, and the interface if that does.
-
-        Vertices may lie on edges of undivided triangles: these are fixed, and tractions may be discontinuous.
-        """
-        marked = np.any(np.isin(self.triangles, self.triangles[~self.covered & ~self.inner]), axis=1)
-        marked = marked | (self.inner & np.any(marked[self.inner]))
-        kept, corners = self.triangles[~marked], self.triangles[marked]
-        edges, walls = (each[:, TRIANGLE_EDGES].reshape(-1, 2) for each in (corners, self.triangles[self.covered]))
-        _, first, place = np.unique(compute_row_keys(edges), return_index=True, return_inverse=True)
-        (a, b, c), (ab, bc, ca) = corners.T, len(self.nodes) + place.reshape(-1, 3).T
-        parts = np.array([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(2, 0, 1).reshape(-1, 3)
-        parent = np.append(np.flatnonzero(~marked), np.repeat(np.flatnonzero(marked), 4))
-        return _Boundaries(
-            np.vstack([self.nodes, self.nodes[edges[first]].mean(axis=1)]),
-            np.append(self.fixed, _is_among(edges[first], walls)),
-            np.vstack([kept, parts]),
-            self.region[parent],
-            self.inner[parent],
-            self.covered[parent],
-            np.vstack([self.halves, edges[first]]),
-            self.triangles[parent],
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class _Region:
     """Region with one tissue.
 
@@ -150,41 +107,54 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
     inner = ~_is_among(triangles, mesh.surface)
     covered = body.fixed[triangles].all(axis=1) & ~inner
     _check_places(body, triangles[covered], np.unique(triangles[inner]))
-    surfaces = _Boundaries(
-        mesh.nodes,
-        body.fixed,
-        triangles,
-        region,
-        inner,
-        covered,
-        np.arange(len(mesh.nodes)).repeat(2).reshape(-1, 2),
-        triangles,
-    ).refine()
-    count = len(surfaces.nodes)
-    move = _number(np.setdiff1d(surfaces.triangles, np.flatnonzero(surfaces.fixed)), count)
-    pull = _number(np.unique(surfaces.triangles[surfaces.covered | surfaces.inner]), count)
+    # Refined: the free surface, what touches it, and the interface if that does.
+    marked = np.any(np.isin(triangles, triangles[~covered & ~inner]), axis=1)
+    marked = marked | (inner & np.any(marked[inner]))
+    walls = triangles[covered][:, TRIANGLE_EDGES].reshape(-1, 2)
+    whole = triangles
+    nodes, triangles, parent, edges = _refine(mesh.nodes, whole, marked)
+    region, inner, covered = region[parent], inner[parent], covered[parent]
+    fixed, count = np.append(body.fixed, _is_among(edges, walls)), len(nodes)
+    move = _number(np.setdiff1d(triangles, np.flatnonzero(fixed)), count)
+    pull = _number(np.unique(triangles[covered | inner]), count)
     act, density = _number(np.asarray(body.acting), count), np.zeros(count)
-    # A divided triangle has a quarter of the area.
-    areas = 4.0 * compute_vertex_areas(surfaces.nodes, surfaces.triangles[~surfaces.inner])
-    density[body.acting] = 1.0 / areas[body.acting]
+    # A refined triangle has a quarter of the area. Ends of the edge that a node halves; itself if it is a vertex.
+    density[body.acting] = 0.25 / compute_vertex_areas(nodes, triangles[~inner])[body.acting]
+    halved = np.vstack([np.arange(len(mesh.nodes)).repeat(2).reshape(-1, 2), edges])
     regions = []
     for number, (some, lame) in enumerate(parts):
-        triangles, inner, covered, origin = (
-            each[surfaces.region == number]
-            for each in (surfaces.triangles, surfaces.inner, surfaces.covered, surfaces.origin)
-        )
-        ends, inner, unknown = triangles.ravel(), np.repeat(inner, 3), np.repeat(inner | covered, 3)
-        sign = np.where(inner & (number == 0), -1.0, 1.0)
+        own = region == number
+        ends, within, unknown = triangles[own].ravel(), np.repeat(inner[own], 3), np.repeat((inner | covered)[own], 3)
+        sign = np.where(within & (number == 0), -1.0, 1.0)
         reaction = _distribute(np.where(unknown, pull[ends], -1), sign, pull.max() + 1)
-        hats = [(surfaces.halves[ends] == each.repeat(3)[:, None]).mean(axis=1) for each in origin.T]
         load = sum(
-            _distribute(np.where(inner, -1, act[each]), (4.0 * hat - 1.0) * density[each], len(body.acting))
-            for each, hat in zip(origin.T.repeat(3, axis=1), hats, strict=True)
+            _distribute(
+                np.where(within, -1, act[corner]),
+                (4.0 * (halved[ends] == corner[:, None]).mean(axis=1) - 1.0) * density[corner],
+                len(body.acting),
+            )
+            for corner in whole[parent[own]].T.repeat(3, axis=1)
         )
         displaced = _distribute(move[ends], np.ones(len(ends)), move.max() + 1)
         members, loaded = np.unique(mesh.tets[some]), sp.csr_array(sp.vstack([reaction, load]))
-        regions.append(_Region(surfaces.nodes, members, triangles, lame, displaced, loaded))
+        regions.append(_Region(nodes, members, triangles[own], lame, displaced, loaded))
     return regions, move, pull
+
+
+def _refine(nodes: np.ndarray, triangles: np.ndarray, marked: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Divide triangles (S, 3) that are `marked` (S,) into four.
+
+    Returns nodes (N, 3) [m], those given first; triangles; the number of the triangle that each is a part of; and the
+    edges (E, 2) at whose centres the other nodes are. Vertices may lie on edges of undivided triangles: these are
+    fixed, and tractions may be discontinuous.
+    """
+    edges = triangles[marked][:, TRIANGLE_EDGES].reshape(-1, 2)
+    _, first, place = np.unique(compute_row_keys(edges), return_index=True, return_inverse=True)
+    (a, b, c), (ab, bc, ca) = triangles[marked].T, len(nodes) + place.reshape(-1, 3).T
+    parts = np.array([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(2, 0, 1).reshape(-1, 3)
+    parent = np.append(np.flatnonzero(~marked), np.repeat(np.flatnonzero(marked), 4))
+    edges = edges[first]
+    return np.vstack([nodes, nodes[edges].mean(axis=1)]), np.vstack([triangles[~marked], parts]), parent, edges
 
 
 def _number(vertices: np.ndarray, count: int) -> np.ndarray:

@@ -58,7 +58,7 @@ def compute_thin_plate_response(body: LinearBody, nodes: np.ndarray) -> np.ndarr
     points, controls = body.anatomy.mesh.nodes, np.concatenate([body.acting, _choose_pins(body)])
     unit = np.eye(len(controls))[:, : len(body.acting)]
     spline = RBFInterpolator(points[controls], unit, kernel="linear", degree=1)
-    return _continue_surface(body, spline(points[nodes]))
+    return _continue_half_space(body, spline(points[nodes]))
 
 
 def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
@@ -77,17 +77,13 @@ def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
         weights.resize(len(some), count.prod())  # SciPy leaves out columns behind the last one in use
     rough = LaplacianNd(tuple(count)).tosparse()
     factor = splu(sp.csc_array(fit.T @ fit - SMOOTHING * rough))
-    return _continue_surface(body, read @ factor.solve(fit[: len(body.acting)].T.toarray()))
+    return _continue_half_space(body, read @ factor.solve(fit[: len(body.acting)].T.toarray()))
 
 
-def _continue_surface(body: LinearBody, weight: np.ndarray) -> np.ndarray:
-    """Return displacements (a, 3, n, 3) [m/N] at n points with weights (n, a) of the loaded vertices' motion."""
-    return np.einsum("nb,aibj->ainj", weight, _compute_half_space(body), optimize=True)
+def _continue_half_space(body: LinearBody, weight: np.ndarray) -> np.ndarray:
+    """Return displacements (a, 3, n, 3) [m/N] at n points with weights (n, a) of the loaded vertices' motion.
 
-
-def _compute_half_space(body: LinearBody) -> np.ndarray:
-    """Return surface displacements (a, 3, a, 3) [m/N] of a half-space under unit forces at the loaded vertices.
-
+    That is the surface motion of a half-space under unit forces at these vertices.
     Johnson 1985, "Contact Mechanics", sections 3.2 and 3.6; r_e^2 = r^2 + e^2 / 4 bounds the singular point, so that
     the centre of a disc of radius e moves as under uniform pressure.
     """
@@ -99,7 +95,7 @@ def _compute_half_space(body: LinearBody) -> np.ndarray:
     out = (1.0 - nu) / far * np.eye(3) + nu / far**3 * along[..., :, None] * along[..., None, :]
     dip = along[..., :, None] * inward[..., None, :]  # motion along the surface, force into it
     out = out + (1.0 - 2.0 * nu) / (2.0 * far**2) * (dip.swapaxes(2, 3) - dip)
-    return out.transpose(0, 3, 1, 2) / (2.0 * np.pi * mu)
+    return np.einsum("nb,abji->ainj", weight, out / (2.0 * np.pi * mu), optimize=True)
 
 
 def _find_main_tissue(body: LinearBody) -> tuple[float, float]:

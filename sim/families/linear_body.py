@@ -10,7 +10,6 @@ from ..discretisation.rigid_modes import check_fixed
 from ..effects import Bonded, Effect, Elasticity, Held, NodalForce, ToolForce
 from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
-from ..material import Tissue
 
 SUPPORTED = (Elasticity, Held, Bonded, ToolForce, NodalForce)
 """Effects that models outside the finite elements compute: forces on tissue that is fixed to bone."""
@@ -50,12 +49,10 @@ def check_effects(name: str, effects: Iterable[Effect]) -> Elasticity:
         Another effect, tissue that relaxes, or no tissue.
     """
     effects = tuple(effects)
-    for effect in effects:
-        if not isinstance(effect, SUPPORTED):
-            names = ", ".join(kind.__name__ for kind in SUPPORTED)
-            raise InputError(
-                f"{name} does not compute {type(effect).__name__}, only {names}: use finite elements (--deformer fem)."
-            )
+    other = next((type(effect).__name__ for effect in effects if not isinstance(effect, SUPPORTED)), None)
+    if other is not None:
+        names = ", ".join(kind.__name__ for kind in SUPPORTED)
+        raise InputError(f"{name} does not compute {other}, only {names}: use finite elements (--deformer fem).")
     tissue = next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if tissue is None:
         raise InputError("no effect resists deformation: add Elasticity.")
@@ -83,24 +80,21 @@ def build_body(name: str, anatomy: Anatomy, effects: Iterable[Effect]) -> Linear
         raise InputError(f"{name} requires vertices that are fixed in all directions or in none: use finite elements.")
     still = fixed.all(axis=1) | anatomy.orphaned
     acting = np.setdiff1d(anatomy.mesh.surface, np.flatnonzero(still))
-    lame = {int(label): _get_tissue(tissue, int(label)).lame for label in np.unique(anatomy.mesh.region)}
-    return LinearBody(anatomy, still, acting, lame, tissue)
+    return LinearBody(anatomy, still, acting, get_lame(tissue, anatomy.mesh), tissue)
 
 
-def get_lame(tissue: Elasticity, mesh: TetMesh) -> np.ndarray:
-    """Return the Lamé parameters mu, lambda (T, 2) [Pa] of the tetrahedra of a mesh.
+def get_lame(tissue: Elasticity, mesh: TetMesh) -> dict[int, tuple[float, float]]:
+    """Return the Lamé parameters mu, lambda [Pa] at small strain of the regions of a mesh, by label.
 
     Raises
     ------
     InputError
         A region without tissue.
     """
-    labels, place = np.unique(mesh.region, return_inverse=True)
-    return np.array([_get_tissue(tissue, int(label)).lame for label in labels])[place]
-
-
-def _get_tissue(tissue: Elasticity, label: int) -> Tissue:
-    law = tissue.get_law(label)
-    if law is None:
-        raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
-    return law
+    lame = {}
+    for label in np.unique(mesh.region).tolist():
+        law = tissue.get_law(label)
+        if law is None:
+            raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
+        lame[label] = law.lame
+    return lame

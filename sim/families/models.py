@@ -113,13 +113,7 @@ class RelaxationModel(_ForceModel):
     """
 
     def __init__(
-        self,
-        name: str,
-        anatomy: Anatomy,
-        effects: Iterable[Effect],
-        method: Relaxation,
-        device: str = "auto",
-        batch: int = 64,
+        self, name: str, anatomy: Anatomy, effects: Iterable[Effect], method: Relaxation, device: str, batch: int = 64
     ):
         effects = tuple(effects)
         tissue, on = check_effects(name, effects), find_device(device, "float64")
@@ -177,14 +171,7 @@ class LinearModel(_ForceModel):
         vertices inside the body.
     """
 
-    def __init__(
-        self,
-        name: str,
-        anatomy: Anatomy,
-        effects: Iterable[Effect],
-        respond: Respond,
-        outcome: Outcome = Outcome.CONVERGED,
-    ):
+    def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], respond: Respond, outcome: Outcome):
         effects, mesh = tuple(effects), anatomy.mesh
         self._body, self._name, self._good = build_body(name, anatomy, effects), name, outcome
         self._respond = lru_cache(2)(lambda nodes: respond(self._body, np.frombuffer(nodes, np.int64)))

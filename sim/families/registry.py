@@ -58,21 +58,16 @@ def build_family(
         from ..fem import Fem
 
         return Fem(anatomy, effects, accuracy, device, element=ELEMENTS_BY_FAMILY[name])
+    from . import boundary_elements, condensed, explicit, geometric, xpbd
+    from .models import LinearModel, RelaxationModel
+
     if name in ("explicit", "xpbd"):
-        from .explicit import EXPLICIT
-        from .models import RelaxationModel
-        from .xpbd import XPBD
-
-        return RelaxationModel(name, anatomy, effects, EXPLICIT if name == "explicit" else XPBD, device)
-    from . import boundary_elements, condensed, geometric
-    from .models import LinearModel
-
-    respond = {
-        "boundary-elements": boundary_elements.compute_response,
-        "condensed": condensed.compute_response,
-        "kelvinlets": geometric.compute_kelvinlet_response,
-        "lattice": geometric.compute_lattice_response,
-        "thin-plate": geometric.compute_thin_plate_response,
+        return RelaxationModel(name, anatomy, effects, explicit.EXPLICIT if name == "explicit" else xpbd.XPBD, device)
+    respond, outcome = {
+        "boundary-elements": (boundary_elements.compute_response, Outcome.CONVERGED),
+        "condensed": (condensed.compute_response, Outcome.CONVERGED),
+        "kelvinlets": (geometric.compute_kelvinlet_response, Outcome.GUESSED),
+        "lattice": (geometric.compute_lattice_response, Outcome.GUESSED),
+        "thin-plate": (geometric.compute_thin_plate_response, Outcome.GUESSED),
     }[name]
-    solved = name in ("boundary-elements", "condensed")
-    return LinearModel(name, anatomy, effects, respond, Outcome.CONVERGED if solved else Outcome.GUESSED)
+    return LinearModel(name, anatomy, effects, respond, outcome)

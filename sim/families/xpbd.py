@@ -6,7 +6,6 @@ Macklin, Muller, Chentanez 2016, "XPBD: position-based simulation of compliant c
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import warp as wp
@@ -16,7 +15,7 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Elasticity
 from ..geometry.tetmesh import EDGES
-from ..runtime.device import Device, forward_kernel
+from ..runtime.device import forward_kernel
 from ..runtime.views import run_in_order, to_library, view
 from ..terms.laws.invariants import cofactor
 from ..terms.laws.springs import compute_spring_coefficients
@@ -47,69 +46,63 @@ class Substeps:
     density: float = 1040.0
 
 
-TOLERANCE = 1e-2  # Relative residual of convergence.
+@wp.func
+def get_displacement(u: wp.array2d(dtype=wp.float64), node: int, c: int):
+    """Return the displacement [m] of a node in load case c."""
+    return wp.vec3d(u[3 * node, c], u[3 * node + 1, c], u[3 * node + 2, c])
 
 
-@cache
-def build_kernel(device: Device) -> wp.Kernel:
-    """Build the kernel that solves the constraints of tetrahedra, for a scalar type."""
-    scalar, vec = device.scalar, device.vector
+@wp.func
+def shift(u: wp.array2d(dtype=wp.float64), node: int, c: int, by: wp.vec3d):
+    """Add `by` [m] to the displacement of a node in load case c."""
+    for k in range(3):
+        u[3 * node + k, c] += by[k]
 
-    @wp.func
-    def place(u: wp.array2d(dtype=scalar), node: int, c: int):
-        return vec(u[3 * node, c], u[3 * node + 1, c], u[3 * node + 2, c])
 
-    @wp.func
-    def shift(u: wp.array2d(dtype=scalar), node: int, c: int, by: vec):
-        for k in range(3):
-            u[3 * node + k, c] += by[k]
+@forward_kernel
+def solve_constraints(
+    order: wp.array(dtype=wp.int32),
+    table: wp.array2d(dtype=wp.int32),
+    ends: wp.array2d(dtype=wp.int32),
+    nodes: wp.array(dtype=wp.vec3d),
+    gradient: wp.array2d(dtype=wp.vec3d),
+    inverse: wp.array(dtype=wp.float64),
+    compliance: wp.array2d(dtype=wp.float64),
+    # outputs
+    u: wp.array2d(dtype=wp.float64),
+    multiplier: wp.array3d(dtype=wp.float64),
+):
+    """Change the multiplier m of the constraints C of a tetrahedron, six lengths and a volume, and its positions.
 
-    @forward_kernel(module="unique")
-    def solve(
-        order: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        ends: wp.array2d(dtype=wp.int32),
-        nodes: wp.array(dtype=vec),
-        gradient: wp.array2d(dtype=vec),
-        inverse: wp.array(dtype=scalar),
-        compliance: wp.array2d(dtype=scalar),
-        # outputs
-        u: wp.array2d(dtype=scalar),
-        multiplier: wp.array3d(dtype=scalar),
-    ):
-        """Change the multiplier m of the constraints C of a tetrahedron, six lengths and a volume, and its positions.
-
-        dm = (-C - a m) / (sum of w |grad C|^2 + a), dx = w grad C dm, with compliance a over the time step squared.
-        """
-        t, c = wp.tid()
-        e = order[t]
-        for k in range(6):
-            i = int(table[e, ends[k, 0]])
-            j = int(table[e, ends[k, 1]])
-            L = nodes[j] - nodes[i]
-            l = L + place(u, j, c) - place(u, i, c)
-            size = wp.length(l)
-            a = compliance[e, k]
-            w = inverse[i] + inverse[j]
-            if w > scalar(0.0) and size > scalar(0.0):
-                change = -(size - wp.length(L) + a * multiplier[e, k, c]) / (w + a)
-                multiplier[e, k, c] += change
-                shift(u, i, c, -(inverse[i] * change / size) * l)
-                shift(u, j, c, (inverse[j] * change / size) * l)
-        F = wp.identity(n=3, dtype=scalar)
-        for k in range(4):
-            F += wp.outer(place(u, table[e, k], c), gradient[e, k])
-        cof = cofactor(F)
-        total = compliance[e, 6]
-        for k in range(4):
-            total += inverse[table[e, k]] * wp.length_sq(cof * gradient[e, k])
-        step = -(wp.determinant(F) - scalar(1.0) + compliance[e, 6] * multiplier[e, 6, c]) / total
-        multiplier[e, 6, c] += step
-        for k in range(4):
-            i = int(table[e, k])
-            shift(u, i, c, inverse[i] * step * (cof * gradient[e, k]))
-
-    return solve
+    dm = (-C - a m) / (sum of w |grad C|^2 + a), dx = w grad C dm, with compliance a over the time step squared.
+    """
+    t, c = wp.tid()
+    e = order[t]
+    for k in range(6):
+        i = int(table[e, ends[k, 0]])
+        j = int(table[e, ends[k, 1]])
+        L = nodes[j] - nodes[i]
+        l = L + get_displacement(u, j, c) - get_displacement(u, i, c)
+        size = wp.length(l)
+        a = compliance[e, k]
+        w = inverse[i] + inverse[j]
+        if w > wp.float64(0.0) and size > wp.float64(0.0):
+            change = -(size - wp.length(L) + a * multiplier[e, k, c]) / (w + a)
+            multiplier[e, k, c] += change
+            shift(u, i, c, -(inverse[i] * change / size) * l)
+            shift(u, j, c, (inverse[j] * change / size) * l)
+    F = wp.identity(n=3, dtype=wp.float64)
+    for k in range(4):
+        F += wp.outer(get_displacement(u, table[e, k], c), gradient[e, k])
+    cof = cofactor(F)
+    total = compliance[e, 6]
+    for k in range(4):
+        total += inverse[table[e, k]] * wp.length_sq(cof * gradient[e, k])
+    step = -(wp.determinant(F) - wp.float64(1.0) + compliance[e, 6] * multiplier[e, 6, c]) / total
+    multiplier[e, 6, c] += step
+    for k in range(4):
+        i = int(table[e, k])
+        shift(u, i, c, inverse[i] * step * (cof * gradient[e, k]))
 
 
 def prepare(
@@ -118,7 +111,8 @@ def prepare(
     """Return the function that moves a number of load cases: displacements (3N, b) [m] and iterations."""
     device, mesh = problem.device, space.mesh
     elements = build_linear_elements(mesh, np.ones(len(mesh.tets), bool))
-    numbers = compute_spring_coefficients(get_lame(tissue, mesh), elements.gradient)
+    lame = get_lame(tissue, mesh)
+    numbers = compute_spring_coefficients(np.array([lame[label] for label in mesh.region.tolist()]), elements.gradient)
     mass = np.bincount(mesh.tets.ravel(), np.repeat(0.25 * settings.density * mesh.volumes, 4), len(mesh.nodes))
     free = ~problem.constraint.fixed.all(axis=1) & (mass > 0.0)
     inverse = np.where(free, 1.0 / np.maximum(mass, 1e-12), 0.0)
@@ -144,7 +138,7 @@ def prepare(
                 old[:], x[:] = x, x + settings.kept * (x - old) + moved
             multiplier.zero_()
             for order in settings.iterations * colours:
-                device.launch(build_kernel(device), (len(order), count), [order, *inputs], [u, multiplier])
+                device.launch(solve_constraints, (len(order), count), [order, *inputs], [u, multiplier])
         return u, settings.count * settings.iterations
 
     return relax
@@ -162,4 +156,4 @@ def group_tetrahedra(tets: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(colour == each) for each in range(colour.max() + 1)]
 
 
-XPBD = Relaxation("springs", prepare, TOLERANCE)
+XPBD = Relaxation("springs", prepare, tolerance=1e-2)
