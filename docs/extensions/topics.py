@@ -11,8 +11,8 @@ TOPICS = {
         "Tools": "Ball Capsule Spatula Core",
         "Effects of a scene": """Elasticity Held Bonded Slide SkullContact ToolForce ToolContact ToolDisplacement
             NodalForce Gravity Inertia Pulsation Resection Retraction build_push_effects""",
-        "Solver": """Fem build_fem build_family FAMILIES Deformer Deformation Outcome Cost Accuracy DRAFT LIVE TRAIN REFERENCE
-            InputError""",
+        "Solver": """Fem build_fem build_family FAMILIES Deformer Deformation Outcome Cost Accuracy DRAFT LIVE TRAIN
+            REFERENCE InputError""",
         "Derived results": "compute_pressure solve_with_debonding DebondedSolution",
         "Extension": "OwnEffect OwnCause OwnTool Term Cases",
     },

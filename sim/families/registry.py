@@ -50,7 +50,7 @@ def build_family(
     >>> model = build_family("condensed", anatomy, build_push_effects(anatomy, BRAIN))
     >>> result = model.deform(push(place.point, 0.1 * place.inward, footprint=7e-3), at=anatomy.tumour_nodes)
     >>> print(f"{1e3 * np.linalg.norm(result.displacement[0].mean(axis=0)):.1f} mm; {result.outcome[0].name}")
-    0.5 mm; CONVERGED
+    0.3 mm; CONVERGED
     """
     if name not in tuple(FAMILIES):
         raise InputError(f"no family of models is called {name!r}: choose one of {', '.join(FAMILIES)}.")
