@@ -65,7 +65,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
     bare = time_model_alone(model, held_out)
     return ReportRow(
         spec.name,
-        "learnt",
+        "trained models",
         reference=compare_with_reference(study, field, np.ones(len(field), bool), nodes),
         **compute_load_errors(study, field, np.ones(len(field), bool), nodes),
         own_fem={name: figures for name, (figures, _) in sets.items() if figures is not None},

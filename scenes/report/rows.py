@@ -43,7 +43,7 @@ from .row import ReportRow
 from .study import ReportStudy
 
 Spec = FemVariant | FamilySpec | LearnerSpec
-FAMILY_NAMES = {FemVariant: "finite elements", FamilySpec: "other families", LearnerSpec: "learnt"}
+FAMILY_NAMES = {FemVariant: "finite elements", FamilySpec: "other families", LearnerSpec: "trained models"}
 """Names of kinds of rows by type."""
 
 
