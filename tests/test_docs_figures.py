@@ -3,6 +3,7 @@
 Records are `benchmarks/records/*.json` and `benchmarks/cards.json`; tests/data/figures.toml says which figure is whose.
 """
 
+import hashlib
 import json
 import re
 import tomllib
@@ -11,6 +12,9 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+
+from scenes.play.deformers import to_model_path
+from scenes.script.shipped_files import get_template_path
 
 HOUSE = Path(__file__).parents[1]
 FILES = {path.stem: json.loads(path.read_text()) for path in (HOUSE / "benchmarks/records").glob("*.json")}
@@ -121,3 +125,9 @@ def test_record_states_its_origin(figures):
         assert file["command"] and file["machine"] and re.fullmatch(r"\d{4}-\d\d-\d\d", file["date"]), name
     listed = {place.partition(" > ")[0] for found in figures.values() for place, *_ in found}
     assert listed == set(RECORDS)
+
+
+def test_the_chart_of_families_is_as_new_as_the_models_that_ship():
+    """Draw docs/report.png again with new models, and write their hash below the table."""
+    digest = hashlib.sha256(to_model_path(get_template_path()).read_bytes()).hexdigest()[:12]
+    assert digest in (HOUSE / "docs/notes/families.md").read_text()

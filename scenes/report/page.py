@@ -34,7 +34,7 @@ th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; ver
 th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
 tr.front td:first-child { font-weight: bold; } tr.pale td { color: #777; } img { max-width: 100%; }
 .wide { overflow-x: auto; }
-figure.chart { width: 880px; max-width: 100%; } figure.chart svg { width: 100%; height: auto; }
+figure.chart { width: 880px; max-width: 100%; margin: 0 0 12px; } figure.chart svg { width: 100%; height: auto; }
 summary { cursor: pointer; margin: 0.5em 0; }
 """
 NOTES = (  # Paragraphs below the tables.
@@ -90,7 +90,8 @@ def _format_section(section: Section, plots: Sequence[str]) -> str:
     missing = "".join(
         f"<p>{escape(row.name)}: {escape(row.state)}</p>" for row in section.rows if row.reference is None
     )
-    own = f"<h3>Learners against their own finite elements</h3>{_format_own_fem_table(learnt)}" if learnt else ""
+    title = "Trained models against their own finite elements"
+    own = f"<details><summary>{title}</summary>{_format_own_fem_table(learnt)}</details>" if learnt else ""
     return f"<h2>{escape(section.name)}</h2>{''.join(plots)}{_format_summary(section.rows)}{missing}{about}{own}"
 
 
