@@ -14,7 +14,7 @@ from sim.errors import InputError
 from sim.families.registry import ELEMENTS_BY_FAMILY, FAMILIES, build_family
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
-from sim.loads import Loads, Posture, Pushed
+from sim.loads import Loads, Posture, Prescribed, Pushed
 from sim.material import Material
 
 SOFT = Material("neo-hookean", 3000.0, 0.45)
@@ -142,14 +142,38 @@ def test_other_effects_and_loads_are_rejected(name, body):
         model.deform(pushes(), at=np.array([10**6]))
 
 
+def test_a_body_with_removed_tissue_still_moves(family, body):
+    """Vertices without tetrahedra, several tools, prescribed motion, and no load at all."""
+    name, model = family
+    lowest = np.argsort(body.mesh.nodes[body.mesh.tets, 2].mean(axis=1))
+    near = lowest[np.isin(body.mesh.tets[lowest], np.flatnonzero(~body.fixed.all(axis=1))[:1]).any(axis=1)]
+    rest = body.remove_elements(near)
+    assert rest.orphaned.any()
+    again = build_family(name, rest, build_push_effects(rest, SOFT), "cpu").deform(pushes())
+    whole = model.deform(pushes())
+    assert np.abs(again.displacement - whole.displacement).max() < 0.5 * np.abs(whole.displacement).max()
+    assert again.outcome == whole.outcome
+    two = Loads((pushes().causes[0], pushes(force=0.01).causes[0]))
+    assert np.abs(model.deform(two).displacement).max() > np.abs(whole.displacement).max()
+    assert len(model.deform(pushes().select(np.zeros(0, int)))) == 0
+    if name not in ELEMENTS_BY_FAMILY:
+        with pytest.raises(InputError, match="does not compute Prescribed"):
+            model.deform(Loads((Prescribed(np.zeros((1, len(body.mesh.nodes), 3))),)))
+
+
 def test_an_unknown_family_is_rejected(body):
     with pytest.raises(InputError, match="no family of models is called 'springs': choose one of kelvinlets"):
         build_family("springs", body, build_push_effects(body, SOFT))
 
 
-def test_a_body_that_slides_is_rejected():
+def test_a_partly_fixed_or_closed_body_is_rejected():
     mesh = make_mesh((3, 3, 2), 0.06)
     low = mesh.nodes[:, 2] < 1e-9
-    half = Anatomy(mesh, low[:, None] & [True, True, False], np.zeros_like(mesh.nodes), ~low)
-    with pytest.raises(InputError):
-        build_family("condensed", half, build_push_effects(half, SOFT), "cpu")
+    side = (mesh.nodes[:, 0] < 1e-9)[:, None] & [True, False, False]
+    half = Anatomy(mesh, low[:, None] | side, np.zeros_like(mesh.nodes), ~low)
+    for name in ("condensed", "xpbd"):
+        with pytest.raises(InputError, match="in all directions or in none"):
+            build_family(name, half, build_push_effects(half, SOFT), "cpu")
+    closed = replace(half, fixed=np.isin(np.arange(len(low)), mesh.surface)[:, None] & [True] * 3)
+    with pytest.raises(InputError, match="open a craniotomy"):
+        build_family("condensed", closed, build_push_effects(closed, SOFT), "cpu")

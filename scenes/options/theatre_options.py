@@ -45,7 +45,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
-        help="deformation model: a trained one (linear, ann, svr, ...); fem; one of the `report` families; "
+        help="deformation model: a trained one (linear, ann, svr, ...); fem; a family of models (condensed, ...); "
         "guarded: the best trained model with FEM where it is unreliable; auto: chosen by --within-error or "
         "--within-time (default: the model with the smallest error)",
     )

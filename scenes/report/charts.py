@@ -84,7 +84,7 @@ def build_learning_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
     curves = tuple(
         Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
     )
-    y = "mean distance from its own finite elements on left-out discs [mm]"
+    y = "mean distance from its own finite elements on held-out discs [mm]"
     title = "How many simulated loads does a learner require?"
     return ChartPanel(title, "training loads", y, curves, size=SIZE) if curves else None
 

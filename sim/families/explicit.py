@@ -49,7 +49,8 @@ def prepare(
     Masses are sums of rows of the undeformed stiffness, so that no eigenvalue of M^-1 K exceeds 1 (Gershgorin).
     """
     device = problem.device
-    mass = to_library(device, np.asarray(abs(problem.rest_curvature()).sum(axis=1)).reshape(-1, 1))
+    rows = np.asarray(abs(problem.rest_curvature()).sum(axis=1)).reshape(-1, 1)
+    mass = to_library(device, np.where(rows > 0.0, rows, 1.0))  # a vertex without tetrahedron is fixed
     step = 2.0 * settings.fraction
 
     def relax(count: int) -> tuple[wp.array, int]:

@@ -19,7 +19,7 @@ SMOOTHING = 1e-2  # Weight of a lattice's roughness relative to its misfit.
 
 
 def compute_kelvinlet_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
-    """Return displacements (a, 3, n, 3) [m/N] by regularised Kelvinlets that vanish at fixed vertices.
+    """Return displacements (a, 3, n, 3) [m/N] by regularised Kelvinlets that vanish at `PINS` fixed vertices.
 
     Forces at fixed vertices bring these back (section 6 of the paper cited by `compute_kelvinlets`). The infinite body
     has the tissue of most of the mesh.

@@ -67,11 +67,13 @@ def build_body(name: str, anatomy: Anatomy, effects: Iterable[Effect]) -> Linear
     Raises
     ------
     InputError
-        Effects that are not supported; a region without tissue; vertices fixed in some directions only; too few fixed
-        vertices.
+        Effects that are not supported; a region without tissue; vertices fixed in some directions only, too few fixed
+        or no free vertices; a quadratic mesh.
     """
     effects = tuple(effects)
     tissue = check_effects(name, effects)
+    if anatomy.mesh.middles is not None:
+        raise InputError(f"{name} requires linear tetrahedra: use finite elements, or a mesh without mid-edge nodes.")
     fixed = anatomy.fixed.copy() if any(isinstance(effect, Held) for effect in effects) else anatomy.fixed & False
     if any(isinstance(effect, Bonded) for effect in effects):
         fixed |= (anatomy.slide_normal != 0.0).any(axis=1)[:, None]
@@ -80,6 +82,8 @@ def build_body(name: str, anatomy: Anatomy, effects: Iterable[Effect]) -> Linear
         raise InputError(f"{name} requires vertices that are fixed in all directions or in none: use finite elements.")
     still = fixed.all(axis=1) | anatomy.orphaned
     acting = np.setdiff1d(anatomy.mesh.surface, np.flatnonzero(still))
+    if not len(acting):
+        raise InputError(f"{name} requires a free vertex on the surface: open a craniotomy.")
     return LinearBody(anatomy, still, acting, get_lame(tissue, anatomy.mesh), tissue)
 
 

@@ -4,7 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from threading import RLock
 from typing import Any
 
@@ -28,6 +28,7 @@ from ..loads import Loads, Nodal, Pushed, check_field
 from ..minimisers.residual import measure_residual
 from ..runtime.columns import unstack_columns
 from ..runtime.device import Device, find_device
+from ..runtime.memory import measure_free_bytes
 from ..runtime.method_lock import lock_method
 from ..runtime.views import view
 from .linear_body import LinearBody, build_body, check_effects
@@ -58,8 +59,8 @@ class Relaxation:
 class _ForceModel(ABC):
     """Deformation model under forces that measures the strain and inversion of elements `watched`."""
 
-    def __init__(self, anatomy: Anatomy, effects: Iterable[Effect], watched: Discretisation, device: Device):
-        self.anatomy, self.effects, self.lock = anatomy, tuple(effects), RLock()
+    def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], watched: Discretisation, device: Device):
+        self._name, self.anatomy, self.effects, self.lock = name, anatomy, tuple(effects), RLock()
         self._surface = ContactSurface(anatomy.mesh.nodes, anatomy.mesh.surface, device)
         self._stretch, self._inversion = Stretch(watched, device), Inversion(watched, device)
 
@@ -73,6 +74,9 @@ class _ForceModel(ABC):
             Loads that no effect uses or the model does not compute; a vertex that the mesh lacks.
         """
         check_causes(self.effects, loads)
+        for cause in loads.causes:
+            if not isinstance(cause, Pushed | Nodal):
+                raise InputError(f"{self._name} does not compute {type(cause).__name__}: use finite elements.")
         count = len(self.anatomy.mesh.nodes)
         return self._deform(loads, np.arange(count) if at is None else check_vertex_numbers("at", at, count))
 
@@ -118,7 +122,7 @@ class RelaxationModel(_ForceModel):
         effects = tuple(effects)
         tissue, on = check_effects(name, effects), find_device(device, "float64")
         space = discretise(anatomy.mesh, method.element)
-        super().__init__(anatomy, effects, space, on)
+        super().__init__(name, anatomy, effects, space, on)
         self._source, self._batch, self._tolerance = f"{name} ({tissue})", batch, method.tolerance
         self._problem = compile_problem(effects, anatomy, on, space, self._surface)
         self._relax = method.prepare(self._problem, space, tissue)
@@ -152,6 +156,7 @@ class LinearModel(_ForceModel):
     """Deformation model with a table of responses to unit forces at the free surface.
 
     `inverted`, `stretch` and `strained` of its results count tetrahedra at the free surface and in the tumour only.
+    Its outcome says nothing of the error of linear theory, which is 10 % of the motion at surgical forces.
 
     Parameters
     ----------
@@ -173,12 +178,12 @@ class LinearModel(_ForceModel):
 
     def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], respond: Respond, outcome: Outcome):
         effects, mesh = tuple(effects), anatomy.mesh
-        self._body, self._name, self._good = build_body(name, anatomy, effects), name, outcome
-        self._respond = lru_cache(2)(lambda nodes: respond(self._body, np.frombuffer(nodes, np.int64)))
+        self._body, self._good = build_body(name, anatomy, effects), outcome
+        self._respond = lru_cache(2)(partial(self._build_table, respond))
         free = np.isin(mesh.tets, self._body.acting).any(axis=1) | anatomy.in_tumour
         self._watched, table = np.unique(mesh.tets[free].astype(np.int64), return_inverse=True)
         part = discretise(TetMesh(mesh.nodes[self._watched], table.reshape(-1, 4), mesh.region[free]), "p1")
-        super().__init__(anatomy, effects, part, find_device("cpu", "float64"))
+        super().__init__(name, anatomy, effects, part, find_device("cpu", "float64"))
         self._respond(self._watched.tobytes())
 
     def _deform(self, loads: Loads, nodes: np.ndarray) -> Deformation:
@@ -188,7 +193,7 @@ class LinearModel(_ForceModel):
         known = np.isin(nodes, self._watched).all()
         place = np.searchsorted(self._watched, nodes) if known else nodes
         every = np.arange(len(self.anatomy.mesh.nodes))
-        u = self._surface.device.upload(watched.reshape(len(loads), -1).T)
+        u = self._surface.device.upload(watched.reshape(len(loads), 3 * len(self._watched)).T)
         return Deformation(
             displacement=(watched if known else self._compute_motion(force, acting, every))[:, place],
             nodes=nodes,
@@ -198,6 +203,19 @@ class LinearModel(_ForceModel):
             cost=Cost({"response": time.perf_counter() - begun}),
             source=f"{self._name} ({self._body.tissue})",
         )
+
+    def _build_table(self, respond: Respond, vertices: bytes) -> np.ndarray:
+        """Return the responses at vertices (n,), given as bytes of int64; fixed vertices do not move."""
+        nodes = np.frombuffer(vertices, np.int64)
+        needed = 2 * 9 * 8 * len(self._body.acting) * len(nodes)
+        if needed > measure_free_bytes(self._surface.device):
+            raise InputError(
+                f"{self._name} needs {needed / 2**30:.1f} GiB for the table of this mesh: use finite elements, or a "
+                "mesh with fewer vertices."
+            )
+        table = respond(self._body, nodes)
+        table[:, :, self._body.fixed[nodes]] = 0.0
+        return table
 
     def _compute_motion(self, force: np.ndarray, acting: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """Return displacements (B, n, 3) [m] of `nodes` under forces (B, a, 3) [N], nonzero at `acting` only."""
@@ -212,7 +230,7 @@ class LinearModel(_ForceModel):
             if isinstance(cause, Pushed):
                 weight = self._surface.press(cause.point, cause.footprint).to_matrix(count)[:, acting]
                 force += weight.toarray()[:, :, None] * cause.force[:, None]
-            elif isinstance(cause, Nodal):
+            if isinstance(cause, Nodal):
                 check_field("Nodal.force", cause.force, count)
                 inside = np.setdiff1d(np.flatnonzero(cause.force.any(axis=(0, 2)) & ~self._body.fixed), acting)
                 if len(inside):
@@ -221,6 +239,4 @@ class LinearModel(_ForceModel):
                         "elements (--deformer fem)."
                     )
                 force += cause.force[:, acting]
-            else:
-                raise InputError(f"{self._name} does not compute {type(cause).__name__}: use finite elements.")
         return force

@@ -11,7 +11,7 @@ from ..effects import Effect
 from ..errors import InputError
 
 FAMILIES = {
-    "kelvinlets": "regularised Kelvinlets: motions of an infinite body, brought back at fixed vertices",
+    "kelvinlets": "regularised Kelvinlets: motions of an infinite body, brought back at some fixed vertices",
     "thin-plate": "thin-plate spline that continues the motion of the surface",
     "lattice": "free-form lattice of B-splines that continues the motion of the surface",
     "mass-spring": "springs along edges and volumes of tetrahedra, to equilibrium",
@@ -24,7 +24,7 @@ FAMILIES = {
 """Descriptions by name; the finite elements of `Fem` are the reference."""
 
 ELEMENTS_BY_FAMILY = {"mass-spring": "springs", "element-free": "element-free"}
-"""Families that `Fem` solves, and their element: these compute every effect."""
+"""Families that `Fem` solves, and their element: these compute contact, gravity, resection and other effects."""
 
 
 def build_family(
@@ -55,9 +55,9 @@ def build_family(
     if name not in tuple(FAMILIES):
         raise InputError(f"no family of models is called {name!r}: choose one of {', '.join(FAMILIES)}.")
     if name in ELEMENTS_BY_FAMILY:
-        from ..fem import Fem
+        from ..resected_fem import build_fem
 
-        return Fem(anatomy, effects, accuracy, device, element=ELEMENTS_BY_FAMILY[name])
+        return build_fem(anatomy, effects, accuracy, device, element=ELEMENTS_BY_FAMILY[name])
     from . import boundary_elements, condensed, explicit, geometric, xpbd
     from .models import LinearModel, RelaxationModel
 

@@ -14,6 +14,7 @@ from ..discretisation.element import build_linear_elements
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Elasticity
+from ..errors import InputError
 from ..geometry.tetmesh import EDGES
 from ..runtime.device import forward_kernel
 from ..runtime.views import run_in_order, to_library, view
@@ -108,13 +109,22 @@ def solve_constraints(
 def prepare(
     problem: Problem, space: Discretisation, tissue: Elasticity, settings: Substeps = Substeps()
 ) -> Callable[[int], tuple[wp.array, int]]:
-    """Return the function that moves a number of load cases: displacements (3N, b) [m] and iterations."""
+    """Return the function that moves a number of load cases: displacements (3N, b) [m] and iterations.
+
+    Raises
+    ------
+    InputError
+        Vertices that are fixed in some directions only.
+    """
     device, mesh = problem.device, space.mesh
     elements = build_linear_elements(mesh, np.ones(len(mesh.tets), bool))
     lame = get_lame(tissue, mesh)
     numbers = compute_spring_coefficients(np.array([lame[label] for label in mesh.region.tolist()]), elements.gradient)
     mass = np.bincount(mesh.tets.ravel(), np.repeat(0.25 * settings.density * mesh.volumes, 4), len(mesh.nodes))
-    free = ~problem.constraint.fixed.all(axis=1) & (mass > 0.0)
+    fixed = problem.constraint.fixed.any(axis=1)
+    if (fixed != problem.constraint.fixed.all(axis=1)).any():
+        raise InputError("xpbd requires vertices that are fixed in all directions or in none: use finite elements.")
+    free = ~fixed & (mass > 0.0)
     inverse = np.where(free, 1.0 / np.maximum(mass, 1e-12), 0.0)
     stiffness = mesh.volumes[:, None] * np.column_stack([np.repeat(numbers[:, :1], 6, axis=1), numbers[:, 1]])
     inputs = [
