@@ -35,7 +35,7 @@ class TestAdapting:
         simulate_debulked(study, reported.append)
         rows_in_all = len(study.dataset.loads) + len(study.dataset.unit_good)
         assert sum(reported) == 2 * rows_in_all
-        row = measure_row(study, LearnerSpec("linear"), study.folder / "adapted.png")
+        row = measure_row(study, LearnerSpec("linear"))
         after = build_debulked_study(study)
         model = train(after.dataset, ["linear"], split=after.discs).models["linear"]
         test = np.flatnonzero(after.discs.test)
