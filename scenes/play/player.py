@@ -17,6 +17,7 @@ from ar.rendering.layer import Layer
 from ar.rendering.renderer import Picture
 from sim.deformation import Deformation, Deformer
 from sim.effects import remember
+from sim.families.models import LinearModel
 from sim.geometry.closest_point import find_closest_points
 from sim.geometry.first_contact import find_resting_tip
 from sim.geometry.surface import is_enclosing
@@ -205,8 +206,8 @@ class Player:
         return self.scene.build_loads(self.site, touch or self.get_touch(number), float(self.scene.times[number]))
 
     def compute_deformation(self, loads: Loads, last: Deformation | None = None) -> Deformation:
-        """Compute the deformation from the last one; a trained model returns the drawn vertices only."""
-        if isinstance(self.deformer, Learned):
+        """Compute the deformation from the last one; a trained model or a table returns the drawn vertices only."""
+        if isinstance(self.deformer, Learned | LinearModel):
             return self.deformer.deform(loads, start=last if self.follows else None, at=self.stage.nodes)
         return self.deformer.deform(loads, start=last)
 
