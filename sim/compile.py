@@ -286,12 +286,7 @@ def _build_elasticity(
     unknown = sorted(set(effect.regions) - set(effect.restrict(labels).regions))
     if unknown:
         raise InputError(f"a law is given for {describe_region(unknown[0])}, but the mesh has the regions {labels}.")
-    materials: dict[int, Tissue] = {}
-    for label in labels:
-        material = effect.get_law(label)
-        if material is None:
-            raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
-        materials[label] = material
+    materials = collect_laws(effect, labels)
     terms: list[Curved] = []
     for name, relaxes in sorted({(material.law, bool(material.prony)) for material in materials.values()}):
         obeying = {
@@ -310,6 +305,23 @@ def _build_elasticity(
             swelling = None if pulsation is None else (pulsation, swell[part.elements.owner])
             terms.append(_build_law_term(list(obeying.values()), which, elements, part.carries, device, swelling))
     return terms
+
+
+def collect_laws(effect: Elasticity, labels: Iterable[int]) -> dict[int, Tissue]:
+    """Return the law of each region.
+
+    Raises
+    ------
+    InputError
+        A region without a law.
+    """
+    laws: dict[int, Tissue] = {}
+    for label in labels:
+        law = effect.get_law(label)
+        if law is None:
+            raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
+        laws[label] = law
+    return laws
 
 
 def _build_law_term(

@@ -32,7 +32,7 @@ body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1200px; mar
 table { border-collapse: collapse; font-size: 13px; margin: 1em 0; }
 th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top; white-space: nowrap; }
 th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
-tr.front td:first-child { font-weight: bold; } tr.pale td { color: #777; } img { max-width: 100%; }
+tr.front td:first-child { font-weight: bold; }
 .wide { overflow-x: auto; }
 figure.chart { width: 880px; max-width: 100%; margin: 0 0 12px; } figure.chart svg { width: 100%; height: auto; }
 summary { cursor: pointer; margin: 0.5em 0; }
@@ -144,9 +144,7 @@ def _share(share: float | None) -> str:
     return "" if share is None else f"{100.0 * share:.0f} %"
 
 
-def _spread(figures: ErrorFigures | None) -> tuple[str, ...]:
-    if figures is None:
-        return ("",) * len(SPREAD_HEADS)
+def _spread(figures: ErrorFigures) -> tuple[str, ...]:
     worst = figures.worst
     values = (*asdict(figures.mm).values(), worst.mean, worst.p95, worst.p999, *asdict(figures.percent).values())
     return tuple("\N{EN DASH}" if value is None else format_number(value) for value in values)

@@ -25,8 +25,7 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     anatomy, device = body.anatomy, find_device("cpu", "float64")
     fixed = np.repeat(body.fixed[:, None], 3, axis=1)
     held = Anatomy(anatomy.mesh, fixed, np.zeros_like(anatomy.slide_normal), anatomy.craniotomy)
-    element = "smoothed" if anatomy.mesh.middles is None else "p2"
-    problem = compile_problem((body.tissue, Held()), held, device, discretise(anatomy.mesh, element))
+    problem = compile_problem((body.tissue, Held()), held, device, discretise(anatomy.mesh, "smoothed"))
     solver = build_rest_solver(problem)
     loaded, read = ((3 * some[:, None] + np.arange(3)).ravel() for some in (body.acting, nodes))
     out = np.empty((len(loaded), len(read)))

@@ -1,4 +1,4 @@
-"""LinearBody of a linear deformation model: fixed vertices, loaded vertices and Lamé parameters."""
+"""Body of a linear deformation model: fixed vertices, loaded vertices and Lamé parameters."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..anatomy import Anatomy
-from ..discretisation.rigid_modes import check_fixed
+from ..compile import collect_laws, compile_problem
+from ..discretisation.problem import Problem
 from ..effects import Bonded, Effect, Elasticity, Held, NodalForce, ToolForce
 from ..errors import InputError
-from ..geometry.tetmesh import TetMesh
+from ..runtime.device import find_device
 
 SUPPORTED = (Elasticity, Held, Bonded, ToolForce, NodalForce)
 """Effects that models outside the finite elements compute: forces on tissue that is fixed to bone."""
@@ -67,38 +68,31 @@ def build_body(name: str, anatomy: Anatomy, effects: Iterable[Effect]) -> Linear
     Raises
     ------
     InputError
-        Effects that are not supported; a region without tissue; vertices fixed in some directions only, too few fixed
-        or no free vertices; a quadratic mesh.
+        Effects that are not supported, or that `compile_problem` rejects; vertices fixed in some directions only; no
+        free vertices; a quadratic mesh.
     """
     effects = tuple(effects)
     tissue = check_effects(name, effects)
     if anatomy.mesh.middles is not None:
         raise InputError(f"{name} requires linear tetrahedra: use finite elements, or a mesh without mid-edge nodes.")
-    fixed = anatomy.fixed.copy() if any(isinstance(effect, Held) for effect in effects) else anatomy.fixed & False
-    if any(isinstance(effect, Bonded) for effect in effects):
-        fixed |= (anatomy.slide_normal != 0.0).any(axis=1)[:, None]
-    check_fixed(anatomy.mesh, fixed, np.zeros_like(anatomy.slide_normal))
-    if (fixed.any(axis=1) != fixed.all(axis=1)).any():
-        raise InputError(f"{name} requires vertices that are fixed in all directions or in none: use finite elements.")
-    still = fixed.all(axis=1) | anatomy.orphaned
+    problem = compile_problem(effects, anatomy, find_device("cpu", "float64"))
+    still = find_fixed(name, problem) | anatomy.orphaned
     acting = np.setdiff1d(anatomy.mesh.surface, np.flatnonzero(still))
     if not len(acting):
         raise InputError(f"{name} requires a free vertex on the surface: open a craniotomy.")
-    return LinearBody(anatomy, still, acting, get_lame(tissue, anatomy.mesh), tissue)
+    laws = collect_laws(tissue, np.unique(anatomy.mesh.region).tolist())
+    return LinearBody(anatomy, still, acting, {label: law.lame for label, law in laws.items()}, tissue)
 
 
-def get_lame(tissue: Elasticity, mesh: TetMesh) -> dict[int, tuple[float, float]]:
-    """Return the Lamé parameters mu, lambda [Pa] at small strain of the regions of a mesh, by label.
+def find_fixed(name: str, problem: Problem) -> np.ndarray:
+    """Return the mask (V,) of vertices that are fixed, for a family called `name`.
 
     Raises
     ------
     InputError
-        A region without tissue.
+        Vertices that are fixed in some directions only.
     """
-    lame = {}
-    for label in np.unique(mesh.region).tolist():
-        law = tissue.get_law(label)
-        if law is None:
-            raise InputError(f"region {label} has no tissue law: name one for it, or a default.")
-        lame[label] = law.lame
-    return lame
+    fixed = problem.constraint.fixed
+    if (fixed.any(axis=1) != fixed.all(axis=1)).any():
+        raise InputError(f"{name} requires vertices that are fixed in all directions or in none: use finite elements.")
+    return np.asarray(fixed.all(axis=1))

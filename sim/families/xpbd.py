@@ -10,17 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from ..compile import collect_laws
 from ..discretisation.element import build_linear_elements
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Elasticity
-from ..errors import InputError
 from ..geometry.tetmesh import EDGES
 from ..runtime.device import forward_kernel
 from ..runtime.views import run_in_order, to_library, view
 from ..terms.laws.invariants import cofactor
 from ..terms.laws.springs import compute_spring_coefficients
-from .linear_body import get_lame
+from .linear_body import find_fixed
 from .models import Relaxation
 
 
@@ -118,13 +118,10 @@ def prepare(
     """
     device, mesh = problem.device, space.mesh
     elements = build_linear_elements(mesh, np.ones(len(mesh.tets), bool))
-    lame = get_lame(tissue, mesh)
-    numbers = compute_spring_coefficients(np.array([lame[label] for label in mesh.region.tolist()]), elements.gradient)
+    laws, region = collect_laws(tissue, np.unique(mesh.region).tolist()), mesh.region.tolist()
+    numbers = compute_spring_coefficients(np.array([laws[label].lame for label in region]), elements.gradient)
     mass = np.bincount(mesh.tets.ravel(), np.repeat(0.25 * settings.density * mesh.volumes, 4), len(mesh.nodes))
-    fixed = problem.constraint.fixed.any(axis=1)
-    if (fixed != problem.constraint.fixed.all(axis=1)).any():
-        raise InputError("xpbd requires vertices that are fixed in all directions or in none: use finite elements.")
-    free = ~fixed & (mass > 0.0)
+    free = ~find_fixed("xpbd", problem) & (mass > 0.0)
     inverse = np.where(free, 1.0 / np.maximum(mass, 1e-12), 0.0)
     stiffness = mesh.volumes[:, None] * np.column_stack([np.repeat(numbers[:, :1], 6, axis=1), numbers[:, 1]])
     inputs = [
