@@ -18,7 +18,6 @@ BENCHMARKS = {
     "frame": "duration of each part of a page's frame: load, deform, render, composite, encode, send",
     "growth": "time and memory that a load takes on finer and finer meshes, and its preconditioner",
     "throughput": "loads a second that the finite elements solve: one mesh, thousands of loads",
-    "published": "errors of the published learners, one force position left out at a time",
     "locate": "share of a tumour's motion that is found from points on the open cortex, by sulcus and by rivals",
     "microscope": "error and duration of locating the tumour from pictures of two eyes",
     "gym": "steps a second of the Gymnasium environments, of states and of pictures",

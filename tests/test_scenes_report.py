@@ -81,9 +81,9 @@ def test_the_page_needs_nothing_but_itself(page, study_rows):
     assert not re.search(r"https?:|<script|<link|@import|src=|url\((?!#)", text)
     for words in ("Reliable loads", "a model difference", "About &lt;this&gt;."):
         assert words in text
-    assert text.count("<svg") == 6 and text.index("<svg") < text.index("<table"), "error against time comes first"
+    assert text.count("<svg") == 7 and text.index("<svg") < text.index("<table"), "error against time comes first"
     assert "<title>condensed, other mechanics: mean" in text, "a row shows where the pointer rests"
-    assert [read_png(path).std() > 5.0 for path in page.glob("data-*.png")] == [True] * 6
+    assert [read_png(path).std() > 5.0 for path in page.glob("data-*.png")] == [True] * 7
 
 
 def test_rows_of_families_have_each_loads_error_and_outcome(study, study_rows, study_box):

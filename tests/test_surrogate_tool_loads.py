@@ -67,7 +67,7 @@ def test_published_protocol(box):
     centre = box.mesh.nodes[box.tumour_nodes].mean(axis=0)
     distance = np.linalg.norm(loads.point - centre, axis=1)
     magnitude = np.linalg.norm(loads.force, axis=1)
-    assert len(loads.point) == 11 * 30 * 20
+    assert len(loads.point) == 11 * 100 * 20
     assert len(np.unique(loads.point, axis=0)) == 11 and distance.min() >= 20e-3 and distance.max() <= 28e-3
     assert np.allclose(np.unique(magnitude.round(9)), np.arange(0.10, 1.051, 0.05))
     assert (loads.footprint == PublishedSettings.footprint).all()

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"number of loads compared with the reference (default: {FULL_COUNTS[1]}; with --quick {QUICK_COUNTS[1]})",
     )
+    parser.add_argument(
+        "--seed-protocol",
+        action="store_true",
+        help="measure the experiment of Tonutti, Gras, Yang 2017 instead: their loads and learners, one position "
+        "left out at a time, and all other models on the same loads",
+    )
+    parser.add_argument(
+        "--seed-mesh",
+        type=Path,
+        metavar="FILE.npz",
+        help="mesh of the authors for --seed-protocol, which measures it before the template",
+    )
     add_force(parser)
     add_json(parser)
 
@@ -62,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, row by row; 1 if a row could not be measured."""
     try:
-        sections = _measure_sections(args)
+        sections = _measure_seed_sections(args) if args.seed_protocol else _measure_sections(args)
     except KeyboardInterrupt:
         print(f"stopped; run the same command again to resume from {args.out}", file=sys.stderr)
         return INTERRUPTED_CODE
@@ -72,12 +85,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _measure_sections(args: argparse.Namespace) -> list[Section]:
     """Measure the rows of each data set; rewrite the page after each."""
-    from sim.runtime.device import parse_device_names
-
     from ..analysis.measurement import describe_machine
+    from ..play.effect_record import SUFFIX, read_effect_records
     from ..report.adaptation import build_debulked_study, simulate_debulked
     from ..report.page import Section, write_report
     from ..report.reference import solve_beyond, solve_reference
+    from ..report.row import describe_reference_error
     from ..report.rows import (
         list_all_combinations,
         list_family_specs,
@@ -86,13 +99,12 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
         measure_rows,
     )
     from ..report.study import ReportStudy
+    from ..script.shipped_files import get_template_path
 
-    several = parse_device_names(args.device)
-    device = args.device if len(several) == 1 else several[0]
-    check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "rows").is_dir())
+    device = _check_options(args)
     count, loads, beyond = QUICK_COUNTS if args.quick else FULL_COUNTS
-    if args.loads is not None and args.loads < 1:
-        raise InputError(f"--loads {args.loads} plays nothing: give at least 1.")
+    if args.seed_mesh:
+        raise InputError("--seed-mesh belongs to --seed-protocol: give that too, or leave it out.")
     if args.data and args.anatomy:
         raise InputError("--anatomy cannot be combined with --data, which contains an anatomy: leave one of them out.")
     if len({path.stem for path in args.data}) < len(args.data):
@@ -122,9 +134,55 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
             for row in measure_rows(study, specs):
                 found.append(row)
                 bar.update()
-        sections.append(Section(study.data.stem, _describe_study(study), tuple(found)))
+        effects = read_effect_records(get_template_path().with_suffix(SUFFIX)) if study.of_template else {}
+        about = (*_describe_study(study), describe_reference_error(study.fine, found))
+        sections.append(Section(study.data.stem, about, tuple(found), tuple(effects.values())))
         write_report(args.out, describe_machine(device), sections)
     return sections
+
+
+def _check_options(args: argparse.Namespace) -> str:
+    """Check the output path and the number of loads; return the device of the measurements."""
+    from sim.runtime.device import parse_device_names
+
+    several = parse_device_names(args.device)
+    check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "rows").is_dir())
+    if args.loads is not None and args.loads < 1:
+        raise InputError(f"--loads {args.loads} plays nothing: give at least 1.")
+    return args.device if len(several) == 1 else several[0]
+
+
+def _measure_seed_sections(args: argparse.Namespace) -> list[Section]:
+    """Measure the protocol on the authors' mesh, if given, and on the template; rewrite the page after each."""
+    from ..analysis.measurement import describe_machine
+    from ..report import seed_protocol
+    from ..report.page import Section, write_report
+    from ..report.seed_bodies import make_seed_template, read_seed_mesh
+
+    device = _check_options(args)
+    if args.data or args.anatomy:
+        raise InputError("--seed-protocol makes its own data: leave out --data and --anatomy.")
+    count, loads = (
+        seed_protocol.SEED_COUNTS[not args.quick],
+        args.loads or (QUICK_COUNTS if args.quick else FULL_COUNTS)[1],
+    )
+    bodies = {"authors": read_seed_mesh(args.seed_mesh, count)} if args.seed_mesh else {}
+    bodies["template"] = make_seed_template(args.out, count)
+    sections = []
+    for name, (body, wanted) in bodies.items():
+        study = seed_protocol.SeedStudy(args.out / f"seed-{name}.h5", args.out, device, loads)
+        with tqdm(desc=name, unit="load", file=sys.stderr) as bar:
+            seed_protocol.simulate_seed(study, body, wanted, partial(_show_progress, bar))
+        rows = seed_protocol.measure_seed_rows(study)
+        found = tuple(tqdm(rows, desc=name, total=len(seed_protocol.list_seed_specs()), unit="row", file=sys.stderr))
+        sections.append(Section(study.data.stem, seed_protocol.describe_seed_study(study, found), found))
+        write_report(args.out, describe_machine(device), sections)
+    return sections
+
+
+def _show_progress(bar: tqdm, done: int, total: int) -> None:
+    bar.total = total
+    bar.update(done - bar.n)
 
 
 def _tabulate(study: ReportStudy, bar: tqdm) -> None:

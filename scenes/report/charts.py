@@ -8,6 +8,7 @@ import numpy as np
 from surrogate.evaluation.choose import find_pareto_front
 
 from ..analysis.loglog_chart import ChartPanel, Curve, Dot
+from ..play.effect_record import EffectRecord
 from .row import ERROR, TOLERANCE_ALONE, ErrorFigures, ReportRow
 
 SIZE = (880, 560)  # Width and height of a chart [pixel].
@@ -40,6 +41,25 @@ def build_error_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
     Rows that show only their tolerance would be far below all others, and are omitted.
     """
     return _scatter(rows, "Which model is most accurate in the time available?", "milliseconds a load", _place_time)
+
+
+def build_batch_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
+    """Build the chart of error against time where all loads are solved together; None without rows."""
+    title = "And in a batch, as for training data or uncertainty?"
+    return _scatter(rows, title, "milliseconds a load, all together", lambda row: _place(row.batch_ms, row.reference))
+
+
+def build_effects_chart(records: Sequence[EffectRecord]) -> ChartPanel | None:
+    """Build the chart of what each effect of a scene costs and changes; None without records."""
+    dots = tuple(
+        Dot(f"{name}, {record.scene}", name, ms, mm, hint=f"{record.scene}, {record.day}, {record.machine}")
+        for record in records
+        for name, (ms, mm) in record.effects.items()
+        if name != "all" and ms is not None and mm is not None and min(ms, mm) > 0.0
+    )
+    title = "What does an effect cost, and what does it change?"
+    y = "the tumour moves by [mm]"
+    return ChartPanel(title, "milliseconds a frame that it adds", y, dots=dots, size=SIZE) if dots else None
 
 
 def build_preparation_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
@@ -128,12 +148,13 @@ def _describe(row: ReportRow) -> str:
     )
     parts = (("", "ms", row.median), ("preparation ", "s", row.preparation), ("resection known after ", "s", row.adapt))
     times = "; ".join(f"{name}{format_number(value)} {unit}" for name, unit, value in parts if value is not None)
-    return f"{row.name}, {row.family}: {error}{loads}; {times}"
+    return f"{row.name}, {row.family}: {error}{loads}; {times}{row.command and f'; {row.command}'}"
 
 
 # Functions that build the charts, by name.
 CHARTS = {
     "time": build_error_chart,
+    "batch": build_batch_chart,
     "preparation": build_preparation_chart,
     "adaptation": build_adaptation_chart,
     "force": build_force_chart,

@@ -51,7 +51,7 @@ class FemVariant:
     """FEM variant; None means the value of the data set.
 
     `mesh`: `OWN_MESH`, `HALVED_MESH` (every edge), or the number of nodes of the template. Default precision: single,
-    or double for tolerances that single precision cannot reach.
+    or double for tolerances that single precision cannot reach. Default device: that of the study.
     """
 
     name: str
@@ -60,6 +60,7 @@ class FemVariant:
     mesh: str = OWN_MESH
     tolerance: float = STANDARD_TOLERANCE
     precision: Precision | None = None
+    device: str | None = None
 
     @property
     def accuracy(self) -> Accuracy:
@@ -86,8 +87,14 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> ReportRow:
     body = find_body(study, spec.mesh)
     fem, set_up = time_work(_build_fem, study, spec, body)
     loads = study.played if spec.mesh == OWN_MESH else move_pushes_onto(body, study.played)
+    law, element = spec.law or get_law_name(study.tissue) or "default", spec.element or study.element
     row = ReportRow(
-        spec.name, "finite elements", against=describe_difference(study, spec), set_up=set_up, plan=fem.plan.explain()
+        spec.name,
+        "finite elements",
+        against=describe_difference(study, spec),
+        set_up=set_up,
+        plan=fem.plan.explain(),
+        command=f"sulcus simulate --material {law} --element {element} --tolerance {spec.tolerance:g} --out DATA.h5",
     )
     row = _measure_loads(study, row, fem, loads)
     debulked = debulk_tumour(body)
@@ -108,7 +115,9 @@ def measure_family(study: ReportStudy, spec: FamilySpec) -> ReportRow:
         return build_family(spec.name, body, build_push_effects(body, study.get_tissue_on(body)), study.device)
 
     model, set_up = time_work(build, study.anatomy)
-    row = _measure_loads(study, ReportRow(spec.name, KINDS[spec.name], set_up=set_up), model, study.played)
+    command = f"sulcus render press --deformer {spec.name}"
+    row = ReportRow(spec.name, KINDS[spec.name], set_up=set_up, command=command)
+    row = _measure_loads(study, row, model, study.played)
     debulked, first = debulk_tumour(study.anatomy), study.played.select(np.array([0]))
     return replace(row, adapt=time_work(lambda: build(debulked).deform(first, at=debulked.tumour_nodes))[1])
 
@@ -118,7 +127,6 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
     own, drawn = study.anatomy, study.drawn
     same = model.anatomy is own
     located = None if same else locate(model.anatomy.mesh, own.mesh.nodes[drawn])
-    reliable = isinstance(model, Fem)
     model.deform(loads.select(np.array([0])), at=drawn if same else None)  # kernels are compiled at their first launch
     fields, outcomes, seconds = [], [], []
     for number in range(len(loads)):
@@ -126,13 +134,15 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
         seconds.append(spent)
         fields.append(result.displacement[0] if located is None else located.read(result.displacement)[0])
         outcomes.append(result.outcome[0])
+    together = time_work(model.deform, loads, None, drawn if same else None)[1]
     field, tumour = np.array(fields), np.isin(drawn, own.tumour_nodes)
-    good = np.array([outcome.good if reliable else outcome is not Outcome.NOT_FINITE for outcome in outcomes])
+    good = np.array([outcome is not Outcome.NOT_FINITE for outcome in outcomes])
     return replace(
         row,
         reference=compare_with_reference(study, field[:, tumour], good, own.tumour_nodes),
         failed=int((~good).sum()),
         outcomes=dict(Counter(outcome.name for outcome in outcomes)),
+        batch_ms=1e3 * together / len(loads),
         **compute_load_errors(study, field, good, drawn),
         **summarise_times(seconds),
     )
@@ -141,7 +151,9 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
 def _build_fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
     """Set up for single loads."""
     effects = build_push_effects(body, change_law(study.get_tissue_on(body), spec.law))
-    return Fem(body, effects, spec.accuracy, study.device, None, spec.element or study.element, live=True)
+    return Fem(
+        body, effects, spec.accuracy, spec.device or study.device, None, spec.element or study.element, live=True
+    )
 
 
 def describe_difference(study: ReportStudy, spec: FemVariant) -> str:

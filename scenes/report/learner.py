@@ -58,7 +58,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
         "sectors": of_sectors,
         "beyond": _compute_errors(model, outside, beyond.displacement[beyond.good], nodes),
     }
-    field = model.deform(study.played, at=nodes).displacement
+    field, together = time_work(lambda: model.deform(study.played, at=nodes).displacement)
     covered = compute_coverage_beyond(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _measure_adaptation(study, spec)
     held_out = study.converged.select(np.flatnonzero(discs.test))
@@ -75,11 +75,13 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
         units=solves.units,
         series=solves.series,
         inside=solves.inside,
+        batch_ms=1e3 * together / len(field),
         bare=None if bare is None else 1e-3 * bare,
         solving=solves.seconds,
         learning=learning,
         adapt=adapt,
         adapted=adapted,
+        command=f"sulcus train DATA.h5 --learners {spec.name} --out MODEL.npz",
         curve=tuple((count, each) for count, each in [*curve, (len(order), of_discs[0])] if each is not None),
         **summarise_times(time_single_loads(model, held_out, nodes, study.timed)),
     )

@@ -14,7 +14,8 @@ from surrogate.model.held_out import MIN_LOADS_FOR_P999
 
 from ..analysis.loglog_chart import draw_panels, draw_svg
 from ..analysis.measurement import write_table
-from .charts import CHARTS, find_front, format_number
+from ..play.effect_record import EffectRecord
+from .charts import CHARTS, build_effects_chart, find_front, format_number
 from .row import ERROR, ErrorFigures, ReportRow
 
 SETS = {  # Descriptions of the sets of test loads.
@@ -54,11 +55,12 @@ NOTES = (  # Paragraphs below the tables.
 
 @dataclass(frozen=True)
 class Section:
-    """The rows of one data set, and sentences about data and reference."""
+    """The rows of one data set, sentences about data and reference, and measured effects of scenes on its body."""
 
     name: str
     about: tuple[str, ...]
     rows: tuple[ReportRow, ...]
+    effects: tuple[EffectRecord, ...] = ()
 
 
 def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> None:
@@ -66,8 +68,8 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
     bodies = []
     for section in sections:
         plots = []
-        for kind, build in CHARTS.items():
-            chart = build(section.rows)
+        charts = {kind: build(section.rows) for kind, build in CHARTS.items()}
+        for kind, chart in {**charts, "effects": build_effects_chart(section.effects)}.items():
             if chart is not None:
                 write_png(folder / f"{section.name}-{kind}.png", draw_panels([chart]))
                 plots.append(f"<figure class=chart>{draw_svg(chart)}</figure>")

@@ -35,14 +35,21 @@ class ReferenceSolutions:
 
 
 def solve_reference(study: ReportStudy, progress: Callable[[int], object], accuracy: Accuracy = REFERENCE) -> None:
-    """Solve the compared loads with quadratic tetrahedra, and store each at `study.drawn`.
+    """Solve the compared loads with the reference's element, and store each at `study.drawn`.
 
     `progress` receives the number of newly solved loads. Stored solutions are not solved again.
     """
 
     def made() -> tuple[Fem, Located]:
         body = refine(study.anatomy) if study.fine else study.anatomy
-        fem = Fem(body, build_push_effects(body, study.get_tissue_on(body)), accuracy, study.device, None, "p2")
+        fem = Fem(
+            body,
+            build_push_effects(body, study.get_tissue_on(body)),
+            accuracy,
+            study.device,
+            None,
+            study.reference_element,
+        )
         return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.drawn])
 
     _solve(study, "reference", study.played, made, progress)

@@ -149,6 +149,8 @@ class ReportRow:
         Numbers of test loads by the name of their `Outcome`.
     median, p99, central_ms
         Time per load [ms], one at a time; p99 only for at least 1,000; range of the central 95 %.
+    batch_ms
+        Time per load [ms] where all compared loads are solved together.
     bare
         Time per load [ms] of the trained model alone in NumPy: no bound, no limits, same kind of code for all.
     timed
@@ -173,6 +175,8 @@ class ReportRow:
         Distances from the FEM that it was trained on, on the discs, by number of training loads.
     plan
         Description of the solvers that FEM tries for a load.
+    command
+        Command that computes with this model.
     """
 
     name: str
@@ -190,6 +194,7 @@ class ReportRow:
     median: float | None = None
     p99: float | None = None
     central_ms: tuple[float, float] | None = None
+    batch_ms: float | None = None
     bare: float | None = None
     timed: int = 0
     set_up: float | None = None
@@ -205,6 +210,7 @@ class ReportRow:
     adapted: ErrorFigures | None = None
     curve: tuple[tuple[int, ErrorFigures], ...] = ()
     plan: tuple[str, ...] = ()
+    command: str = ""
 
     @property
     def preparation(self) -> float | None:
@@ -212,3 +218,17 @@ class ReportRow:
         if self.learning is None:
             return self.set_up
         return None if self.solving is None else self.learning + self.solving
+
+
+def describe_reference_error(fine: bool, rows: Sequence[ReportRow]) -> str:
+    """Describe the error of the reference itself, from the row of its element on the mesh with edges twice as long."""
+    coarse = next((row.reference for row in rows if row.name == "FEM p2"), None)
+    if not fine or coarse is None:
+        return (
+            "Error of the reference: not measured. Without --quick its mesh is finer, and is compared with p2 on this."
+        )
+    mean = coarse.mm.mean
+    return (
+        f"Error of the reference: p2 on edges twice as long differs from it by {mean:.2g} mm, so that its own error is "
+        f"about {mean / 3.0:.2g} mm (Richardson extrapolation, if errors fall with the square of the edge)."
+    )

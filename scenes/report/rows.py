@@ -99,6 +99,7 @@ def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[F
             if size != STANDARD_TOLERANCE
         ),
         FemVariant("FEM float64", precision="float64"),
+        *((FemVariant("FEM CPU", device="cpu"),) if study.on_card else ()),
         *(FemVariant(f"FEM {law} law", law=law) for law in LAWS if law != get_law_name(study.tissue)),
     )
 

@@ -45,6 +45,8 @@ class ReportStudy:
         timed.
     fine
         True if the reference mesh is refined by halving every edge.
+    reference_element
+        Element of the reference.
     """
 
     data: Path
@@ -54,6 +56,7 @@ class ReportStudy:
     beyond: int = 120
     timed: int = 1000
     fine: bool = False
+    reference_element: str = "p2"
 
     @cached_property
     def on_card(self) -> bool:

@@ -77,7 +77,7 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     """Sample `count` loads on the open cortex; load i depends on the preset, the anatomy, the seed and i alone.
 
     `mixed` samples the tool first; `brutal` is far beyond surgery. `seed` is the protocol of Tonutti, Gras, Yang 2017,
-    Artif. Intell. Med. 80:39-47, in an order shuffled by the seed: at most 6,600 loads, of which fewer are returned
+    Artif. Intell. Med. 80:39-47, in an order shuffled by the seed: at most 22,000 loads, of which fewer are returned
     when `count` is larger.
 
     Raises
@@ -100,7 +100,7 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
         raise InputError(f"a count of {count} with seed {seed} draws nothing: give --count >= 1 and --seed >= 0.")
     patch = open_patch(anatomy)
     if preset == "seed":
-        return _build_published_loads(anatomy, patch, count, seed)
+        return _place_published_loads(anatomy, patch, count, seed)
     tools = list(TOOLS.values()) if preset == "mixed" else [{**TOOLS, BRUTAL.name: BRUTAL}[preset]]
     rows = _sample_in_blocks(tools, patch, count, seed)
     return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
@@ -227,19 +227,15 @@ class PublishedSettings:
     """Settings of the published loads."""
 
     positions: int = 11  # Number of positions of the published loads.
-    directions: int = 30  # Number of directions of the published loads.
+    directions: int = 100  # Number of directions of the published loads.
     footprint: float = 7e-3  # Radius of the area of one free surface node of the published mesh [m].
     cone: float = np.pi / 3.0  # Largest angle between a published force and the inward normal [rad].
 
 
-def _build_published_loads(
+def _place_published_loads(
     anatomy: Anatomy, patch: Patch, count: int, seed: int, settings: PublishedSettings = PublishedSettings()
 ) -> Loads:
-    """Build the published loads: 11 positions 20-28 mm from the tumour's centre x 30 directions x 20 sizes, shuffled.
-
-    The authors do not print their directions: a spherical Fibonacci lattice within 60 degrees of the inward normal
-    replaces them.
-    """
+    """Build `build_published_loads` at 11 positions of the open cortex, 20-28 mm from the tumour's centre."""
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
     centre = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
@@ -252,15 +248,29 @@ def _build_published_loads(
             f"No node at 20-28 mm lies {1e3 * settings.footprint:g} mm inside its rim: make the anatomy with --preset "
             "seed, or choose another --preset here."
         )
-    near = near[spread(patch.points[near], settings.positions)]
+    return build_published_loads(
+        patch, patch.points[near[spread(patch.points[near], settings.positions)]], count, seed, settings
+    )
+
+
+def build_published_loads(
+    patch: Patch, positions: np.ndarray, count: int, seed: int, settings: PublishedSettings = PublishedSettings()
+) -> Loads:
+    """Build the published loads: `positions` (m, 3) [m] x 100 directions x 20 sizes, shuffled, at most `count`.
+
+    The authors draw their directions at random: a spherical Fibonacci lattice within 60 degrees of the inward normal
+    replaces them.
+    """
     golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(settings.directions) / (2.0 * np.pi)
     lattice = np.column_stack([(np.arange(settings.directions) + 0.5) / settings.directions, golden % 1.0])
-    axes = [np.broadcast_to(patch.inward[node], (settings.directions, 3)) for node in near]
+    axes = [np.broadcast_to(inward, (settings.directions, 3)) for inward in patch.find_normals(positions)]
     direction = np.array([_sample_in_cone(axis, settings.cone, lattice) for axis in axes])
-    whole = np.random.default_rng(seed).permutation(len(near) * settings.directions * len(PUBLISHED_FORCES))[:count]
-    position, way, magnitude = np.unravel_index(whole, (len(near), settings.directions, len(PUBLISHED_FORCES)))
+    whole = np.random.default_rng(seed).permutation(len(positions) * settings.directions * len(PUBLISHED_FORCES))
+    position, way, magnitude = np.unravel_index(
+        whole[:count], (len(positions), settings.directions, len(PUBLISHED_FORCES))
+    )
     force = PUBLISHED_FORCES[magnitude, None] * direction[position, way]
-    return Loads((Pushed(patch.points[near[position]], force, np.full(len(whole), settings.footprint)),))
+    return Loads((Pushed(positions[position], force, np.full(len(position), settings.footprint)),))
 
 
 def spread(points: np.ndarray, count: int) -> np.ndarray:

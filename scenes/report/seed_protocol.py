@@ -1,0 +1,163 @@
+"""Experiment of Tonutti, Gras, Yang 2017: each force position is left out once, and predicted from the others."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+
+from sim.accuracy import NO_STRAIN_LIMIT
+from sim.anatomy import Anatomy
+from sim.effects import Elasticity, NodalForce, build_push_effects
+from sim.errors import InputError
+from sim.fem import Fem
+from sim.loads import Loads
+from surrogate.data.cortex_patch import find_nearest
+from surrogate.data.indentation import get_only_pushes
+from surrogate.data.simulate import simulate
+from surrogate.data.solution_rows import describe_tissue_source
+from surrogate.data.splits import DiscSplit
+from surrogate.training.learners import LEARNED_MODELS
+from surrogate.training.train import train
+
+from ..analysis.measurement import time_work
+from .finite_elements import FemVariant
+from .learner import LearnerSpec
+from .reference import solve_reference
+from .row import ReportRow, compute_figures, summarise_times
+from .rows import Spec, list_family_specs, measure_row, measure_rows
+from .seed_bodies import SEED_TISSUE
+from .seed_learners import PUBLISHED, fit_vertex_models, select_vertices
+from .study import ReportStudy
+
+SEED_COUNTS = (220, 22000)  # Numbers of loads of a quick and of a full run.
+MAX_TRAINING = 2000  # Largest number of training loads of a model.
+WARM_UP, TIMED = 10, 100  # Numbers of predictions of a learner before the timed ones, and of these.
+PUBLISHED_LIMITS = {"published-ann": 0.3, "published-svr": 0.2}
+"""Mean errors that the authors report their models to be below [mm]."""
+Predict = Callable[[Loads], np.ndarray]
+
+
+@dataclass(frozen=True)
+class SeedStudy(ReportStudy):
+    """Study of the protocol, with linear tetrahedra (p1) as reference, as the authors had."""
+
+    reference_element: str = "p1"
+
+    @cached_property
+    def played(self) -> Loads:
+        """The first of the converged loads, which are in random order."""
+        return self.converged.select(slice(0, self.loads))
+
+    @cached_property
+    def positions(self) -> np.ndarray:
+        """Positions (m, 3) [m] of the forces."""
+        return np.unique(self.pushed.point, axis=0)
+
+    @cached_property
+    def position(self) -> np.ndarray:
+        """Number (B,) of each load's position."""
+        return find_nearest(self.pushed.point, self.positions)[0]
+
+
+def simulate_seed(study: SeedStudy, body: Anatomy, loads: Loads, progress: Callable[[int, int], None]) -> None:
+    """Solve the loads with p1 and the authors' tissue into the study's data set, or resume."""
+    tissue = Elasticity(SEED_TISSUE)
+    effects = (*build_push_effects(body, tissue), NodalForce())
+    fem = Fem(body, effects, NO_STRAIN_LIMIT, study.device, None, study.reference_element)
+    stated = {**describe_tissue_source(tissue), "element": study.reference_element, "preset": "seed"}
+    simulate(study.data, fem, loads, stated, fem.batch, progress)
+
+
+def list_seed_specs() -> tuple[Spec, ...]:
+    """Return the published learners, those of this project, elements and other families."""
+    return (
+        *(LearnerSpec(name) for name in (*PUBLISHED, "linear", *LEARNED_MODELS)),
+        *(FemVariant(f"FEM {element}", element=element) for element in ("p1", "smoothed", "p2")),
+        *list_family_specs(),
+    )
+
+
+def measure_seed_rows(study: SeedStudy) -> Iterator[ReportRow]:
+    """Solve the loads of the other models, and yield all rows; stored ones are read."""
+    solve_reference(study, lambda count: None, NO_STRAIN_LIMIT)
+    return measure_rows(study, list_seed_specs(), measure_seed_row)
+
+
+def measure_seed_row(study: ReportStudy, spec: Spec) -> ReportRow:
+    """Measure a row of the protocol; `ReportRow.state` gives the reason for a missing one."""
+    if not isinstance(spec, LearnerSpec):
+        return measure_row(study, spec)
+    assert isinstance(study, SeedStudy)
+    try:
+        return measure_seed_learner(study, spec)
+    except InputError as error:
+        return ReportRow(spec.name, "trained models", state=str(error))
+
+
+def measure_seed_learner(study: SeedStudy, spec: LearnerSpec) -> ReportRow:
+    """Measure a learner that is trained once for each position, without the loads there, and tested on these.
+
+    Raises
+    ------
+    InputError
+        Input that `train` rejects.
+    """
+    nodes = select_vertices(study.anatomy)
+    truth = study.dataset.read_displacement(nodes)[study.dataset.good].astype(np.float64)
+    fit = partial(_fit_published if spec.name in PUBLISHED else _fit_learner, study, spec.name, truth)
+    predicted, fits, count = np.empty_like(truth), [], 0
+    for number in range(len(study.positions)):
+        test = np.flatnonzero(study.position == number)
+        training = np.flatnonzero(study.position != number)[:MAX_TRAINING]
+        fits.append(time_work(fit, number, training))
+        predicted[test] = fits[-1][0](study.converged.select(test))
+        count = max(count, len(training))
+    single = np.arange(-WARM_UP, TIMED)[:, None] % len(truth)
+    times = [time_work(fits[-1][0], study.converged.select(row))[1] for row in single]
+    return ReportRow(
+        spec.name,
+        "published learners" if spec.name in PUBLISHED else "trained models",
+        reference=compute_figures(predicted, truth, study.converged),
+        load_mm=tuple((1e3 * np.linalg.norm(predicted - truth, axis=2).mean(axis=1)).tolist()),
+        loads=count,
+        solving=study.dataset.estimate_seconds("load", count),
+        learning=float(np.mean([seconds for _, seconds in fits])),
+        **summarise_times(times[WARM_UP:]),
+    )
+
+
+def _fit_published(study: SeedStudy, name: str, truth: np.ndarray, number: int, training: np.ndarray) -> Predict:
+    pushed = get_only_pushes(study.converged.select(training))
+    model = fit_vertex_models(name, study.anatomy, pushed, truth[training])
+    return lambda loads: model.predict(get_only_pushes(loads))
+
+
+def _fit_learner(study: SeedStudy, name: str, truth: np.ndarray, number: int, training: np.ndarray) -> Predict:
+    disc = np.full(len(truth), -2)
+    disc[training], disc[study.position == number] = -1, 0
+    split = DiscSplit(study.positions[[number]], float(study.pushed.footprint[0]), disc, 0.0)
+    model = train(study.dataset, [name], split=split).models[name]
+    nodes = select_vertices(study.anatomy)
+    return lambda loads: model.deform(loads, at=nodes).displacement
+
+
+def describe_seed_study(study: SeedStudy, rows: tuple[ReportRow, ...]) -> tuple[str, ...]:
+    """Describe the experiment, and which published errors its rows meet."""
+    found = {row.name: row.reference for row in rows if row.reference is not None}
+    verdicts = [
+        f"{name} {found[name].mm.mean:.2g} mm (below {most:g} mm: {'met' if found[name].mm.mean < most else 'not met'})"
+        for name, most in PUBLISHED_LIMITS.items()
+        if name in found
+    ]
+    motion = next((f", which move the tumour by {figures.motion:.2g} mm on average" for figures in found.values()), "")
+    return (
+        f"Experiment of Tonutti, Gras, Yang 2017: {len(study.converged)} converged loads of "
+        f"{len(study.dataset.loads)} at {len(study.positions)} positions{motion}; {len(study.anatomy.mesh.nodes)} "
+        "vertices, linear tetrahedra (p1), the authors' two-term Ogden tissue.",
+        "Learners: trained once for each position, on at most "
+        f"{MAX_TRAINING} loads at the others, and tested on all loads there. Other models: on {len(study.played)} "
+        "loads. The reference is p1 as the authors had; rows of p2 and smoothed elements show how far it is from a "
+        "finer discretisation.",
+        f"Published mean errors, and here: {'; '.join(verdicts) or 'not measured'}.",
+    )
