@@ -1,6 +1,7 @@
 """Healthy heads other than the template: from a brain mask, or from the inner skull of fsaverage."""
 
 from dataclasses import replace
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -58,9 +59,7 @@ def read_fsaverage_head(volume: float) -> HealthyHead:
     """
     path = _find_skull_path()
     with read_as(path, "one surface in FIF", "Reinstall its package."):
-        from mne import read_bem_surfaces  # takes a second
-
-        (surface,) = read_bem_surfaces(path, verbose="error")
+        (surface,) = import_module("mne").read_bem_surfaces(path, verbose="error")
     try:
         mask, affine = fill_enclosed(surface["rr"], surface["tris"], VOXEL_SIZE)
     except InputError as error:
