@@ -148,7 +148,7 @@ def test_rows_shared_by_threads_give_the_same_depths():
     for parts, begin, end in ((3, 0, 120), (8, 0, 120), (7, 31, 90)):
         shared = allocate_z_buffer(1, 120, 160, "cpu")
         size = 1, -(-len(layer.triangles) // 64), parts
-        inputs = [whole.points, whole.triangles, 0, wp.float64(1e-3), begin, end, parts, 64]
+        inputs = [whole.points, whole.triangles, 0, wp.float64(1e-3), begin, end, parts, 64, whole.unbent]
         wp.launch(keep_nearest, size, inputs, [shared], device="cpu")
         assert np.array_equal(shared.numpy()[0, begin:end], whole.nearest.numpy()[0, begin:end])
         assert (shared.numpy()[0, :begin] == np.uint64(EMPTY_PIXEL)).all()

@@ -8,7 +8,7 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 # Lines of the packages and of their tests. Nobody reads more than this: a feature that exceeds it deletes something.
 # Lower a number when lines have gone. Raise it only with the reason in the commit.
 # 1,380 of the packages are the families of models that finite elements are compared with; 770 lines are their tests.
-MOST = {"packages": 83_790, "tests": 53_650}
+MOST = {"packages": 83_200, "tests": 53_450}
 
 
 def lines(paths):

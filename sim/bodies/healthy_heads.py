@@ -1,6 +1,7 @@
 """Healthy heads other than the template: from a brain mask, or from the inner skull of fsaverage."""
 
 from dataclasses import replace
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -8,8 +9,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..runtime.optional_packages import install_hint
+from ..runtime.outside_files import read_as
 from .enclosed_voxels import fill_enclosed
-from .fif import read_surface
 from .head_masks import HeadMasks
 from .intensity import Intensity, read_intensity
 from .label_map import count_on_border
@@ -57,9 +58,10 @@ def read_fsaverage_head(volume: float) -> HealthyHead:
         The package mne is missing, or does not contain the skull as one closed surface.
     """
     path = _find_skull_path()
-    points, triangles = read_surface(path)
+    with read_as(path, "one surface in FIF", "Reinstall its package."):
+        (surface,) = import_module("mne").read_bem_surfaces(path, verbose="error")
     try:
-        mask, affine = fill_enclosed(points, triangles, VOXEL_SIZE)
+        mask, affine = fill_enclosed(surface["rr"], surface["tris"], VOXEL_SIZE)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return _scale_head(HealthyHead(mask, affine, middle=VIEW_CENTRE), volume)
