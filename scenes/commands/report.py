@@ -130,7 +130,7 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
 def _tabulate(study: ReportStudy, bar: tqdm) -> None:
     from ..report.study import tabulate_series
 
-    tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"))
+    tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} positions"))
     bar.set_postfix_str("")
 
 

@@ -224,13 +224,13 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
             f"{args.out} already holds {len(outcomes)} loads, more than the {asked} asked for: nothing was taken away."
         )
     listed = ", ".join(f"{number} {name}" for name, number in counts.items())
-    print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved.rows} solved now.")
+    print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved.rows} solved in this run.")
     print(f"Solved by {solver}.")
     if rate is not None:
-        print(f"{rate:.4g} loads a second, from their footprints to the file.")
+        print(f"{rate:.3g} loads per second, with sampling and writing.")
     if not args.pose_control and describe_rejected(args.tool_preset):
         print(describe_rejected(args.tool_preset))
     if failed:
         print(
-            f"{failed} solutions are unreliable (see their outcomes): they stay in the file, but are not trained with."
+            f"{failed} solutions are unreliable (see their outcomes): they stay in the file, but no model is trained on them."
         )

@@ -239,9 +239,9 @@ def format_motion(frame: Frame) -> str:
     """Describe the tumour's displacement with its errors: of the model, and of the tumour in the patient."""
     motion = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' (estimate)'}"
     if frame.moved_error is not None:
-        error = f"tumour position error {hud.bound_words(frame.moved_error, 1)}"
+        error = f"motion error {hud.bound_words(frame.moved_error, 1)}"
     else:
-        error = f"{'error' if frame.doubt else 'tumour position error'} not known"
+        error = f"{'error' if frame.doubt else 'motion error'} not known"
     if frame.model_error is not None and frame.estimate is None:
         error = f"surrogate error {hud.bound_words(frame.model_error, 2)}, {error}"
     return f"{motion} ({error})"

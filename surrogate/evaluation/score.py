@@ -244,7 +244,7 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
     best = find_best(scores)
     fastest = min(scores, key=lambda row: row.microseconds)
     verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
-    wins = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
+    wins = f"{best.name} has the smallest error: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
     few = [f"p99.9: not estimated from fewer than {MIN_LOADS_FOR_P999} loads"] if scores[0].p999_mm is None else []
     return "\n".join([head, *rows, *few, wins if len(scores) > 1 else f"{best.name}: {verdict}", *_solve_lines(scores)])
 

@@ -119,7 +119,7 @@ class Learned:
         stated = self.training
         tissue = str(read_tissue_statement(stated)) if "tissue" in stated else "tissue not given"
         element = stated.get("element", "not given")
-        return f"{stated.get('learner', 'learned')}, from finite elements ({element}; {tissue})"
+        return f"{stated.get('learner', 'learned')}, trained on FEM ({element}; {tissue})"
 
     @cached_property
     def series(self) -> Pairs:
