@@ -89,7 +89,7 @@ def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
 
 
 def test_metre_input_is_rejected_and_zero_has_no_sign(files, tmp_path, capsys):
-    """Motions of nothing at all are answered."""
+    """Motions of exactly zero are accepted."""
     folder, _ = files
     table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "seen.csv"
     said_of = ((1.0, 1.0, ""), (1e-3, 1.0, "no point moves"), (1.0, 1e-3, "a sigma is 0.00015 mm"), (0.0, 1.0, ""))

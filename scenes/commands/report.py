@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_devices(parser, "; loads are simulated on all, everything else is measured on the first")
     parser.add_argument(
         "--data", nargs="+", type=Path, default=[], metavar="DATA.h5",
-        help="data sets from `sulcus simulate`, each with its own rows (default: a new one: smoothed, palpation)",
+        help="data sets from `sulcus simulate`, each in its own rows (default: new: palpation, smoothed elements)",
     )  # fmt: skip
     parser.add_argument(
         "--anatomy", metavar="MESH.vtu", help="anatomy of the simulation without --data (default: the template)"

@@ -231,6 +231,4 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
     if not args.pose_control and describe_rejected(args.tool_preset):
         print(describe_rejected(args.tool_preset))
     if failed:
-        print(
-            f"{failed} solutions are unreliable (see their outcomes): they stay in the file, but no model is trained on them."
-        )
+        print(f"{failed} solutions are unreliable (see their outcomes): they stay in the file, but no model uses them.")

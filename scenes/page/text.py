@@ -118,7 +118,7 @@ def describe_tissue(tissue: Tissue | None) -> str:
     """Return a tissue's law and constants."""
     if tissue is None:
         return "a tissue for each region"
-    relaxation = ", which relaxes under a held load" if tissue.prony else ""
+    relaxation = ", viscoelastic" if tissue.prony else ""
     if not isinstance(tissue, Material):
         return f"{tissue.law} tissue{relaxation}"
     return (
@@ -249,7 +249,7 @@ def format_motion(frame: Frame) -> str:
 
 def describe_estimate(estimate: TumourEstimate) -> list[str]:
     """Describe an estimate, its error and its input; or the reason of its rejection."""
-    reference = f"simulated (FEM): {format_unbroken(estimate.truly)}"
+    reference = f"simulated (FEM): {format_unbroken(estimate.true_motion)}"
     if estimate.location is None:
         return [
             f'<p class="number">tumour position unknown ({reference})</p>',

@@ -182,9 +182,9 @@ def score(
     motion = np.linalg.norm(truth, axis=2).mean(axis=1, keepdims=True)
     return Score(
         name,
-        *spread(1e3 * distance),
-        *spread(100.0 * distance / motion),
-        *spread(1e3 * distance.max(axis=1))[:3],
+        *compute_spread(1e3 * distance),
+        *compute_spread(100.0 * distance / motion),
+        *compute_spread(1e3 * distance.max(axis=1))[:3],
         1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED_LOADS))),
         time_model_alone(deformer, loads),
         solves,
@@ -272,7 +272,7 @@ def _solve_lines(scores: Sequence[Score]) -> list[str]:
     ]
 
 
-def spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
+def compute_spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
     """Compute mean, 95th and 99.9th percentile (None for too few loads), and maximum of values (B, ...) of B loads."""
     p95, p999 = np.percentile(values, (95.0, 99.9))
     return (
