@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument(
-        "--scene", metavar="NAME", help="tool and poses of a scene, as a hand sets them on its page, such as spatula"
+        "--scene", metavar="NAME", help="tool and poses of a scene under manual control, such as spatula"
     )
     shape.add_argument("--ball", type=float, metavar="MM", help="radius of a ball [mm], such as 7 in the scene palpate")
     shape.add_argument(

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--precision", default="float64", choices=("float32", "float64"),
         help=f"scalar type of the solver: float32 is faster, with tolerances of at least {MIN_TOLERANCE['float32']:g}",
     )  # fmt: skip
-    parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file (default: m)")
+    parser.add_argument("--unit", default="m", choices=UNITS, help="unit of length in the file")
     add_device(parser)
     parser.add_argument(
         "--out", required=True,

@@ -40,7 +40,7 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
         help="distance of the camera (default: 300; tracked: all targets in sight)",
     )  # fmt: skip
     group.add_argument("--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})")
-    group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held (default: 0)")
+    group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
 
 
