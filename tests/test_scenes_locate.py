@@ -113,7 +113,7 @@ def test_uninformative_points_are_rejected_unless_few(files, tmp_path, capsys):
         assert ("have a sigma of 30 mm or more" in capsys.readouterr().err) is (code == 2)
 
 
-def test_what_is_said_is_in_json_too(files, body, tmp_path, capsys):
+def test_json_has_the_warnings_and_regions(files, body, tmp_path, capsys):
     """Sentences of warning, and the regions that the locator knows."""
     folder, _ = files
     path = tmp_path / "own.npz"
@@ -124,7 +124,7 @@ def test_what_is_said_is_in_json_too(files, body, tmp_path, capsys):
     np.savetxt(tmp_path / "slipped.csv", table, delimiter=",", header="x,y,z,dx,dy,dz", comments="")
     words = ["locate", str(folder / "box.vtu"), str(tmp_path / "slipped.csv"), "--locator", str(path)]
     assert main(words) == 0
-    sentences = capsys.readouterr().out.splitlines()[4:]
+    sentences = capsys.readouterr().out.splitlines()[5:]
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["regions"] == {"tumour": 3.0} and said["warnings"] == sentences and len(sentences) == 3
