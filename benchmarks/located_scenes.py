@@ -44,7 +44,7 @@ def estimates(theatre: PatientSetup, name: str, sights: int) -> dict[str, list[T
 def row(answers: list[TumourEstimate]) -> list[str]:
     """Figures of answers to one scene."""
     given = [answer for answer in answers if answer.location is not None]
-    moved = 1e3 * np.mean([answer.truly for answer in answers])
+    moved = 1e3 * np.mean([answer.true_motion for answer in answers])
     doubted = sum(answer.location.slipped for answer in given if answer.location)
     refused = len(answers) - len(given)
     if not given:

@@ -156,7 +156,7 @@ def test_several_visitors_see_the_page_and_are_heard(page, heard):
 def test_who_came_first_leads_and_what_others_set_is_put_back(page, heard):
     """They may ask; who leads lets them, and the lead passes on when its owner leaves."""
     first, second = Visitor(page, 1600), Visitor(page, 420)
-    page.tell(lambda visitor: f"number {visitor}")
+    page.show_line(lambda visitor: f"number {visitor}")
     assert wait_for(lambda: set(page.crowd.rows) == {0, 1} and page.crowd.rows[1].ask.visible)
     leads, looks = (page.crowd.rows[number] for number in (0, 1))
     assert "You lead" in leads.line.content and "(number 1) leads" in looks.line.content
@@ -168,9 +168,9 @@ def test_who_came_first_leads_and_what_others_set_is_put_back(page, heard):
     first.set(page.frame, 12)
     assert wait_for(lambda: heard["frame"] == [12]) and heard["force"] == [] and heard["play"] == []
     second.set(looks.ask, True)
-    page.tell(lambda visitor: "")
+    page.show_line(lambda visitor: "")
     assert wait_for(lambda: page.crowd.lead.asking == (2,))
-    page.tell(lambda visitor: "")
+    page.show_line(lambda visitor: "")
     assert wait_for(lambda: leads.give.visible and "Visitor 2 asks to lead" in leads.line.content)
     assert not looks.ask.visible
     first.set(leads.give, True)

@@ -7,7 +7,7 @@ class TestLead:
     def test_control_passes_to_first_request_then_oldest(self):
         lead = ControlLock()
         lead.see({2, 3, 4}, 0.0)
-        assert lead.leader == 2 and lead.act(2, 1.0) and not lead.act(3, 1.0)
+        assert lead.leader == 2 and lead.record_change(2, 1.0) and not lead.record_change(3, 1.0)
         for visitor in (4, 3):
             lead.ask(visitor, 2.0)
         assert (
@@ -25,6 +25,6 @@ class TestLead:
     def test_who_does_nothing_for_long_hands_over_on_being_asked(self):
         lead = ControlLock()
         lead.see({1, 2}, 0.0)
-        lead.act(1, 10.0)
+        lead.record_change(1, 10.0)
         lead.ask(2, 10.0 + MAX_IDLE_TIME)
         assert lead.leader == 2 and lead.asking == ()

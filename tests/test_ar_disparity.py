@@ -108,7 +108,7 @@ def test_windows_show_what_cameras_with_lenses_see(pair, geometry):
 
 
 @pytest.mark.parametrize("darker", [1.0, 0.85])
-def test_depths_are_as_far_off_as_is_said(pair, geometry, pictures, darker):
+def test_depth_errors_match_their_standard_deviation(pair, geometry, pictures, darker):
     pixels = grid(geometry.size)
     view = compute_stereo_view(geometry, taken(pictures[0], 0), taken(pictures[1], 1, darker))
     found = triangulate_cloud(view, pixels)
@@ -118,7 +118,7 @@ def test_depths_are_as_far_off_as_is_said(pair, geometry, pictures, darker):
     assert 0.4 < np.sqrt(((error / found.sigma) ** 2).mean()) < 1.6
 
 
-def test_noisier_pictures_are_stated_to_be_farther_off(geometry, pictures):
+def test_noise_increases_the_reported_deviation(geometry, pictures):
     pixels, random = grid(geometry.size), np.random.default_rng(0)
     sigma = []
     for noise in (0.0, 10.0):

@@ -34,7 +34,7 @@ def test_a_focal_length_is_found_by_the_relief_of_a_target():
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= factor
         fit = fit_focal_length(replace(camera, K=K), seen)
-        assert fit is not None and fit.differs == (factor > 1.0)
+        assert fit is not None and fit.is_significant == (factor > 1.0)
         assert abs(fit.factor * factor - 1.0) < 4.0 * fit.deviation < 0.04
     few = replace(seen[0][1], **{name: getattr(seen[0][1], name)[:8] for name in ("points", "pixels", "face")})
     assert fit_focal_length(camera, [(CUBE, few)]) is None and fit_focal_length(camera, []) is None

@@ -24,8 +24,8 @@ def test_the_rasteriser_sees_what_rays_see(lens):
 
 
 @each_lens
-def test_a_box_holds_what_a_lens_bends_out_of_the_corners(lens):
-    """A triangle as large as the picture: its edges are no lines."""
+def test_pixel_box_contains_a_distorted_triangle(lens):
+    """The triangle is as large as the image: the lens bends its edges."""
     camera = seen_by(lens)
     points = np.array([[-0.08, -0.05, 0.0], [0.08, -0.05, 0.0], [0.0, 0.08, 0.0]])
     mask = compute_silhouette(camera, points, np.array([[0, 1, 2]]))

@@ -58,13 +58,13 @@ def test_a_film_that_fails_leaves_nothing(tmp_path, suffix):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_disk_leaves_no_part_of_a_frame(tmp_path):
+def test_full_disk_leaves_no_partial_frame(tmp_path):
     with files_below(100), pytest.raises(OSError, match="large"):
         Film(tmp_path).show(0, picture())
     assert not list(tmp_path.iterdir())
 
 
-def test_bad_places_are_refused(tmp_path):
+def test_invalid_output_paths_are_rejected(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="folder"):
         Film(tmp_path / "file")

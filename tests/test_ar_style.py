@@ -67,8 +67,8 @@ def test_the_page_fits_and_is_in_register(demo, window, size):
     assert window.errors == []
 
 
-def test_in_a_low_window_what_switches_physics_off_is_in_sight(demo, window):
-    """The fold stands above the 3-D view, with room for a verdict's five lines over it."""
+def test_physics_switches_are_visible_in_a_low_window(demo, window):
+    """The folded section is above the 3-D view, with room for five lines of a comparison."""
     window.size(1280, 720)
     fold = (
         "[...document.querySelectorAll('legend, span, div')].findLast(e => e.innerText?.startsWith('physics effects'))"

@@ -202,7 +202,7 @@ def test_what_a_process_started_ends_with_it(tmp_path):
     assert gone(int(ended.output))
 
 
-def test_numbers_from_before_stay_where_none_can_be_had_here():
+def test_recorded_numbers_stay_without_a_new_measurement():
     gone = Figure("live-cpu", "live", "cpu", LIVE, modules=("no_such_module",))
     before = entry(median=3.0, origin=replace(HERE, machine="another"))
     assert said_by("sys.exit(2)", gone, before) is before
@@ -210,7 +210,7 @@ def test_numbers_from_before_stay_where_none_can_be_had_here():
     assert said_by("sys.exit(2)", before=before).state == "failed"  # of another machine, so measured anew
 
 
-def test_a_number_is_found_by_what_its_row_is():
+def test_number_is_found_by_the_names_of_its_row():
     said = {"rows": [{"engine": "tled", "x": 1.0}, {"engine": "felupe 11.3", "x": True}, {"engine": "b", "x": -1.0}]}
     assert number_at(said, ("rows", {"engine": "tled"}, "x")) == 1.0
     assert number_at({"rows": [{"engine": "felupe 11.3", "x": 2}]}, ("rows", {"engine": "felupe"}, "x")) == 2.0

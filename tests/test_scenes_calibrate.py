@@ -72,7 +72,7 @@ def test_a_video_gives_the_same_camera(pictures, tmp_path, capsys):
     assert np.abs(read_calibration(tmp_path / "camera.yml").K - K).max() < 6.0
 
 
-def test_pictures_that_are_no_views_of_the_board_are_refused(folder, pictures, tmp_path, capsys):
+def test_images_without_the_board_are_rejected(folder, pictures, tmp_path, capsys):
     out = ["--out", tmp_path / "camera.yaml"]
     assert "none.mp4: no such file. Give a video" in refused([tmp_path / "none.mp4", *out], capsys)
     assert "holds no images. Give a folder" in refused([tmp_path, *out], capsys)

@@ -41,14 +41,14 @@ def test_counts_are_whole_numbers(words, tmp_path, capsys):
     assert "is no whole number from" in capsys.readouterr().err
 
 
-def test_a_folder_of_another_seed_is_refused_by_the_command(tmp_path, capsys):
+def test_folder_of_another_seed_is_rejected(tmp_path, capsys):
     digest = load_plan("small").digest
     begin(tmp_path, tiny_run(digest=digest), "")
     assert main(["episodes", "small", "--count", "1", "--seed", "7", "--out", str(tmp_path), "--workers", "1"]) == 2
     assert "Give --seed 1" in capsys.readouterr().err
 
 
-def test_a_run_that_ends_has_a_data_sheet_of_what_is_there(box, tmp_path, capsys):
+def test_finished_run_has_a_data_sheet(box, tmp_path, capsys):
     folder, begun = tmp_path / "data", tiny_run(digest=load_plan("small").digest)
     begin(folder, begun, "")
     words = ["episodes", "small", "--count", "2", "--seed", "1", "--out", str(folder), "--workers", "1", "--json"]

@@ -14,7 +14,7 @@ def test_itk_finds_no_fold(warp_out):
         assert least >= min(said.values()) > 0.4
 
 
-def test_markups_and_figures(warp_out):
+def test_markups_and_report_list_the_written_files(warp_out):
     landmarks = json.loads((warp_out / "landmarks.mrk.json").read_text())
     assert landmarks["@schema"].endswith("markups-schema-v1.0.3.json#")
     (markup,) = landmarks["markups"]

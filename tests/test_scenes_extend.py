@@ -64,14 +64,14 @@ def test_the_code_of_each_section_runs_by_itself(folder):
     np.testing.assert_allclose(np.linalg.norm(forces, axis=1), 0.1, rtol=1e-3)
 
 
-def test_the_package_of_a_learner_has_a_whole_project_file():
+def test_example_plugin_has_a_complete_project_file():
     (text,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     project = tomllib.loads(text)["project"]
     assert project["name"] and project["version"]
     assert project["entry-points"][ENTRY_POINT_GROUP] == {"nearest": "my_package.nearest"}
 
 
-def test_a_mesh_from_elsewhere_becomes_an_anatomy(tmp_path, monkeypatch, box):
+def test_own_mesh_is_converted_to_an_anatomy(tmp_path, monkeypatch, box):
     """The code of docs/own_mesh.md, on a file in millimetres."""
     (code,) = blocks_of(PATIENT)
     mesh = box.mesh

@@ -53,7 +53,7 @@ def test_finite_elements_answer_together_what_they_answer_apart(boxed):
     assert touched.any()
 
 
-def test_the_tumour_sinks_and_is_cut_share_by_share(boxed):
+def test_debulk_removes_the_tumour_in_steps(boxed):
     rows = played(made("Debulk", anatomy=boxed), 0, 120, "debulk")
     truths = [truth for _, _, truth in rows]
     assert truths[-1]["success"] and truths[-1]["reached"] == 3.0 and truths[-1]["violations"] == 0

@@ -23,7 +23,7 @@ from sim.tools import Ball
 SMALL = USUAL_CALIBRATION.resize_calibration(800, 600, scale=True)
 
 
-def test_stamp_survives_noise_and_is_not_invented():
+def test_stamp_is_read_under_noise_and_not_elsewhere():
     random = np.random.default_rng(0)
     picture = random.integers(0, 256, (100, 500), np.uint8)
     assert read_stamp(picture) is None and read_stamp(picture[:4]) is None

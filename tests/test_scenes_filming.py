@@ -71,7 +71,7 @@ def test_what_goes_wrong_does_and_nothing_else(shots):
     assert [read_stamp(grey(shot)) for shot in shots] == pytest.approx([shot.time for shot in shots])
 
 
-def test_a_trouble_that_is_none_is_refused():
+def test_invalid_disturbance_is_rejected():
     with pytest.raises(InputError, match="no trouble is called 'fog'"):
         Trouble("fog", 0.0, 1.0)
     with pytest.raises(InputError, match="two times in order"):

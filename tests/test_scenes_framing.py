@@ -36,7 +36,7 @@ def test_outline_in_the_craniotomy_and_band_in_the_image(size):
     assert compute_visible_share(OBLIQUE_VIEWPOINT.build_camera(site), surface, build_rims(site)) < 0.6  # another view
 
 
-def test_the_view_is_as_oblique_as_it_may_be():
+def test_view_has_the_largest_tilt_that_shows_the_cortex():
     site = template_theatre().site
     found = USUAL_VIEWPOINT.find_framing(site)
     tilt = np.arccos(-found.outward @ site.axis)
@@ -46,6 +46,6 @@ def test_the_view_is_as_oblique_as_it_may_be():
     assert down.outward == pytest.approx(-site.axis) and down.visible >= MIN_VISIBLE
 
 
-def test_a_calibrated_camera_stands_far_enough():
+def test_calibrated_camera_is_far_enough():
     site, view = template_theatre().site, USUAL_VIEWPOINT.calibrate(replace(REAL, lens=None))
     assert count_inside(view.build_camera(site), grow(site.anatomy)) == 1.0

@@ -91,7 +91,7 @@ def test_what_looks_wrong_is_said(tmp_path, capsys):
     for more in ((), ("--inspect",)):
         refused = ["patient", "none.nii", "--out", str(tmp_path / "p.vtu"), "--nodes", "1999", *more]
         assert main(refused) == 2 and "1999 nodes are outside 2000 to" in capsys.readouterr().err
-    assert "stored LAS (mirrored, as many scanners do; left is where its affine says)" in text and "warnings:" in text
+    assert "stored LAS (mirrored, as many scanners do; sides from its affine)" in text and "warnings:" in text
 
 
 def test_missing_folder_is_made_or_rejected(tmp_path, capsys):

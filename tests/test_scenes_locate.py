@@ -89,7 +89,7 @@ def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
 
 
 def test_metre_input_is_rejected_and_zero_has_no_sign(files, tmp_path, capsys):
-    """Motions of nothing at all are answered."""
+    """Motions of exactly zero are accepted."""
     folder, _ = files
     table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "seen.csv"
     said_of = ((1.0, 1.0, ""), (1e-3, 1.0, "no point moves"), (1.0, 1e-3, "a sigma is 0.00015 mm"), (0.0, 1.0, ""))
@@ -113,7 +113,7 @@ def test_uninformative_points_are_rejected_unless_few(files, tmp_path, capsys):
         assert ("have a sigma of 30 mm or more" in capsys.readouterr().err) is (code == 2)
 
 
-def test_what_is_said_is_in_json_too(files, body, tmp_path, capsys):
+def test_json_has_the_warnings_and_regions(files, body, tmp_path, capsys):
     """Sentences of warning, and the regions that the locator knows."""
     folder, _ = files
     path = tmp_path / "own.npz"
@@ -124,7 +124,7 @@ def test_what_is_said_is_in_json_too(files, body, tmp_path, capsys):
     np.savetxt(tmp_path / "slipped.csv", table, delimiter=",", header="x,y,z,dx,dy,dz", comments="")
     words = ["locate", str(folder / "box.vtu"), str(tmp_path / "slipped.csv"), "--locator", str(path)]
     assert main(words) == 0
-    sentences = capsys.readouterr().out.splitlines()[4:]
+    sentences = capsys.readouterr().out.splitlines()[5:]
     assert main([*words, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["regions"] == {"tumour": 3.0} and said["warnings"] == sentences and len(sentences) == 3

@@ -41,7 +41,7 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     said = report(frame, player.stage, "linear", "", (), 7)
     for line in (
         ">tip to tumour 12.3&nbsp;mm<",
-        "<p>tumour moved 1.23 mm (surrogate error 0.02 mm, tumour position error not known)</p><label ",
+        "<p>tumour moved 1.23 mm (surrogate error 0.02 mm, motion error not known)</p><label ",
         "<p>frame 3 of 6; 0.10 s; force 0.25 N; error of the distance &lt;= 2.5 mm (95 %, relative to FEM)</p>",
         "<p>Tumour position error: not known.",
         "time [ms]: deformation 12.3, rendering 4.5, overlay 0.7<",
@@ -61,7 +61,7 @@ def test_the_page_reads_what_the_frame_holds(theatre):
     for said, off in ((prior, "4.7"), (seen, "1.2")):
         assert f"tip to tumour 12.3&nbsp;±&nbsp;{off}&nbsp;mm<" in said
     surely = report(replace(frame, moved_error=5.31e-3, model_error=None), player.stage, "fem", "", (), 7)
-    assert "<p>tumour moved 1.23 mm (tumour position error 5.4 mm)</p>" in surely
+    assert "<p>tumour moved 1.23 mm (motion error 5.4 mm)</p>" in surely
     failed = report(frame, player.stage, "linear", '<p class="warn">no FEM</p>', (), 7)
     assert failed.index("no FEM") < failed.index("details") < failed.index("frame 3 of 6")
     doubted = replace(frame, tumour_error=known[0], doubt="why", model_error=None)

@@ -19,7 +19,7 @@ from scenes.tracked.tool_motion import BrainMotion
 from sim.errors import InputError
 
 
-def test_the_tumour_comes_where_it_is_with_the_time_of_its_pose(follower, registration, truth, beside):
+def test_sent_tumour_has_the_position_and_time_of_its_pose(follower, registration, truth, beside):
     row, stamp = 10, NOW + 12345
     expected = 1e3 * (follower.motion.stage.tumour_at_rest.vertices + truth.displacement[row])
 

@@ -102,7 +102,7 @@ def test_millimetres_give_the_same_answer(solve) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk"])
-def test_fixed_by_node_and_by_component(solve, suffix: str) -> None:
+def test_fixed_per_node_equals_fixed_per_component(solve, suffix: str) -> None:
     by_node = solve({"fixed": BASE.astype(float), "force": FORCE}, suffix=suffix)
     by_component = solve({"fixed": np.repeat(BASE[:, None], 3, axis=1).astype(float), "force": FORCE}, suffix=suffix)
     np.testing.assert_array_equal(by_node.displacement, by_component.displacement)
@@ -162,7 +162,7 @@ def test_turned_and_dropped_cells_are_printed(solve) -> None:
     np.testing.assert_allclose(run.displacement, plain.displacement, atol=1e-8)
 
 
-def test_stray_nodes_stay_and_are_printed(solve) -> None:
+def test_nodes_outside_tetrahedra_stay_and_are_reported(solve) -> None:
     points = np.vstack([MESH.nodes, [[1.0, 1.0, 1.0], [2.0, 0.0, 0.0]]])
     data = {"fixed": np.append(BASE, [0, 0]).astype(int), "force": np.vstack([FORCE, np.ones((2, 3))])}
     run = solve(data, points=points)

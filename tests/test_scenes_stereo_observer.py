@@ -209,6 +209,6 @@ def test_a_study_sums_up_what_was_refused_too(observer, moved):
     assert found.removed == pytest.approx(1.0 - (2.0 * good.off + length) / (3.0 * length))
 
 
-def test_the_bench_asks_for_a_scene_that_two_eyes_see(capsys):
+def test_bench_rejects_scene_without_stereo(capsys):
     assert main(["benchmarks", "microscope", "--scene", "sag", "--device", "cpu"]) == 2
     assert "no pair of eyes sees the scene sag" in capsys.readouterr().err

@@ -86,7 +86,7 @@ class TestWords:
         assert describe_fem(plain, other) == (
             "smoothed linear tetrahedra, corotational tissue of Young's modulus 5 kPa and Poisson's ratio 0.4"
         )
-        assert describe_fem(plain, find_scene("retract")).endswith("relaxes under a held load")
+        assert describe_fem(plain, find_scene("retract")).endswith("viscoelastic")
         assert describe_fem(plain, find_scene("sag")).endswith(
             "Young's modulus 1.8 kPa and Poisson's ratio 0.45; the tumour of neo-hookean tissue of Young's modulus "
             "3.2 kPa and Poisson's ratio 0.45"

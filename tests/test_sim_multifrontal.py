@@ -86,8 +86,8 @@ def test_only_live_columns_are_solved(count: int) -> None:
 
 
 @pytest.mark.parametrize("columns", [1, FEW + 1])
-def test_in_single_precision_it_solves_for_forces_of_any_size(columns: int) -> None:
-    """Under a solver in double precision; a column without forces stays so. Processors round differently."""
+def test_single_precision_solves_forces_of_any_size(columns: int) -> None:
+    """In a double-precision solver; a column without forces stays zero. Rounding depends on the processor."""
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"))
     r = np.random.default_rng(4).normal(size=(stiffness.shape[0], columns)) * 10.0 ** (-60 * np.arange(1, columns + 1))
@@ -97,7 +97,7 @@ def test_in_single_precision_it_solves_for_forces_of_any_size(columns: int) -> N
     assert (np.linalg.norm(found - expected, axis=0) <= 1e-4 * np.linalg.norm(expected, axis=0)).all()
 
 
-def test_in_single_precision_it_stays_positive_definite() -> None:
+def test_single_precision_stays_positive_definite() -> None:
     """Where single precision holds no inverse: springs between neighbours, ten thousand million times as stiff here."""
     stiff = np.where(np.arange(299) % 3 == 0, 1e10, 1.0)
     diagonal = np.append(stiff, 0.0) + np.append(1.0, stiff)

@@ -199,8 +199,8 @@ def test_search_lengthens_what_it_cut_too_much(problem: Problem) -> None:
     assert (np.abs(slope(length)) <= 0.5 * long.predicted).all()
 
 
-def test_a_step_of_nothing_is_none(problem: Problem) -> None:
-    """Only a billionth of the way descends: it is not worth a step."""
+def test_negligible_step_is_rejected(problem: Problem) -> None:
+    """Only a step of 1e-10 of the direction lowers the energy."""
     u, direction = downhill(problem, np.ones(2))
     length = search(problem, u, direction)
     far = 1e10 * length

@@ -68,21 +68,21 @@ def test_pressure_and_gap_complement_each_other(element: str, force: float) -> N
 
 
 @pytest.mark.parametrize("element", ["p1", "p2"])
-def test_it_never_pulls(element: str) -> None:
-    """Tissue that leaves it moves as if it were not there."""
+def test_skull_never_pulls(element: str) -> None:
+    """Tissue that separates from the skull moves as without a skull."""
     away = body(element, SkullContact(GAP)).deform(lifted(-0.5))
     free = body(element).deform(lifted(-0.5))
     np.testing.assert_allclose(away.displacement, free.displacement, atol=1e-8 * np.abs(free.displacement).max())
 
 
-def test_pressed_on_it_is_as_held_by_it() -> None:
+def test_pressed_on_skull_equals_slide() -> None:
     """Under 20 N the lid is where `Slide` keeps it, but for the gap."""
     touching = body("p1", SkullContact(1e-5)).deform(lifted(20.0))
     kept = body("p1", Slide()).deform(lifted(20.0))
     assert np.abs(touching.displacement - kept.displacement).max() < 1.1e-5
 
 
-def test_nothing_acts_nothing_moves() -> None:
+def test_no_load_gives_no_motion() -> None:
     np.testing.assert_array_equal(body("p1", SkullContact(GAP)).deform(lifted(0.0)).displacement, 0.0)
 
 

@@ -9,7 +9,7 @@ from sim.terms.contact.tool_path import ContactSampling, ToolPath
 from sim.tools import Ball
 
 
-def test_a_way_is_as_long_as_it_is_clear() -> None:
+def test_stride_is_clearance_plus_part_of_the_radius() -> None:
     tool = Ball(RADIUS)
     begin, end = at(0.0, 0.0, 0.1)[None, None], at(0.1, 0.0, 0.1)[None, None]
     way = ToolPath(begin, end)
@@ -20,7 +20,7 @@ def test_a_way_is_as_long_as_it_is_clear() -> None:
     np.testing.assert_allclose(way.compute_stride((tool,), np.full((1, 1), 0.2)), 1.0)
 
 
-def test_a_tool_flies_in_few_strides() -> None:
+def test_tool_in_air_needs_few_strides() -> None:
     """Beside the body, and away from it: from 9 cm off it, seven cm are free whichever way."""
     fem = solver(TRAIN)
     term = fem.problem.barriers[0]

@@ -13,8 +13,8 @@ def test_causes_are_grouped_as_finely_as_their_shares_are_known():
     drawn = np.stack([np.full(2000, 0.2), first, 0.8 - first, np.zeros(2000)], axis=1)
     both, alone = group_cause_shares(drawn)
     assert both.causes == KINDS[1:3] and (both.share, both.low, both.high) == pytest.approx((0.8, 0.8, 0.8))
-    assert str(alone) == "tool 20% (20% to 20%)"
-    assert str(both) == "drainage or swelling or shrinking (not separable) 80% (80% to 80%)"
+    assert str(alone) == "tool 20 % (20 to 20 %)"
+    assert str(both) == "drainage or swelling or shrinking (not separable) 80 % (80 to 80 %)"
     narrow = group_cause_shares(np.stack([first / 4.0, 1.0 - first / 4.0, 0.0 * first, 0.0 * first], axis=1))
     assert [each.causes for each in narrow] == [("drainage",), ("tool",)]
     assert narrow[1].low == pytest.approx(0.01, abs=0.003) and narrow[1].high == pytest.approx(0.19, abs=0.003)

@@ -69,8 +69,8 @@ def test_points_that_are_turned_are_in_doubt_as_those_that_slip(locator, way):
     assert "The two cannot be distinguished" in found.doubt and found.warnings == (found.doubt,)
 
 
-def test_a_slip_is_held_against_what_is_stated(locator):
-    """A slip of 12 mm is no surprise where 8 mm along each axis are stated, but is where 4 are."""
+def test_shift_is_judged_by_the_given_registration_error(locator):
+    """A shift of 12 mm is plausible with 8 mm per axis, and suspected with 4 mm."""
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
     slipped = replace(seen, now=seen.now + sideways(body, 12e-3))
@@ -79,8 +79,8 @@ def test_a_slip_is_held_against_what_is_stated(locator):
     assert far.slipped and "where 4 mm and 1.5 degrees are reported" in far.doubt
 
 
-def test_a_registration_that_was_checked_is_not_doubted(locator):
-    """By what does not move: what is seen is then a motion, however much it looks like a slip."""
+def test_checked_registration_is_not_suspected(locator):
+    """Then even an observation that resembles a registration shift is a motion."""
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
     seen = replace(seen, now=seen.now + sideways(body, 12e-3))

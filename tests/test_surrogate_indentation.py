@@ -68,7 +68,7 @@ def test_how_a_ball_came_there_is_nothing(box):
     np.testing.assert_allclose(sunk.force, BALL.radius * normal, atol=1e-9)
 
 
-def test_a_ball_in_the_air_or_beside_the_cortex_has_no_depth(box):
+def test_ball_without_contact_has_no_depth(box):
     patch = open_patch(box)
     point = patch.points[[3, 3]] + [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
     away = compute_poses(BALL, point, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[0.0, 0.0, -1e-3]] * 2))
@@ -78,7 +78,7 @@ def test_a_ball_in_the_air_or_beside_the_cortex_has_no_depth(box):
     assert np.isfinite(found.point).all()
 
 
-def test_a_ball_half_in_the_tissue_presses_inward(box):
+def test_half_embedded_ball_presses_inwards(box):
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -BALL.radius]  # its middle is on the box's top
     pushed = to_indentation(Loads((Touching(pose[None, None]),)), BALL, open_patch(box))

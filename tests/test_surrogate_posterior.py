@@ -130,8 +130,8 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
     assert POSTERIOR.evidence_divisor * np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
 
 
-def test_axes_that_are_alike_are_whitened_as_all_rows_together(prior):
-    """The short way for whole motions gives what the long one gives, which single rows take."""
+def test_whitening_by_axis_equals_whitening_of_all_rows(prior):
+    """The shortcut for points with three equal axes agrees with the general method."""
     _, evidence = drawn(prior, np.random.default_rng(2))
     short = evidence.build_whitening(1e-3)
     turned = evidence.select(np.random.default_rng(0).permutation(len(evidence)))

@@ -1,4 +1,4 @@
-"""Distances of points and pixels from a closed surface by a tree of its triangles, on any device; rings of them."""
+"""Distances of points and pixels from a closed surface by a tree of its triangles; lines of equal distance."""
 
 from collections.abc import Sequence
 

@@ -131,7 +131,7 @@ class AccessPolicy:
         for header in request.headers.get_all("Cookie"):
             for pair in to_plain_text(header).split(";"):
                 name, _, value = pair.strip().partition("=")
-                if name == name_cookie(port):
+                if name == get_cookie_name(port):
                     yield value
 
 
@@ -290,7 +290,7 @@ def handle_request(
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
         if door.token is not None:
-            secret = f"{name_cookie(port)}={door.token}; HttpOnly; SameSite=Strict; Path=/"
+            secret = f"{get_cookie_name(port)}={door.token}; HttpOnly; SameSite=Strict; Path=/"
             response.headers["Set-Cookie"] = secret + "; Secure" * door.is_encrypted(request)
     return response
 
@@ -333,7 +333,7 @@ def to_bracketed(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def name_cookie(port: int) -> str:
+def get_cookie_name(port: int) -> str:
     """Return the name of a page's cookie; pages on other ports of the same host have others."""
     return f"page-{port}"
 

@@ -264,7 +264,7 @@ class Browser:
 
         self.note("button", send)
 
-    def tell(self, line: Callable[[int], str]) -> None:
+    def show_line(self, line: Callable[[int], str]) -> None:
         """Show each client a line of Markdown of its own under the report: `line` takes the client's number.
 
         With several clients it also shows who has control, and the others may request it.

@@ -29,7 +29,7 @@ class ControlLock:
         if self.leader not in here:
             self._give_control((*self.asking, *sorted(here), None)[0], now)
 
-    def act(self, visitor: int, now: float) -> bool:
+    def record_change(self, visitor: int, now: float) -> bool:
         """Record that a client sets something; return True if it has control."""
         if visitor == self.leader:
             self.acted = now
@@ -91,7 +91,7 @@ class Clients:
         """Record that a client acts on the page; return True if it has control."""
         now = clock.monotonic()
         self.lead.see(self.here | {client.client_id + 1}, now)
-        return self.lead.act(client.client_id + 1, now)
+        return self.lead.record_change(client.client_id + 1, now)
 
     def read(self, line: Callable[[int], str]) -> None:
         """Show each client its own line: the result of `line`, then who has control."""
@@ -113,8 +113,8 @@ class Clients:
     def add_row(self, client: viser.ClientHandle) -> ClientRow:
         """Add the elements that only this client sees to its page."""
         gui, lead = client.gui, self.lead
-        ask = gui.add_button("Ask to lead", color="orange", order=self.order + 0.1, visible=False)
-        give = gui.add_button("Let them lead", color="orange", order=self.order + 0.2, visible=False)
+        ask = gui.add_button("Request control", color="orange", order=self.order + 0.1, visible=False)
+        give = gui.add_button("Hand over control", color="orange", order=self.order + 0.2, visible=False)
 
         @ask.on_click
         async def asked(_: viser.GuiEvent) -> None:
@@ -122,7 +122,7 @@ class Clients:
 
         @give.on_click
         async def given(_: viser.GuiEvent) -> None:
-            if lead.act(client.client_id + 1, clock.monotonic()):
+            if lead.record_change(client.client_id + 1, clock.monotonic()):
                 lead.give(clock.monotonic())
 
         return ClientRow(gui.add_markdown("", order=self.order), ask, give, gui.add_html("", order=self.order + 0.3))

@@ -115,7 +115,7 @@ def read_at(place: wp.vec3f, normal: wp.vec3f, light: Light) -> wp.vec3f:
 
 
 @wp.func
-def lit(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
+def compute_lit_share(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.float32:
     """Compute the lamp's share at a point: percentage-closer filter of the shadow map (Reeves et al. 1987).
 
     The smallest and largest depth of the tiles under the filter decide most points at once.
@@ -294,7 +294,7 @@ def shade(
         winner = face_of(key)
         share = wp.float32(1.0)
         if key != EMPTY_PIXEL and winner < still:
-            share = lit(picture, lit_at[pixel], shadow)
+            share = compute_lit_share(picture, lit_at[pixel], shadow)
         if key != EMPTY_PIXEL and (winner >= still or share < 1.0):
             row = pixel / width
             column = pixel - row * width
@@ -309,6 +309,6 @@ def shade(
             if winner >= still:
                 depth[index] = depth_of(key)
                 segmentation[index] = look.id
-                share = lit(picture, read_at(point.place, point.normal, light), shadow)
+                share = compute_lit_share(picture, read_at(point.place, point.normal, light), shadow)
             out = light_on(point, look, light, share)
             colour[index] = wp.vec3ub(tone(out[0], curve), tone(out[1], curve), tone(out[2], curve))

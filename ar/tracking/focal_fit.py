@@ -33,8 +33,8 @@ class FocalFit:
     deviation: float
 
     @property
-    def differs(self) -> bool:
-        """True if the focal length differs significantly."""
+    def is_significant(self) -> bool:
+        """True if the difference of the focal length is significant."""
         return abs(self.factor - 1.0) > max(MAX_RELATIVE_ERROR, MAX_DEVIATIONS * self.deviation)
 
 

@@ -16,7 +16,7 @@ MAX_LIVE_ERROR = 5e-5  # Largest distance of a node from the converged solution 
 
 
 def time_offers(theatre: PatientSetup, scene: Scene) -> list[Offer]:
-    """One offer for each deformer that states an error, timed on moments of the scene, as they are played."""
+    """Time each deformer that reports an error, on frames of the scene in playing order."""
     made = []
     times = scene.times[np.linspace(0, len(scene.times) - 1, TIMED_FRAMES + 1).astype(int)]
     loads = [scene.build_loads(theatre.site, scene.path(float(time)), float(time)) for time in times]
@@ -35,7 +35,7 @@ def time_offers(theatre: PatientSetup, scene: Scene) -> list[Offer]:
 
 
 def _get_reported_error(deformer: Deformer) -> float:
-    """Return the error that a deformer states of itself [m]."""
+    """Return the error [m] that a deformer reports; NaN without one."""
     if isinstance(deformer, Guarded):
         return float(np.fmin(deformer.model.bound, deformer.limit))
     return deformer.bound if isinstance(deformer, Learned) else MAX_LIVE_ERROR

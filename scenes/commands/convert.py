@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=FORMATS,
         help="output format: LeRobot v3.0, robomimic (.hdf5), images and tables, XDMF for ParaView, or a dataset card",
     )
-    parser.add_argument("--out", type=Path, help="new folder or .hdf5 file; a card is written into the data set")
+    parser.add_argument("--out", type=Path, help="new folder or .hdf5 file; not for `--to card`")
     add_force(parser)
     add_json(parser)
 

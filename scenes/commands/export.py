@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cortex",
         action="store_true",
-        help="onnx: include the open cortex; the graph then needs the footprint's weights at its nodes",
+        help="onnx: also predict the open cortex; needs the footprint's weights at its nodes as input",
     )
     add_force(parser)
 

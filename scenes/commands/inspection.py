@@ -100,10 +100,10 @@ class Inspection:
             *shown,
             *([f"  and {hidden} smaller"] if hidden > 0 else []),
             *(f"{name} {volume:.2f} ml: {self._describe_part(name)}" for name, volume in self.parts.items()),
-            f"tumour {self.depth:.0f} mm under the nearest cortex, give or take a voxel of {error:.1f} mm",
+            f"tumour {self.depth:.0f} mm under the nearest cortex, within one voxel ({error:.1f} mm)",
             f"opening: {self.place}, at {at} mm (RAS), {self.distance:.0f} mm from the tumour",
             f"voxels {' x '.join(f'{edge:.3g}' for edge in self.voxel)} mm, stored {self.axes} "
-            f"({'mirrored, as many scanners do' if self.mirrored else 'not mirrored'}; left is where its affine says)",
+            f"({'mirrored, as many scanners do' if self.mirrored else 'not mirrored'}; sides from its affine)",
         ]
 
     def _describe_part(self, part: str) -> str:

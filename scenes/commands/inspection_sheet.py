@@ -176,7 +176,7 @@ def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.n
     right = np.cross(down, inward)
     across = subject.cortex - subject.site
     reach = float(np.abs(np.stack([across @ right, across @ down])).max(axis=1).mean()) * 0.8
-    view = InspectionView("from outside, along the opening", right, down, subject.site, reach)
+    view = InspectionView("from outside", right, down, subject.site, reach)
     cell = max(2.0 * reach / SIDE, 1.5 * float(np.linalg.norm(masks.affine[:3, :3], axis=0).max()))
     seen = _rasterise_points(view, subject.cortex, inward, cell)
     colour = np.tile(np.array(GROUND_COLOUR, float), (SIDE, SIDE, 1))
@@ -238,7 +238,7 @@ def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
 def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
     """Draw numbers, warnings and colours in the right column."""
     left, top = 2 * SIDE + PAD, PAD
-    rows: list[tuple[str, Colour]] = [("What would be made", TEXT_COLOUR)]
+    rows: list[tuple[str, Colour]] = [("Model to be built", TEXT_COLOUR)]
     for text in found.format_lines():
         rows += [(part, TEXT_COLOUR) for part in textwrap.wrap(text, MAX_LINE_LENGTH, subsequent_indent="    ")]
     rows += [

@@ -122,7 +122,8 @@ def _format_result(found: Location, out: Path | None) -> str:
     lines = [
         f"The centre of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",
         f"{sure} its error is at most {1e3 * found.p95:.1f} mm.",
-        f"The motion explains {found.explained:.0%} of the observations. Causes: {found.named_causes}.",
+        f"The estimate explains {100 * found.explained:.0f} % of the observed motion (mean square).",
+        f"Causes of the motion: {found.named_causes}.",
         f"Estimated registration shift of the observation: {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
     ]
     lines += _list_warnings(found)

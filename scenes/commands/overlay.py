@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "pictures", metavar="FILM|CAMERA", help="a video, a folder of PNG or JPEG images, or a camera number"
     )
     parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
-    parser.add_argument("--registration", required=True, metavar="R.json", help="the scan's, from `sulcus register`")
+    parser.add_argument("--registration", required=True, metavar="R.json", help="registration from `sulcus register`")
     parser.add_argument("--tool", metavar="TOOL.json", help="tool with its marker cube (default: no tool)")
     add_bodies(parser)
     parser.add_argument(

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "of the patient's reference",
     )  # fmt: skip
     parser.add_argument("--out", required=True, metavar="R.json", help="the registration")
-    parser.add_argument("--anatomy", type=Path, metavar="P.vtu", help="tells the error at the tumour of this anatomy")
+    parser.add_argument("--anatomy", type=Path, metavar="P.vtu", help="anatomy: also estimate the error at its tumour")
     parser.add_argument(
         "--surface", type=Path, metavar="CLOUD.csv",
         help="columns px,py,pz [mm]: places traced on the brain's surface of --anatomy, in the reference's frame",

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_devices(parser, "; loads are simulated on all, everything else is measured on the first")
     parser.add_argument(
         "--data", nargs="+", type=Path, default=[], metavar="DATA.h5",
-        help="data sets from `sulcus simulate`, each with its own rows (default: a new one: smoothed, palpation)",
+        help="data sets from `sulcus simulate`, each in its own rows (default: new: palpation, smoothed elements)",
     )  # fmt: skip
     parser.add_argument(
         "--anatomy", metavar="MESH.vtu", help="anatomy of the simulation without --data (default: the template)"
@@ -188,7 +188,7 @@ def _show_progress(bar: tqdm, done: int, total: int) -> None:
 def _tabulate(study: ReportStudy, bar: tqdm) -> None:
     from ..report.study import tabulate_series
 
-    tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"))
+    tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} positions"))
     bar.set_postfix_str("")
 
 

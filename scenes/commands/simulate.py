@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     shape = parser.add_mutually_exclusive_group()
     shape.add_argument(
-        "--scene", metavar="NAME", help="tool and poses of a scene, as a hand sets them on its page, such as spatula"
+        "--scene", metavar="NAME", help="tool and poses of a scene under manual control, such as spatula"
     )
     shape.add_argument("--ball", type=float, metavar="MM", help="radius of a ball [mm], such as 7 in the scene palpate")
     shape.add_argument(
@@ -224,13 +224,11 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
             f"{args.out} already holds {len(outcomes)} loads, more than the {asked} asked for: nothing was taken away."
         )
     listed = ", ".join(f"{number} {name}" for name, number in counts.items())
-    print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved.rows} solved now.")
+    print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved.rows} solved in this run.")
     print(f"Solved by {solver}.")
     if rate is not None:
-        print(f"{rate:.4g} loads a second, from their footprints to the file.")
+        print(f"{rate:.3g} loads per second, with sampling and writing.")
     if not args.pose_control and describe_rejected(args.tool_preset):
         print(describe_rejected(args.tool_preset))
     if failed:
-        print(
-            f"{failed} solutions are unreliable (see their outcomes): they stay in the file, but are not trained with."
-        )
+        print(f"{failed} solutions are unreliable (see their outcomes): they stay in the file, but no model uses them.")

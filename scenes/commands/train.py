@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         expansion = Expansion(
             data,
             device,
-            lambda done, total: bar.set_postfix_str(f"series: {done} of {total} places"),
+            lambda done, total: bar.set_postfix_str(f"series: {done} of {total} positions"),
             begun=to_unfinished_path(out),
         )
         trained = train(data, learners, lambda learner: bar.update(), most=args.most, expansion=expansion)
@@ -88,8 +88,8 @@ def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
     expanded = [name for name in learners if name in SERIES_MODELS]
     if expanded:
         notes.append(
-            f"{' and '.join(expanded)} begin with a table that the finite elements fill, which takes minutes on a CPU; "
-            "the bar counts its places."
+            f"{' and '.join(expanded)} first compute a table by FEM, which takes minutes on a CPU; "
+            "the bar counts its contact positions."
         )
     if good // CALIBRATION_STRIDE < MIN_CALIBRATION_LOADS:
         notes.append(

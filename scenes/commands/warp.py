@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     cause.add_argument(
         "--located", type=Path, metavar="RESULT.vtu",
-        help="result of `sulcus locate`, whose covariance bounds the tumour position, or of `sulcus solve`",
+        help="result of `sulcus locate`, with the covariance of the tumour position, or of `sulcus solve`",
     )  # fmt: skip
     parser.add_argument("--frame-number", type=int, metavar="K", help="frame number of --scene")
     parser.add_argument(

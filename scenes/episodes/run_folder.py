@@ -129,7 +129,7 @@ def read_run(folder: Path) -> RunSettings | None:
 
 
 def list_finished(folder: Path) -> set[int]:
-    """Numbers of the episodes that are there."""
+    """Numbers of the finished episodes."""
     return {number for number, ending in _find_episodes(folder) if ending == ".h5"}
 
 

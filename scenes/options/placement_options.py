@@ -25,7 +25,7 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
         "--opening-at", type=point_or_file, metavar="X,Y,Z|FILE.mrk.json",
-        help="centre the craniotomy on the nearest reachable point of the brain's surface [mm, RAS] (default: over the "
+        help="centre of the craniotomy, on the nearest accessible point of the cortex [mm, RAS] (default: over the "
         "tumour). A file of 3D Slicer may hold a point, a trajectory as a line, or an outline as a closed curve",
     )  # fmt: skip
     place.add_argument(

@@ -89,7 +89,7 @@ def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: 
 def describe_change(truth: FemResult, player: Player, shown: Deformation, disabled: Sequence[str]) -> str:
     """Describe the tumour's distance from its position under all effects, for a solution without some."""
     mean = 1e3 * float(compute_distances(truth, player, shown).mean())
-    return f"<p>without {escape(', '.join(disabled))} the tumour moves {mean:.2f} mm differently</p>"
+    return f"<p>without {escape(', '.join(disabled))} the tumour position differs by {mean:.2f} mm</p>"
 
 
 @dataclass

@@ -143,7 +143,7 @@ class Demo:
     def _show_tool_holder(self) -> None:
         """Tell each visitor who has the tool, and who leads."""
         tool, holder, connected = self.stage.scene.tool, self.wish.holder, self.browser.here
-        self.browser.tell(lambda client: "" if tool is None else describe_holder(client, holder, connected))
+        self.browser.show_line(lambda client: "" if tool is None else describe_holder(client, holder, connected))
 
     def close(self) -> None:
         """Stop the page and the finite elements."""

@@ -24,7 +24,7 @@ def refine_error(theatre: PatientSetup, scene: Scene, touch: Touch, time: float,
         See `solve_nominal` and `estimate_uncertainty`.
     """
     static_scene, samples = replace(scene, path=lambda time: touch), sample_priors(count, 0)
-    yield "<p>The load is solved for sampled patients...</p>"
+    yield "<p>solving the load for sampled patients...</p>"
     nominal, solutions = solve_nominal(theatre, static_scene), list[Answer]()
     for result in solve_ensemble(theatre, static_scene, samples):
         solutions.append(result)

@@ -21,7 +21,7 @@ DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of the model (95 
 FORCE = Line("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: error unknown")  # Chart of the force.
 SET_FORCE = Line("force", "N", "#ffa94d", "as it is set")  # Chart of the prescribed force.
 # Chart of the tumour's motion.
-TUMOUR_MOTION = Line("tumour moved", "mm", "#4cf28c", "band: tumour position error (95 %); dotted: not known")
+TUMOUR_MOTION = Line("tumour moved", "mm", "#4cf28c", "band: motion error (95 %); dotted: not known")
 
 
 def list_lines(scene: Scene) -> tuple[Line, ...]:

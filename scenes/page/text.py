@@ -118,7 +118,7 @@ def describe_tissue(tissue: Tissue | None) -> str:
     """Return a tissue's law and constants."""
     if tissue is None:
         return "a tissue for each region"
-    relaxation = ", which relaxes under a held load" if tissue.prony else ""
+    relaxation = ", viscoelastic" if tissue.prony else ""
     if not isinstance(tissue, Material):
         return f"{tissue.law} tissue{relaxation}"
     return (
@@ -239,9 +239,9 @@ def format_motion(frame: Frame) -> str:
     """Describe the tumour's displacement with its errors: of the model, and of the tumour in the patient."""
     motion = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' (estimate)'}"
     if frame.moved_error is not None:
-        error = f"tumour position error {hud.bound_words(frame.moved_error, 1)}"
+        error = f"motion error {hud.bound_words(frame.moved_error, 1)}"
     else:
-        error = f"{'error' if frame.doubt else 'tumour position error'} not known"
+        error = f"{'error' if frame.doubt else 'motion error'} not known"
     if frame.model_error is not None and frame.estimate is None:
         error = f"surrogate error {hud.bound_words(frame.model_error, 2)}, {error}"
     return f"{motion} ({error})"
@@ -249,7 +249,7 @@ def format_motion(frame: Frame) -> str:
 
 def describe_estimate(estimate: TumourEstimate) -> list[str]:
     """Describe an estimate, its error and its input; or the reason of its rejection."""
-    reference = f"simulated (FEM): {format_unbroken(estimate.truly)}"
+    reference = f"simulated (FEM): {format_unbroken(estimate.true_motion)}"
     if estimate.location is None:
         return [
             f'<p class="number">tumour position unknown ({reference})</p>',

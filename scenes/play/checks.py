@@ -114,7 +114,7 @@ class SceneFigures:
         return [sentence for sentence, kept in rules.items() if not kept]
 
     def to_row(self) -> dict[str, float | bool | str | None]:
-        """For machines: JSON knows no infinity, so None is a figure that could not be measured."""
+        """Convert to a row of JSON; None: not measured (JSON has no infinity)."""
         figures = asdict(self)
         return {name: value if name == "doubt" or np.isfinite(value) else None for name, value in figures.items()}
 

@@ -86,7 +86,7 @@ class TumourEstimate:
         return float(np.sqrt(RADIUS_SQUARED * largest))
 
     @property
-    def truly(self) -> float:
+    def true_motion(self) -> float:
         """True displacement of the tumour centroid [m]."""
         return float(np.linalg.norm(self.true))
 
@@ -115,7 +115,7 @@ class TumourEstimate:
             return ""
         still = "" if self.noticed else "no significant motion detected; "
         guess = "" if self.location.calibrated else "rough estimate; "
-        motion, error = format_millimetres(self.truly), format_millimetres(self.off)
+        motion, error = format_millimetres(self.true_motion), format_millimetres(self.off)
         return f"{still}{guess}simulated motion {motion}; estimate error {error}"
 
     @property
@@ -213,7 +213,7 @@ class Observer:
 
     @cached_property
     def _smooth(self) -> np.ndarray:
-        """(n, 3) [m]: the error that neighbours share."""
+        """Spatially correlated noise (n, 3) [m]."""
         at, random = self._interpolate_points(self._rest), np.random.default_rng([self.observation_model.seed, 0, 1])
         return self.observation_model.smooth * smooth_root(at) @ random.standard_normal(at.shape)
 

@@ -26,7 +26,7 @@ def label_lines(frame: Frame, name: str) -> list[str]:
     rest = [*doubt, moment, "ms: " + ", ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in spent)]
     if found is None:
         return [f"{name}: tumour moved {_format_length(frame.moved, frame.moved_error)}", *rest, source]
-    moved = [f"simulated tumour motion: {1e3 * found.truly:.2f} mm"]
+    moved = [f"simulated tumour motion: {1e3 * found.true_motion:.2f} mm"]
     moved += (
         [] if found.location is None else [f"estimate: tumour moved {_format_length(found.moved, frame.moved_error)}"]
     )

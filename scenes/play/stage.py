@@ -226,7 +226,7 @@ class Stage:
         return scale_picture(picture, camera.width, camera.height) if coarse else picture
 
     def render_tool_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
-        """Return the same, of a tool by its corners (t, 3) [m]."""
+        """Render as `render`, with the tool given by its corners (t, 3) [m]; None: without a tool."""
         return self._draw(camera, self._list_layers(positions, corners))
 
     def _draw(self, camera: Camera, layers: Sequence[Layer]) -> Picture:

@@ -235,7 +235,7 @@ def find_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarra
 
 
 def compute_deviations(sigma: np.ndarray) -> np.ndarray:
-    """Scale deviations (n,) [m] of independent errors to those of a locator, which include correlated errors."""
+    """Scale standard deviations (n,) [m] of independent noise to a locator's `sigma`, which adds correlated noise."""
     return sigma * (SIGMA / NOISE.independent_error)
 
 

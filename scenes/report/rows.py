@@ -88,7 +88,7 @@ CORES = 4  # Number of CPU cores per measured learner, which uses one; the other
 
 def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
     """Return the data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
-    meshes = {} if not remesh else MESHES if study.of_template else {"halved edges": HALVED_MESH}
+    meshes = {} if not remesh else MESHES if study.is_shipped else {"halved edges": HALVED_MESH}
     return (
         FemVariant("FEM"),
         *(FemVariant(f"FEM {name}", element=name) for name in ELEMENTS if name != study.element),
@@ -106,7 +106,7 @@ def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[F
 
 def list_all_combinations(study: ReportStudy) -> tuple[FemVariant, ...]:
     """All of the star's laws, elements, meshes, tolerances and precisions with each other."""
-    meshes = {OWN_MESH: OWN_MESH, **(MESHES if study.of_template else {"halved edges": HALVED_MESH})}
+    meshes = {OWN_MESH: OWN_MESH, **(MESHES if study.is_shipped else {"halved edges": HALVED_MESH})}
     precisions: tuple[Precision, ...] = ("float32", "float64")
     return tuple(
         FemVariant(f"FEM {law} {element} {name} {_format_power(size)} {precision}", law, element, mesh, size, precision)

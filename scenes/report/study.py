@@ -79,7 +79,7 @@ class ReportStudy:
         return self.dataset.anatomy
 
     @cached_property
-    def of_template(self) -> bool:
+    def is_shipped(self) -> bool:
         """True if the body is the shipped template, of which other meshes can be built."""
         return self.anatomy.digest == read_anatomy(get_template_path()).digest
 

@@ -86,7 +86,7 @@ class Painter:
         return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= MIN_REPORTED_SHARE else ()
 
     def _build_layers(self, known: TrackingResult) -> list[Layer]:
-        """Build the open cortex, under which the tumour is seen, the surrounding drape as in videos, and the tool."""
+        """Build the layers to render: open cortex above the tumour, drape around it as in videos, and tool."""
         tool = self.build_tool_layer(known)
         return [*self.stage.build_layers(known.motion.positions, None), *([] if tool is None else [tool])]
 

@@ -132,7 +132,7 @@ class OverlayPage:
         end, known = due + seconds, None
         with self._show_failure(end):
             while (now := clock.perf_counter()) < end:
-                self.browser.tell(lambda visitor: "")
+                self.browser.show_line(lambda visitor: "")
                 wanted = self._find_next_number(film.count, now >= due)
                 if wanted is None:
                     self._draw_in_style()
@@ -182,7 +182,7 @@ class OverlayPage:
                 now = clock.perf_counter()
                 if now >= end:
                     break
-                self.browser.tell(lambda visitor: "")
+                self.browser.show_line(lambda visitor: "")
                 if not self.plays:
                     self._mark_outdated("paused")
                 elif picture is None:

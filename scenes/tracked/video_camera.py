@@ -48,7 +48,7 @@ def check_video(film: Path, rate: float, calibration: Calibration, camera: str) 
     if not count:
         raise InputError(f"{film}: holds no image. {REMEDY}")
     fit = fit_focal_length(calibration.build_camera(np.eye(4)), seen)
-    if fit is not None and fit.differs:
+    if fit is not None and fit.is_significant:
         way = "longer" if fit.factor > 1.0 else "shorter"
         raise InputError(
             f"{film}: its markers are seen with focal lengths that are {abs(fit.factor - 1.0):.0%} {way} "

@@ -39,14 +39,14 @@ class Cause:
 
 
 def play_scene_cause(scene: Scene, number: int) -> Cause:
-    """Return a moment of a scene, by the number of its frame."""
+    """Describe frame `number` of a scene as a cause."""
     time = float(scene.times[number])
     record = {"kind": "scene", "scene": scene.name, "frame": number, "time_s": time}
     return Cause(f"scene {scene.name}, frame {number}, {time:.2f} s", record)
 
 
 def load_cause(loads: Loads) -> Cause:
-    """Return the one push of a load case."""
+    """Describe the one push of a load case as a cause."""
     (pushed,) = loads.get_all(Pushed)
     place, force = 1e3 * pushed.point[0], pushed.force[0]
     newton = float(np.linalg.norm(force))

@@ -80,7 +80,7 @@ def _format_array(name: str, kind: str, components: int, values: np.ndarray) -> 
 
 
 def write_stl(path: Path, mesh: NamedSurface) -> None:
-    """Write binary STL in millimetres, LPS, which its header says in Slicer's words."""
+    """Write binary STL in millimetres, LPS, with the header from which 3D Slicer reads the coordinate system."""
     corners = (1e3 * mesh.vertices * LPS)[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

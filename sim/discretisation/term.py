@@ -212,7 +212,7 @@ class Strained(Term, Protocol):
     ) -> None:
         """Add the tangent stiffness minus the undeformed one [N/m] of these elements to out (k, p, p) float64.
 
-        Only points with |H| above `least` (k,) count. Rows 3 `place` (N, k) of out are the first of a node.
+        Only points with |H| above `least` (k,) count. The rows of a node in out begin at 3 `place` (N, k).
         """
         ...
 

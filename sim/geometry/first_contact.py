@@ -67,7 +67,7 @@ def _compute_vertex_paths(corners: np.ndarray, inward: np.ndarray, radius: np.nd
 
 
 def _compute_edge_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Compute the centre's path (M, 3) to the first contact with the interior of each edge."""
+    """Compute the centre's path (M, 3) [m] to the first contact with each edge's interior; inf: no contact."""
     edge = np.roll(corners, -1, axis=1) - corners
     square = np.einsum("mei,mei->me", edge, edge)
     unit = edge / np.sqrt(np.where(square > 0.0, square, 1.0))[..., None]

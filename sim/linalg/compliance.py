@@ -30,7 +30,7 @@ class Columns:
 
 
 class Compliance:
-    """Compliance H (3N, 3N) [m/N], applied by a preconditioner, and its columns at n nodes: `views.get_library` arrays.
+    """Compliance H (3N, 3N) [m/N], applied by a preconditioner; its columns at n nodes are kept on the device.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Compliance:
     columns
         Block size and cache of the columns.
 
-    `rows` (3n,) are the rows of the nodes, and `places` the same on the device.
+    `rows` (3n,) are the rows of the nodes, and `places` is their copy on the device.
     """
 
     def __init__(

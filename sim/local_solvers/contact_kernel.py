@@ -213,7 +213,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def relieve(m: int, s: Scratch, c: int, me: int) -> bool:
-        """Subtract D (1 + C D)^-1 a from the change, C = L L' as in `soft`; False if this is not convex.
+        """Subtract D (1 + C D)^-1 a from the change, for the compliance C = L L' of `soft`; False if not convex.
 
         It is D (a - L (1 + L' D L)^-1 L' D a): Woodbury 1950. a is `at` at the touched nodes.
         """

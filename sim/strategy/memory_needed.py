@@ -140,7 +140,7 @@ def _list_unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
 
 
 def _find_invertible(unknowns: tuple[int, ...], device: Device) -> int:
-    """Return the largest of these numbers that the GPU can invert, else the size of the last multigrid level."""
+    """Return the first of these sizes whose inverse fits the GPU, else the size of the last multigrid level."""
     from ..linalg.dense_inverse import can_invert
 
     last = 6 * Preconditioning().max_coarsest_nodes

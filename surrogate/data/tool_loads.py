@@ -139,8 +139,8 @@ def describe_rejected(preset: str) -> str:
     """Describe that share; empty if it is zero."""
     share = compute_rejected_share(preset)
     return (
-        f"{100.0 * share:.0f} % of the nominal loads of {preset} (its forces on its radii) exceed the pressure or "
-        "depth of surgery: they are not sampled, and are outside the training range."
+        f"{100.0 * share:.0f} % of the nominal loads of {preset} exceed the pressure or depth of surgery: they are not "
+        "sampled, and are outside the training range."
         if share > 0.0
         else ""
     )

@@ -56,7 +56,7 @@ def draw_poses(
     tool: BuiltIn | None = None,
     settings: ToolPoseSettings = ToolPoseSettings(),
 ) -> Loads:
-    """Sample `count` poses of a tool, pressed into the open cortex; load i depends on the same as in `surrogate.draw`.
+    """Sample `count` poses of a tool, pressed into the open cortex; load i is reproducible as in `surrogate.draw`.
 
     Positions are uniform by area, and the tool's end is inside the edge. For a ball, positions and directions are those
     of the preset's forces. Depths are uniform from 0.05 to 0.9 of the radius, and limited to the depth of the preset's

@@ -49,7 +49,7 @@ class Coverage:
     def __str__(self) -> str:
         tenths = " ".join(f"{100 * share:.0f}" for share in self.tenths)
         return (
-            f"{format_shares(self.shares)}; by tenths of force {tenths}; median bound {self.bound_mm:.4f} mm, median "
+            f"{format_shares(self.shares)}; by decile of force {tenths}; median bound {self.bound_mm:.4f} mm, median "
             f"error {self.error_mm:.4f} mm; {self.extrapolated} loads outside the training range"
         )
 

@@ -182,9 +182,9 @@ def score(
     motion = np.linalg.norm(truth, axis=2).mean(axis=1, keepdims=True)
     return Score(
         name,
-        *spread(1e3 * distance),
-        *spread(100.0 * distance / motion),
-        *spread(1e3 * distance.max(axis=1))[:3],
+        *compute_spread(1e3 * distance),
+        *compute_spread(100.0 * distance / motion),
+        *compute_spread(1e3 * distance.max(axis=1))[:3],
         1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED_LOADS))),
         time_model_alone(deformer, loads),
         solves,
@@ -244,7 +244,7 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
     best = find_best(scores)
     fastest = min(scores, key=lambda row: row.microseconds)
     verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
-    wins = f"{best.name} wins: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
+    wins = f"{best.name} has the smallest error: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
     few = [f"p99.9: not estimated from fewer than {MIN_LOADS_FOR_P999} loads"] if scores[0].p999_mm is None else []
     return "\n".join([head, *rows, *few, wins if len(scores) > 1 else f"{best.name}: {verdict}", *_solve_lines(scores)])
 
@@ -272,7 +272,7 @@ def _solve_lines(scores: Sequence[Score]) -> list[str]:
     ]
 
 
-def spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
+def compute_spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
     """Compute mean, 95th and 99.9th percentile (None for too few loads), and maximum of values (B, ...) of B loads."""
     p95, p999 = np.percentile(values, (95.0, 99.9))
     return (

@@ -41,7 +41,7 @@ class CauseShare:
     def __str__(self) -> str:
         named = " or ".join(CAUSE_NAMES.get(cause, cause) for cause in self.causes)
         apart = "" if len(self.causes) == 1 else " (not separable)"
-        return f"{named}{apart} {self.share:.0%} ({self.low:.0%} to {self.high:.0%})"
+        return f"{named}{apart} {100 * self.share:.0f} % ({100 * self.low:.0f} to {100 * self.high:.0f} %)"
 
 
 def group_cause_shares(drawn: np.ndarray) -> tuple[CauseShare, ...]:

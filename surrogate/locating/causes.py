@@ -197,7 +197,7 @@ def sample_directions(random: np.random.Generator, axis: np.ndarray, causes: Cau
 
 @dataclass(frozen=True, eq=False)
 class Presses:
-    """Motions by forces of equal size.
+    """Motions by forces of equal magnitude on the open cortex.
 
     Parameters
     ----------

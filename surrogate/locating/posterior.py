@@ -127,7 +127,7 @@ class Posterior:
 
     @property
     def weight(self) -> np.ndarray:
-        """(r,): mean of the shapes' weights."""
+        """Posterior mean (r,) of the weights of the shapes."""
         return self.unknown[:-6]
 
     @property

@@ -30,7 +30,7 @@ from .conformal import LEVELS, Bound, compute_features
 from .held_out import HeldOutErrors
 from .relaxation import MEMORY_KEY, Relaxed, follow_relaxation
 from .tip_distance import Distance, TipModel
-from .tool_contact import ForceModel, build_warm_encoders, collect_held_state, compute_wrench
+from .tool_contact import ForceModel, build_warm_encoders, collect_contact, compute_wrench
 from .training_range import Envelope, Measured, Outside, measure_loads
 
 # Largest force or footprint relative to the training's. On the template FEM finds no equilibrium for three loads of
@@ -119,7 +119,7 @@ class Learned:
         stated = self.training
         tissue = str(read_tissue_statement(stated)) if "tissue" in stated else "tissue not given"
         element = stated.get("element", "not given")
-        return f"{stated.get('learner', 'learned')}, from finite elements ({element}; {tissue})"
+        return f"{stated.get('learner', 'learned')}, trained on FEM ({element}; {tissue})"
 
     @cached_property
     def series(self) -> Pairs:
@@ -246,7 +246,7 @@ class Learned:
             answer = replace(answer, memory={MEMORY_KEY: past.memory})
         if self.tool is not None:
             answer = replace(
-                answer, warm=collect_held_state(self._regressors, self._patch, self.clip_to_range(pushed)[1], encoders)
+                answer, warm=collect_contact(self._regressors, self._patch, self.clip_to_range(pushed)[1], encoders)
             )
         if self.force is None or self.tool is None:
             return answer

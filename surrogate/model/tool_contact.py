@@ -67,7 +67,7 @@ def build_warm_encoders(regressors: Sequence[Fitted], start: Deformation | None)
     return {**ENCODERS, "core": followed}
 
 
-def collect_held_state(
+def collect_contact(
     regressors: Sequence[Fitted], patch: Patch, asked: Pushed, encoders: Mapping[str, Encoder]
 ) -> dict[str, np.ndarray]:
     """Return the contact to store with a result for the next warm start: rows (B, h), or nothing."""

@@ -179,7 +179,7 @@ class Remainder:
 
 
 def add_pressing(X: np.ndarray) -> np.ndarray:
-    """Append force over radius to `compute_tool_features` (n, 8): (n, 9)."""
+    """Append force / radius to the features (n, 8) of `compute_tool_features`: (n, 9)."""
     return np.column_stack([X, X[:, 6] / X[:, 7]])
 
 

@@ -177,7 +177,7 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
+class TrainingResult:
     """Model of one type, its score on held-out discs, and the empirical coverage of its bounds there."""
 
     model: Learned
@@ -196,7 +196,7 @@ def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, lef
 
 def _train_and_score(
     name: str, data: Dataset, answers: TrainingSolutions, split: DiscSplit, apart: np.ndarray, fits: Sequence[Fit]
-) -> Result:
+) -> TrainingResult:
     """Fit one model type outside the discs and score it inside, then fit it to all loads not used for calibration."""
     outside, patch = fits[0], answers.patch
     parts, force = outside.fit_parts(name, patch)
@@ -238,7 +238,7 @@ def _train_and_score(
     if apart.sum() >= MIN_CALIBRATION_LOADS:
         with time_stage("calibrate"):
             model = _add_bounds(model, answers.compute_errors(model, apart), growth, far)
-    return Result(model, scored, of_tumour, of_tip, forces)
+    return TrainingResult(model, scored, of_tumour, of_tip, forces)
 
 
 def _fit_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: Fit) -> Learned:

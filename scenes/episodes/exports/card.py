@@ -60,7 +60,7 @@ def write_card(
     Raises
     ------
     InputError
-        A folder without episodes, an episode that is damaged, or a file of such a name that no card is, unless `force`.
+        A folder without episodes, a damaged episode, or a file of such a name that is not a card (unless `force`).
     """
     for name in NAMES:
         if not force and (folder / name).exists() and not is_card(folder / name):

@@ -184,7 +184,7 @@ class ToolContactTerm:
         return np.unique(self._triangles)
 
     def select_nodes(self, most: int) -> np.ndarray:
-        """Return nodes as `Local.select_nodes`."""
+        """Select the touchable nodes and those nearest to them; see `Local.select_nodes`."""
         own = self.touchable
         far, _ = KDTree(self._nodes[own]).query(self._nodes)
         far[own] = -1.0
@@ -259,7 +259,7 @@ class ToolContactTerm:
         return out
 
     def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
-        """Return the structs as `DenseTerm.build_stage`."""
+        """Build the arguments of the kernels; see `DenseTerm.build_stage`."""
         if self._pose is None:
             raise ValueError("no tool is there")
         out, near, name = ContactStage(), NearPairs(), self._device.name

@@ -79,7 +79,7 @@ def distance_to_core(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDis
 
 @wp.func
 def clear(room: wp.float64, pace: wp.float64, most: int) -> int:
-    """Return the offset, 1 to `most`, of the next point that may touch if `room` shrinks by `pace` per point."""
+    """Return the offset, 1 to `most`, of the next point that may touch if `room` [m] shrinks by `pace` per point."""
     out = wp.int32(1)
     if room > pace:
         out = wp.int32(wp.min(room / pace, wp.float64(most)))
