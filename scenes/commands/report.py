@@ -122,7 +122,8 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
             for row in measure_rows(study, specs):
                 found.append(row)
                 bar.update()
-        sections.append(Section(study.data.stem, _describe_study(study), tuple(found)))
+        body = study.anatomy.digest, str(study.tissue)
+        sections.append(Section(study.data.stem, _describe_study(study), tuple(found), *body))
         write_report(args.out, describe_machine(device), sections)
     return sections
 

@@ -54,11 +54,13 @@ NOTES = (  # Paragraphs below the tables.
 
 @dataclass(frozen=True)
 class Section:
-    """The rows of one data set, and sentences about data and reference."""
+    """The rows of one data set, sentences about data and reference, digest of the anatomy, and tissue."""
 
     name: str
     about: tuple[str, ...]
     rows: tuple[ReportRow, ...]
+    anatomy: str = ""
+    tissue: str = ""
 
 
 def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> None:
