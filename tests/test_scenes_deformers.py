@@ -17,8 +17,10 @@ from scenes.script.shipped_files import get_template_path
 from scenes.script.tool_paths import Touch
 from sim.bodies.intensity import to_intensity_path
 from sim.bodies.meshfile import write_anatomy
+from sim.effects import Elasticity, Gravity, Held, ToolForce
 from sim.errors import InputError
 from sim.families.registry import FAMILIES
+from sim.material import Material
 from surrogate.model.store import save
 
 
@@ -115,13 +117,12 @@ def write_report(path, digest, **change):
         "rows": [ROW | change, {**ROW, "name": "FEM"}],
     }
     path.write_text(json.dumps({"machine": "a card, 16 cores", "sections": [part]}))
-    return path
 
 
 def test_recorded_family_is_timed_and_chosen_by_its_error(theatre, tmp_path):
-    path, scene, said = tmp_path / "box.report.json", short(), []
+    scene, said = short(), []
     put(theatre, tmp_path / "box.vtu")
-    write_report(path, theatre.anatomy.digest)
+    write_report(tmp_path / "box.report.json", theatre.anatomy.digest)
     here = open_theatre(tmp_path / "box.vtu", device="cpu")
     offer = choose_within(here, scene, (1e-3, None), said.append).offer
     assert offer.name == "condensed" and offer.median_ms > ROW["median"] and "64 recorded pushes" in str(offer)
@@ -134,17 +135,17 @@ def test_recorded_family_is_timed_and_chosen_by_its_error(theatre, tmp_path):
         choose_within(here, scene, (1e-3, 1e-3), said.append)
 
 
-@pytest.mark.parametrize("name", ["sag", "press"])
-def test_families_without_figures_are_not_offered(theatre, tmp_path, name):
-    here = replace(theatre, models={}, family_figures=read_family_figures(tmp_path / "none", theatre.anatomy.digest))
-    figures = read_family_figures(write_report(tmp_path / "other", "other"), theatre.anatomy.digest)
-    assert here.family_figures == figures == {}
-    said, scene = [], replace(find_scene(name), observation_model=None)
-    if name == "sag":
-        path = write_report(tmp_path / "own", theatre.anatomy.digest)
-        here = replace(here, family_figures=read_family_figures(path, theatre.anatomy.digest))
-    assert choose_within(here, scene, (1.0, None), said.append).offer.name == "fem"
-    assert ("under a tool's force" if name == "sag" else "`sulcus report --quick --anatomy") in said[0]
+def test_families_without_figures_of_the_scene_are_not_offered(theatre, tmp_path):
+    write_report(tmp_path / "box.report.json", theatre.anatomy.digest)
+    assert read_family_figures(tmp_path / "box.vtu", "another") == read_family_figures(tmp_path / "no.vtu", "") == {}
+    figures = read_family_figures(tmp_path / "box.vtu", theatre.anatomy.digest)
+    here, said = replace(theatre, models={}, family_figures=figures), []
+    for scene in (
+        replace(short(), effects=(*short().effects, Gravity())),
+        replace(short(), effects=(Elasticity(Material("neo-hookean", 900.0, 0.49)), Held(), ToolForce())),
+    ):
+        assert choose_within(here, scene, (1.0, None), said.append).offer.name == "fem"
+    assert len(said) == 2 and all("`sulcus report --anatomy MESH.vtu`" in words for words in said)
 
 
 BROKEN = (
@@ -155,9 +156,9 @@ BROKEN = (
 
 @pytest.mark.parametrize("change", BROKEN)
 def test_a_broken_report_is_rejected_in_one_sentence(tmp_path, change):
-    path = write_report(tmp_path / "box.report.json", "1", **change)
+    write_report(tmp_path / "box.report.json", "1", **change)
     with pytest.raises(InputError, match=r"box.report.json: cannot be read as a report: .*Delete it\. `sulcus report"):
-        read_family_figures(path, "1")
+        read_family_figures(tmp_path / "box.vtu", "1")
 
 
 def test_template_report_has_the_recorded_figures_of_families(template):

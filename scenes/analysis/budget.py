@@ -35,9 +35,7 @@ def choose_within(
     """
     stage, recorded, offers = theatre.build_stage(scene), theatre.select_recorded(scene), []
     if not recorded:
-        known = f"their errors are known under a tool's force in other tissue or scenes than {scene.name}"
-        none = f"nothing is recorded of them on this anatomy. {REMEDY}"
-        report(f"no other families of models to choose from: {known if theatre.family_figures else none}")
+        report(f"families of models are not offered: no figures for {scene.name} on this anatomy. {REMEDY}")
 
     def offer(name: str, error_mm: float | None, of: str) -> None:
         player = theatre.build_player_of(stage, theatre.build_deformer(name, scene), name)

@@ -43,7 +43,6 @@ from ..script.uncertainty import (
     to_uncertainty_path,
 )
 from .effect_record import SUFFIX, EffectRecord, read_effect_records
-from .family_record import SUFFIX as REPORT_SUFFIX
 from .family_record import FamilyFigures, read_family_figures
 from .observer import Observer
 from .player import Player
@@ -377,8 +376,5 @@ def open_theatre(
     intensity = read_intensity(scan) if scan.is_file() else None
     uncertainties = read_uncertainties(to_uncertainty_path(path))
     records = read_effect_records(path.with_suffix(SUFFIX))
-    figures = read_family_figures(path.with_suffix(REPORT_SUFFIX), body.digest)
-    return PatientSetup(
-        body, intensity, models, device, to_locator_path(path), uncertainties,
-        effect_records=records, family_figures=figures,
-    )  # fmt: skip
+    setup = PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties, effect_records=records)
+    return replace(setup, family_figures=read_family_figures(path, body.digest))

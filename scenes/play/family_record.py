@@ -1,6 +1,5 @@
 """Figures of families of models on an anatomy: a report of `sulcus report`, stored next to it."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,14 +9,12 @@ from ar.overlay.hud import bound_words
 from sim.families.registry import FAMILIES
 from sim.runtime.outside_files import read_as
 
-SUFFIX = ".report.json"  # Ending of the file, next to the anatomy.
 # Sentence that says how the file is made.
-REMEDY = "`sulcus report --quick --anatomy MESH.vtu` measures them: copy report/report.json to MESH.report.json."
+REMEDY = "`sulcus report --anatomy MESH.vtu` measures them under forces: copy its report.json to MESH.report.json."
 Figure = Annotated[float, msgspec.Meta(ge=0.0, lt=1e7)]  # Number in a report [mm, ms, s].
 
 
-@dataclass(frozen=True)
-class FamilyFigures:
+class FamilyFigures(msgspec.Struct, array_like=True, frozen=True):
     """Figures of a family over a number of palpation loads on `tissue` that is fixed to bone, timed on `machine`.
 
     `p95_mm`: 95th percentile of the maximum error at the tumour relative to quadratic FEM (p2). `preparation_s`: time
@@ -37,26 +34,22 @@ class FamilyFigures:
         return f"model <= {bound}" if brief else f"model error <= {bound} (95 % of {self.loads} pushes, relative to p2)"
 
 
-def read_family_figures(path: Path, digest: str) -> dict[str, FamilyFigures]:
-    """Read the figures of families on the anatomy with this digest; none without a file or such an anatomy in it.
+def read_family_figures(mesh: Path, digest: str) -> dict[str, FamilyFigures]:
+    """Read the figures of families in MESH.report.json, of the anatomy with this digest; none without such a file.
 
     Raises
     ------
     InputError
         A file that cannot be read as such.
     """
-    if not path.is_file():
+    if not (path := mesh.with_suffix(".report.json")).is_file():
         return {}
     with read_as(path, "a report", f"Delete it. {REMEDY}"):
         report = msgspec.json.decode(path.read_bytes())
-        found = {
-            row["name"]: {
-                **dict(tissue=part["tissue"], machine=report["machine"], median_ms=row["median"]),
-                **dict(preparation_s=row["set_up"], p95_mm=row["reference"]["worst"]["p95"]),
-                "loads": row["reference"]["loads"],
-            }
-            for part in report["sections"]
-            for row in part["rows"]
-            if part["anatomy"] == digest and row["name"] in FAMILIES and row["reference"]
-        }
+        found = {}
+        for part in report["sections"]:
+            for row in part["rows"] if part["anatomy"] == digest else ():
+                if row["name"] in FAMILIES and row["reference"]:
+                    errors = row["reference"]["loads"], row["reference"]["worst"]["p95"]
+                    found[row["name"]] = part["tissue"], report["machine"], *errors, row["median"], row["set_up"]
         return msgspec.convert(found, dict[str, FamilyFigures])
