@@ -2,19 +2,25 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from theatres import PUSHING, player, put, short
 
+from scenes.analysis.budget import choose_within
 from scenes.cli import main
 from scenes.play.deformers import open_theatre, to_model_path
+from scenes.play.family_record import read_family_figures
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import get_template_path
 from scenes.script.tool_paths import Touch
 from sim.bodies.intensity import to_intensity_path
 from sim.bodies.meshfile import write_anatomy
+from sim.effects import Elasticity, Gravity, Held, ToolForce
 from sim.errors import InputError
+from sim.families.registry import FAMILIES
+from sim.material import Material
 from surrogate.model.store import save
 
 
@@ -98,3 +104,67 @@ def test_a_scene_is_played_by_a_family_that_it_names(theatre):
         theatre.build_deformer("condensed", find_scene("sag"))
     with pytest.raises(InputError, match=r"no deformer is called 'rocks'.*Other families: kelvinlets"):
         theatre.build_deformer("rocks", scene)
+
+
+ROW = {"name": "condensed", "median": 1e-3, "set_up": 1.0, "reference": {"loads": 64, "worst": {"p95": 1e-3}}}
+
+
+def write_report(path, digest, **change):
+    """Write a report of a family that is more accurate than any model, and faster than it can be."""
+    part = {
+        "anatomy": digest,
+        "tissue": "neo-hookean, E 3 kPa, nu 0.49",
+        "rows": [ROW | change, {**ROW, "name": "FEM"}],
+    }
+    path.write_text(json.dumps({"machine": "a card, 16 cores", "sections": [part]}))
+
+
+def test_recorded_family_is_timed_and_chosen_by_its_error(theatre, tmp_path):
+    scene, said = short(), []
+    put(theatre, tmp_path / "box.vtu")
+    write_report(tmp_path / "box.report.json", theatre.anatomy.digest)
+    here = open_theatre(tmp_path / "box.vtu", device="cpu")
+    offer = choose_within(here, scene, (1e-3, None), said.append).offer
+    assert offer.name == "condensed" and offer.median_ms > ROW["median"] and "64 recorded pushes" in str(offer)
+    assert len(said) == 1 and "0.001 ms" in said[0] and "time of a card" in said[0]
+    frame = here.build_player("condensed", scene).draw(0, 0.0, Touch(force=0.2))
+    assert " ".join(frame.head).startswith("model <= 0.01 mm")
+    assert here.family_figures["condensed"].describe_error(brief=False).endswith("(95 % of 64 pushes, relative to p2)")
+    assert len(here.families) == 1  # built once
+    with pytest.raises(InputError, match=r"no deformer here is within 0\.001 mm and 0\.001 ms: .* condensed"):
+        choose_within(here, scene, (1e-3, 1e-3), said.append)
+
+
+def test_families_without_figures_of_the_scene_are_not_offered(theatre, tmp_path):
+    write_report(tmp_path / "box.report.json", theatre.anatomy.digest)
+    assert read_family_figures(tmp_path / "box.vtu", "another") == read_family_figures(tmp_path / "no.vtu", "") == {}
+    figures = read_family_figures(tmp_path / "box.vtu", theatre.anatomy.digest)
+    here, said = replace(theatre, models={}, family_figures=figures), []
+    for scene in (
+        replace(short(), effects=(*short().effects, Gravity())),
+        replace(short(), effects=(Elasticity(Material("neo-hookean", 900.0, 0.49)), Held(), ToolForce())),
+    ):
+        assert choose_within(here, scene, (1.0, None), said.append).offer.name == "fem"
+    assert len(said) == 2 and all("`sulcus report --anatomy MESH.vtu`" in words for words in said)
+
+
+BROKEN = (
+    {"median": float("nan")}, {"median": 1e300}, {"median": -1.0}, {"set_up": "1"}, {"median": True}, {"set_up": None},
+    {"reference": {"loads": 64}}, {"reference": {"loads": 0.5, "worst": {"p95": 1.0}}}, {"reference": 5}, {"name": []},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("change", BROKEN)
+def test_a_broken_report_is_rejected_in_one_sentence(tmp_path, change):
+    write_report(tmp_path / "box.report.json", "1", **change)
+    with pytest.raises(InputError, match=r"box.report.json: cannot be read as a report: .*Delete it\. `sulcus report"):
+        read_family_figures(tmp_path / "box.vtu", "1")
+
+
+def test_template_report_has_the_recorded_figures_of_families(template):
+    figures = open_theatre(device="cpu").select_recorded(find_scene("press"))
+    recorded = json.loads((Path(__file__).parents[1] / "benchmarks/records/families.json").read_text())["figures"]
+    assert list(figures) == list(FAMILIES)
+    for name, one in figures.items():
+        assert (one.median_ms, one.preparation_s) == (recorded[name]["time [ms]"], recorded[name]["preparation [s]"])
+        assert one.p95_mm > recorded[name]["error [mm]"]

@@ -81,8 +81,8 @@ def test_a_record_is_written_and_read(theatre, tmp_path):
 
 PAIRS = [1.0], [240, None], [[1, 2], [3, 4]], [True, False], [1e300, 1], [1, float("nan")], ["1", "2"]
 BAD = (
-    *(({"effects": {"ToolForce": pair}}, "not finite") for pair in PAIRS), ({"effects": [[1, 2]]}, "damaged"),
-    *(({"frames": frames}, "frames must be") for frames in (None, 0, 2.5, True)), ({"unphysical": -1}, "unphysical"),
+    *(({"effects": {"ToolForce": pair}}, "damaged|of two") for pair in PAIRS), ({"effects": [[1, 2]]}, "damaged"),
+    *(({"frames": frames}, "damaged") for frames in (None, 0, 2.5, True)), ({"unphysical": -1}, "damaged"),
     ({"mark": 5}, "damaged"), ({"machine": None}, "damaged"), ({"machine": "\ud800"}, "UTF-8|damaged"),
     ({"refused": {"Gravity": 1}}, "damaged"), ({"effects": {ALL: 5}}, "damaged"),
 )  # fmt: skip

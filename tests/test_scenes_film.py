@@ -75,6 +75,7 @@ def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):
         (["--noise", "-1"], "not below 0"),
         (["--trouble", "gap:0-9"], "no image would be recorded"),
         (["--trouble", "tool:30-40"], "tool:30-40 contains no image of this video"),
+        (["--within-time", "5", "--force"], "leaves a budget nothing to choose"),
     ]:
         assert main([*words, *few, *more]) == 2
         assert why in capsys.readouterr().err

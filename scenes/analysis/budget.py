@@ -1,13 +1,18 @@
-"""Reported error and measured frame time of each deformation model: the choices of a budget."""
+"""Choice of a deformation model by its reported error and its measured time for a frame."""
+
+from collections.abc import Callable
 
 import numpy as np
 
 from sim.deformation import Deformer
-from surrogate.evaluation.choose import Offer
+from sim.errors import InputError
+from surrogate.evaluation.choose import ModelChoice, Offer, choose
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 
 from ..play.deformers import PatientSetup
+from ..play.family_record import REMEDY
+from ..play.player import Player
 from ..script.scene import Scene
 from .measurement import time_work
 
@@ -15,23 +20,53 @@ TIMED_FRAMES = 24  # Number of frames that are timed, after one that is not.
 MAX_LIVE_ERROR = 5e-5  # Largest distance of a node from the converged solution at the accuracy LIVE [m].
 
 
-def time_offers(theatre: PatientSetup, scene: Scene) -> list[Offer]:
-    """Time each deformer that reports an error, on frames of the scene in playing order."""
-    made = []
-    times = scene.times[np.linspace(0, len(scene.times) - 1, TIMED_FRAMES + 1).astype(int)]
-    loads = [scene.build_loads(theatre.site, scene.path(float(time)), float(time)) for time in times]
+def choose_within(
+    theatre: PatientSetup, scene: Scene, budget: tuple[float | None, float | None], report: Callable[[str], object]
+) -> ModelChoice:
+    """Choose among the deformers of a scene, timed on its frames, and the families with figures of such loads.
+
+    Families are timed when they are chosen by their recorded time, and the choice is made again. `budget`: largest
+    error [mm] and time [ms]; `report` receives sentences for the user.
+
+    Raises
+    ------
+    InputError
+        See `choose` and `build_stage`.
+    """
+    stage, recorded, offers = theatre.build_stage(scene), theatre.select_recorded(scene), []
+    if not recorded:
+        report(f"families of models are not offered: no figures for {scene.name} on this anatomy. {REMEDY}")
+
+    def offer(name: str, error_mm: float | None, of: str) -> None:
+        player = theatre.build_player_of(stage, theatre.build_deformer(name, scene), name)
+        error_mm = 1e3 * _get_reported_error(player.deformer) if error_mm is None else error_mm
+        if not np.isnan(error_mm):
+            offers.append(Offer(name, error_mm, _time_frames(player), of))
+
     for name in theatre.list_deformers(scene):
-        deformer = theatre.build_deformer(name, scene)
-        forgets = isinstance(deformer, Learned) and not deformer.series
-        seconds, last = [], None
-        error_mm = 1e3 * _get_reported_error(deformer)
-        if np.isnan(error_mm):
-            continue
-        for load in loads:
-            last, spent = time_work(deformer.deform, load, start=None if forgets else last)
-            seconds.append(spent)
-        made.append(Offer(name, error_mm, 1e3 * float(np.median(seconds[1:]))))
-    return made
+        offer(name, None, f"; error relative to {'converged ' * (name == 'fem')}FEM")
+    of = {name: f"; error relative to p2 in 95 % of {one.loads} recorded pushes" for name, one in recorded.items()}
+    waiting = {
+        name: Offer(name, one.p95_mm, one.median_ms, f"{of[name]}; time of {one.machine.partition(',')[0]}")
+        for name, one in recorded.items()
+    }
+    while (choice := choose([*offers, *waiting.values()], *budget)).offer.name in waiting:
+        name = choice.offer.name
+        report(f"timing {waiting.pop(name)}, where its preparation took {recorded[name].preparation_s:.2g} s")
+        try:
+            offer(name, recorded[name].p95_mm, of[name])
+        except InputError as error:
+            report(f"{name} cannot be chosen: {error}")
+    return choice
+
+
+def _time_frames(player: Player) -> float:
+    """Return the median time of a deformation [ms], on frames that are spread over the scene."""
+    seconds, last = [], None
+    for number in np.linspace(0, len(player.scene.times) - 1, TIMED_FRAMES + 1).astype(int).tolist():
+        last, spent = time_work(player.compute_deformation, player.build_loads(number), last)
+        seconds.append(spent)
+    return 1e3 * float(np.median(seconds[1:]))
 
 
 def _get_reported_error(deformer: Deformer) -> float:

@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
             f"skull{_describe_bond(figures.bond)}{_summarise_estimates(figures)}",
             file=table,
         )
-        for sentence in format_errors(promised, error, name != "fem"):
+        for sentence in format_errors(promised, error, name != "fem", recorded=player.recorded):
             print(f"{'':11s} {sentence}", file=table)
         for sentence in (*broken, *against):
             print(f"{'':11s} {sentence}", file=table)

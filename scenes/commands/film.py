@@ -19,7 +19,7 @@ from sim.runtime.atomic_files import REMEDY, explain_error
 from ..options.camera_options import add_camera, add_targets
 from ..options.outputs import add_force, check_output_folder, check_output_frames, check_output_path
 from ..options.shared_options import add_json, add_seed, to_json_line
-from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre
+from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 
 if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     assert calibration is not None
     folder = check_output_folder(args.out, "video and its ground truth")
     paths = {name: check_output_path(folder / name, Path(name).suffix, args.force) for name in WRITTEN_FILES}
-    player = theatre.build_player(args.deformer or "fem", scene)
+    player = theatre.build_player(choose_deformer(args, theatre, scene, "fem"), scene)
     mounts = mount_targets(player)
     shots: list[VideoFrame] = []
     film = _write_film(args, render_shots(player, mounts, taking, args.every), shots, player)

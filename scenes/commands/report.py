@@ -134,9 +134,10 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
             for row in measure_rows(study, specs):
                 found.append(row)
                 bar.update()
-        effects = read_effect_records(get_template_path().with_suffix(SUFFIX)) if study.of_template else {}
+        effects = read_effect_records(get_template_path().with_suffix(SUFFIX)) if study.is_shipped else {}
         about = (*_describe_study(study), describe_reference_error(study.fine, found))
-        sections.append(Section(study.data.stem, about, tuple(found), tuple(effects.values())))
+        body = study.anatomy.digest, str(study.tissue)
+        sections.append(Section(study.data.stem, about, tuple(found), *body, tuple(effects.values())))
         write_report(args.out, describe_machine(device), sections)
     return sections
 

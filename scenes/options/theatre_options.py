@@ -53,7 +53,7 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
         "--guard", type=float, metavar="MM",
         help="bound (95 %%) of the tumour's surface error above which guarded uses FEM [mm] (default: 0.2)",
     )  # fmt: skip
-    budget = parser.add_argument_group("budget, instead of --deformer; errors as reported by the models")
+    budget = parser.add_argument_group("budget, instead of --deformer; errors as reported by models, or recorded")
     budget.add_argument(
         "--within-error", type=float, metavar="MM",
         help="use the fastest deformation model whose reported error is at most this [mm]",
@@ -133,8 +133,10 @@ def list_playable(args: argparse.Namespace, theatre: PatientSetup, scenes: Seque
     return [scene for scene in scenes if scene not in left]
 
 
-def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scene) -> str:
+def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scene, default: str | None = None) -> str:
     """Return the requested deformation model; one that a budget selected is reported, with the reason.
+
+    `default`: the one without any request; None: that of the scene.
 
     Raises
     ------
@@ -143,7 +145,10 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
     """
     budget = args.within_error, args.within_time
     if args.deformer != "auto" and budget == (None, None):
-        if args.deformer is None and not theatre.select_models(scene):
+        if asked := args.deformer or default:
+            return asked
+        usual, best = theatre.select_default(scene), theatre.select_best(scene)
+        if usual == "fem":
             from ..play.deformers import TRUTH_TEXT
 
             none = (
@@ -153,20 +158,17 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
             )
             reason = next(iter(theatre.list_rejections(scene).values()), none)
             print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {reason}", file=sys.stderr)
-        default, best = theatre.select_default(scene), theatre.select_best(scene)
-        if args.deformer is None and best in theatre.models and default != scene.deformer:
+        if best in theatre.models and usual != scene.deformer:
             from surrogate.model.guarded import describe_error, get_reported_errors
 
             model = theatre.models[best]
             if get_reported_errors(model).weak:
                 print(f"{args.program}: on held-out cortex, {best}: {describe_error(model)}", file=sys.stderr)
-        return args.deformer or default
+        return usual
     if args.deformer not in (None, "auto"):
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
-    from surrogate.evaluation.choose import choose
+    from ..analysis.budget import choose_within
 
-    from ..analysis.budget import time_offers
-
-    choice = choose(time_offers(theatre, scene), *budget)
+    choice = choose_within(theatre, scene, budget, lambda words: print(f"{args.program}: {words}", file=sys.stderr))
     print(f"{args.program}: {choice.reason}", file=sys.stderr)
     return choice.offer.name

@@ -76,7 +76,7 @@ class SceneSolvers:
                 deformer = fem_player.deformer
             else:
                 deformer = self._build_trained(name, stage.scene)
-            self.players[name, disabled] = self.theatre.build_player_of(stage, deformer)
+            self.players[name, disabled] = self.theatre.build_player_of(stage, deformer, name)
         return self.players[name, disabled]
 
     def get_player_with_camera(self, name: str, disabled: frozenset[str], look: Look) -> Player:

@@ -13,7 +13,7 @@ from sim.bodies.intensity import Intensity, read_intensity, to_intensity_path
 from sim.bodies.meshfile import read_anatomy
 from sim.deformation import Deformation, Deformer, guess
 from sim.discretisation.space import recommend_element
-from sim.effects import Elasticity
+from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.families.registry import FAMILIES, build_family
 from sim.fem import Fem, describe_solver
@@ -43,6 +43,7 @@ from ..script.uncertainty import (
     to_uncertainty_path,
 )
 from .effect_record import SUFFIX, EffectRecord, read_effect_records
+from .family_record import FamilyFigures, read_family_figures
 from .observer import Observer
 from .player import Player
 from .stage import Stage
@@ -59,7 +60,7 @@ class PatientSetup:
     """Anatomy, its T1 scan if there is one, models by name, uncertainties and costs of effects by scene.
 
     `locator_file` is the locator of its tumour, for scenes with an observation model. `limit` [m] is that of a guarded
-    model; None: the limit derived from its own errors on held-out cortex.
+    model; None: the limit derived from its own errors on held-out cortex. `families`: those that were built.
     """
 
     anatomy: Anatomy
@@ -70,6 +71,8 @@ class PatientSetup:
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict)
     limit: float | None = None
     effect_records: Mapping[str, EffectRecord] = field(default_factory=dict)
+    family_figures: Mapping[str, FamilyFigures] = field(default_factory=dict)
+    families: dict[str, Deformer] = field(default_factory=dict)
 
     @cached_property
     def site(self) -> CraniotomyFrame:
@@ -217,7 +220,10 @@ class PatientSetup:
         if name == "fem":
             return self.build_fem(scene, scene.accuracy, live=True)
         if name in FAMILIES:
-            return build_family(name, self.anatomy, scene.get_effects_on(self.anatomy), self.device, scene.accuracy)
+            wanted = scene.get_effects_on(self.anatomy), find_device(self.device, LIVE.precision).name, scene.accuracy
+            if (key := repr((name, *wanted))) not in self.families:
+                self.families[key] = build_family(name, self.anatomy, *wanted)
+            return self.families[key]
         allowed = ", ".join(self.list_deformers(scene))
         if name == GUARDED and self.select_models(scene) and not self._can_guard(scene):
             raise InputError(
@@ -250,12 +256,13 @@ class PatientSetup:
         InputError
             See `deformer`; an anatomy without open cortex.
         """
-        return self.build_player_of(self.build_stage(scene), self.build_deformer(name, scene))
+        return self.build_player_of(self.build_stage(scene), self.build_deformer(name, scene), name)
 
-    def build_player_of(self, stage: Stage, deformer: Deformer) -> Player:
-        """Return a player of a stage with its errors on this anatomy."""
+    def build_player_of(self, stage: Stage, deformer: Deformer, name: str) -> Player:
+        """Return a player of a stage and a deformer of that name, with its errors on this anatomy."""
         ensemble, motion_error = self.estimate_uncertainty(stage.scene), self.estimate_motion_error(stage.scene)
-        return Player(stage, deformer, uncertainty=ensemble, motion_error=motion_error)
+        recorded = self.select_recorded(stage.scene).get(name)
+        return Player(stage, deformer, uncertainty=ensemble, motion_error=motion_error, recorded=recorded)
 
     def estimate_uncertainty(self, scene: Scene) -> Uncertainty | None:
         """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""
@@ -266,6 +273,12 @@ class PatientSetup:
         """Return the recorded costs of a scene's effects; None without a record of exactly this scene and anatomy."""
         found = self.effect_records.get(scene.name)
         return found if found and found.mark == self.compute_mark(scene) else None
+
+    def select_recorded(self, scene: Scene) -> dict[str, FamilyFigures]:
+        """Select the families with figures that hold in a scene: of a tool's force on this tissue, fixed to bone."""
+        kinds = {type(effect): str(effect) for effect in scene.get_effects_on(self.anatomy)}
+        pushed = {*kinds, Bonded} == {Elasticity, Held, Bonded, ToolForce}
+        return {name: one for name, one in self.family_figures.items() if pushed and one.tissue == kinds[Elasticity]}
 
     def compute_mark(self, scene: Scene) -> str:
         """Compute the fingerprint of a scene on this anatomy."""
@@ -358,4 +371,5 @@ def open_theatre(
     intensity = read_intensity(scan) if scan.is_file() else None
     uncertainties = read_uncertainties(to_uncertainty_path(path))
     records = read_effect_records(path.with_suffix(SUFFIX))
-    return PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties, effect_records=records)
+    setup = PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties, effect_records=records)
+    return replace(setup, family_figures=read_family_figures(path, body.digest))

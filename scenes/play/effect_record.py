@@ -4,7 +4,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+import msgspec
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
@@ -12,7 +14,7 @@ from sim.runtime.outside_files import parse_json, read_as
 
 FORMAT = "sulcus effects 1"  # Name and version of the file format.
 SUFFIX = ".effects.json"  # Ending of the file, next to the anatomy.
-MAX_FIGURE = 1e7  # Upper bound on the size of every number in a file [ms, mm, frames].
+Figure = Annotated[float, msgspec.Meta(gt=-1e7, lt=1e7)]  # Number in a file [ms, mm].
 REMEDY = "Delete it, and measure again by `sulcus effects --out`."  # Remedy for a file that cannot be read.
 
 
@@ -30,9 +32,9 @@ class EffectRecord:
     mark: str
     day: str
     machine: str
-    frames: int
-    effects: Mapping[str, tuple[float | None, float | None]]
-    unphysical: int = 0
+    frames: Annotated[int, msgspec.Meta(ge=1, lt=10**7)]
+    effects: Mapping[str, tuple[Figure | None, Figure | None]]
+    unphysical: Annotated[int, msgspec.Meta(ge=0, lt=10**7)] = 0
     refused: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -53,25 +55,12 @@ def read_effect_records(path: Path) -> dict[str, EffectRecord]:
     if not path.is_file():
         return {}
     with read_as(path, "costs of effects", REMEDY):
-        return {row.scene: row for row in map(_read_row, parse_json(path, FORMAT, REMEDY)["scenes"])}
-
-
-def _read_row(row: dict[str, Any]) -> EffectRecord:
-    scene, mark, day, machine = (row[key] for key in ("scene", "mark", "day", "machine"))
-    frames, unphysical, refused = row["frames"], row.get("unphysical", 0), dict(row.get("refused", {}))
-    "".join((scene, mark, day, machine, *refused, *refused.values())).encode()  # fails for a value that is not text
-    if any(type(count) is not int for count in (frames, unphysical)) or not 1 <= frames < MAX_FIGURE > unphysical >= 0:
-        raise InputError(f"frames must be an integer >= 1, unphysical an integer >= 0. {REMEDY}")
-    effects = {name: _read_pair(pair) for name, pair in row["effects"].items()}
-    return EffectRecord(scene, mark, day, machine, frames, effects, unphysical, refused)
-
-
-def _read_pair(pair: Any) -> tuple[float | None, float | None]:
-    if pair == [None, None]:
-        return None, None
-    if len(pair) != 2 or not all(type(one) in (int, float) and abs(one) < MAX_FIGURE for one in pair):
-        raise InputError(f"a figure is not finite: an effect has two below {MAX_FIGURE:g}, or two nulls. {REMEDY}")
-    return float(pair[0]), float(pair[1])
+        parse_json(path, FORMAT, REMEDY)
+        stored = msgspec.json.decode(path.read_text(encoding="utf-8-sig"))  # unlike `json`, rejects NaN
+        rows = msgspec.convert(stored["scenes"], list[EffectRecord])
+        if any((cost is None) != (motion is None) for row in rows for cost, motion in row.effects.values()):
+            raise InputError(f"an effect has one figure of two. {REMEDY}")
+        return {row.scene: row for row in rows}
 
 
 def write_effect_record(path: Path, found: EffectRecord) -> None:

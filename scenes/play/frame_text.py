@@ -13,6 +13,7 @@ from sim.families.registry import FAMILIES
 from sim.loads import Cause, Loads, Posture, Pushed, Resected, Retracted, Touching
 
 from ..script.uncertainty import REGISTRATION, TumourError
+from .family_record import FamilyFigures
 
 # Parts of the head in the positive and negative direction of each RAS axis.
 SIDES = (("right", "left"), ("front", "back"), ("crown", "feet"))
@@ -88,8 +89,9 @@ NOT_KNOWN_WORDS = "tumour position error: not known"
 
 
 def format_errors(
-    promised: float | None, error: TumourError, trained: bool, doubt: str = "", brief: bool = False
-) -> list[str]:
+    promised: float | None, error: TumourError, trained: bool, doubt: str = "", brief: bool = False,
+    recorded: FamilyFigures | None = None,
+) -> list[str]:  # fmt: skip
     """Build the lines for an image: error of the model, and error of the tumour position.
 
     Only the latter for an unreliable solution, and for an estimate from observations.
@@ -102,9 +104,12 @@ def format_errors(
         True if another model than FEM computed the deformation.
     brief
         True for the short form, for a small image.
+    recorded
+        Recorded figures of another family than FEM, which replace the bound.
     """
     modelled = error.observed is None and not doubt
-    return [*([format_model_error(promised, trained, brief)] if modelled else []), format_tumour_error(error, brief)]
+    model = recorded.describe_error(brief) if recorded else format_model_error(promised, trained, brief)
+    return [*([model] if modelled else []), format_tumour_error(error, brief)]
 
 
 def is_of_other_family(deformation: Deformation) -> bool:

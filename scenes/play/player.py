@@ -33,6 +33,7 @@ from ..script.tool import Instrument, Probe
 from ..script.tool_paths import Touch, compute_lift
 from ..script.uncertainty import NOT_KNOWN, MotionError, TumourError, Uncertainty
 from .cortex_layers import COTTON, GLOVE
+from .family_record import FamilyFigures
 from .frame_text import annotate, describe_outcome, format_acting, format_errors, is_of_other_family
 from .observer import TumourEstimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, SIMULATED, TOOL, Stage
@@ -166,6 +167,7 @@ class Player:
     motion_error: MotionError | None = None
     composed: bool = True
     coarse: bool = False
+    recorded: FamilyFigures | None = None
 
     @property
     def scene(self) -> Scene:
@@ -238,21 +240,22 @@ class Player:
         gauge = None if held is None else self._measure_tip_gauge(held, loads, deformation, tumour)
         promised = None if doubt else self._get_model_error(deformation)
         motion = float(np.linalg.norm(tumour.vertices - rest.vertices, axis=1).mean())
-        error = NOT_KNOWN if doubt else self._compute_tumour_error(touch, loads, motion, promised or 0.0, estimate)
+        bound = promised or (1e-3 * self.recorded.p95_mm if self.recorded else 0.0)
+        error = NOT_KNOWN if doubt else self._compute_tumour_error(touch, loads, motion, bound, estimate)
         shown = None if gauge is None else replace(gauge, error=error.bound)
         traces = () if estimate is None else list_traces(estimate, stage.build_reference(positions))
-        moved = None if estimate is None or estimate.location is None else (estimate.moved, estimate.location.p95)
+        moved = (estimate.moved, estimate.location.p95) if estimate and estimate.location else (motion, None)
         if estimate is None and error.moved is not None and not is_undeformed(deformation):
             moved = motion, error.moved
         band = 0.0 if estimate is not None else error.bound or 0.0
         trained = find_first_model(self.deformer, deformation) is not None or is_of_other_family(deformation)
-        lines = format_errors(promised, error, trained, doubt, camera.width < NARROW_IMAGE_WIDTH)
+        lines = format_errors(promised, error, trained, doubt, camera.width < NARROW_IMAGE_WIDTH, self.recorded)
         head = format_head_lines(lines, picture.segmentation == TOOL)
         remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.words
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
             marks = Marks(band, shown, stage.smooth_tumour_at_rest, traces)
-            words = Words(doubt, head, get_legend_names(estimate), moved or (motion, None), error.bound)
+            words = Words(doubt, head, get_legend_names(estimate), moved, error.bound)
             outline, cover = stage.smooth_tumour(tumour), Cover(OCCLUDER_LABELS, OPENING)
             over = composite(picture, camera, outline, self.style, cover, marks, words)
             if estimate is not None and self.style != "none":
@@ -262,13 +265,11 @@ class Player:
             over = Overlaid(picture.colour, np.zeros((camera.height, camera.width), np.uint8))
         spent = seconds, seen - begun - located, clock.perf_counter() - seen
         took = dict(zip(STAGES, spent, strict=True)) | ({} if estimate is None else {"locate": located})
-        how_far, moved_error = (motion, None) if moved is None else moved
         return Frame(
             number=number, time=float(loads.times[0]), touch=touch, loads=loads, deformation=deformation, camera=camera,
-            pose=pose, tip=None if held is None else held.tip,
-            picture=picture, shown=over.colour, taken=over.taken, named=over.named,
+            pose=pose, tip=None if held is None else held.tip, picture=picture, shown=over.colour, taken=over.taken,
             distance=None if gauge is None else gauge.distance, distance_error=None if gauge is None else gauge.error,
-            inside=gauge is not None and gauge.inside, moved=how_far, moved_error=moved_error,
+            named=over.named, inside=gauge is not None and gauge.inside, moved=moved[0], moved_error=moved[1],
             model_error=promised, tumour_error=error, doubt=doubt,
             acts=format_acting(loads, deformation, self.site.anatomy.mesh.nodes), head=tuple(head), remark=remark,
             seconds=took, estimate=estimate,

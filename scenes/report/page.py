@@ -55,11 +55,13 @@ NOTES = (  # Paragraphs below the tables.
 
 @dataclass(frozen=True)
 class Section:
-    """The rows of one data set, sentences about data and reference, and measured effects of scenes on its body."""
+    """Rows of one data set, sentences about data and reference, digest of the anatomy, tissue, and scene effects."""
 
     name: str
     about: tuple[str, ...]
     rows: tuple[ReportRow, ...]
+    anatomy: str = ""
+    tissue: str = ""
     effects: tuple[EffectRecord, ...] = ()
 
 

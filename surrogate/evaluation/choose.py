@@ -8,14 +8,15 @@ from sim.errors import InputError
 
 @dataclass(frozen=True)
 class Offer:
-    """Name of a deformer, its reported error [mm], and the median time of one load [ms]."""
+    """Name of a deformer, its reported error [mm], the median time of one load [ms], and a remark on both."""
 
     name: str
     error_mm: float
     median_ms: float
+    remark: str = ""
 
     def __str__(self) -> str:
-        return f"{self.name} ({self.error_mm:.3g} mm, {self.median_ms:.3g} ms)"
+        return f"{self.name} ({self.error_mm:.3g} mm, {self.median_ms:.3g} ms{self.remark})"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,55 @@
+"""Figures of families of models on an anatomy: a report of `sulcus report`, stored next to it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from ar.overlay.hud import bound_words
+from sim.families.registry import FAMILIES
+from sim.runtime.outside_files import read_as
+
+# Sentence that says how the file is made.
+REMEDY = "`sulcus report --anatomy MESH.vtu` measures them under forces: copy its report.json to MESH.report.json."
+Figure = Annotated[float, msgspec.Meta(ge=0.0, lt=1e7)]  # Number in a report [mm, ms, s].
+
+
+class FamilyFigures(msgspec.Struct, array_like=True, frozen=True):
+    """Figures of a family over a number of palpation loads on `tissue` that is fixed to bone, timed on `machine`.
+
+    `p95_mm`: 95th percentile of the maximum error at the tumour relative to quadratic FEM (p2). `preparation_s`: time
+    before the first load.
+    """
+
+    tissue: str
+    machine: str
+    loads: Annotated[int, msgspec.Meta(ge=1, lt=10**7)]
+    p95_mm: Figure
+    median_ms: Figure
+    preparation_s: Figure
+
+    def describe_error(self, brief: bool) -> str:
+        """Describe the error for an image."""
+        bound = bound_words(1e-3 * self.p95_mm, 2)
+        return f"model <= {bound}" if brief else f"model error <= {bound} (95 % of {self.loads} pushes, relative to p2)"
+
+
+def read_family_figures(mesh: Path, digest: str) -> dict[str, FamilyFigures]:
+    """Read the figures of families in MESH.report.json, of the anatomy with this digest; none without such a file.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read as such.
+    """
+    if not (path := mesh.with_suffix(".report.json")).is_file():
+        return {}
+    with read_as(path, "a report", f"Delete it. {REMEDY}"):
+        report = msgspec.json.decode(path.read_bytes())
+        found = {}
+        for part in report["sections"]:
+            for row in part["rows"] if part["anatomy"] == digest else ():
+                if row["name"] in FAMILIES and row["reference"]:
+                    errors = row["reference"]["loads"], row["reference"]["worst"]["p95"]
+                    found[row["name"]] = part["tissue"], report["machine"], *errors, row["median"], row["set_up"]
+        return msgspec.convert(found, dict[str, FamilyFigures])
