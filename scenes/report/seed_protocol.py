@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads
 from surrogate.data.cortex_patch import find_nearest
+from surrogate.data.dataset import Dataset
 from surrogate.data.indentation import get_only_pushes
 from surrogate.data.simulate import simulate
 from surrogate.data.solution_rows import describe_tissue_source
@@ -32,10 +33,23 @@ from .study import ReportStudy
 
 SEED_COUNTS = (220, 22000)  # Numbers of loads of a quick and of a full run.
 MAX_TRAINING = 2000  # Largest number of training loads of a model.
+SCORED = 100  # Largest number of left-out loads on which `train` scores a model.
 WARM_UP, TIMED = 10, 100  # Numbers of predictions of a learner before the timed ones, and of these.
 PUBLISHED_LIMITS = {"published-ann": 0.3, "published-svr": 0.2}
 """Mean errors that the authors report their models to be below [mm]."""
 Predict = Callable[[Loads], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedRows(Dataset):
+    """Some rows of a data set, with displacements (n, k, 3) [m] of ascending vertices `nodes` (k,) in memory."""
+
+    nodes: np.ndarray
+    displacement: np.ndarray
+
+    def read_displacement(self, nodes: np.ndarray) -> np.ndarray:
+        """Return displacements (n, k, 3) [m] of vertices that are in memory."""
+        return self.displacement[:, np.searchsorted(self.nodes, nodes)]
 
 
 @dataclass(frozen=True)
@@ -58,6 +72,32 @@ class SeedStudy(ReportStudy):
     def position(self) -> np.ndarray:
         """Number (B,) of each load's position."""
         return find_nearest(self.pushed.point, self.positions)[0]
+
+    @cached_property
+    def solutions(self) -> np.ndarray:
+        """Displacements (B, m, 3) [m] of the converged loads at `drawn`."""
+        return self.dataset.read_displacement(self.drawn)[self.dataset.good]
+
+    @cached_property
+    def truth(self) -> np.ndarray:
+        """Displacements (B, k, 3) [m] of the converged loads at `select_vertices`."""
+        return self.solutions[:, np.searchsorted(self.drawn, select_vertices(self.anatomy))].astype(np.float64)
+
+    def load_rows(self, rows: np.ndarray) -> LoadedRows:
+        """Return a data set of some converged loads (n,)."""
+        data, numbers = self.dataset, np.flatnonzero(self.dataset.good)[rows]
+        return LoadedRows(
+            path=data.path,
+            anatomy=data.anatomy,
+            loads=data.loads.select(numbers),
+            outcome=tuple(data.outcome[number] for number in numbers),
+            iterations=data.iterations[numbers],
+            residual=data.residual[numbers],
+            unit_good=data.unit_good,
+            provenance=data.provenance,
+            nodes=self.drawn,
+            displacement=self.solutions[rows],
+        )
 
 
 def simulate_seed(study: SeedStudy, body: Anatomy, loads: Loads, progress: Callable[[int, int], None]) -> None:
@@ -103,14 +143,12 @@ def measure_seed_learner(study: SeedStudy, spec: LearnerSpec) -> ReportRow:
     InputError
         Input that `train` rejects.
     """
-    nodes = select_vertices(study.anatomy)
-    truth = study.dataset.read_displacement(nodes)[study.dataset.good].astype(np.float64)
-    fit = partial(_fit_published if spec.name in PUBLISHED else _fit_learner, study, spec.name, truth)
+    truth, fit = study.truth, _fit_published if spec.name in PUBLISHED else _fit_learner
     predicted, fits, count = np.empty_like(truth), [], 0
     for number in range(len(study.positions)):
         test = np.flatnonzero(study.position == number)
         training = np.flatnonzero(study.position != number)[:MAX_TRAINING]
-        fits.append(time_work(fit, number, training))
+        fits.append(time_work(fit, study, spec.name, number, training))
         predicted[test] = fits[-1][0](study.converged.select(test))
         count = max(count, len(training))
     single = np.arange(-WARM_UP, TIMED)[:, None] % len(truth)
@@ -127,17 +165,17 @@ def measure_seed_learner(study: SeedStudy, spec: LearnerSpec) -> ReportRow:
     )
 
 
-def _fit_published(study: SeedStudy, name: str, truth: np.ndarray, number: int, training: np.ndarray) -> Predict:
+def _fit_published(study: SeedStudy, name: str, number: int, training: np.ndarray) -> Predict:
     pushed = get_only_pushes(study.converged.select(training))
-    model = fit_vertex_models(name, study.anatomy, pushed, truth[training])
+    model = fit_vertex_models(name, study.anatomy, pushed, study.truth[training])
     return lambda loads: model.predict(get_only_pushes(loads))
 
 
-def _fit_learner(study: SeedStudy, name: str, truth: np.ndarray, number: int, training: np.ndarray) -> Predict:
-    disc = np.full(len(truth), -2)
-    disc[training], disc[study.position == number] = -1, 0
+def _fit_learner(study: SeedStudy, name: str, number: int, training: np.ndarray) -> Predict:
+    tested = np.flatnonzero(study.position == number)[:SCORED]
+    disc = np.repeat([-1, 0], [len(training), len(tested)])
     split = DiscSplit(study.positions[[number]], float(study.pushed.footprint[0]), disc, 0.0)
-    model = train(study.dataset, [name], split=split).models[name]
+    model = train(study.load_rows(np.append(training, tested)), [name], split=split).models[name]
     nodes = select_vertices(study.anatomy)
     return lambda loads: model.deform(loads, at=nodes).displacement
 
