@@ -2,4 +2,11 @@
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+FORMER = {"lamp_beside": "build_lamp", "stereo_pair": "build_stereo_pair"}
+"""Former names of public names, for one release."""
+
+
+def __getattr__(name):
+    """Load a public name, also by its former name."""
+    return _load(FORMER.get(name, name))

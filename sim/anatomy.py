@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 
 import numpy as np
 
@@ -148,3 +149,5 @@ class Anatomy:
     def digest(self) -> str:
         """Hash of the mesh and its boundary conditions."""
         return compute_digest(*self.mesh.arrays, self.fixed, self.slide_normal, self.craniotomy)
+
+    without, held = remove_elements, property(attrgetter("fixed"))  # Former names, for one release.

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 import warp as wp
@@ -64,6 +65,9 @@ class DebondedSolution:
     free: np.ndarray
     rounds: int
     converged: bool
+
+    # Former names, for one release.
+    answer, rested = property(attrgetter("deformation")), property(attrgetter("converged"))
 
 
 def solve_with_debonding(

@@ -174,6 +174,8 @@ class Deformation:
         position = order[np.searchsorted(self.nodes, nodes, sorter=order)]
         return replace(self, displacement=self.displacement[:, position], nodes=nodes)
 
+    rows, at = select, restrict  # Former names, for one release.
+
 
 def join_deformations(parts: Sequence[Deformation]) -> Deformation:
     """Concatenate results for the same vertices; times are added, and only memories common to all are kept."""

@@ -60,6 +60,8 @@ class Elasticity:
         named = [] if self.default is None else [str(self.default)]
         return "; ".join([*named, *(f"{describe_region(label)}: {tissue}" for label, tissue in self.regions.items())])
 
+    of, on = get_law, restrict  # Former names, for one release.
+
 
 def _get_enclosing_region(label: int) -> int:
     """Return the region that contains a region, or itself."""
@@ -271,6 +273,8 @@ class Pulsation:
         """Return the relative volume change (B,) at times (B,) [s]."""
         waves = (self.cardiac, self.respiratory)
         return sum((wave.amplitude * np.sin(2.0 * np.pi * wave.frequency * times) for wave in waves), np.zeros(()))
+
+    swelling = compute_swelling  # Former names, for one release.
 
 
 @dataclass(frozen=True)

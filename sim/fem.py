@@ -366,6 +366,8 @@ class Fem:
             source=self.description,
         )
 
+    reading, series = build_reading, compute_series  # Former names, for one release.
+
 
 def describe_solver(element: str, effects: Iterable[Effect]) -> str:
     """Return the description of the element and the tissue, for results, images and files."""

@@ -210,6 +210,9 @@ class Loads:
 
         return Loads(tuple(grown(cause) for cause in self.causes), self.times)
 
+    # Former names, for one release.
+    of, every, without_kind, only, rows, scaled = get, get_all, drop, get_only, select, scale
+
 
 def select_rows(cause: C, index: slice | np.ndarray) -> C:
     """Return a cause for a subset of the load cases, by number, slice, or mask (B,)."""

@@ -10,6 +10,10 @@ import pytest
 from style_rules import find_texts
 from test_house import FILES, HOUSE, nodes_of
 
+import ar
+import scenes
+import sim
+import surrogate
 from sim.runtime.optional_packages import install_hint
 
 PROJECT = tomllib.loads((HOUSE / "pyproject.toml").read_text())["project"]
@@ -87,6 +91,14 @@ def test_names_in_backticks_exist():
     found = [(place, name) for place, text in said for name in re.findall(r"(?<!`)`([A-Za-z_][\w.]*)`(?!`)", text)]
     assert len(found) > 1000
     assert not [(place, name) for place, name in found if not set(filter(None, name.split("."))) <= known]
+
+
+@pytest.mark.parametrize("package", [sim, surrogate, ar, scenes])
+def test_former_public_names_are_the_present_ones(package):
+    assert package.FORMER and not set(package.FORMER) & set(package.__all__)
+    assert all(getattr(package, former) is getattr(package, name) for former, name in package.FORMER.items())
+    with pytest.raises(AttributeError, match="nothing_of_this_name"):
+        package.nothing_of_this_name  # noqa: B018
 
 
 def test_cited_titles_match_their_checked_list():

@@ -206,6 +206,8 @@ class Camera:
         shift[:2, 2] = (width - self.width) // 2, (height - self.height) // 2
         return replace(self, K=self.K + shift, width=width, height=height)
 
+    moved, zoomed, scaled, padded = move, zoom, scale, pad  # Former names, for one release.
+
 
 def look_at(
     eye: np.ndarray,

@@ -155,6 +155,8 @@ class Lens:
             q + 2.0 * steep * y * y + 6.0 * self.p1 * y + 2.0 * self.p2 * x,
         )
 
+    bent, straight = distort, undistort  # Former names, for one release.
+
 
 @lru_cache(maxsize=4)
 def undistort_pixels(lens: Lens, K: tuple[float, ...], width: int, height: int) -> np.ndarray:

@@ -367,6 +367,8 @@ class Browser:
         self.controls.press(self.recorder.add_button(name), record)
         self.controls.bind_key(RECORD_KEY, record)
 
+    status, plays = show_status, show_playback  # Former names, for one release.
+
 
 def build_element(name: str, words: str) -> str:
     """Wrap words in an element with an id, for the style rules."""

@@ -94,6 +94,8 @@ class Lamp:
         side = np.eye(3)[np.argmin(np.abs(axis))]
         return look_at(np.asarray(self.position), self.target, side, 2.0 * angle, SHADOW_PIXELS, SHADOW_PIXELS)
 
+    camera = build_camera  # Former names, for one release.
+
 
 def build_lamp(camera: Camera, target: np.ndarray, radius: float = 0.06) -> Lamp:
     """Build a lamp above the camera's left shoulder, aimed at `target` (3,) [m]: shadows fall next to the tool."""
@@ -269,6 +271,8 @@ class Renderer:
         launch_in_bands(remember, inputs, [lit_at], height * width, self.device)
         self.backdrop = Backdrop(camera, nearest, placed, pictures, lit_at)
         return self.backdrop
+
+    picture, pictures = render, render_batch  # Former names, for one release.
 
 
 def allocate_images(count: int, height: int, width: int, device: str) -> Pictures:

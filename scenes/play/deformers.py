@@ -295,6 +295,11 @@ class PatientSetup:
         kinds = [[type(effect) for effect in one.effects] for one in (scene, find_scene(scene.name))]
         return fit_motion_error(found) if kinds[0] == kinds[1] else None
 
+    # Former names, for one release.
+    stage, knowing, names, best = build_stage, select_models, list_deformers, select_best
+    usual, described, fem, deformer = select_default, describe_deformer, build_fem, build_deformer
+    player, uncertainty = build_player, estimate_uncertainty
+
 
 @dataclass(frozen=True, eq=False)
 class AtRest:

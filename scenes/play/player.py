@@ -364,6 +364,11 @@ class Player:
         pose = tool.pose(tip, inward, self.site.right)
         return HeldTool(tip, pose, beyond)
 
+    # Former names, for one release.
+    camera_at, touch, loads, answer = get_camera, get_touch, build_loads, compute_deformation
+    drawn, frames, positions, believed = draw_frame, play_frames, compute_positions, estimate_positions
+    tool = place_tool
+
 
 def is_undeformed(deformation: Deformation) -> bool:
     """Return True if nothing moves by more than a micrometre: there is no motion whose error could be given."""

@@ -40,6 +40,9 @@ class CraniotomyFrame(OpenCortex):
         along = self.axis + np.tan(touch.tilt[0]) * self.right + np.tan(touch.tilt[1]) * self.up
         return along / np.linalg.norm(along)
 
+    # Former names, for one release.
+    reach, within, contact, direction = compute_reach, clip_to_opening, find_contact, compute_direction
+
 
 def build_craniotomy_frame(anatomy: Anatomy) -> CraniotomyFrame:
     """Return the frame of an anatomy's open cortex.

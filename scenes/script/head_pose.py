@@ -33,6 +33,8 @@ class HeadPose:
         down = np.array(self.direction) / np.linalg.norm(self.direction)
         return Posture(down[None], np.array([compute_fluid_level(nodes, down, self.fluid)]), np.ones(1))
 
+    posture = build_posture  # Former names, for one release.
+
 
 Lie = Callable[[float], HeadPose]
 """Time [s] -> Lying."""

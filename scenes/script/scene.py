@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Real
+from operator import attrgetter
 from pathlib import Path as FilePath
 from typing import Any, cast
 
@@ -255,6 +256,10 @@ class Scene:
         assert self.tool is not None
         force = touch.force * site.compute_direction(touch)
         return Pushed(self.find_contact(site, touch).point[None], force[None], np.array([self.tool.radius]))
+
+    # Former names, for one release.
+    made_of, contact, tip, stopped = replace_tissue, find_contact, compute_tip, describe_stop
+    pose, loads, sight = compute_pose, build_loads, property(attrgetter("observation_model"))
 
 
 @lru_cache(8)

@@ -193,6 +193,8 @@ class Viewpoint:
         left, right = build_stereo_pair(found, working_distance=float(found.to_camera_frame(target)[2]))
         return left if self.eye == "left" else right
 
+    calibrated, target, camera = calibrate, find_target, build_camera  # Former names, for one release.
+
 
 USUAL_VIEWPOINT = Viewpoint()
 """Default viewpoint of scenes."""

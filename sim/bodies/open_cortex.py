@@ -38,6 +38,8 @@ class Place:
         """Return the deformed position (3,) [m], given vertex positions (V, 3) [m]."""
         return self.weights @ positions[self.vertices]
 
+    carried = locate  # Former names, for one release.
+
 
 @dataclass(frozen=True, eq=False)
 class OpenCortex:
@@ -112,6 +114,8 @@ class OpenCortex:
                 f"{1e3 * self.clearance:.3g} mm of its middle, or open the skull wider with --craniotomy."
             )
         return found
+
+    across, nearest = compute_axis_distance, find_nearest  # Former names, for one release.
 
 
 def open_cortex(anatomy: Anatomy) -> OpenCortex:

@@ -179,6 +179,8 @@ class Lobed:
         length = np.linalg.norm(arm, axis=1)
         return length - self.compute_radius(arm / np.maximum(length, 1e-12)[:, None])
 
+    radius = compute_radius  # Former names, for one release.
+
 
 def build_template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     """Return the template with a tumour, in the template's RAS coordinates, scaled about the brain's centroid.

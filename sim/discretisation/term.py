@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -81,6 +82,9 @@ class Cases:
                 "mesh, element and tools, or from rest."
             )
         return np.zeros(whole) if found is None else np.asarray(found, np.float64)
+
+    # Former names, for one release.
+    rows, past, gone, anew = select, get_past, path_fraction, property(attrgetter("restarted"))
 
 
 @runtime_checkable

@@ -157,6 +157,8 @@ class TetMesh:
         """Hash of `arrays` (hexadecimal), equal for equal meshes."""
         return compute_digest(*self.arrays)
 
+    within, nodes_of = mark_elements, find_nodes  # Former names, for one release.
+
 
 def compute_digest(*arrays: np.ndarray) -> str:
     """Compute the SHA-256 of the arrays' bytes and shapes, shortened to 16 hexadecimal digits."""

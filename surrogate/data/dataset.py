@@ -183,6 +183,9 @@ class Dataset:
             )
         return np.concatenate(chosen)
 
+    # Former names, for one release.
+    seconds, displacement, reaction = estimate_seconds, read_displacement, read_reaction
+
 
 def _format_damaged(path: Path, lost: np.ndarray, group: str) -> str:
     return (

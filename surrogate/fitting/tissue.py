@@ -105,6 +105,8 @@ class FittedTissue:
         )
         return [list(SKULLS)[each] for each in skull], FINE_POISSONS[poisson], FINE_RATIOS[ratio]
 
+    drawn = sample  # Former names, for one release.
+
 
 def _compute_quantiles(values: np.ndarray, share: np.ndarray) -> np.ndarray:
     return np.interp(INTERVAL_PROBABILITIES, np.cumsum(share) - 0.5 * share, values)

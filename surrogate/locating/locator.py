@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from operator import attrgetter
 
 import numpy as np
 
@@ -225,6 +226,9 @@ class Location:
             return "none, as what was seen is within its errors"
         return ", ".join(map(str, self.cause_shares))
 
+    # Former names, for one release.
+    at, covariance, tips_left_out = compute_motion, compute_covariance, property(attrgetter("outlier_tips"))
+
 
 @dataclass(frozen=True, eq=False)
 class Locator:
@@ -290,6 +294,8 @@ class Locator:
             calibrated=not slipped and is_within_trials(self.tried, found.evidence),
             seconds=time.perf_counter() - begun,
         )
+
+    small = restrict  # Former names, for one release.
 
 
 def find_observed_nodes(anatomy: Anatomy) -> np.ndarray:

@@ -83,6 +83,8 @@ class Guarded:
         bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
         return find_handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
 
+    unsure = find_unreliable  # Former names, for one release.
+
 
 def get_reported_errors(model: Learned) -> ReportedErrors:
     """Return a model's reported errors on held-out cortex."""

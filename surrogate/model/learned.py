@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, reduce
-from operator import add
+from operator import add, attrgetter
 
 import numpy as np
 
@@ -357,6 +357,10 @@ class Learned:
             return pushed, None
         past = follow_relaxation(self.series, pushed, loads.times, start, self.envelope.force[0])
         return add_relaxation(pushed, past.share), past
+
+    # Former names, for one release.
+    motion, within, exerted, promised = predict_motion, clip_to_range, predict_force, compute_bounds
+    distance, asked, left_out = predict_distance, to_input, property(attrgetter("held_out"))
 
 
 def build_prediction(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -62,6 +63,10 @@ class Trained:
     held_out_coverage: dict[str, Coverage]
     held_out_distance_coverage: dict[str, Coverage]
     force: dict[str, ForceScore]
+
+    # Former names, for one release.
+    left_out = property(attrgetter("held_out_coverage"))
+    distance_left_out = property(attrgetter("held_out_distance_coverage"))
 
 
 def list_learners(data: Dataset) -> tuple[str, ...]:

@@ -40,6 +40,8 @@ class EpisodeDataset(Dataset[dict[str, Any]]):
         """Return the window of an episode that begins at a frame; InputError as `Episodes.get_window`."""
         return {name: _to_tensor(value) for name, value in self.episodes.get_window(episode, first).items()}
 
+    at = get_window  # Former names, for one release.
+
 
 def _to_tensor(value: Any) -> Any:
     return torch.from_numpy(value) if isinstance(value, np.ndarray) else value

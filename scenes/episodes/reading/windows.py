@@ -233,6 +233,8 @@ class Episodes(Sequence[dict[str, Any]]):
             windows = [self[int(index)] for index in order[start : start + size]]
             yield {name: _stack_rows(name, [one[name] for one in windows]) for name in windows[0]}
 
+    at, batches = get_window, iterate_batches  # Former names, for one release.
+
 
 def read_episodes(
     paths: str | Path | Sequence[str | Path],
