@@ -4,11 +4,13 @@ from pathlib import Path
 
 import h5py
 import meshio
+import numpy as np
 import pytest
 from boxes import base_held, box
 
 from sim.bodies.meshfile import read_mesh
 from sim.errors import InputError
+from sim.runtime.file_limits import MeshBytes
 
 BODY = base_held(box((2, 2, 2), 0.02))
 
@@ -45,16 +47,46 @@ def test_xdmf_refers_to_its_own_folder_alone(tmp_path: Path, way: str) -> None:
         read_mesh(path)
 
 
+@pytest.mark.parametrize("way", ["external link", "soft link", "external", "virtual", "declared"])
 @pytest.mark.parametrize("name", ["a.xdmf", "a.hmf"])
-def test_hdf5_that_declares_more_than_it_holds_is_rejected(tmp_path: Path, name: str) -> None:
+def test_hdf5_of_a_mesh_holds_its_arrays_itself(tmp_path: Path, name: str, way: str) -> None:
     path = tmp_path / name
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
     assert read_mesh(path).mesh.digest == BODY.mesh.digest
+    other, shape = tmp_path / "other.h5", BODY.mesh.nodes.shape
+    with h5py.File(other, "w") as file:
+        file["x"] = BODY.mesh.nodes
+    BODY.mesh.nodes.tofile(tmp_path / "other.bin")
     with h5py.File(path.with_suffix(".h5") if name == "a.xdmf" else path, "r+") as file:
         place: list[str] = []
-        shape = BODY.mesh.nodes.shape
         file.visititems(lambda key, item: place.append(key) if getattr(item, "shape", None) == shape else None)
         del file[place[0]]
-        file.create_dataset(place[0], (100_000_000, 3), "f8", chunks=(100_000, 3))  # missing chunks are zeros
-    with pytest.raises(InputError, match=r"take more than 1\.07 GB|it is damaged"):
+        if way == "external link":
+            file[place[0]] = h5py.ExternalLink(str(other), "/x")
+        if way == "soft link":
+            file["moved"] = BODY.mesh.nodes
+            file[place[0]] = h5py.SoftLink("/moved")
+        if way == "external":
+            file.create_dataset(place[0], shape, "f8", external=[(str(tmp_path / "other.bin"), 0, 8 * 81)])
+        if way == "virtual":
+            layout = h5py.VirtualLayout(shape, "f8")
+            layout[:] = h5py.VirtualSource(str(other), "x", shape)
+            file.create_virtual_dataset(place[0], layout)
+        if way == "declared":  # chunks that are missing are zeros
+            file.create_dataset(place[0], (100_000_000, 3), "f8", chunks=(100_000, 3))
+    words = {"external": "lies in another file", "virtual": "lies in another file", "declared": "more than it holds"}
+    with pytest.raises(InputError, match=words.get(way, "is a link of .* to another place")):
         read_mesh(path)
+
+
+def test_hdf5_is_as_large_as_its_own_file_allows(tmp_path: Path) -> None:
+    path, few = tmp_path / "a.xdmf", MeshBytes(max_ratio=2, small=2**10)
+    meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
+    with h5py.File(path.with_suffix(".h5"), "r+") as file:
+        file["more"] = np.random.default_rng(0).random(400_000)  # 3.2 MB, far more than the XML
+    assert read_mesh(path, limits=few).mesh.digest == BODY.mesh.digest
+    with h5py.File(path.with_suffix(".h5"), "r+") as file:
+        for number in range(3):
+            file.create_dataset(f"zeros{number}", (400_000,), "f8", compression="gzip")[:] = 0.0
+    with pytest.raises(InputError, match="take more than"):
+        read_mesh(path, limits=few)

@@ -92,7 +92,7 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
         most = limits.limit_bytes(path.stat().st_size)
         with warnings.catch_warnings(), limit_memory(most):
             warnings.simplefilter("ignore")  # meshio warns about arrays that it skips
-            check_mesh_references(path)
+            check_mesh_references(path, limits)
             raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _read_with_meshio(path)
         return _build_mesh_file(path, raw, UNITS[unit])
 
