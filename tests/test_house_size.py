@@ -8,8 +8,8 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 # Lines of the packages and of their tests. Nobody reads more than this: a feature that exceeds it deletes something.
 # Lower a number when lines have gone. Raise it only with the reason in the commit.
 # 1,380 of the packages are the families of models that finite elements are compared with; 770 lines are their tests.
-# 700 more measure the published experiment, choose among families, and plot batches and effects.
-MOST = {"packages": 84_010, "tests": 53_560}
+# 900 more measure the published experiment, choose among families, and plot batches and effects; 490 were deleted.
+MOST = {"packages": 84_200, "tests": 53_600}
 
 
 def lines(paths):
