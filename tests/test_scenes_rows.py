@@ -141,13 +141,13 @@ def test_only_what_lacks_is_measured_again(study, study_rows, tmp_path):
 
 def test_plans(study):
     names = [spec.name for spec in list_one_factor_variants(study)]
-    assert names[0] == "FEM" and len(set(names)) == len(names) == 12 and "FEM halved edges" in names
+    assert names[0] == "FEM" and len(set(names)) == len(names) == 11 and "FEM halved edges" in names
     assert (
         list_one_factor_variants(study)[0].accuracy == TRAIN and list_one_factor_variants(study)[-1].law != TISSUE.law
     )
     assert (
         not any(spec.mesh != OWN_MESH for spec in list_one_factor_variants(study, remesh=False))
-        and len(list_one_factor_variants(study, remesh=False)) == 11
+        and len(list_one_factor_variants(study, remesh=False)) == 10
     )
     product = list_all_combinations(study)
     assert len({spec.name for spec in product}) == len(product) == 4 * 3 * 2 * (3 + 5)

@@ -87,11 +87,15 @@ CORES = 4  # Number of CPU cores per measured learner, which uses one; the other
 
 
 def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
-    """Return the data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`."""
+    """Return the data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`.
+
+    The reference itself is left out: it would show only its tolerance.
+    """
+    known = (study.element, "" if study.fine else study.reference_element)
     meshes = {} if not remesh else MESHES if study.is_shipped else {"halved edges": HALVED_MESH}
     return (
         FemVariant("FEM"),
-        *(FemVariant(f"FEM {name}", element=name) for name in ELEMENTS if name != study.element),
+        *(FemVariant(f"FEM {name}", element=name) for name in ELEMENTS if name not in known),
         *(FemVariant(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
         *(
             FemVariant(f"FEM {_format_power(size)}", tolerance=size)
