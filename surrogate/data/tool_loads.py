@@ -136,7 +136,7 @@ def compute_rejected_share(preset: str) -> float:
 
 
 def describe_rejected(preset: str) -> str:
-    """Describe that share; empty if it is zero."""
+    """Describe the share of rejected loads; empty if it is zero."""
     share = compute_rejected_share(preset)
     return (
         f"{100.0 * share:.0f} % of the nominal loads of {preset} exceed the pressure or depth of surgery: they are not "

@@ -44,7 +44,7 @@ class SolveCounts:
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Total number of solves."""
         return self.loads + self.units + self.series
 
 

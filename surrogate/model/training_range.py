@@ -41,7 +41,7 @@ class Outside(NamedTuple):
 
     @property
     def here(self) -> Outside:
-        """The same with all distances 0, as for training loads."""
+        """The same position with all distances zero, as for training loads."""
         return Outside(*(0.0 * each for each in self))
 
 
