@@ -125,8 +125,9 @@ next: open the table in a spreadsheet""",
   sulcus uncertainty press --anatomy patient.vtu
   sulcus uncertainty press palpate --draws 40 --twins 20 --out tried.json
 next: sulcus demo press --anatomy patient.vtu, which shows both errors""",
-    "report": """example:
+    "report": """examples:
   sulcus report --quick --out report
+  sulcus report --seed-protocol --seed-mesh seed.npz --out seed
 next: open report/index.html""",
     "check": """examples:
   sulcus check
