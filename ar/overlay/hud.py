@@ -142,7 +142,7 @@ def wrap_line(text: str, room: float, scale: float = TEXT_SCALE) -> list[str]:
 
 @lru_cache(maxsize=256)  # most texts stay from image to image, and this takes 1 ms
 def _wrap_line(text: str, room: float, scale: float) -> list[str]:
-    if cv2.getTextSize(text, FONT, scale, 1)[0][0] <= room:
+    if _measure_width(text, scale) <= room:
         return [text] if text else []
     lines = _break_lines(text, room, scale)
     for narrower in range(int(room), 0, -BORDER_DISTANCE):
@@ -157,11 +157,16 @@ def _break_lines(text: str, room: float, scale: float) -> list[str]:
     lines: list[str] = []
     for word in BREAK_PATTERN.split(text.strip()):
         longer = f"{lines[-1]} {word}" if lines else word
-        if lines and cv2.getTextSize(longer, FONT, scale, 1)[0][0] <= room:
+        if lines and _measure_width(longer, scale) <= room:
             lines[-1] = longer
         else:
             lines.append(word)
     return lines
+
+
+@lru_cache(maxsize=1024)  # the same beginnings of lines are tried at many widths
+def _measure_width(text: str, scale: float) -> int:
+    return cv2.getTextSize(text, FONT, scale, 1)[0][0]
 
 
 def format_millimetres(length: float, error: float | None = None) -> str:
