@@ -29,7 +29,7 @@ def site(tmp_path_factory):
     return build_craniotomy_frame(read_anatomy(folder / "long.vtu"))
 
 
-def test_craniotomy_axis_points_inwards_at_request(site):
+def test_craniotomy_frame_is_at_requested_site_pointing_inwards(site):
     middle = site.anatomy.mesh.nodes.mean(axis=0)
     assert np.linalg.norm(site.origin - 1e-3 * np.array([-42.0, 18.0, 12.0])) < 6e-3
     assert site.axis @ (middle - site.origin) > 0.02 and site.axis[0] > 0.9

@@ -55,7 +55,7 @@ def filmed(box):
     )  # fmt: skip
 
 
-def test_nothing_is_off_where_nobody_contributes(filmed):
+def test_error_is_zero_without_error_sources(filmed):
     none = sample_errors(filmed, [], 20)
     for values in (none.across, none.along, none.pixels, none.worst):
         assert np.abs(values).max() < 1e-12
@@ -74,7 +74,7 @@ def test_error_sources_have_their_stated_size(filmed):
     assert sample_errors(alike, [MESH, PARAMETERS], COUNT).worst.max() == pytest.approx(0.2 * off, rel=0.02)
 
 
-def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
+def test_latency_error_equals_camera_motion_during_the_delay(filmed):
     moving = replace(filmed, viewpoint=replace(VIEW, path=sideways), latency=0.02, clock=0.0)
     found = sample_errors(moving, [LATENCY], 20)
     np.testing.assert_allclose(found.across, 0.02 * SPEED, rtol=0.05)
@@ -82,7 +82,7 @@ def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
     assert sample_errors(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() < 1e-12  # nothing moves
 
 
-def test_latency_costs_what_the_tumour_moves_meanwhile(filmed):
+def test_latency_error_equals_tumour_motion_during_the_delay(filmed):
     sunk = replace(filmed, velocity=np.tile(SPEED * filmed.site.axis, (60, 1)), latency=0.02, clock=0.0)
     found = sample_errors(sunk, [LATENCY], 20)
     for each in (found.middle, found.worst):
@@ -109,7 +109,7 @@ def test_worst_error_is_that_of_the_farthest_point(filmed):
     assert found.worst == pytest.approx(3e-3, rel=0.02) and found.middle == pytest.approx(3e-3 / 60, rel=0.05)
 
 
-def test_deviation_of_coverage_counts_bodies_and_not_samples(filmed):
+def test_deviation_of_coverage_is_computed_over_bodies(filmed):
     """Of two bodies one is always covered, the other never: the deviation of a ratio of two clusters."""
     bodies = np.stack([filmed.field, filmed.field + 0.1 * filmed.site.right])
     share, deviation = compute_budget(
@@ -119,7 +119,7 @@ def test_deviation_of_coverage_counts_bodies_and_not_samples(filmed):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
+def test_registration_error_uses_axes_of_the_reference_frame(filmed, axis):
     """The reference is turned by 90 degrees in the scan: about an axis through the tumour a turn moves no middle."""
     T, middle = filmed.T_scan_patient.copy(), (filmed.rest + filmed.field).mean(axis=0)
     T[:3, :3] = Rotation.from_euler("xyz", [90.0, 0.0, 90.0], degrees=True).as_matrix() @ T[:3, :3]
@@ -184,7 +184,7 @@ def test_band_covers_twins_but_not_other_bodies(filmed):
     assert (sample_errors(replace(twins, bodies=6.0 * other), CLINICAL, 200, 1).worst <= band).mean() < 0.8
 
 
-def test_parts_add_up_in_quadrature_and_the_largest_is_named(filmed):
+def test_error_parts_add_in_quadrature_and_largest_is_named(filmed):
     budget = compute_budget(filmed, 100, twins=filmed)
     technical, clinical = (np.median(each.middle) for each in (budget.technical, budget.clinical))
     assert technical < clinical and set(budget.alone) == set(CLINICAL)
@@ -193,7 +193,7 @@ def test_parts_add_up_in_quadrature_and_the_largest_is_named(filmed):
     assert budget.find_largest("middle") == REGISTRATION and budget.held is not None and budget.held[0] > 0.8
 
 
-def test_a_reference_out_of_sight_is_said(filmed):
+def test_reference_outside_the_camera_view_is_rejected(filmed):
     away = filmed.T_scan_patient.copy()
     away[:3, 3] += 0.5
     with pytest.raises(InputError, match="does not see the patient's reference"):

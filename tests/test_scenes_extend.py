@@ -41,13 +41,13 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_the_first_block_is_a_scene(folder):
+def test_first_code_block_of_extend_page_defines_a_scene(folder):
     (folder / "my_scene.py").write_text(BLOCKS[0])
     scene = find_scene(str(folder / "my_scene.py"))
     assert scene.name == "stiff" and "my_scene.py" in PAGE
 
 
-def test_the_code_of_each_section_runs_by_itself(folder):
+def test_code_of_each_section_runs_separately(folder):
     """In an interpreter that runs elsewhere; no section knows a name of another. Veins hold tissue back."""
     assert len(SECTIONS) == 7
     (folder / "page.py").write_text(
@@ -87,7 +87,7 @@ def test_own_mesh_is_converted_to_an_anatomy(tmp_path, monkeypatch, box):
     assert answer.outcome[0].good and np.abs(answer.displacement[0, own.tumour_nodes]).max() > 1e-5
 
 
-def test_the_command_says_how_large_the_tumour_is(capsys):
+def test_example_command_prints_the_tumour_volume(capsys):
     (block,) = (block for block in BLOCKS if "def add_arguments" in block)
     names = {}
     exec(block, names)

@@ -16,7 +16,7 @@ from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
 
 
-def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):
+def test_cut_body_is_reliable_if_both_fluid_levels_converge(box, tmp_path):
     """Half way between two levels of the fluid, of which the lower one finds no equilibrium."""
     write_anatomy(tmp_path / "box.vtu", box)
     setting, solved = open_setting(DEBULK, str(tmp_path / "box.vtu"), "auto", "cpu", (48, 36)), []
@@ -34,7 +34,7 @@ def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):
         solved.clear()
 
 
-def test_finite_elements_answer_together_what_they_answer_apart(boxed):
+def test_batched_fem_responses_equal_separate_responses(boxed):
     """A spatula on a box: each tool goes its own way, and the second begins anew in between."""
     vectors = [many(2, "Retract", anatomy=boxed, together=each) for each in (False, True)]
     seen = [vector.reset(seed=[0, 1]) for vector in vectors]

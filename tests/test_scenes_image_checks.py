@@ -46,7 +46,7 @@ def drawn_by_opencv(camera, layer, fine=8, times=4):
 
 
 @pytest.mark.parametrize("path", [None, *PATHS])
-def test_the_overlay_is_in_register_under_each_path(theatre, path):
+def test_overlay_matches_opencv_projection_on_each_camera_path(theatre, path):
     """The outline found again in the picture, against the tumour as OpenCV projects it."""
     play = filmed(theatre, path=None if path is None else PATHS[path](1))
     frames = list(play.play_frames(every=25))
@@ -78,7 +78,7 @@ def test_scene_checks_pass_on_path_and_fail_on_other_camera(theatre, path):
     )
 
 
-def test_episodes_hold_the_lens_and_the_camera_of_each_frame(theatre, tmp_path):
+def test_episodes_store_lens_and_camera_of_each_frame(theatre, tmp_path):
     from scenes.episodes.episode import collect
 
     play = filmed(theatre, path=Microscope((Focus(0.0, 1.2, 1.5),), 0.2))

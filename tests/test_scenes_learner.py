@@ -20,7 +20,7 @@ def study(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["linear", "series-gp"])
-def test_no_answer_to_a_load_of_the_discs_reaches_a_row(study, tmp_path, name, monkeypatch):
+def test_held_out_solutions_do_not_influence_training(study, tmp_path, name, monkeypatch):
     """Bit for bit, the table of the series made anew: wild answers to the loads of the discs change figures alone."""
     monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})

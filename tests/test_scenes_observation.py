@@ -8,7 +8,7 @@ from scenes.gym.observation import FORCE_NOISE, POSITION_NOISE
 from scenes.gym.tasks import PALPATE
 
 
-def test_what_is_observed_is_the_truth_with_its_noise():
+def test_observed_states_are_truth_plus_given_noise():
     """In the axes of the twists."""
     environment = made()
     environment.reset(seed=3)

@@ -64,7 +64,7 @@ def seek(page, number):
         (12, TumourState.NO_REFERENCE, "reference not seen yet: nothing is drawn"),
     ],
 )
-def test_each_state_is_said_with_both_errors(page, number, state, words):
+def test_page_text_has_tracking_state_and_both_errors(page, number, state, words):
     assert seek(page, number)
     said = page.browser.shown[2]
     assert page.newest.known.state is state and words in said and "Tumour position error: not known" in said
@@ -79,7 +79,7 @@ def test_each_state_is_said_with_both_errors(page, number, state, words):
         assert sample.values == sample.errors[:1] + (None,) == (None, None)
 
 
-def test_a_style_is_had_on_a_picture_that_stands(page):
+def test_style_change_redraws_a_paused_image(page):
     assert seek(page, 6)
     before = page.browser.shown[1]
     visitor = Visitor(page.browser, 1200)
@@ -99,7 +99,7 @@ def test_a_style_is_had_on_a_picture_that_stands(page):
     assert wait_for(lambda: page.browser.visitors == 0)
 
 
-def test_a_film_plays_on_and_after_its_end_anew(follower, stage):
+def test_video_page_restarts_after_the_last_image(follower, stage):
     film = SeekableFilm(FILM / "film.mp4", 30.0)
     film.count = 40  # as a file may say
     with opened(follower, stage, film.count) as page:
@@ -179,7 +179,7 @@ def window(page):
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-def test_the_page_fits_and_is_in_register(page, window, size):
+def test_overlay_page_fits_window_and_registers_with_image(page, window, size):
     assert seek(page, 6)
     window.size(*size)
     said = f"document.getElementById('{SAID}').innerText"

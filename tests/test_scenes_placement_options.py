@@ -25,7 +25,7 @@ def two_foci(folder):
     nibabel.save(nibabel.Nifti1Image(labels, image.affine), folder / "labels.nii.gz")
 
 
-def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
+def test_craniotomy_lies_over_the_selected_tumour_piece(tmp_path):
     two_foci(tmp_path)
     subject = build_volume_subject(tmp_path / "labels.nii.gz", (1,), (2,))
     large, small = subject.pieces

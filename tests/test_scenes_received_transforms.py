@@ -25,12 +25,12 @@ def changed(row, column, value):
         (matrix((0.0, 2e4, 0.0)), "more than 10 m"),
     ],
 )
-def test_a_matrix_that_moves_no_body_is_refused(T, why):
+def test_matrix_that_is_not_rigid_is_rejected(T, why):
     with pytest.raises(BadMessageError, match=why):
         to_rigid(T)
 
 
-def test_a_rigid_matrix_of_single_precision_is_taken_in_metres():
+def test_single_precision_rigid_matrix_is_converted_to_metres():
     T = to_rigid(matrix().astype(np.float32).astype(float))
     assert T[:3, 3] == pytest.approx([0.01, -0.02, 0.03]) and T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3))
 

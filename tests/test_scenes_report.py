@@ -34,7 +34,7 @@ def figures_by_hand(distance, truth):
     return [f(v) for v in (1e3 * distance, share) for f in (np.mean, lambda x: np.percentile(x, 95), np.max)]
 
 
-def test_numbers_are_those_recomputed_by_hand(study, page, study_box):
+def test_report_figures_match_independent_recomputation(study, page, study_box):
     """Quadratic reference, finite elements, and a learner against those it was trained on, each from its own source."""
     stored = json.loads((page / "report.json").read_text())["sections"][0]["rows"]
     with open(page / "data.csv") as file:
@@ -76,7 +76,7 @@ def test_numbers_are_those_recomputed_by_hand(study, page, study_box):
     assert stored[2]["loads"] == study.discs.train.sum() and stored[2]["units"] == 3 * study_box.craniotomy.sum()
 
 
-def test_the_page_needs_nothing_but_itself(page, study_rows):
+def test_report_page_loads_no_external_resources(page, study_rows):
     text = (page / "index.html").read_text()
     assert not re.search(r"https?:|<script|<link|@import|src=|url\((?!#)", text)
     for words in ("Reliable loads", "a model difference", "About &lt;this&gt;."):
@@ -119,7 +119,7 @@ def test_reference_elements_differ_by_tolerance_only(study, fine):
     assert describe_difference(here, FemVariant("it", "linear", *alone)) == DIFFERENCE
 
 
-def test_page_is_written_and_missing_row_reported(study, study_rows, monkeypatch, capsys):
+def test_report_command_writes_page_and_lists_missing_row(study, study_rows, monkeypatch, capsys):
     """Everything is solved already; the rows are those found."""
     words = ["report", "--quick", "--loads", str(study.loads), "--data", str(study.data), "--out", str(study.folder)]
     words += ["--device", "cpu"]

@@ -59,7 +59,7 @@ def found(anatomy):
     return {(row.variant.factor, row.variant.now): row for row in all_rows}
 
 
-def test_every_thing_has_its_row(found):
+def test_sensitivity_study_has_one_row_per_variant(found):
     assert list(found) == [
         ("motion itself", ""), ("force or motion", "+-5 %"), ("its direction", "+-2 deg"),
         ("its position", "+-1 mm"), ("E", "-20%"), ("E", "+20%"), ("nu", "0.49"), ("nu", "0.495"),
@@ -84,14 +84,14 @@ def test_stiffness_matters_under_known_force_alone(found, now, factor):
     assert row.motion.motion == pytest.approx(1.0, rel=1e-7)
 
 
-def test_a_linear_body_answers_in_proportion(found):
+def test_linear_body_has_displacement_proportional_to_load(found):
     for one in (found["force or motion", "+-5 %"].force, found["force or motion", "+-5 %"].motion):
         assert one.percent == pytest.approx(5.0, rel=1e-6)
         assert one.motion == pytest.approx(1.0, rel=1e-7)
         assert one.mean_mm == pytest.approx(0.05 * found["motion itself", ""].force.mean_mm, rel=1e-6)
 
 
-def test_known_motions_are_those_of_the_known_forces(found):
+def test_default_motion_and_force_give_equal_displacement(found):
     """The default is one and the same field."""
     whole = found["motion itself", ""]
     assert whole.force.percent == pytest.approx(100.0)
@@ -106,7 +106,7 @@ def test_softer_tumour_and_freer_skull_move_more(found):
 
 
 @pytest.mark.parametrize(("now", "times"), [("0.5 x", 0.5), ("3 x", 3.0)])
-def test_a_stiff_tumour_lies_in_the_same_brain(found, anatomy, now, times):
+def test_stiff_tumour_variant_changes_only_the_tumour(found, anatomy, now, times):
     """Against finite elements that are put together here, of two tissues."""
     brain = Material("linear", 3000.0, 0.45)
     tumour = Material("linear", times * 3000.0, 0.45)
@@ -124,7 +124,7 @@ def test_a_stiff_tumour_lies_in_the_same_brain(found, anatomy, now, times):
     assert row.mean_mm == pytest.approx(1e3 * np.linalg.norm(changed - default, axis=2).mean(), rel=1e-5)
 
 
-def test_what_does_not_converge_is_counted_and_left_out(anatomy):
+def test_loads_without_convergence_are_counted_and_omitted(anatomy):
     """With a budget that suffices for none."""
     few = Accuracy(tolerance=1e-9, outer=1, inner=1, steps=0)
     study = SensitivityStudy(anatomy, draw("palpation", anatomy, 3, 0), BodyVariant(element="p1"), few, "cpu")
@@ -133,7 +133,7 @@ def test_what_does_not_converge_is_counted_and_left_out(anatomy):
     assert np.isnan(one.force.mean_mm)
 
 
-def test_a_load_counts_where_it_and_its_default_converged(pretender):
+def test_change_uses_loads_converged_in_variant_and_default(pretender):
     loads = push(np.zeros((3, 3)), np.array([[0.0, 0.0, -f] for f in (0.1, 0.2, 0.3)]), 7e-3)
     nodes = pretender.anatomy.tumour_nodes
     default, answer = (replace(pretender, fails_above=most).deform(loads, at=nodes) for most in (0.25, 0.15))
@@ -148,7 +148,7 @@ def test_a_load_counts_where_it_and_its_default_converged(pretender):
     assert (all_good.solves, all_good.failed) == (2, 1)
 
 
-def test_a_change_has_the_percentiles_that_it_says():
+def test_change_has_percentiles_over_loads_and_vertices():
     """p95 over every load x vertex; worst95 over the loads, each by its farthest vertex."""
     field = np.random.default_rng(0).normal(size=(40, 7, 3))
     default = replace(guess(np.ones((40, 7, 3))), outcome=40 * (Outcome.CONVERGED,))
@@ -158,7 +158,7 @@ def test_a_change_has_the_percentiles_that_it_says():
     assert (found.mean_mm, found.p95_mm, found.worst95_mm, found.largest_mm) == pytest.approx(wanted)
 
 
-def test_tools_are_off_by_what_is_asked(anatomy):
+def test_aim_errors_have_the_given_angle_and_shift(anatomy):
     loads, patch = draw("palpation", anatomy, 5, 1), open_patch(anatomy)
     drawn = loads.get(Pushed)
     size = np.linalg.norm(drawn.force, axis=1)
@@ -177,7 +177,7 @@ def test_tools_are_off_by_what_is_asked(anatomy):
     np.testing.assert_array_equal(shifted.force, np.tile(drawn.force, (4, 1)))
 
 
-def test_a_known_motion_is_the_footprints_mean(box, pretender):
+def test_prescribed_motion_is_mean_over_the_footprint(box, pretender):
     loads = draw("palpation", box, 2, 0)
     answer = pretender.deform(loads)
     moved, pushed = match_motion(box, loads, answer).get(Displaced), loads.get(Pushed)
@@ -188,7 +188,7 @@ def test_a_known_motion_is_the_footprints_mean(box, pretender):
         match_motion(box, match_motion(box, loads, answer), answer)
 
 
-def test_a_body_without_tumour_is_refused(anatomy):
+def test_body_without_tumour_is_rejected(anatomy):
     whole = replace(anatomy, mesh=replace(anatomy.mesh, region=np.ones_like(anatomy.mesh.region)))
     with pytest.raises(InputError, match="no tumour"):
         next(measure_variants(SensitivityStudy(whole, draw("palpation", anatomy, 1, 0), BodyVariant()), []))
@@ -199,7 +199,7 @@ def trained(anatomy):
     return knowing_nothing(anatomy, {"learner": "table", "preset": "bipolar", "element": "p2"})
 
 
-def test_the_command(tmp_path, capsys):
+def test_sensitivity_command_reports_all_rows(tmp_path, capsys):
     """Every figure is in the file; what the surrogate is wrong by stands beside, or that nobody knows it."""
     body = make_box(cells=(5, 5, 3), spacing=15e-3, tumour=16e-3, opening=40e-3)
     write_anatomy(tmp_path / "box.vtu", body)
@@ -229,7 +229,7 @@ def test_the_command(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "reason"), [(["--out", "table.txt"], ".csv"), (["--anatomy", "none.vtu"], "no such file")]
 )
-def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+def test_sensitivity_command_rejects_bad_input(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["sensitivity", *words]) == 2
     assert reason in capsys.readouterr().err

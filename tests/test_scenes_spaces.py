@@ -91,7 +91,7 @@ def brightest(path, more_than):
     return LPS * np.mean([image.TransformContinuousIndexToPhysicalPoint(place) for place in places.tolist()], axis=0)
 
 
-def test_meshes_say_ras_and_metres(folder):
+def test_mesh_files_state_ras_and_metres(folder):
     for name in ("patient.vtu", "located.vtu"):
         read = meshio.read(folder / name)
         assert list(read.field_data) == ["RAS, metres per unit"] and read.field_data["RAS, metres per unit"] == 1.0
@@ -101,7 +101,7 @@ def test_meshes_say_ras_and_metres(folder):
     near(1e3 * read.point_data["displacement"][np.unique(tumour)].mean(axis=0), SHIFT, 0.1)
 
 
-def test_images_lie_where_the_scan_does(folder):
+def test_images_have_the_position_of_the_scan(folder):
     near(brightest(folder / "labels.nii.gz", 1.5), TUMOUR)
     near(brightest(folder / "patient.t1.nii.gz", 190), TUMOUR)
     now = TUMOUR + SHIFT
@@ -111,7 +111,7 @@ def test_images_lie_where_the_scan_does(folder):
     assert header.get_xyzt_units()[0] == "mm" and int(header["sform_code"]) > 0
 
 
-def test_fields_lead_there_and_back(folder):
+def test_forward_and_inverse_fields_map_tumour_and_back(folder):
     now = TUMOUR + SHIFT
     for name, start, end in (("modeling.nrrd", TUMOUR, now), ("resampling.nii.gz", now, TUMOUR)):
         field = sitk.ReadImage(str(folder / f"warp/field_{name}"), sitk.sitkVectorFloat64)
@@ -156,7 +156,7 @@ def test_data_sets_and_registrations_name_their_spaces(folder, pretender):
     near(said["scanned"]["tumour_mm"], TUMOUR)
 
 
-def test_an_episode_shows_the_tumour_where_it_says_it_is(folder, pretender):
+def test_episode_mask_matches_projected_tumour(folder, pretender):
     """Through the camera's matrices, the resting tumour falls on the middle of its mask in the first picture."""
     anatomy = read_anatomy(folder / "patient.vtu")
     theatre = PatientSetup(anatomy, None, {}, "cpu")

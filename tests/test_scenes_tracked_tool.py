@@ -33,7 +33,7 @@ def test_tool_file_round_trip_encloses_its_shape(shape, tmp_path):
         ("tip_covariance_mm2", [[-1, 0, 0], [0, 1, 0], [0, 0, 1]], "no covariance"),
     ],
 )
-def test_a_damaged_tool_is_refused(name, value, said, tmp_path):
+def test_damaged_tool_file_is_rejected(name, value, said, tmp_path):
     path = tmp_path / "tool.json"
     write_tool(path, TrackedTool(Ball(7e-3)))
     path.write_text(json.dumps(json.loads(path.read_text()) | {name: value}))

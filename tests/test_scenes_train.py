@@ -17,6 +17,6 @@ def test_training_notes_slow_parts_and_too_few_loads():
 
 
 @pytest.mark.parametrize("learners", ["", "linear,,svr", " "])
-def test_learners_without_a_name_are_a_sentence(learners, tmp_path, capsys):
+def test_train_command_rejects_empty_learner_name(learners, tmp_path, capsys):
     assert main(["train", "none.h5", "--out", str(tmp_path / "m.npz"), "--learners", learners]) == 2
     assert "name each learner" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from scenes.cli import main
 from scenes.episodes.reading.validation import validate_episode
 
 
-def test_the_command_names_broken_files_and_ends_with_one(whole, tmp_path, capsys):
+def test_validate_command_names_broken_files_and_exits_with_1(whole, tmp_path, capsys):
     broken = tmp_path / "broken.h5"
     broken.write_bytes(whole.read_bytes()[:3000])
     assert main(["validate", str(whole), "--workers", "1"]) == 0
