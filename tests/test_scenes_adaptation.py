@@ -1,4 +1,4 @@
-"""Bodies, materials and scenes to which trained models are adapted: what has to be made again."""
+"""Tests of studies after debulking: mesh, loads solved again, learners trained again and recorded time."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Agreement of two trackers: the places that are kept."""
+"""Agreement of two trackers: the stored positions."""
 
 import numpy as np
 from test_scenes_error_parts import shifted

@@ -1,4 +1,4 @@
-"""`sulcus anatomy` as a user runs it."""
+"""`sulcus anatomy` on the command line: meshes of the template and of label maps, and rejected input."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A scene's tool goes in where a planned trajectory enters, and along it; what does not fit the opening is refused."""
+"""Planned trajectories: entry and direction of the tool, and rejected trajectories outside the craniotomy."""
 
 import argparse
 import json
@@ -56,7 +56,7 @@ def planned(
 @pytest.mark.parametrize("swapped", [False, True])
 @pytest.mark.parametrize(("right", "up", "tilt"), [(0.0, 0.0, (0.0, 0.0)), (9e-3, -6e-3, (0.5, -0.3))])
 def test_tool_follows_entry_and_direction_of_trajectory(site, tmp_path, right, up, tilt, swapped):
-    """Whichever end was drawn first; the scene's own places and tilts are added."""
+    """For both drawing orders of the line; the scene's own positions and tilts are added."""
     entry, way, line = planned(site, right, up, tilt)
     approach = approach_of(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
     touch = approach.follow(press(0.3))(2.0)
@@ -89,7 +89,7 @@ def test_trajectory_ending_near_the_cortex_is_extended(site, tmp_path):
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.5, -0.3), (-0.2, 0.6)])
 def test_probe_shaft_aligns_with_trajectory(site, tmp_path, tilt):
-    """That of a probe; a point, and a blade, leave the tool as it is."""
+    """Points and blades leave the orientation of the tool unchanged."""
     entry, way, line = planned(site, 4e-3, 2e-3, tilt)
     approach = approach_of(read_markup(marked(tmp_path, line)), site)
     held, plain = approach.align_tool(PALPATION), PALPATION
@@ -126,7 +126,7 @@ def test_trajectory_outside_the_craniotomy_is_rejected(site, tmp_path):
 
 
 def test_trajectory_option_moves_the_tool_of_the_scene(site, tmp_path, capsys):
-    """The push of `press`; near the rim the bone stops the tool and that is said; a scene without a tool stays."""
+    """Scene `press`; near the rim a message names the stop at the bone; scenes without a tool are unchanged."""
     from scenes.options.theatre_options import add_theatre, build_requested_scene
 
     def asked(name: str, line: np.ndarray):

@@ -1,4 +1,4 @@
-"""Regions of an own anatomy in a plan: they are drawn as so many times as stiff, and what is not there is not said."""
+"""Regions of an anatomy in a plan: sampled stiffness, and weak models in the data sheet."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""`sulcus budget`: every part of the overlay's error, and bad input."""
+"""`sulcus budget`: all parts of the overlay's error, and rejected input."""
 
 import json
 

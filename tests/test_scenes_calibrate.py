@@ -1,4 +1,4 @@
-"""`sulcus calibrate`: what it finds in files, what it writes, and what it refuses by name."""
+"""`sulcus calibrate`: camera, pivot and hand-eye calibration from files, and rejected input."""
 
 import json
 import zlib

@@ -1,4 +1,4 @@
-"""Files of calibrations: what comes from outside is read, or refused with its path, a reason and a remedy."""
+"""Calibration files: round trip, and rejected files with path, reason and remedy."""
 
 import os
 

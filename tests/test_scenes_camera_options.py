@@ -1,4 +1,4 @@
-"""Options of a scene's camera: a calibration, a path, an eye."""
+"""Options of a scene's camera: calibration, path and eye."""
 
 from argparse import ArgumentParser
 

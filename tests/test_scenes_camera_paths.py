@@ -1,4 +1,4 @@
-"""Paths of a camera over a scene: pure functions of time, smooth, and rejected where they cannot be."""
+"""Camera paths over a scene: deterministic and smooth functions of time, and rejected parameters."""
 
 from dataclasses import replace
 

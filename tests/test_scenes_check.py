@@ -1,4 +1,4 @@
-"""Each check fails when what it guards is perturbed, and passes when nothing is."""
+"""Scene checks: perturbed frames fail, unperturbed frames pass."""
 
 import json
 from dataclasses import replace
@@ -132,7 +132,7 @@ def compute_error(camera, columns, rows):
 
 
 class TestThePictureItself:
-    """What was answered is right; what was drawn is not."""
+    """Correct solution, wrong image."""
 
     def pixels(self, play, frames, truth, wrong):
         """Sentences and figures where the middle frame's picture is another."""
@@ -149,7 +149,7 @@ class TestThePictureItself:
         assert about(sentences, "outline") and figures.drawn > 2.0
 
     def test_image_of_tumour_shifted_by_1_mm_fails(self, play, frames, truth):
-        """Picture and answer agree, and both differ from the finite elements."""
+        """Image and solution agree, and both differ from FEM."""
         away = shifted(frames[2], 1e-3 * play.site.right)
         sentences, figures = self.pixels(
             play, frames, truth, drawn(play, away, play.compute_positions(away.deformation))
@@ -272,7 +272,7 @@ def anatomy(small_theatre, tmp_path_factory):
 
 class TestCommand:
     def test_check_command_reports_every_scene_as_json(self, anatomy, capsys):
-        """All but the blades, which strain 1 ml of so small a body beyond what was measured, or invert tetrahedra."""
+        """Blade scenes fail: they strain this small body beyond the measured range, or invert tetrahedra."""
         assert main(["check", "--anatomy", str(anatomy), "--every", "60", "--json"]) == 1
         out, err = capsys.readouterr()
         report = json.loads(out)

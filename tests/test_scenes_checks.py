@@ -1,4 +1,4 @@
-"""A scene's picture in every style: honest about drape and bone, legible, in colours that all eyes tell apart."""
+"""Images of a scene in each style: drape and bone, legible text, and colours for colour-blind eyes."""
 
 from dataclasses import replace
 from functools import cache

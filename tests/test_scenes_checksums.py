@@ -1,4 +1,4 @@
-"""Checksums of an episode: what is changed, gone or came later is named."""
+"""Checksums of an episode: changed, removed and added arrays are named."""
 
 import h5py
 

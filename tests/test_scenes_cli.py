@@ -1,4 +1,4 @@
-"""The program from the outside: help of every command, bad input as one sentence, and the start of `sulcus demo`."""
+"""Command line: help of each command, rejected input, and the start of `sulcus demo`."""
 
 import os
 import subprocess
@@ -22,7 +22,7 @@ from sim.bodies.meshfile import write_anatomy, write_mesh
 
 
 def test_help_of_commands_does_not_import_warp_or_scipy():
-    """They take a second to import."""
+    """Importing them takes a second."""
     code = (
         "import sys; from scenes.cli import make_parsers\n"
         "for name in sys.argv[1:]:\n"
@@ -35,8 +35,8 @@ def test_help_of_commands_does_not_import_warp_or_scipy():
 
 
 @pytest.mark.parametrize("name", ["linear", "fem"])
-def test_page_opens_during_compilation_then_plays(name, box, tmp_path, monkeypatch):
-    """A model's first answer belongs to what is made ready."""
+def test_demo_page_opens_during_compilation_and_then_plays(name, box, tmp_path, monkeypatch):
+    """Preparation includes the first prediction of a model."""
     done, predicted = [], SceneSolvers.predict
     opened = threading.Event()
 

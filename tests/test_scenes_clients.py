@@ -1,4 +1,4 @@
-"""Clients of a live link: newest messages first, bad messages and storms, over 127.0.0.1 and a free port."""
+"""Clients of a live link on 127.0.0.1: newest messages, invalid messages and many connections."""
 
 import asyncio
 import socket

@@ -1,4 +1,4 @@
-"""Columns of exports: twists, rates of frames and what is held out."""
+"""Columns of exports: twists, frame rates and held-out bodies."""
 
 from types import SimpleNamespace
 

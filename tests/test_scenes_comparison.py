@@ -1,4 +1,4 @@
-"""Verdict on the present load, and accuracy against time on the page."""
+"""Comparison of deformers on the page: error for the current load, and error against time."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -44,7 +44,7 @@ def test_deformers_are_ranked_on_common_loads():
 
 
 def test_deformers_without_common_load_are_not_ranked():
-    """One on frames without force, the other at full force: the medians are no comparison."""
+    """One was timed without force, the other at full force: their medians are not comparable."""
     tally = AccuracyTimeTable()
     shown(tally, "resting", "ab", 1.0, 0.002)
     assert [row.best for row in tally.rows] == [None]
@@ -93,7 +93,7 @@ class TestVerdict:
 
 
 def test_comparison_with_fem_gives_error_in_millimetres(theatre):
-    """Of a model whose answer is 0.2 mm off everywhere, and of the finite elements' own distance."""
+    """For a solution with a constant error of 0.2 mm, and for the solution of FEM."""
     scene = short()
     whole = Player(Stage(scene, theatre.site), theatre.build_fem(scene, LIVE))
     loads = whole.build_loads(3)

@@ -1,4 +1,4 @@
-"""The contents of files that are not what they seem."""
+"""Contents of damaged episode files."""
 
 import h5py
 import pytest

@@ -1,4 +1,4 @@
-"""Episodes in the formats of others: what is written is what was read."""
+"""Conversion of episodes: output folders, interrupted runs and full disks."""
 
 import os
 import subprocess

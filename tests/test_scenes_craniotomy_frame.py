@@ -1,4 +1,4 @@
-"""The built-in scenes' place on a head of another shape, opened at the left side: a long ellipsoid."""
+"""Craniotomy frame of the built-in scenes on a head of another shape: a long ellipsoid opened on the left."""
 
 import numpy as np
 import pytest

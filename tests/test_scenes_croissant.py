@@ -1,4 +1,4 @@
-"""Croissant metadata, read by its own reader."""
+"""Croissant metadata, read by mlcroissant."""
 
 import os
 import subprocess

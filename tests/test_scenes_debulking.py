@@ -1,4 +1,4 @@
-"""The debulking of a tumour: its corridor, and what is refused."""
+"""Debulking of a tumour: its corridor, and rejected numbers of steps."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from sim.errors import InputError
 
 @pytest.mark.parametrize(("asked", "wide"), [(1e-4, 6e-3), (9e-3, 9e-3)])
 def test_corridor_reaches_from_cortex_to_tumour(box, asked, wide):
-    """As wide as it is asked for, and never narrower than an edge of the mesh, which is 6 mm here."""
+    """Width as requested, but at least one mesh edge, which is 6 mm here."""
     corridor = np.array(Debulking(SURGERY.times, corridor=asked).build_resection(box).steps[0])
     middle = box.mesh.nodes[box.mesh.tets].mean(axis=1)
     brain, across = box.mesh.region != TUMOUR_LABEL, np.linalg.norm(middle[:, :2], axis=1)

@@ -1,4 +1,4 @@
-"""Moments of a body: displacement, bound and time of a frame."""
+"""Deformed anatomies: displacement, bound and time of a frame."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Theatres read from their files, and the models in them."""
+"""Patient setups read from files, and the models in them."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The page alive, without a browser: it plays, listens, is refereed, and goes away."""
+"""Page of `sulcus demo` without a browser: playback, comparison with FEM, controls and shutdown."""
 
 import threading
 import time
@@ -64,7 +64,7 @@ def test_demo_plays_and_shows_difference_from_fem(demo, theatre):
 
 
 def test_demo_shows_the_solver_plan_of_fem(demo, monkeypatch):
-    """While a model answers and where they do; nothing where none have a plan."""
+    """With a model and with FEM as deformer; nothing for deformers without a plan."""
     folder, text = demo.browser.controls.notes[PLAN]
     assert not folder.visible
     demo.wish.set(plays=False)
@@ -89,7 +89,7 @@ def test_page_text_and_image_have_the_same_frame_number(demo, monkeypatch):
 
 
 def test_play_continues_from_the_paused_frame(demo, monkeypatch):
-    """In the middle of a run: the frame that it paused at is shown already, and so nothing new is asked for."""
+    """Inside a run: the paused frame is shown already, and no new solution is requested."""
     demo.wish.set(plays=False, number=20)
     seen = []
 
@@ -150,7 +150,7 @@ def test_visitor_can_move_tool_select_frame_and_deformer(running):
 
 
 def test_tool_menu_shows_who_controls_the_tool(demo):
-    """The script gets the tool back while a slider's word that the hand has it is still on its way to the menu."""
+    """Case: the script takes the tool while a slider's message of manual control is still being processed."""
     visitor, inputs = Visitor(demo.browser, 1200), demo.browser.inputs
     visitor.set(inputs["force [N]"], 0.2)
     assert wait_for(lambda: inputs["tool"].value == HAND)

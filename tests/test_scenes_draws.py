@@ -1,4 +1,4 @@
-"""Every key of a plan: the page's table has its meaning, and rejections name its limits."""
+"""Keys of a plan: their meaning in the table of the docs, and their limits in messages."""
 
 import importlib.util
 import sys

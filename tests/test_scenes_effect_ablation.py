@@ -1,4 +1,4 @@
-"""What each effect costs and changes, and the list of scenes with its sheet."""
+"""Cost and influence of each effect of a scene."""
 
 import json
 import re
@@ -84,7 +84,7 @@ def counted(theatre, scene, every):
 
 
 def test_printed_memory_equals_size_of_device_arrays(small_theatre, printed):
-    """Of every row, in the table and in JSON, by bytes that are counted without `scenes.play.effect_ablation.rows`."""
+    """Each row of table and JSON, against bytes counted without `scenes.play.effect_ablation.rows`."""
     out, error = printed
     table = [[cell.strip() for cell in line.split("|")] for line in error.splitlines() if line.startswith("| ")]
     scene = find_scene("brain_shift")
@@ -99,7 +99,7 @@ def test_printed_memory_equals_size_of_device_arrays(small_theatre, printed):
 
 
 def test_effect_change_is_difference_between_solutions(small_theatre):
-    """By another way: an effect that does all that is done."""
+    """Independent check: an effect that causes the whole motion."""
     scene = sinking()
     found = {row.effect: row for row in measure_effects(small_theatre, scene, 2)}
     alone = run(replace(small_theatre, models={}), scene, 2)

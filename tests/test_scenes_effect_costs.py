@@ -1,4 +1,4 @@
-"""Costs of the effects: record that ships with the template, and what the page shows of it and measures."""
+"""Costs of the effects: the record of the template, and the costs that the page shows and measures."""
 
 import json
 import threading
@@ -45,7 +45,7 @@ def test_measure_costs_measures_each_switchable_effect(theatre):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_template_record_has_each_effect_of_each_scene(template, name):
-    """Otherwise: `sulcus effects --out scenes/data/template.effects.json`."""
+    """If it fails: `sulcus effects --out scenes/data/template.effects.json`."""
     scene = find_scene(name)
     record = template.find_effect_record(scene)
     assert record is not None and set(record.effects) == {ALL, *list_switchable_effects(scene, template.anatomy)}

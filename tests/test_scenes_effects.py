@@ -1,4 +1,4 @@
-"""What acts in a scene follows from its effects, and a learnt model answers none that it was not trained on."""
+"""Effects of a scene: their causes, scenes without a tool, switches on the page, and brain shift."""
 
 import re
 from dataclasses import replace
@@ -199,7 +199,7 @@ class TestBrainShift:
         assert (low[beyond < 0.0] == 0.0).all() and (low[beyond > 2e-3] > 5e-3).all() and (beyond > 2e-3).sum() > 20
 
     def test_border_of_the_visible_cortex_stays_below_the_bone(self, coarse):
-        """The cortex that moves out from under the bone is drawn too: nothing is seen through the hole beside it."""
+        """Cortex that slides out from below the bone is drawn too: no gap at the rim of the hole."""
         playing = coarse.build_player("fem", small("brain_shift"))
         still, sunk = (playing.draw(0, time, Touch()) for time in (0.0, 3.0))
         seen = still.picture.segmentation == CORTEX

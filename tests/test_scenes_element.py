@@ -1,4 +1,4 @@
-"""--element from the outside: quadratic meshes as input, the same body by different files, refusals."""
+"""Option --element: quadratic meshes as input, equal bodies from different files, and rejected input."""
 
 import json
 from itertools import combinations
@@ -71,7 +71,7 @@ def middles_held_by_the_rule(held: np.ndarray) -> np.ndarray:
 
 
 def test_linear_mesh_with_p2_equals_straight_quadratic_mesh(solve) -> None:
-    """Held nodes that make a wall, and some that do not; prescribed values are linear along the edges of the wall."""
+    """Fixed nodes of a wall and single ones; prescribed values are linear along the edges of the wall."""
     held = np.repeat(BASE[:COUNT, None], 3, axis=1)
     wall = LINEAR.nodes[:, 0] < 1e-9
     held[wall, 0] = True  # slides in its plane
@@ -102,7 +102,7 @@ def test_curved_mesh_equilibrium_by_independent_formulas(solve) -> None:
 
 @pytest.mark.parametrize("seen", ["in a mirror", "with corners exchanged"])
 def test_curved_mesh_of_negative_orientation_is_mirrored(solve, seen: str) -> None:
-    """Corners are turned; every middle stays on its edge, or the curved elements would be others."""
+    """Corners are swapped; each mid-edge node stays on its edge, to keep the curved elements."""
     data = {"fixed": BASE.astype(int), "force": FORCE}
     plain = solve(CURVED, data)[2]
     mirror = np.array([-1.0, 1.0, 1.0]) if seen == "in a mirror" else np.ones(3)
@@ -143,7 +143,7 @@ def test_node_outside_quadratic_tetrahedra_does_not_move(solve) -> None:
 
 
 def test_element_folded_at_mid_edge_counts_as_inverted(solve) -> None:
-    """All corners stay where they are: their tetrahedra look sound."""
+    """All corners stay fixed: their linear tetrahedra are valid."""
     assert STRAIGHT.middles is not None
     node = STRAIGHT.middles[0, 0]
     ends = STRAIGHT.nodes[STRAIGHT.tets[0, :2]]

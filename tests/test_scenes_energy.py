@@ -1,4 +1,4 @@
-"""Under loads that stay, with mass, no built-in scene gains energy, be its effects what they are."""
+"""Energy of the built-in scenes with mass under constant loads."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,4 +1,4 @@
-"""Thousands of episodes by many processes: what is there is skipped, what fails is kept, marked and counted."""
+"""Episodes by many processes: existing episodes are skipped, failures are recorded and counted."""
 
 import json
 import os
@@ -89,7 +89,7 @@ def test_full_disk_ends_the_run_with_a_message(workers, tmp_path):
 
 
 def test_each_worker_uses_one_gpu_and_is_replaced_after_failure(undisturbed, tmp_path):
-    """A card that has failed answers nothing any more; the number of an episode that broke it is tried anew."""
+    """After a failed GPU its process is replaced, and the episode is tried again."""
     with start_own_workers(["cuda:0", "cuda:1"]) as workers:
         tally = played(tmp_path, workers, 12, Trouble({3: "broken once"}, seconds=0.05))
     assert tally.made == 12 and tally.failed == tally.lost == 0 and held(tmp_path) == undisturbed

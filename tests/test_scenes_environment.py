@@ -1,4 +1,4 @@
-"""Surgical tasks as Gymnasium environments: one alone, many together, and what they refuse."""
+"""Surgical tasks as Gymnasium environments: single, vectorised, and rejected input."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def test_gymnasium_checker_accepts_all_environments(observation, boxed):
 
 
 def test_same_seed_and_actions_give_same_bytes():
-    """Alone, and second of three, whose neighbours do something else; pictures too."""
+    """Single, and second of three with other actions; images too."""
     alone = played(made(observation="rgbd"), 7, 18)
     vector = many(3, observation="rgbd")
     seen, _ = vector.reset(seed=[0, 7, 3])
@@ -50,7 +50,7 @@ def test_vector_environment_resets_finished_episodes():
 
 
 def test_vector_environment_equals_gymnasium_sync_vector():
-    """Byte for byte, over the end of episodes; the truth too."""
+    """Byte for byte, across the end of episodes; ground truth too."""
     vectors = [many(2, max_episode_steps=4), many(2, max_episode_steps=4, vectorization_mode="sync")]
     assert vectors[0].metadata["autoreset_mode"] == vectors[1].metadata["autoreset_mode"]
     random = np.random.default_rng(0)
@@ -105,7 +105,7 @@ def test_environment_rejects_invalid_actions_and_reset_options():
 
 
 def test_spatula_model_gives_same_bytes_alone_and_in_vector():
-    """Byte for byte, through contact; and with a process of its own."""
+    """Byte for byte, during contact; and in a separate process."""
     alone = played(made("Retract"), 2, 16, "retract")
     vector = many(2, "Retract")
     seen, _ = vector.reset(seed=[5, 2])

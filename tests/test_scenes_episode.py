@@ -1,4 +1,4 @@
-"""Scenes as files: episodes that read back, frames and films."""
+"""Scenes as files: stored episodes, frames and videos."""
 
 import json
 from dataclasses import replace
@@ -78,7 +78,7 @@ class TestEpisode:
         assert set(file["pictures"]) <= set(PICTURES) and set(file) - {"pictures"} <= set(ARRAYS)
 
     def test_frame_is_recomputed_from_attributes_of_the_file(self, episode, box):
-        """Tissue, element, tool and load are those that the file names; so is what solved it."""
+        """Tissue, element, tool, load and solver are those in the file's attributes."""
         _, file, _, _ = episode
         said, number = file.attrs, 3
         effects = (read_tissue_statement({name: str(text) for name, text in said.items()}), Held(), ToolForce())
@@ -196,7 +196,7 @@ class TestEpisode:
 
     @pytest.mark.parametrize(("size", "most"), [(40_000, 4), (150_000, 7)])
     def test_collect_reports_a_full_disk_as_input_error(self, theatre, tmp_path, size, most, monkeypatch):
-        """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
+        """HDF5 aborts the process on a failed write: it does not write to the disk itself."""
         # The check before the start finds enough space.
         monkeypatch.setattr("scenes.episodes.episode.check_disk_space", lambda *asked: None)
         drawn, play = [], player(theatre, short(), "linear")
@@ -255,7 +255,7 @@ class TestRender:
         assert 2 <= json.loads(capsys.readouterr().out)["not_good"] <= 5
 
 
-def test_oversized_episode_is_reported_before_work(theatre, tmp_path):
+def test_oversized_episode_is_rejected_at_the_start(theatre, tmp_path):
     play = player(theatre, short(), "linear")
     with files_below(100_000), pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
         collect(tmp_path / "press.h5", theatre, play, "linear", iter)

@@ -1,4 +1,4 @@
-"""`sulcus episodes`: what it refuses, how it stops, what it plans on paper, and its script for a cluster."""
+"""`sulcus episodes`: rejected input, interruption, data sheet and script for a cluster."""
 
 import json
 import os
@@ -92,7 +92,7 @@ def test_signal_stops_processes_and_keeps_resumable_work(number, tmp_path):
 
 
 def test_slurm_script_starts_one_command_on_each_machine(tmp_path, capsys):
-    """Run by bash, with a program that prints what it was given."""
+    """Run by bash, with a program that prints its arguments."""
     words = ["episodes", "small", "--count", "9", "--out", str(tmp_path / "a b"), "--device"]
     assert main([*words, "cuda", "--slurm", "3"]) == 0
     text = capsys.readouterr().out

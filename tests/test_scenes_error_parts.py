@@ -1,4 +1,4 @@
-"""Parts of an overlay's error that are known exactly: registration, clock, and covariances that are turned."""
+"""Exactly known parts of an overlay's error: registration, hand-eye calibration, tool and model."""
 
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -39,7 +39,7 @@ def six(shift):
 
 @pytest.mark.parametrize("shift", [1e-6 * np.eye(3), np.diag([1e-6, 0.0, 0.0])])
 def test_link_bound_of_registration_is_2_80_sigma(shift):
-    """The ball that holds 95 % of an isotropic error of 1 mm along each axis."""
+    """Ball with 95 % of an isotropic error of 1 mm along each axis."""
     follower, names = follower_of(template_theatre().build_stage(find_scene("palpate"))), TransformNames()
     given = replace(follower.registration, covariance=six(shift))
     pose = solve_reference_frames(follower.motion.stage).T_scan_tool[10] @ np.linalg.inv(follower.tool.T_cube_tool)
@@ -50,7 +50,7 @@ def test_link_bound_of_registration_is_2_80_sigma(shift):
 
 
 def test_hand_eye_error_equals_shift_of_the_camera():
-    """A small shift and turn of the camera, in the axes of what carries it, along one direction of all six."""
+    """Small shift and rotation of the camera in its mount's frame, along one direction of six."""
     times, step = np.zeros(1), 1e-4 * np.array([1.0, -2.0, 3.0, 5.0, -3.0, 2.0])
     T, far = (
         turned("zx", [30.0, 50.0]) @ shifted(0.3),

@@ -1,4 +1,4 @@
-"""The time that a run of episodes takes, as planned from what was measured."""
+"""Estimated time of a run of episodes from measured rates."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What an overlay has from elsewhere: another tracker's poses and clock, past midnight too, and a camera's errors."""
+"""External trackers: interpolated poses, clock offset, daily clocks, and the camera's calibration error."""
 
 import json
 from dataclasses import replace
@@ -71,7 +71,7 @@ def twist(found, true):
 
 
 @pytest.mark.parametrize(("rate", "late"), [(20.0, 0.08), (30.0, 0.05), (60.0, 0.03)])
-def test_pose_interpolation_beats_newest_sample(rate, late):
+def test_pose_interpolation_is_closer_than_newest_sample(rate, late):
     rng = np.random.default_rng(int(rate))
     stream = sampled(swung, np.arange(0.0, 4.0, 1.0 / rate), rng)
     plain, found, inside = [], [], []
@@ -348,7 +348,7 @@ def test_overlay_command_estimates_clock_of_pose_files(bodies, tmp_path, capsys)
         read_hand_eye(tmp_path / "h.json")
 
 
-def test_calibration_error_in_band_unless_reference_absorbs_it(follower, stage, tmp_path):
+def test_calibration_error_in_band_unless_cancelled_by_reference(follower, stage, tmp_path):
     follower = replace(follower, motion=replace(follower.motion, deformer=Still()))
     first, deviations = (
         next(iter(read_video(FILM / "film.mp4", 30.0))),

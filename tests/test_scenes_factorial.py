@@ -1,4 +1,4 @@
-"""Every combination of what is not known: which factors decide, alone and together."""
+"""Factorial study of unknown parameters: variance shares of single factors and interactions."""
 
 import csv
 import json
@@ -30,7 +30,7 @@ def made(rule):
 
 
 def test_multiplicative_factors_have_no_interaction():
-    """The motion's logarithm is a sum, so that its variance is that of its parts."""
+    """The logarithm of the motion is a sum, and so is its variance."""
     found = compute_variance_shares(
         made(lambda at: 2.0 * (3.0 if at["skull"] == "slide" else 1.0) * (np.e if at["nu"] == 0.45 else 1.0))
     )

@@ -1,4 +1,4 @@
-"""Families of episodes in the plans that ship."""
+"""Families of episodes in the shipped plans."""
 
 from scenes.episodes.families import FAMILIES, FamilyMotions
 from scenes.episodes.plan import list_shipped, load_plan

@@ -1,4 +1,4 @@
-"""Reference solutions of the page: those of the newest request, and of the frame that is shown."""
+"""FEM solutions of the page: newest request and displayed frame."""
 
 import threading
 
@@ -9,7 +9,7 @@ from scenes.page.fem_worker import FemWorker
 
 
 def test_paused_page_shows_fem_solution_that_arrives_later(demo, monkeypatch):
-    """The frame was drawn before the finite elements answered it: no further one brings their tumour along."""
+    """The frame is drawn before its FEM solution exists, and no further frame updates the tumour."""
     asked = []
     monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
     demo.wish.set(plays=False, number=90)

@@ -1,4 +1,4 @@
-"""Films of a scene as files: time stamps in their pixels, and all that belongs to a film."""
+"""Synthetic videos as files: time stamps in the pixels, and ground truth."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""Films of a scene as a camera takes them: targets, troubles, and an erroneous registration."""
+"""Synthetic videos of a scene: targets, disturbances and registration errors."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The fine cortex: gyri, sulci and vessels that the FEM surface carries, on any anatomy."""
+"""Fine cortex on the FEM surface of any anatomy: gyri, sulci and vessels."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""`sulcus report`: which rows are measured at the same time, and what happens when one of them stops."""
+"""`sulcus report`: rows measured in parallel, and interruption."""
 
 import subprocess
 import sys
@@ -83,7 +83,7 @@ def test_no_row_starts_after_an_interruption(study, cores):
 
 
 def test_row_process_reports_error_and_releases_its_turn(study, tmp_path):
-    """What cannot be had is said, and the turn is given back."""
+    """An unknown law is reported in the state of the row."""
     turns = []
 
     @contextmanager
@@ -97,7 +97,7 @@ def test_row_process_reports_error_and_releases_its_turn(study, tmp_path):
 
 
 def test_row_process_prints_no_output_of_warp():
-    """They would stand before the line of --json."""
+    """Such lines would precede the line of --json."""
     code = (
         "from types import SimpleNamespace as Study; from scenes.report.rows import prepare_rows\n"
         "prepare_rows('cpu', Study(on_card=False)); import warp as wp; wp.zeros(1, device='cpu')"

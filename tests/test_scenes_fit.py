@@ -1,4 +1,4 @@
-"""`sulcus fit` as a user calls it, its file where an ensemble is drawn, and what its bench says of known tissue."""
+"""`sulcus fit`: the command, its file in an ensemble, and its benchmark on known tissue."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What is known of a picture: registration, tool, and what makes it stale."""
+"""Tracking results of images: registration, tool and stale states."""
 
 from dataclasses import replace
 from itertools import islice
@@ -82,7 +82,7 @@ PARTS = np.array([1e-3, 2e-3, 3e-3])
 
 @pytest.mark.parametrize("source", ["tracking", "tool", "registration"])
 def test_tip_covariance_is_rotated_into_the_scan_frame(source):
-    """A quarter turn of the registration, another one of the cube; an error along (1, 2, 3) in its own frame."""
+    """Registration and cube are rotated by 90 degrees; the error lies along (1, 2, 3) in its own frame."""
     T_patient_scan, T_patient_cube = turned("z", 90.0), turned("x", 90.0)
     own, none = np.outer(PARTS, PARTS), np.zeros((3, 3))
     into_patient = T_patient_cube[:3, :3] if source == "tool" else np.eye(3)
@@ -110,7 +110,7 @@ def looking(motion, **given):
 
 
 def test_pace_is_measured_across_the_view_and_decays():
-    """10 mm along the view, then 10 mm across it, then nothing: each in 40 ms."""
+    """Motion of 10 mm along the view, 10 mm across it, then none: each in 40 ms."""
     _, known = looking([shifted(0.0), shifted(0.0, 0.01), shifted(0.01, 0.01), shifted(0.01, 0.01)])
     assert [each.pace for each in known] == [None, *(pytest.approx(pace) for pace in (0.0, 0.25, 0.25 * 0.1**0.04))]
 

@@ -1,4 +1,4 @@
-"""`python -m benchmarks frame`: every stage of a page's frame is timed, and the page gets the pictures."""
+"""`python -m benchmarks frame`: time of each stage of a frame, and images sent to the page."""
 
 import json
 from functools import partial

@@ -1,4 +1,4 @@
-"""An ensemble of few draws, or of loads beyond the tissue's law, is shown as a rough estimate."""
+"""Rough estimates of the tumour error: few draws, or loads beyond the tissue's law."""
 
 from dataclasses import replace
 

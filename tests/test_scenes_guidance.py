@@ -1,4 +1,4 @@
-"""What the command line says before, while and after it works."""
+"""Messages of the command line: help, examples, progress and missing CUDA."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""The posture of the head, and how its fluid drains."""
+"""Posture of the head, and drainage of its fluid."""
 
 import numpy as np
 import pytest

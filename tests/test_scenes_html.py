@@ -1,4 +1,4 @@
-"""The page in one file: its model against Python's, its lines against Python's camera, and its controls."""
+"""Page in one file: its model and outline against Python, and its controls."""
 
 import base64
 import json

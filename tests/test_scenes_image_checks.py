@@ -1,4 +1,4 @@
-"""Overlay in register under each camera path, and in episodes, by OpenCV alone."""
+"""Overlay registration on each camera path and in episodes, checked by OpenCV alone."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def drawn_by_opencv(camera, layer, fine=8, times=4):
 
 @pytest.mark.parametrize("path", [None, *PATHS])
 def test_overlay_matches_opencv_projection_on_each_camera_path(theatre, path):
-    """The outline found again in the picture, against the tumour as OpenCV projects it."""
+    """Outline found in the image, against the tumour projected by OpenCV."""
     play = filmed(theatre, path=None if path is None else PATHS[path](1))
     frames = list(play.play_frames(every=25))
     assert len({id(frame.camera) for frame in frames}) == (1 if path is None else len(frames))

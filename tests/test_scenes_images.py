@@ -1,4 +1,4 @@
-"""ANTs reads the field as it is: runs where SULCUS_ANTS_PYTHON names a Python that has antspyx."""
+"""Fields read by ANTs: runs where SULCUS_ANTS_PYTHON names a Python that has antspyx."""
 
 import json
 import os

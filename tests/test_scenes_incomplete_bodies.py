@@ -1,4 +1,4 @@
-"""Bodies of data sets that were interrupted: loads that were solved are kept, and the files have the same bytes."""
+"""Interrupted bodies of data sets: solved loads are kept, and the files have identical bytes."""
 
 import os
 import signal
@@ -101,7 +101,7 @@ def killed(folder, plan, after):
 
 
 def test_killed_body_resumes_with_identical_files(plan, undisturbed, solved, tmp_path):
-    """Killed among the unit responses, and by a worker of another machine once all was solved."""
+    """Killed during the unit responses, and on another machine after all loads were solved."""
     elsewhere, tmp_path = tmp_path / "elsewhere", tmp_path / "here"
     assert begin(tmp_path, tiny_run(), "")
     killed(tmp_path, plan, 64)
@@ -129,7 +129,7 @@ def full(*given, **more):
 
 
 def test_tabulated_series_is_reused_after_an_error(plan, tmp_path, monkeypatch):
-    """An error comes once it is there; the model has the same bytes as without any."""
+    """The error occurs after the table is written; the model has the same bytes as without an error."""
     text = plan.text.replace('"linear"', '"series"').replace("loads = 70", "loads = 40")
     again = replace(plan_from(text, "own", plan.folder), own=plan.own)
 

@@ -1,4 +1,4 @@
-"""The inspection of an anatomy."""
+"""Inspection of an anatomy."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""`sulcus patient --inspect`: what would be made is shown as it is, in figures and a picture, and nothing is made."""
+"""`sulcus patient --inspect`: figures, image and warnings before an anatomy is made."""
 
 import json
 
@@ -29,7 +29,7 @@ def compute_middle(panel, colour):
 
 
 def test_inspection_reports_volumes_depth_and_directions(tmp_path, capsys):
-    """A ball of 55 mm round the origin, and one of 10 mm in it, 20 mm to the right and up."""
+    """Ball of 55 mm at the origin, with a ball of 10 mm, 20 mm to the right and up."""
     ball(tmp_path)
     found, picture = inspect_subject(capsys, tmp_path, tmp_path / "labels.nii.gz", "--brain", 1, "--tumour", 2)
     assert found["brain_ml"] == pytest.approx(4 / 3 * np.pi * 55**3 / 1e3, rel=0.01)
@@ -115,7 +115,7 @@ def moved(folder, name, to, affine, crop=None):
 
 
 def test_inspection_rejects_lps_scan_labelled_as_ras(tmp_path, capsys):
-    """On the grid of the labels, whichever of both is wrong; and on one of its own, which then misses the brain."""
+    """On the grid of the labels, with either file wrong; and on a separate grid, which misses the brain."""
     ball(tmp_path)
     labels, affine = tmp_path / "labels.nii.gz", nibabel.load(tmp_path / "labels.nii.gz").affine
     far = affine.copy()

@@ -1,4 +1,4 @@
-"""The natural look: instruments with the contact shape at their tips, a folded drape, and effects of the camera."""
+"""Natural appearance: instruments with the contact shape at their tips, folded drape and camera effects."""
 
 from dataclasses import replace
 from typing import get_args

@@ -1,4 +1,4 @@
-"""`sulcus demo` ends at a signal, however long what it computes takes."""
+"""Signals end `sulcus demo` during a long solve."""
 
 import signal
 import subprocess
@@ -65,7 +65,7 @@ def started(what):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_signal_closes_the_page_without_waiting_for_solver(number, code):
-    """Page's loop and referee are in a solve of 100 s; the limit on this test is far below, and far above a second."""
+    """Page and FEM worker are in a solve of 100 s; the test's time limit is far shorter."""
     process = started("computing")
     try:
         assert process.stdout is not None and any("playing" in line for line in process.stdout)

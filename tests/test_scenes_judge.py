@@ -1,4 +1,4 @@
-"""Models judged with the element and the tissue that they were trained on."""
+"""Model evaluation with the element and the tissue of the training."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def physics(theatre: PatientSetup, scene: Scene) -> tuple[str, Tissue | None]:
 
 
 def test_models_are_evaluated_with_their_training_tissue(box, body, tmp_path) -> None:
-    """Through the model file, and for the truth of frames as for the page's finite elements."""
+    """Through the model file, for reference solutions of frames and for FEM of the page."""
     words = "--element", "smoothed", "--material", STIFF.law, "--young", "9000", "--poisson", "0.3"
     provenance = read_dataset(simulated(body, tmp_path, *words)).provenance
     models = theatre_of(box).models

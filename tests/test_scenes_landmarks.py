@@ -1,4 +1,4 @@
-"""Landmarks of a warp: places in tissue, or of a hollow tumour the nearest."""
+"""Landmarks of a warp: points in tissue, or the nearest tissue of a hollow tumour."""
 
 import json
 

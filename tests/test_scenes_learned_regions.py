@@ -1,4 +1,4 @@
-"""Regions with their own tissue: by `--region` in every command, and those that models beside an anatomy learned."""
+"""Regions with their own tissue: option `--region` of each command, and regions of trained models."""
 
 import argparse
 import json

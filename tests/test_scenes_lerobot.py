@@ -1,4 +1,4 @@
-"""LeRobot data sets: what is written is what was read."""
+"""LeRobot data sets: layout, images and statistics equal those of the episodes."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Command of the live link: it serves this machine, measures a solution, and refuses what cannot be served."""
+"""Command of the live link: local server, measured solution, and rejected options."""
 
 import signal
 import socket

@@ -1,4 +1,4 @@
-"""`sulcus locate`: files in, a mesh and numbers out, and what is wrong with a file in one sentence."""
+"""`sulcus locate`: mesh and figures from point files, and rejected files."""
 
 import json
 from dataclasses import replace
@@ -75,7 +75,7 @@ def test_locate_writes_mesh_and_figures_in_millimetres(files, body, capsys):
 
 
 def test_rigid_option_takes_millimetres_and_rejects_bad_values(files, capsys):
-    """Of no rigid error none is found; what no tracker does is refused before anything is written."""
+    """Zero gives no rigid error; implausible values are rejected before output is written."""
     folder, _ = files
     out, bias = folder / "rigid.vtu", []
     words = f"locate {folder / 'box.vtu'} {folder / 'plain.csv'} --out {out} --json --force --rigid".split()
@@ -114,7 +114,7 @@ def test_locate_rejects_mostly_uncertain_points(files, tmp_path, capsys):
 
 
 def test_locate_json_has_warnings_and_regions(files, body, tmp_path, capsys):
-    """Sentences of warning, and the regions that the locator knows."""
+    """Warnings of outliers, and regions of the locator."""
     folder, _ = files
     path = tmp_path / "own.npz"
     save_locator(path, replace(load_locator(folder / "box.locator.npz", body), regions=TUMOUR))
@@ -182,7 +182,7 @@ def seen_dent(body, truth, count):
 
 @pytest.mark.parametrize("named", [True, False])
 def test_locate_uses_a_subset_of_many_points(files, body, named):
-    """They say the same alone, and others cost nothing; those that are off are counted among them."""
+    """Unused points do not change the result; outliers are counted in the subset."""
     folder, truth = files
     locator = load_locator(folder / "box.locator.npz", body)
     rest, motion = seen_dent(body, truth, 20_000)
@@ -196,7 +196,7 @@ def test_locate_uses_a_subset_of_many_points(files, body, named):
 
 
 def test_locate_rejects_points_half_off_the_cortex(files, body):
-    """No cortex moves by 40 mm: such points are left out, rather than explained by a registration."""
+    """No cortex moves by 40 mm: such points are outliers, not a registration error."""
     folder, truth = files
     rest, motion = seen_dent(body, truth, 60)
     now = rest + motion
@@ -226,7 +226,7 @@ def test_locate_rejects_folder_as_point_file(files, tmp_path, capsys):
 
 
 def test_locate_rejects_distant_points_before_building_locator(tmp_path, capsys, body):
-    """The anatomy has none, and none is begun."""
+    """The anatomy has no locator, and none is built."""
     write_anatomy(tmp_path / "box.vtu", body)
     far = tmp_path / "far.csv"
     far.write_text("x,y,z\n" + "".join(f"{300 + 9 * (k % 3)},{9 * (k // 3)},{k % 2}\n" for k in range(9)))
@@ -280,7 +280,7 @@ def test_locator_command_writes_file_next_to_anatomy(files, body, tmp_path, caps
 
 
 def test_locator_of_other_regions_is_rejected(files, body, tmp_path, capsys):
-    """Of a patient's regions, those count that the locator was made with."""
+    """Compared are the regions of the locator alone."""
     folder, _ = files
     write_anatomy(tmp_path / "box.vtu", body)
     seen = [str(tmp_path / "box.vtu"), str(folder / "vessels.csv"), "--json"]
@@ -293,7 +293,7 @@ def test_locator_of_other_regions_is_rejected(files, body, tmp_path, capsys):
 
 
 def test_locator_uses_regions_of_the_trained_models(body, tmp_path, capsys, monkeypatch):
-    """A patient's own stiffness is said once, where the models are made."""
+    """Users give the stiffness once, where the models are made."""
     asked = []
 
     def make(anatomy, seed, device, causes, folder, progress):

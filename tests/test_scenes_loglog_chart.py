@@ -1,4 +1,4 @@
-"""Charts: what is drawn lies where it belongs, and what cannot be drawn is refused."""
+"""Log-log charts: positions of curves, dots and labels, and rejected values."""
 
 import re
 import sys
@@ -58,7 +58,7 @@ def test_dots_have_data_positions_and_given_opacity():
 
 
 def test_labels_of_adjacent_dots_do_not_overlap():
-    """Ink of two names beside two dots that touch: as much as of each alone."""
+    """Two labels at touching dots have as many dark pixels as both drawn separately."""
 
     def dark(*names):
         dots = tuple(Dot(name, "g", 10.0 + 0.5 * k, 1.0) for k, name in enumerate(names))
@@ -69,7 +69,7 @@ def test_labels_of_adjacent_dots_do_not_overlap():
 
 
 def test_pale_dot_in_a_dense_cluster_has_no_label():
-    """Where 60 dots crowd; the one in full colour is named all the same."""
+    """In a cluster of 60 dots; the dot in full colour keeps its label."""
 
     def picture(pale, full, crowd=60):
         pales = [Dot(pale, "g", 10.0 + 0.01 * k, 1.0 + 0.01 * k, pale=True) for k in range(crowd)]

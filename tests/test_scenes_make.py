@@ -1,4 +1,4 @@
-"""The making of one body of a data set."""
+"""Making of one body of a data set."""
 
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def test_incomplete_body_folder_is_reported(plan, tmp_path):
 
 
 def test_image_noise_has_given_deviation_and_zero_mean():
-    """Away from black and white, up to the greatest that a plan may ask for."""
+    """At medium grey, up to the largest deviation of a plan."""
     grey = np.full((200, 200, 3), 128, np.uint8)
     for deviation in (1.0, 6.0, 40.0):
         added = add_noise(grey, deviation, np.random.default_rng(3)).astype(float) - 128.0

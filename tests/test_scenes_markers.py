@@ -1,4 +1,4 @@
-"""`sulcus markers`: what it writes, and what it does not write over."""
+"""`sulcus markers`: written files, and existing files that are kept."""
 
 import json
 

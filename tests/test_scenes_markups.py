@@ -1,4 +1,4 @@
-"""Where the skull is opened, as drawn in 3D Slicer: points, trajectories and outlines of `.mrk.json`."""
+"""Craniotomies from `.mrk.json` files of 3D Slicer: points, trajectories and outlines."""
 
 import json
 
@@ -93,7 +93,7 @@ class TestOpenings:
             assert reason in self.found(folder, capsys, option, points, kind)
 
     def test_opening_of_the_mesh_follows_the_outline(self, folder, capsys):
-        """An ellipse twice as wide as high: what is open lies within it, and all that lies well within is open."""
+        """Ellipse with axes 2 : 1: open nodes lie within it, and nodes well within are open."""
         file = markup(folder / "outline.mrk.json", curve(), "ClosedCurve")
         words = f"anatomy --labels {folder / 'labels.nii.gz'} --brain 1 --tumour 2 --nodes 2500".split()
         assert main([*words, "--opening-at", str(file), "--out", str(folder / "a.vtu"), "--json"]) == 0

@@ -1,4 +1,4 @@
-"""What a scene keeps on the device is what its effects keep, byte by byte: counted, not sampled."""
+"""Device memory of a scene: the exact sum of the memory of its effects."""
 
 import gc
 from types import FunctionType, ModuleType

@@ -1,4 +1,4 @@
-"""Meshes of a warp as trimesh and others read them: their space and their unit."""
+"""Meshes of a warp, read by trimesh: coordinate space and unit."""
 
 import struct
 from xml.etree import ElementTree

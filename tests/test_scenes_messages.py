@@ -1,4 +1,4 @@
-"""OpenIGTLink's messages as pyigtl and the C++ library have them, both ways; and what is no message."""
+"""OpenIGTLink messages against pyigtl and the C++ library, and malformed messages."""
 
 import struct
 import warnings
@@ -106,7 +106,7 @@ def test_polydata_and_status_messages_have_protocol_layout():
 
 
 def test_position_message_has_translation_and_quaternion():
-    """As `igtl_position.h` has it; pyigtl writes that of points."""
+    """Layout of `igtl_position.h`; pyigtl writes the layout of points instead."""
     numbers = [*matrix()[:3, 3], *Rotation.from_matrix(matrix()[:3, :3]).as_quat()]
     assert read_position(struct.pack(">7f", *numbers)) == pytest.approx(matrix(), abs=1e-5)
     with pytest.raises(BadMessageError, match="wrong size: 12 bytes"):

@@ -1,4 +1,4 @@
-"""Trained models that answer tools of environments, against finite elements and Hertz."""
+"""Responses of trained models to tools of the environments, against FEM and Hertz."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from sim.material import MATERIALS
 
 
 def test_model_force_and_motion_match_fem():
-    """By pose, at 3 mm: its force within 25 %, the tumour's nodes within a quarter of their motion."""
+    """At a depth of 3 mm: force within 25 %, tumour nodes within a quarter of their motion."""
     site = open_setting(PALPATE, "template", "model", "cpu", SIZE).site
     poses = [PALPATE.tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (-2e-3, 3e-3)]
     found = []

@@ -1,4 +1,4 @@
-"""Observations of the environments: tracked, felt and seen with noise."""
+"""Observations of the environments: poses, forces and noise."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scenes.gym.tasks import PALPATE
 
 
 def test_observed_states_are_truth_plus_given_noise():
-    """In the axes of the twists."""
+    """In the axes of the actions."""
     environment = made()
     environment.reset(seed=3)
     episode, off = environment.unwrapped.episode, []

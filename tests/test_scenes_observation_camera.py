@@ -1,4 +1,4 @@
-"""Pictures of the environments."""
+"""Images of the environments."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Locating a tumour in scenes: what an image and the page show of it, and how it is checked."""
+"""Tumour localisation in scenes: image, page text and checks."""
 
 import json
 from dataclasses import replace
@@ -184,7 +184,7 @@ def test_rejected_observation_shows_warning_and_no_ellipsoid(refused, monkeypatc
 
 
 def test_check_reports_locator_rejections_and_slips(refused, frames):
-    """Refusals, slips, and a tumour that lies still in most frames, each with its reason; else nothing."""
+    """Rejections, slips and a tumour mostly at rest, each with its reason; otherwise nothing."""
     _, wild = refused
     best = max(frames, key=lambda frame: np.linalg.norm(frame.estimate.true))
     slipped = replace(best.estimate, location=replace(best.estimate.location, slipped=True))

@@ -1,4 +1,4 @@
-"""Observations of an undeformed body: their errors, and their seeds."""
+"""Observations of an undeformed body: errors and seeds."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Places on and inside the tumour that a live link sends."""
+"""Points on and inside the tumour that a live link sends."""
 
 from dataclasses import replace
 

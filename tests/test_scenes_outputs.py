@@ -1,4 +1,4 @@
-"""What commands may write: asked before the work, and nothing of a user's is replaced by it."""
+"""Output paths of commands: checked before the work, and existing files are kept."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A film with known truth and its overlay: where it is drawn, how far off it says to be, and what is lost in it."""
+"""Overlay on a video with ground truth: outline, error band, drape and paced playback."""
 
 import csv
 import json

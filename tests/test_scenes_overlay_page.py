@@ -1,4 +1,4 @@
-"""The page of a film or a camera: in real pictures, in words, for all visitors, and in a real browser."""
+"""Page of a video or a camera: image, text, several visitors and a real browser."""
 
 import re
 import threading
@@ -154,7 +154,7 @@ def test_camera_image_dims_when_stale_and_recovers(follower, stage):
             page.watch(iter([replace(first, grey=first.grey[::2])]), 0.1)
 
 
-def test_video_and_camera_pages_differ_from_demo(capsys):
+def test_overlay_page_serves_video_and_demo_rejects_it(capsys):
     given = [f"--camera={FILM}/camera.yaml", f"--registration={FILM}/registration.json", "--device", "cpu"]
     film, port = str(FILM / "film.mp4"), str(free_port())
     assert main(["overlay", film, *given, "--page", "--port", port, "--seconds", "2"]) == 1  # nobody knows the motion

@@ -1,4 +1,4 @@
-"""What the page says and offers: the words of an answer and of a brain; sliders that the opening allows."""
+"""Text of the page: values of the frame, and the digest of loads."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ class TestDigestOfLoads:
 
 
 def test_page_text_has_the_values_of_the_frame(theatre):
-    """Distance, motion, force and milliseconds, and whose error is how large, each as a person reads it."""
+    """Distance, motion, force, milliseconds and errors in readable units."""
     player = theatre.build_player("linear", short())
     seconds = {"deform": 12.3e-3, "render": 4.5e-3, "overlay": 0.7e-3}
     known = {

@@ -1,4 +1,4 @@
-"""Scenes whose hand moves its tool: what it reads, and that nothing but time and the start decides an answer."""
+"""Palpation scenes with manual control: tool force, models, and reproducible solutions."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ class TestPalpate:
             assert compute_distances(shape, frame.pose, positions).min() > 0.0
 
     def test_frame_solved_again_from_same_start_is_identical(self, theatre, palpated):
-        """A frame is a function of its loads and of the answer that it starts from."""
+        """Frames depend on their loads and on their start solution alone."""
         again = player(theatre, small("palpate"), "fem")
         for row in (8, 3, 6):
             frame = palpated[row]
@@ -87,7 +87,7 @@ class TestPalpate:
         assert frame.acts == f"tool force {reads:.2f} N"
 
     def test_model_without_force_output_shows_no_tool_force(self, palpated):
-        """Trained on where a ball is, it answers without the force that it takes."""
+        """The model is trained on tool positions and predicts no force."""
         frame = palpated[6]
         assert format_acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6))), NODES) == ""
 
@@ -101,7 +101,7 @@ class TestPalpate:
 
     @pytest.mark.parametrize("force", [ForceModel(), None])
     def test_guarded_deformer_uses_fem_beyond_training_depth(self, theatre, palpated, force):
-        """Deeper than in training the finite elements answer: each frame, and all of them as one batch."""
+        """For single frames and for one batch of all frames."""
         scene, anatomy = small("palpate"), theatre.anatomy
         plain = replace(untrained(anatomy, scene), bound=1e-4, force=force)
         model = replace(plain, envelope=replace(plain.envelope, force=(1e-6, 2e-3)))
@@ -142,7 +142,7 @@ class TestPalpate:
             assert np.isnan(file["reaction_bound"][:]).all() and file["reaction_bound"].shape == (4, 2)
 
     def test_linear_contact_model_approximates_fem(self, theatre, palpated):
-        """Nearly as finite elements of softer tissue that stiffens do, on tumour and cortex."""
+        """Against FEM of softer, stiffening tissue, on tumour and cortex."""
         scene, anatomy = small("palpate"), theatre.anatomy
         model = untrained(anatomy, scene)
         assert find_rejection(model, scene.effects) is None

@@ -1,4 +1,4 @@
-"""Command that takes a patient from scan to models: in one go, after a stop, and what cannot be."""
+"""Command `sulcus patient`: all steps from scan to models, resumed runs, and rejected input."""
 
 import json
 
@@ -14,7 +14,7 @@ from sim.runtime.timing import time_stage
 from surrogate.model.store import load
 
 
-def test_patient_passes_options_and_checks_them_first(tmp_path, monkeypatch, capsys):
+def test_patient_command_checks_options_and_passes_them_to_steps(tmp_path, monkeypatch, capsys):
     steps = []
     monkeypatch.setattr("scenes.cli.main", lambda words: steps.append(words) or 0)
     words = ["patient", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu"]

@@ -1,4 +1,4 @@
-"""Options for the opening in the skull and for the tumour: over which piece, and what may be left behind."""
+"""Options for the craniotomy and the tumour: selected piece, and kept data."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -47,7 +47,7 @@ def test_craniotomy_lies_over_the_selected_tumour_piece(tmp_path):
         place_craniotomy(replace(subject, pieces=(large,)), SimpleNamespace(**asked | {"opening_over": 2}))
 
 
-def test_anatomy_lists_pieces_and_keeps_existing_data(tmp_path, capsys):
+def test_anatomy_command_lists_tumour_pieces_and_keeps_data(tmp_path, capsys):
     two_foci(tmp_path)
     out = tmp_path / "me.vtu"
     words = ["anatomy", "--labels", str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--nodes", "2000"]

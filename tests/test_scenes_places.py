@@ -1,4 +1,4 @@
-"""How exact a warp is: its error by part, the spacing that follows from it, and folds of the finite elements."""
+"""Accuracy of a warp: error by part, grid spacing and folds of FEM."""
 
 import json
 from dataclasses import replace
@@ -52,7 +52,7 @@ def test_part_error_is_the_larger_of_both_field_errors(kinked, fields):
 
 
 def test_tumour_places_include_necrosis(kinked):
-    """One half of the tumour's tetrahedra is necrosis; the places are those of the whole."""
+    """Half of the tumour's tetrahedra are necrosis."""
     mesh = kinked.anatomy.mesh
     region = mesh.region.copy()
     region[np.flatnonzero(region == TUMOUR_LABEL)[::2]] = NECROSIS_LABEL
@@ -83,7 +83,7 @@ def dented(small_box):
 
 
 def test_dented_cortex_is_fitted_with_points_outside_the_mesh(dented):
-    """Points of the tetrahedra alone leave the cortex 0.9 mm off."""
+    """With points inside tetrahedra alone the cortex has an error of 0.9 mm."""
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = list_places(dented)
     errors = places.compute_errors(fields)
@@ -100,7 +100,7 @@ def test_finer_spacing_follows_from_the_landmark_error(dented):
 
 
 def test_folds_of_fem_are_found_and_sorted_by_size(small_box):
-    """Two inner vertices go through a face of theirs: one of them hardly."""
+    """Two inner vertices pass through a face of their tetrahedron, one of them barely."""
     mesh, moved = small_box.mesh, np.zeros_like(small_box.mesh.nodes)
     inner = np.setdiff1d(np.arange(len(mesh.nodes)), mesh.surface)
     first, last = inner[0], inner[-1]

@@ -1,4 +1,4 @@
-"""Episodes as folders of pictures and tables."""
+"""Episodes as folders of images and tables."""
 
 import csv
 import json

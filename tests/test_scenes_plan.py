@@ -1,4 +1,4 @@
-"""Plans of data sets: what may be drawn, that each episode is drawn by itself, and what is written of it."""
+"""Plans of data sets: limits, independent sampling of each episode, and stored parameters."""
 
 import json
 from dataclasses import replace
@@ -162,7 +162,7 @@ def test_body_that_cannot_be_meshed_fails_with_reason(tmp_path):
 
 
 def test_memory_shortage_is_raised_and_marks_no_failed_body(tmp_path, monkeypatch):
-    """Others on the same card may leave: the error is passed on, and the engine tries again."""
+    """Memory may become free: the engine tries again."""
 
     def full(*args):
         check_fits(10**9, 10**6, 1, find_device("cpu", "float64"))

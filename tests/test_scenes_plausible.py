@@ -1,4 +1,4 @@
-""""""
+"""Plausibility of a registration and of a tool pose."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The loop: a tool that rests on the tissue, one picture a moment, and a picture that is a function of its moment."""
+"""Player of scenes: tool at rest on the tissue, and frames that depend on their moment alone."""
 
 import importlib
 from dataclasses import replace
@@ -38,8 +38,8 @@ def says(picture, text, ink=WHITE):
     )
 
 
-def test_the_pressing_tip_rests_on_the_deformed_surface(play):
-    """Its ball touches, and no point of the tissue is inside it."""
+def test_pressing_tip_rests_on_the_deformed_surface(play):
+    """The ball touches the tissue, and no point of the tissue is inside it."""
     touch, radius = play.scene.path(1.7), play.scene.tool.radius
     frame = play.draw(51, 1.7, touch)
     rest = play.scene.find_contact(play.site, touch).point
@@ -61,8 +61,8 @@ def test_tool_below_the_bone_stops_at_its_edge_with_remark(play, way):
     assert inside.remark == "" and not says(inside.shown, frame.remark)
 
 
-def test_tissue_pressed_into_bone_is_not_reliable(theatre):
-    """Drawn aside with all that the model knows, beside the rim: the ball stays inside, and the picture says why."""
+def test_result_is_unreliable_with_tissue_pressed_into_bone(theatre):
+    """Largest force of the training range at the rim: the ball stays inside, and the image shows the warning."""
     play = player(theatre, replace(small(), viewpoint=Viewpoint()), "fem")
     reach = play.site.compute_reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
@@ -94,7 +94,7 @@ def test_idle_tool_is_outside_the_tissue(template, name):
 
 
 def test_frame_does_not_depend_on_frames_drawn_before(play):
-    """Whatever was drawn in between."""
+    """Another frame is drawn in between."""
     touch = play.scene.path(1.2)
     first = play.draw(36, 1.2, touch)
     play.draw(3, 0.1, Touch(0.01, 0.0, 0.1, (0.3, 0.1)))
@@ -158,7 +158,7 @@ def test_overlay_draws_only_lines_over_the_tool(name):
 
 
 def test_overlay_covers_the_opencv_projection_of_the_tumour(play):
-    """By another way: the tumour's corners through OpenCV's camera lie inside what was changed."""
+    """Independent check: tumour vertices projected by OpenCV lie inside the changed pixels."""
 
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     changed = (frame.shown != frame.picture.colour).any(axis=2)
@@ -168,7 +168,7 @@ def test_overlay_covers_the_opencv_projection_of_the_tumour(play):
     assert seen.sum() > 4 and changed[row, column][seen].mean() > 0.97
 
 
-def test_frame_computes_rest_and_nearest_point_once(play, monkeypatch):
+def test_frame_computes_resting_tip_and_nearest_point_once(play, monkeypatch):
     found = []
     for place, name in (
         ("scenes.play.player", "find_resting_tip"),
@@ -203,7 +203,7 @@ def test_distance_equals_sampled_distance_from_tip_to_tumour(play):
 
 
 def test_trained_model_and_fem_give_similar_displacements(theatre):
-    """The same scene, the same call: the answers agree to a fraction of the motion."""
+    """Same scene, same call: the difference is below a tenth of the motion."""
     nodes = theatre.anatomy.tumour_nodes
     fem, learnt = (
         player(theatre, small(), name).draw(51, 1.7, Touch(force=0.2)).deformation.restrict(nodes).displacement

@@ -1,4 +1,4 @@
-"""Pictures of episodes as PNG: read by others' readers, without loss."""
+"""Images of episodes as PNG: lossless, and read by other libraries."""
 
 import io
 import struct

@@ -1,4 +1,4 @@
-"""Files of poses: rows, counts and units."""
+"""Pose files: rows, counts and units."""
 
 import numpy as np
 import pytest

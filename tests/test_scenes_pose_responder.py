@@ -1,4 +1,4 @@
-"""Solutions that a live link computes for poses, where it takes the camera to be, and the doubts that it reports."""
+"""Solutions of a live link for poses: camera pose, tumour position and warnings."""
 
 from dataclasses import replace
 

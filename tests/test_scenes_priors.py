@@ -28,7 +28,7 @@ class TestPriors:
         assert all(prior.meaning and prior.source for prior in PRIORS)
 
     def test_samples_cover_each_prior_evenly(self):
-        """One draw in each of so many parts of equal probability."""
+        """One sample in each interval of equal probability."""
         found = sample_priors(20, 3)
         stiffness = np.sort([one.stiffness for one in found])
         edges = STIFFNESS.compute_quantiles(np.arange(21) / 20.0)

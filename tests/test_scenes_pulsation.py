@@ -1,4 +1,4 @@
-"""The built-in scene of a ball on a brain that pulsates."""
+"""Built-in scene of a ball on a pulsating brain."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Two machines in one folder, one of which is unplugged and ended whole: nothing is lost, and nothing is made twice.
+"""Two machines that share one folder, one of them disconnected and killed: no episode is lost or made twice.
 
 Each is a network, a host name and a table of processes of its own (namespaces of Linux), on one kernel and one disk.
 """

@@ -1,4 +1,4 @@
-"""What is heard from a tracker: matrices, units and frames."""
+"""Transforms received from a tracker: matrices, units and frames."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_single_precision_rigid_matrix_is_converted_to_metres():
     assert T[:3, 3] == pytest.approx([0.01, -0.02, 0.03]) and T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3))
 
 
-def test_tracker_frame_bodies_map_to_reference():
+def test_poses_in_tracker_frame_are_converted_to_reference():
     names = TransformNames(tool="StylusTipToTracker")
     heard = ReceivedTransforms(names, 0.3).add_transform(names.tool, matrix(), STAMP, 1.0, 0)
     assert heard.find_relative(names.tool, 1.0) == "no ReferenceToTracker yet"

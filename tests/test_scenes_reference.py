@@ -1,4 +1,4 @@
-"""Reference solutions of a report and of frames: kept load by load, and read at the points that are compared."""
+"""Reference solutions of a report and of frames: stored by load, and evaluated at the compared points."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -46,7 +46,7 @@ def test_reference_resumes_with_missing_loads_only(study, monkeypatch):
 
 
 def test_damaged_reference_file_is_rejected_by_name(study):
-    """So is a damaged table of the series: a stopped run goes on from both."""
+    """Also a damaged table of the series: stopped runs resume from both."""
     get_reference(study)
     kept = study.folder / "answers"
     answer, table = min(kept.glob("reference-*")), kept / f"series-{study.digest}.npz"
@@ -58,7 +58,7 @@ def test_damaged_reference_file_is_rejected_by_name(study):
 
 
 def test_finer_reference_is_evaluated_at_the_same_points(study, tmp_path):
-    """On a coarse box halving every edge changes the motion by some percent, not by half."""
+    """On a coarse box, halved edges change the motion by some percent."""
     one, fine = (replace(study, folder=tmp_path, loads=1, fine=fine) for fine in (False, True))
     for each in (one, fine):
         solve_reference(each, nothing, TRAIN)
@@ -78,7 +78,7 @@ def test_outside_loads_lie_beyond_the_training_range(study):
 
 
 def test_reference_frame_depends_on_loading_history() -> None:
-    """Tissue that relaxes: pressed, held and all but let go, it is not where it was never pressed."""
+    """Relaxing tissue after a press differs from tissue that was never pressed."""
     anatomy = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
     theatre = PatientSetup(anatomy, None, {}, "cpu")
     scene = replace(small(), effects=(Elasticity(RELAXING_BRAIN), Held(), Slide(), ToolForce()), element="p1")

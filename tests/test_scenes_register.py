@@ -1,4 +1,4 @@
-"""Command that registers a patient: the file that it writes, and the error at the tumour."""
+"""Command that registers a patient: its file, and the error at the tumour."""
 
 import json
 

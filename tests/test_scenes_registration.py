@@ -1,4 +1,4 @@
-"""The names of the environments in Gymnasium's registry."""
+"""Names of the environments in Gymnasium's registry."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Registration files: what is written is read, and other bodies are refused."""
+"""Registration files: round trip, and rejected registrations of another body."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Command that renders frames: those of another run are kept, or removed by force."""
+"""Command that renders frames: existing frames are kept, or removed by force."""
 
 from ar.screen import read_png
 from scenes.cli import main

@@ -1,4 +1,4 @@
-"""Frames of an episode solved again: those whose past matters after their past, and any that is wrong is named."""
+"""Frames of an episode solved again after their history: changed frames are named."""
 
 import os
 import signal
@@ -41,7 +41,7 @@ def episode(request, small_box, tmp_path_factory):
 
 
 def test_repeated_solution_detects_a_changed_frame(episode):
-    """Of the frames 0, 2 and 5 the last is not as it was: the others are right, and it alone is named."""
+    """Only the changed one of frames 0, 2 and 5 is named."""
     report = solve_again(Report(episode), 3, "cpu")
     assert report.problems == [] and report.again == 3 and report.again_mm < 0.1
     with h5py.File(episode, "a") as file:

@@ -1,4 +1,4 @@
-"""Whatever a visitor does, a frame of the script is that of the straight run; plain statics need no run."""
+"""Replayed frames of a scene: equal to sequential frames in any order; static scenes need no replay."""
 
 import threading
 import time
@@ -129,7 +129,7 @@ class TestReel:
         assert list(reel.kept) == [0]
 
 
-def test_jumps_use_frames_where_brain_separates(theatre) -> None:
+def test_replay_order_depends_on_contact_and_history(theatre) -> None:
     """And nowhere else; tissue that relaxes is answered in order."""
     box = theatre.anatomy
     sides = box.fixed.any(axis=1) & (box.mesh.nodes[:, 2] > box.mesh.nodes[:, 2].min() + 1e-9)
@@ -148,7 +148,7 @@ def test_jumps_use_frames_where_brain_separates(theatre) -> None:
 
 @pytest.mark.parametrize("name", REMEMBERING)
 def test_frames_in_any_order_equal_sequential_frames(theatre, name):
-    """Of two visitors' sessions in turns, with one solver, a hand in between."""
+    """Two visitors take turns on one solver, with manual control in between."""
     player = theatre.build_player("fem", REMEMBERING[name])
     assert player.remembers
     run = straight(player)
@@ -162,7 +162,7 @@ def test_frames_in_any_order_equal_sequential_frames(theatre, name):
 
 
 def test_frame_of_relaxing_tissue_depends_on_its_history(theatre):
-    """Else nothing above would say anything: from rest, or from a later frame's shape, it is another answer."""
+    """Control: solutions from rest or from a later frame differ."""
     player = theatre.build_player("fem", REMEMBERING["tissue that relaxes under a blade"])
     run = straight(player)
     alone = player.compute_deformation(player.build_loads(12))
@@ -170,9 +170,9 @@ def test_frame_of_relaxing_tissue_depends_on_its_history(theatre):
 
 
 def test_manual_tool_continues_from_the_last_solution(theatre):
-    """Whichever frame its number says: held where it is, tissue goes on relaxing under the tool, and never back.
+    """For any frame number: held tissue continues to relax below the tool, and never reverses.
 
-    It stays where it is in a frame that begins within the tolerance.
+    Within the tolerance of its start a frame keeps its solution.
     """
     player = theatre.build_player("fem", REMEMBERING["tissue that relaxes under a blade"])
     session = ReplaySession(player)
@@ -190,7 +190,7 @@ def test_manual_tool_continues_from_the_last_solution(theatre):
 
 
 def test_static_scene_solves_each_frame_once(theatre, monkeypatch):
-    """One solve a frame, from whatever was shown last."""
+    """One solve per frame, started from the last displayed solution."""
     player = theatre.build_player("fem", hasty("press", path=press(0.2, rise=0.2, hold=0.1)))
     asked: list[Deformation | None] = []
     solve = player.deformer.deform

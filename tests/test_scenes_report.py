@@ -1,4 +1,4 @@
-"""`sulcus report`: its numbers by hand, the front, and a page that needs nothing."""
+"""`sulcus report`: figures recomputed independently, and a page without external resources."""
 
 import csv
 import json
@@ -35,7 +35,7 @@ def figures_by_hand(distance, truth):
 
 
 def test_report_figures_match_independent_recomputation(study, page, study_box):
-    """Quadratic reference, finite elements, and a learner against those it was trained on, each from its own source."""
+    """Quadratic reference, FEM and a learner's error on its training loads, each from its own source."""
     stored = json.loads((page / "report.json").read_text())["sections"][0]["rows"]
     with open(page / "data.csv") as file:
         lines = list(csv.DictReader(file))
@@ -86,8 +86,8 @@ def test_report_page_loads_no_external_resources(page, study_rows):
     assert [read_png(path).std() > 5.0 for path in page.glob("data-*.png")] == [True] * 7
 
 
-def test_rows_of_families_have_each_loads_error_and_outcome(study, study_rows, study_box):
-    """The table against elements to a small tolerance: of the same tissue, but linear."""
+def test_family_rows_have_error_and_outcome_of_each_load(study, study_rows, study_box):
+    """Table against linear FEM of the same tissue to a small tolerance."""
     fem, _, learner, condensed, plate = study_rows
     nodes = np.union1d(study.patch.nodes, study_box.tumour_nodes)
     effects = build_push_effects(study_box, TISSUE)
@@ -107,7 +107,7 @@ def test_rows_of_families_have_each_loads_error_and_outcome(study, study_rows, s
 
 
 @pytest.mark.parametrize("fine", [False, True])
-def test_reference_elements_differ_by_tolerance_only(study, fine):
+def test_row_with_reference_elements_differs_by_tolerance_only(study, fine):
     here = replace(study, fine=fine)
     said = {
         (element, mesh): describe_difference(here, FemVariant("it", element=element, mesh=mesh))
@@ -120,7 +120,7 @@ def test_reference_elements_differ_by_tolerance_only(study, fine):
 
 
 def test_report_command_writes_page_and_lists_missing_row(study, study_rows, monkeypatch, capsys):
-    """Everything is solved already; the rows are those found."""
+    """All loads are solved before; the rows are those of the fixture."""
     words = ["report", "--quick", "--loads", str(study.loads), "--data", str(study.data), "--out", str(study.folder)]
     words += ["--device", "cpu"]
     monkeypatch.setattr("scenes.report.rows.measure_rows", lambda study, specs: iter(study_rows))

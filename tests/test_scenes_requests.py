@@ -1,4 +1,4 @@
-"""Wishes of visitors: who plays, seeks and holds the tool; what one of them asks ends the page for nobody."""
+"""Requests of visitors: playback, frame selection, manual control, and rejected loads."""
 
 import threading
 import time
@@ -31,7 +31,7 @@ class TestWish:
         wish.go_on(number, 3)
         return number
 
-    def test_seek_is_not_overridden_by_current_frame(self):
+    def test_requested_frame_is_not_overridden_by_playback(self):
         wish = Requests("linear", Touch())
         wish.set(number=2)
         wish.go_on(0, 3)
@@ -48,7 +48,7 @@ class TestWish:
         assert wish.read_current()[1:3] == ("fem", None)
 
     def test_simultaneous_slider_changes_are_both_applied(self):
-        """The page calls each slider on a thread of its own."""
+        """The page calls each slider in its own thread."""
         wish = Requests("linear", Touch(force=0.1))
         hands = [threading.Thread(target=wish.take_over, kwargs=turn) for turn in ({"right": 0.2}, {"up": -0.3})]
         with wish.lock:  # both are under way before either is heard
@@ -168,7 +168,7 @@ def test_each_visitor_sees_who_controls_the_tool(running):
 
 
 def test_manual_control_starts_at_the_scripted_tool_position(demo, monkeypatch):
-    """By a slider and by the menu; the sliders follow the script."""
+    """With a slider and with the menu; the sliders follow the script."""
     demo.wish.set(plays=False, number=100)
     path = demo.stage.scene.path
 

@@ -1,4 +1,4 @@
-"""A tumour that is taken in steps: what is cut, what is drawn of the rest, and what an episode and a page say of it."""
+"""Resection of a tumour in steps: removed elements, remaining tumour in images, episodes and on the page."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -79,7 +79,7 @@ def test_remaining_tumour_is_drawn_after_each_step(play, frames):
 
 
 def test_corridor_is_visible_in_the_cortex(play, frames):
-    """Through the hole the camera sees deeper than the surface."""
+    """Depth in the image increases in the hole."""
     before, after = frames[1].picture.depth, frames[2].picture.depth
     assert (after - before).max() > 4e-3 and (np.abs(after - before) < 1e-3).mean() > 0.9
 

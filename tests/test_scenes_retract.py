@@ -1,4 +1,4 @@
-"""The built-in scene of a blade that is held."""
+"""Built-in scene of a held blade."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the report counts and refuses, without a study: tenths of the force, the front, data of its own."""
+"""Figures of report rows without a study: tenths of the force, Pareto front, and rejected input."""
 
 import json
 import re
@@ -55,7 +55,7 @@ def test_time_summary_has_p99_only_with_1000_values():
 
 
 def test_report_table_has_values_under_their_headings(tmp_path):
-    """Read back from the page: sets of loads, shares of them, minutes of solves and fitting."""
+    """Values read from the page: load sets, shares, minutes of solves and of training."""
     one = compute_distance_figures(np.full((4, 2), 1e-3), np.full((4, 2, 3), 1e-2), np.arange(4.0))
     sets = {
         name: replace(one, mm=replace(one.mm, mean=mean), loads=loads)
@@ -104,7 +104,7 @@ def test_report_command_rejects_bad_input(words, reason, capsys, tmp_path, monke
 
 
 def test_report_command_without_data_simulates_its_own(tmp_path, monkeypatch, capsys):
-    """Neo-Hookean, smoothed, on two devices; what it says goes elsewhere than the line for machines."""
+    """Neo-Hookean, smoothed, on two devices; log text is not mixed with the JSON line."""
     box = make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
     monkeypatch.setattr("scenes.report.rows.measure_rows", lambda study, specs: iter([]))
     write_anatomy(tmp_path / "box.vtu", box)

@@ -1,4 +1,4 @@
-"""Rows of a report: each one measured once, or a reason."""
+"""Rows of a report: measured once, or with a reason."""
 
 import json
 from dataclasses import replace
@@ -32,7 +32,7 @@ from surrogate.training.train import train
 
 
 def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path, monkeypatch):
-    """Fitted here to the training rows; in the file that the report reads, answers to the discs' loads are wild."""
+    """Trained here on the training rows; the report's file has wrong solutions of the held-out loads."""
     training, pushed, nodes = study.discs.train, study.pushed, study_box.tumour_nodes
     truth = study.dataset.read_displacement(nodes)[study.dataset.good]
     path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
@@ -93,7 +93,7 @@ def test_rows_state_error_type_and_coverage(study_rows):
 
 
 def test_series_is_tabulated_once_for_all_rows(study, monkeypatch):
-    """Made of what is kept, a row has no finite elements to ask; the table's seconds are its own all the same."""
+    """A row made from the stored table needs no FEM, and keeps the table's seconds."""
     reported = []
     tabulate_series(study, lambda done, total: reported.append((done, total)))
     assert reported and reported[-1][0] == reported[-1][1]
@@ -109,7 +109,7 @@ def test_series_is_tabulated_once_for_all_rows(study, monkeypatch):
 
 
 def test_only_missing_rows_are_measured_again(study, study_rows, tmp_path):
-    """Stopped in the second row, begun again; then with other inputs; then with a file that is not whole."""
+    """Stopped in the second row and resumed; then with other inputs; then with a truncated file."""
     here = replace(study, folder=tmp_path)
     asked = []
 

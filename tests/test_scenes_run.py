@@ -1,4 +1,4 @@
-"""Masks of what lies in front in a real picture: the overlay is not drawn there, and the picture says so."""
+"""Masks of objects in front of the brain in a real image: no overlay there, and the covered share is reported."""
 
 from dataclasses import replace
 from itertools import islice

@@ -1,4 +1,4 @@
-"""Files of a data set that somebody holds, or that cannot be written: each is a sentence, and clocks decide nothing."""
+"""Locked or unwritable files of a data set: each gives a message."""
 
 import errno
 import fcntl

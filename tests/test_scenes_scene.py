@@ -1,4 +1,4 @@
-"""Scenes in a researcher's own files: every command that plays takes one, and a file that is none gets a sentence."""
+"""Scene files of users: played by each command, and rejected where invalid."""
 
 import json
 import sys

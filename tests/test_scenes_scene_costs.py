@@ -1,4 +1,4 @@
-"""Label above an image, and images of a scene side by side: source, time, motion, and doubts."""
+"""Label above an image and tiled images of a scene: source, time, motion and warnings."""
 
 from dataclasses import replace
 

@@ -39,6 +39,6 @@ def test_larger_pose_sample_starts_with_the_smaller_sample(site):
     assert not np.allclose(few, draw_scene_poses(scene, site, DEPTHS, 4)[1].get(Touching).pose)
 
 
-def test_a_scene_without_a_moved_tool_is_rejected(site):
+def test_scene_without_moved_tool_is_rejected(site):
     with pytest.raises(InputError, match="the scene press moves no ball"):
         draw_scene_poses(find_scene("press"), site, 8, 0)

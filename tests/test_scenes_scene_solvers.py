@@ -1,4 +1,4 @@
-"""A page whose finite elements take their time: what is on the way is shown, and whoever jumps elsewhere goes there."""
+"""Page with slow finite elements: intermediate frames, jumps, pauses and failures."""
 
 import threading
 import time
@@ -187,7 +187,7 @@ def test_effect_switch_starts_new_solver_and_stops_old_one(demo, gated):
         assert full.truth.number == 3 and wait_for(lambda: gated.solved[4] == 2)  # then they are compared
 
 
-def test_jumps_reuse_solutions_and_end_at_last_target(demo, gated):
+def test_frame_jumps_reuse_solutions_and_end_at_last_target(demo, gated):
     gated.let(10_000)
     before = set(threading.enumerate())
     with Loop(demo) as page:
@@ -213,7 +213,7 @@ def test_overlay_style_changes_during_a_solve(demo, gated):
         assert shows(page, 0) and gated.solved == Counter((0, 1))
 
 
-def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
+def test_undeformed_body_is_shown_while_fem_is_prepared(gated, monkeypatch):
     prepared, said = threading.Event(), []
     player = PatientSetup.build_player
 
@@ -234,8 +234,8 @@ def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
     demo.close()
 
 
-def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
-    """A visitor leafs through the scenes while the first is prepared."""
+def test_skipped_scenes_are_not_prepared(demo, monkeypatch):
+    """A visitor selects several scenes while the first is prepared."""
     prepared, made = threading.Event(), []
     player = PatientSetup.build_player
 

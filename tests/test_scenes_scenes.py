@@ -1,4 +1,4 @@
-"""Command that lists scenes: who can play them, pictures and a sheet."""
+"""Command that lists scenes: deformers, thumbnails and a sheet."""
 
 import json
 from dataclasses import replace

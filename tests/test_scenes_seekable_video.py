@@ -1,4 +1,4 @@
-"""Films that are read from any frame on."""
+"""Videos that are read from any frame."""
 
 import numpy as np
 from films import FILM

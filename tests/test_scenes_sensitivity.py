@@ -1,4 +1,4 @@
-"""What else moves the tumour: changes whose size is known beforehand, and what does not converge is counted."""
+"""Sensitivity of the tumour's motion: changes of known size, and loads without convergence."""
 
 import csv
 import json
@@ -75,8 +75,8 @@ def test_sensitivity_study_has_one_row_per_variant(found):
 
 
 @pytest.mark.parametrize(("now", "factor"), [("-20%", 1.0 / 0.8), ("+20%", 1.0 / 1.2)])
-def test_stiffness_matters_under_known_force_alone(found, now, factor):
-    """Displacement is in inverse proportion to E under dead forces, and does not depend on it where it is imposed."""
+def test_stiffness_changes_motion_under_known_force_only(found, now, factor):
+    """Displacement is inversely proportional to E under dead forces and independent of E under prescribed motion."""
     row = found["E", now]
     assert row.force.motion == pytest.approx(factor, rel=1e-6)
     assert row.force.percent == pytest.approx(100.0 * abs(factor - 1.0), rel=1e-5)
@@ -92,14 +92,14 @@ def test_linear_body_has_displacement_proportional_to_load(found):
 
 
 def test_default_motion_and_force_give_equal_displacement(found):
-    """The default is one and the same field."""
+    """Both defaults are the same field."""
     whole = found["motion itself", ""]
     assert whole.force.percent == pytest.approx(100.0)
     assert whole.motion.mean_mm == pytest.approx(whole.force.mean_mm, rel=1e-6)
     assert whole.motion.largest_mm == pytest.approx(whole.force.largest_mm, rel=1e-6)
 
 
-def test_softer_tumour_and_freer_skull_move_more(found):
+def test_softer_tumour_and_looser_skull_increase_motion(found):
     motion = [found["tumour's stiffness", now].force.motion for now in ("0.5 x", "2 x", "3 x")]
     assert motion[0] > 1.0 > motion[1] > motion[2]
     assert 1.0 < found["skull", "slide"].force.motion < found["skull", "contact"].force.motion
@@ -107,7 +107,7 @@ def test_softer_tumour_and_freer_skull_move_more(found):
 
 @pytest.mark.parametrize(("now", "times"), [("0.5 x", 0.5), ("3 x", 3.0)])
 def test_stiff_tumour_variant_changes_only_the_tumour(found, anatomy, now, times):
-    """Against finite elements that are put together here, of two tissues."""
+    """Against FEM with two tissues, assembled here."""
     brain = Material("linear", 3000.0, 0.45)
     tumour = Material("linear", times * 3000.0, 0.45)
     rest = (Held(), Bonded(), ToolForce())
@@ -125,7 +125,7 @@ def test_stiff_tumour_variant_changes_only_the_tumour(found, anatomy, now, times
 
 
 def test_loads_without_convergence_are_counted_and_omitted(anatomy):
-    """With a budget that suffices for none."""
+    """With an iteration budget too small for each load."""
     few = Accuracy(tolerance=1e-9, outer=1, inner=1, steps=0)
     study = SensitivityStudy(anatomy, draw("palpation", anatomy, 3, 0), BodyVariant(element="p1"), few, "cpu")
     one = next(measure_variants(study, []))
@@ -200,7 +200,7 @@ def trained(anatomy):
 
 
 def test_sensitivity_command_reports_all_rows(tmp_path, capsys):
-    """Every figure is in the file; what the surrogate is wrong by stands beside, or that nobody knows it."""
+    """Each figure is in the file, together with the surrogate's error or that it is unknown."""
     body = make_box(cells=(5, 5, 3), spacing=15e-3, tumour=16e-3, opening=40e-3)
     write_anatomy(tmp_path / "box.vtu", body)
     words = ["sensitivity", "--anatomy", str(tmp_path / "box.vtu"), "--count", "2", "--element", "p1"]

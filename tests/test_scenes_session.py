@@ -1,4 +1,4 @@
-"""The link beside others' programs: the C++ library's examples, pyigtl, a camera's pictures, and Ctrl-C."""
+"""Live link with other programs: examples of the C++ library, pyigtl and camera images."""
 
 import asyncio
 import shutil

@@ -1,4 +1,4 @@
-"""Settings of surgical tasks: the answering model, its tissue and the reward."""
+"""Settings of surgical tasks: model, tissue and reward."""
 
 import json
 from dataclasses import replace
@@ -90,7 +90,7 @@ def test_contact_ball_uses_tissue_at_the_cortex(stiff, box, tmp_path):
 
 
 def test_inapplicable_model_is_rejected_with_reason(stiff):
-    """One that is asked for is refused; one that lies beside the body is warned of."""
+    """Requested models raise an error; models next to the body give a warning."""
     beside, force = str(to_model_path(stiff)), "it was trained on what a tool's force does, and here is none"
     with pytest.raises(InputError, match=rf"model\.npz: is not applicable .*task retract: {force}, but .*ToolContact"):
         open_setting(RETRACT, str(stiff), "auto", "cpu", SIZE, beside)

@@ -1,4 +1,4 @@
-"""Chart and slices beside the image of the page."""
+"""Chart and slices next to the image of the page."""
 
 from dataclasses import replace
 

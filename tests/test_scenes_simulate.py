@@ -1,4 +1,4 @@
-"""Command that solves loads: the element asked for, bodies without tumour, quadratic anatomies."""
+"""Command that solves loads: selected element, bodies without tumour, quadratic anatomies."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`sulcus solve`: from a mesh file to a mesh file, exit codes, and refusals that write nothing."""
+"""`sulcus solve`: mesh files, exit codes, and rejected input without output."""
 
 import json
 import re
@@ -211,8 +211,8 @@ def test_single_precision_solution_matches_double_precision(solve) -> None:
     assert np.linalg.norm(run.displacement - exact.displacement) < 1e-3 * np.linalg.norm(exact.displacement)
 
 
-def test_missing_equilibrium_exits_1_with_finite_state(solve) -> None:
-    """The top is pressed through the base: the logarithmic law has no such state."""
+def test_solve_without_equilibrium_exits_1_with_finite_state(solve) -> None:
+    """The top is pressed through the base: the logarithmic law has no such equilibrium."""
     mesh = box((1, 1, 1), 0.1)
     top = mesh.nodes[:, 2] > 0.05
     run = solve(
@@ -233,7 +233,7 @@ def test_missing_equilibrium_exits_1_with_finite_state(solve) -> None:
 
 
 def test_start_displacement_reduces_iterations(solve) -> None:
-    """In the file's unit; the answer is the same."""
+    """In the unit of the file; the displacement is the same."""
     first = solve(GOOD)
     assert first.report["load_fraction"] == 1.0
     mm = {**GOOD, "start": 1e3 * first.displacement}
@@ -254,7 +254,7 @@ def test_overflow_gives_finite_report_and_displacement(solve) -> None:
 
 @pytest.mark.parametrize(("depth", "inverted"), [(0.05, 0), (0.11, 6)])
 def test_inverted_tetrahedra_are_counted_and_reported(solve, depth: float, inverted: int) -> None:
-    """The stable law has a state where the top is pressed through the base: converged, but no tissue."""
+    """The stable law has an equilibrium with the top below the base, with inverted tetrahedra."""
     mesh = box((1, 1, 1), 0.1)
     top = mesh.nodes[:, 2] > 0.05
     run = solve(
@@ -297,7 +297,7 @@ GOOD = {"fixed": BASE.astype(int), "force": FORCE}
         (GOOD | {"start": np.full((COUNT, 3), np.nan)}, ["`start` is not finite"]),
     ],
 )
-def test_bad_point_data_is_rejected(solve, data: dict, words: list[str]) -> None:
+def test_solve_rejects_bad_point_data(solve, data: dict, words: list[str]) -> None:
     refused(solve(data), *words)
 
 
@@ -323,12 +323,12 @@ def test_bad_point_data_is_rejected(solve, data: dict, words: list[str]) -> None
         (["--device", "tpu"], ["no device 'tpu'"]),
     ],
 )
-def test_bad_option_values_are_rejected(solve, flags: list[str], words: list[str]) -> None:
+def test_solve_rejects_bad_option_values(solve, flags: list[str], words: list[str]) -> None:
     refused(solve(GOOD, *flags), *words)
 
 
 @pytest.mark.parametrize("flags", [["--material", "jelly"], ["--unit", "inch"], ["--young", "soft"], ["--nonsense"]])
-def test_options_rejected_by_the_parser_exit_with_2(solve, flags: list[str]) -> None:
+def test_solve_exits_with_2_for_options_rejected_by_parser(solve, flags: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         solve(GOOD, *flags)
     assert caught.value.code == 2
@@ -343,7 +343,7 @@ def test_mesh_piece_without_support_is_rejected(solve) -> None:
 
 @pytest.mark.parametrize("shared", [1, 2])
 def test_piece_attached_by_corner_or_edge_is_rejected(solve, shared: int) -> None:
-    """It touches the held body, but turns about what it shares."""
+    """The piece touches the fixed body, but rotates about the shared nodes."""
     top = np.flatnonzero(TOP)[:shared]
     apex = MESH.nodes[top].mean(axis=0) + [0.0, 0.0, 0.05]
     extra = apex + 0.02 * np.random.default_rng(3).normal(size=(4 - shared, 3))
@@ -380,7 +380,7 @@ def test_bad_output_name_is_rejected_before_reading_the_mesh(tmp_path: Path, cap
     assert ".vtu" in capsys.readouterr().err
 
 
-def test_missing_mesh_file_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_solve_rejects_missing_mesh_file(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["solve", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "new" / "a.vtu")]) == 2
     assert "no such file" in capsys.readouterr().err
     assert not (tmp_path / "new" / "a.vtu").exists()

@@ -1,4 +1,4 @@
-"""A patient whose scan is oblique, mirrored and anisotropic: others find the tumour at one place in all its files."""
+"""Oblique, mirrored and anisotropic scan of a patient: one tumour position in all files, by other readers."""
 
 import csv
 import io
@@ -121,7 +121,7 @@ def test_forward_and_inverse_fields_map_tumour_and_back(folder):
     assert header["space"] == "left-posterior-superior" and header["space units"] == ["mm"] * 3
 
 
-def test_surfaces_points_and_segments_follow_tumour(folder):
+def test_exported_surfaces_points_and_segments_follow_tumour(folder):
     warp, now = folder / "warp", TUMOUR + SHIFT
     near(LPS * trimesh.load(warp / "tumour.stl").center_mass, now)
     assert b"SPACE=LPS" in (warp / "tumour.stl").read_bytes()[:80]
@@ -157,7 +157,7 @@ def test_data_sets_and_registrations_name_their_spaces(folder, pretender):
 
 
 def test_episode_mask_matches_projected_tumour(folder, pretender):
-    """Through the camera's matrices, the resting tumour falls on the middle of its mask in the first picture."""
+    """Projected by the camera's matrices, the undeformed tumour lies in the middle of its first mask."""
     anatomy = read_anatomy(folder / "patient.vtu")
     theatre = PatientSetup(anatomy, None, {}, "cpu")
     play = Player(Stage(short(), theatre.site, None), replace(pretender, anatomy=anatomy))
@@ -179,7 +179,7 @@ def test_episode_mask_matches_projected_tumour(folder, pretender):
 
 
 def test_tables_and_headers_name_their_spaces(tmp_path):
-    """Rows are of two pictures of a tumour of one vertex; what places are is held by tests of who writes them."""
+    """Rows of two images with a tumour of one vertex; values are tested with their writers."""
     poses, still = np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 1, 3))
     truth = VideoGroundTruth("digest", np.arange(2.0), poses, poses, still)
     write_truth(tmp_path / "truth.npz", truth)

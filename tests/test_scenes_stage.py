@@ -1,4 +1,4 @@
-"""What the scan gives the picture: colours that no scanner's scale changes, a round field, the same bytes again."""
+"""Appearance from the scan: colours independent of the scanner's scale, and a deterministic vignette."""
 
 from dataclasses import replace
 from typing import cast

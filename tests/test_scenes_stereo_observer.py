@@ -1,4 +1,4 @@
-"""The open cortex seen by two eyes: points found in pictures, what is refused, and what an estimate is worth."""
+"""Stereo observation of the open cortex: tracked points, rejected images, and the resulting estimate."""
 
 from dataclasses import replace
 
@@ -123,7 +123,7 @@ def test_unnamed_stereo_points_lie_on_the_moved_cortex(moved, shot):
 
 
 def test_cortex_without_scan_has_vessels_for_stereo_tracking(observer):
-    """A head without T1 gets the same vessels, on even tissue; before, it was bare and nothing was found on it."""
+    """Heads without T1 get the same vessels on uniform tissue."""
     bare = replace(observer, stage=replace(observer.stage, intensity=None))
     assert len(bare.first.rest) > 60
     plain = replace(
@@ -183,7 +183,7 @@ class TestRefusals:
                 StereoObservation(**wrong)
 
 
-def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):
+def test_tumour_is_located_and_dark_eye_is_rejected(observer, moved):
     found = observer.estimate(30, moved)
     assert found.held and found.off < 0.6 * np.linalg.norm(found.true) and found.location.calibrated
     stage = replace(observer.stage, observer=replace(observer, observation_model=replace(EXACT, darker=0.999)))
@@ -209,6 +209,6 @@ def test_study_summary_counts_rejected_frames(observer, moved):
     assert found.removed == pytest.approx(1.0 - (2.0 * good.off + length) / (3.0 * length))
 
 
-def test_bench_rejects_scene_without_stereo(capsys):
+def test_microscope_benchmark_rejects_scene_without_stereo(capsys):
     assert main(["benchmarks", "microscope", "--scene", "sag", "--device", "cpu"]) == 2
     assert "no pair of eyes sees the scene sag" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""What a step took is unknown where its note is damaged."""
+"""Recorded time of a step: unknown if its file is damaged."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Tasks that workers take."""
+"""Tasks of workers."""
 
 from test_scenes_engine import PLAN
 from tiny_work import Made, tiny_run

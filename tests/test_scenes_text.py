@@ -1,4 +1,4 @@
-"""Words of the page: trust in an answer, tissue and elements, plans and sides."""
+"""Text of the page: error bound of a solution, tissue and elements, solver plans."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ class TestTrust:
         "outcome", [Outcome.EXTRAPOLATED, Outcome.BUDGET, Outcome.STALLED, Outcome.NOT_FINITE, Outcome.PIERCED]
     )
     def test_page_warns_of_unreliable_solution_without_bound(self, outcome):
-        """It stands in another colour, with the reason."""
+        """Shown in the warning colour, with the reason."""
         said = format_trust(answer(outcome), "svr")
         assert "Surrogate error" not in said and 'class="warn"' in said and "Do not rely on this result" in said
 

@@ -1,4 +1,4 @@
-"""The tissue on the command line: laws, named tissues, regions, and options that contradict each other."""
+"""Tissue options of the command line: laws, named tissues, regions and contradictions."""
 
 import argparse
 import json
@@ -44,7 +44,7 @@ def asked(*words: str) -> Tissue:
         (("--material", "ogden", "--ogden=-300,2; 1e3 , 4", "--bulk", "2e4"), Ogden(((-300.0, 2.0), (1e3, 4.0)), 2e4)),
     ],
 )
-def test_options_give_the_expected_tissue(words: tuple[str, ...], expected: Tissue) -> None:
+def test_tissue_options_give_the_expected_tissue(words: tuple[str, ...], expected: Tissue) -> None:
     assert asked(*words) == expected
 
 

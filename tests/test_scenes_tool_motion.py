@@ -1,4 +1,4 @@
-"""The motion of a tool that an action asks for."""
+"""Tool motion that an action requests."""
 
 import numpy as np
 import pytest

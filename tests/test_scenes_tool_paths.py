@@ -1,4 +1,4 @@
-"""Paths of tools: presses, slides and draws as functions of time."""
+"""Tool paths: presses, slides and draws as functions of time."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ class TestPaths:
         motion = sampled(PATHS["press"], np.linspace(1.0, 1.5, 11))
         assert np.allclose(motion, [0.003, -0.002, 0.25, 0.0, 0.0])
 
-    def test_slide_goes_from_end_to_end_under_full_force(self):
+    def test_slide_moves_from_start_to_end_under_full_force(self):
         motion = sampled(PATHS["slide"], np.linspace(0.5, 2.5, 101))
         assert np.allclose(motion[:, 2], 0.2)
         assert np.allclose(motion[0, :2], START) and np.allclose(motion[-1, :2], END)
@@ -65,7 +65,7 @@ class TestPaths:
         for time in (1.0, 5.0):
             assert path(time) == Touch(0.002, -0.001, 0.0, (0.4, 0.0), pytest.approx(3e-3))
 
-    def test_palpation_comes_down_slides_and_lifts_off(self):
+    def test_palpation_path_lowers_slides_and_lifts_the_tool(self):
         path = palpate(2e-3, START, END, seconds=2.0, rise=0.5)
         assert path(0.0).depth == -IDLE_HEIGHT and path(3.0).depth == pytest.approx(-IDLE_HEIGHT)
         for time, place in ((0.5, START), (1.5, np.mean([START, END], axis=0)), (2.5, END)):

@@ -1,4 +1,4 @@
-"""Episodes for a loader with several workers."""
+"""Episodes for a data loader with several workers."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""A film of printed targets, followed from the command line: rows with poses, blanks where they are lost."""
+"""`sulcus track`: poses of printed targets in a video, and blank rows where they are lost."""
 
 import csv
 import json
@@ -147,7 +147,7 @@ def test_incomplete_pose_row_is_rejected(tmp_path):
 
 
 def test_times_are_read_from_image_stamps():
-    """The file's own last time is 2.133 s: of a film at another rate."""
+    """The last time by the file's frame rate is 2.133 s, which is wrong."""
     film = Path(__file__).parent / "data" / "film"
     rows = follow_body(film / "film.mp4", read_calibration(film / "camera.yaml"), "patient", "camera", 30.0)
     assert [row.time for row in rows][-2:] == pytest.approx([2.1333, 2.2667], abs=1e-4)

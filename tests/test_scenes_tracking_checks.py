@@ -1,4 +1,4 @@
-"""What `sulcus check` judges of lost, found and stale pictures fails where the code that it guards is perturbed."""
+"""Tracking checks of `sulcus check`: perturbed code for lost, found and stale images fails."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Two errors, of the model and of the tumour: priors, the ensemble, what is stored, and what the picture says."""
+"""Errors of model and tumour: priors, ensemble, stored file, and text in the image."""
 
 import json
 from dataclasses import replace
@@ -86,7 +86,7 @@ class TestEnsemble:
         asked, given = scene.path(1.3), found.path(1.3)
         assert (given.x - asked.x, given.y - asked.y, given.depth - asked.depth) == pytest.approx((1e-3, 2e-3, 3e-3))
 
-    def test_stiffness_matters_under_known_force_alone(self, theatre):
+    def test_stiffness_changes_motion_under_known_force_only(self, theatre):
         """Under a known pose it cancels."""
         stiff = replace(SAME, stiffness=2.0)
         for scene, times in ((short(), 0.5), (small("palpate"), 1.0)):
@@ -103,7 +103,7 @@ class TestEnsemble:
         np.testing.assert_allclose(middle, [[np.hypot(2.75, 0.25), 2.5]])
 
     def test_contributions_of_independent_parameters_are_separated(self):
-        """Fields that depend on stiffness and tool, each by itself, are found as such; of nothing else is anything."""
+        """Fields depend on stiffness and tool independently; other parameters contribute nothing."""
         scene, draws = short(), sample_priors(40, 5)
         random = np.random.default_rng(0)
         field, of_stiffness, of_tool = random.normal(size=(3, 6, 3))
@@ -118,7 +118,7 @@ class TestEnsemble:
         assert not any(column.any() for column in collect_contributor_values([SAME], scene).values())
 
     def test_error_bound_covers_95_percent_of_new_samples(self, theatre):
-        """Twins of a body whose motion is in inverse proportion to its stiffness: 95 in 100 lie within the bound."""
+        """Motion inversely proportional to stiffness: 95 of 100 new samples lie within the bound."""
         scene = short()
         random = np.random.default_rng(1)
         normals = random.normal(size=(9, 3))
@@ -154,8 +154,8 @@ class TestEnsemble:
             estimate_uncertainty(theatre, short(), still, draws, [*answers[:7], None, None, None])
 
     @pytest.mark.parametrize(("failing", "asked"), [((), 5), ((1,), 9), ((1, 3), 4)])
-    def test_unreachable_time_is_reached_by_substeps(self, theatre, failing, asked):
-        """After a call that failed the solver is asked again from the moment before; failing again is no answer."""
+    def test_failed_time_step_is_repeated_with_substeps(self, theatre, failing, asked):
+        """After a failed call the solver starts again from the time before; a second failure gives no result."""
         hasty = Hasty(theatre, failing)
         found, whole = solve_scene(hasty, short()), solve_scene(theatre, short())
         assert len(hasty.starts) == asked
@@ -167,8 +167,8 @@ class TestEnsemble:
         if failing:
             assert hasty.starts[1] is hasty.starts[2] is not None
 
-    def test_excessive_force_counts_inverted_tetrahedra(self, theatre):
-        """The scene itself turns none; at a tenth of its stiffness some are."""
+    def test_very_soft_sample_counts_inverted_tetrahedra(self, theatre):
+        """The scene itself inverts none; a tenth of its stiffness inverts some."""
         weak = solve_scene(theatre, apply_sample(short(), replace(SAME, stiffness=0.1)))
         assert solve_scene(theatre, short()).inverted == 0 and weak is not None and weak.inverted > 0
 
@@ -208,7 +208,7 @@ class TestStored:
         )  # fmt: skip
         assert [knowing.estimate_uncertainty(other) for other in others] == [None] * 5
 
-    def test_error_interpolates_between_moments_plus_model(self, theatre):
+    def test_tumour_error_is_interpolated_in_time_plus_model_error(self, theatre):
         found = stated(short(), theatre)
         for time, most, largest in ((0.0, 2e-3, "registration"), (0.15, 3.5e-3, "E")):
             error = found.evaluate(time)

@@ -1,4 +1,4 @@
-"""Episodes looked at before they are trusted: whole ones pass, and each thing that is wrong is named."""
+"""Validation of episodes: complete ones pass, and each defect is named."""
 
 import h5py
 import numpy as np
@@ -83,7 +83,7 @@ def test_each_defect_of_an_episode_is_reported(name, whole, tmp_path):
     assert len(problems) == 1 and words in problems[0]
 
 
-def test_frames_are_not_solved_again_without_a_plan(whole):
+def test_episode_without_plan_is_not_solved_again(whole):
     report = solve_again(validate_episode(whole), 2, "cpu")
     assert not report.problems and any("solved again: it states no" in words for words in report.skipped)
     assert report.again == 0 and report.again_mm is None

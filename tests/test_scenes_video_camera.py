@@ -1,4 +1,4 @@
-"""A film that was taken by another camera, or at another zoom, is refused."""
+"""Rejected videos of another camera or of another zoom."""
 
 import subprocess
 import sys
@@ -54,7 +54,7 @@ def test_unreadable_video_is_rejected_with_reason(content, why, tmp_path, capsys
 
 
 def test_unreadable_video_gives_no_library_output(tmp_path):
-    """In a process that has opened none: FFmpeg asks once how much it says."""
+    """In a new process: FFmpeg reads its log level once."""
     (tmp_path / "short.mp4").write_text("no video")
     code = (
         "import pathlib, sys; from ar.tracking.image_sequences import read_frame_rate; "

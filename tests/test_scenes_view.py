@@ -1,4 +1,4 @@
-"""3-D view of the page: it follows the frame, and an old comparison is marked as such."""
+"""3-D view of the page: deformed tumour, and the comparison for a previous load."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def test_page_3d_view_shows_the_deformed_tumour(demo, theatre):
 
 
 def test_comparison_of_previous_load_is_greyed_until_new_one(demo, monkeypatch):
-    """A hand moves the tool: what the finite elements said of the load before it is greyed until they answer anew."""
+    """After manual motion the last comparison is grey until the new FEM solution."""
     demo.wish.set(plays=False, number=60)
     assert wait_for(lambda: demo.run(0.3) and "|difference from FEM: mean" in report(demo))
     assert "previous load" not in report(demo)

@@ -1,4 +1,4 @@
-"""Viewpoints of scenes: eyes of a microscope, and calibrations of another size."""
+"""Viewpoints of scenes: eyes of a microscope, and calibrations of another image size."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The notice that a wait is long."""
+"""Notice of a long wait."""
 
 import time
 

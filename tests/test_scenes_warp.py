@@ -1,4 +1,4 @@
-"""Warps by `sulcus warp`: what it is asked for and refuses, and images and label maps as SimpleITK carries them."""
+"""`sulcus warp`: loads and scenes, rejected input, and images and label maps against SimpleITK."""
 
 import json
 from dataclasses import replace
@@ -47,7 +47,7 @@ def centroids(image, near):
 
 
 @pytest.mark.parametrize("kind", GRIDS)
-def test_simpleitk_landmarks_match_fem(kind, warp_folder, warp_out, middles):
+def test_simpleitk_resampled_blobs_match_fem(kind, warp_folder, warp_out, middles):
     field = sitk.ReadImage(str(warp_out / "field_resampling.nii.gz"), sitk.sitkVectorFloat64)
     transform = sitk.DisplacementFieldTransform(field)
     scan = sitk.ReadImage(str(warp_folder / f"{kind}.nii.gz"))
@@ -63,7 +63,7 @@ def test_simpleitk_landmarks_match_fem(kind, warp_folder, warp_out, middles):
 
 
 @pytest.mark.parametrize("kind", MAPPED)
-def test_label_maps_keep_their_labels_type_and_place(kind, warp_folder, warp_out, middles):
+def test_warped_label_maps_keep_labels_type_and_position(kind, warp_folder, warp_out, middles):
     before, after = (
         nibabel.load(warp_folder / f"{kind}_labels.nii.gz"),
         nibabel.load(warp_out / f"{kind}_labels_deformed.nii.gz"),
@@ -79,7 +79,7 @@ def test_label_maps_keep_their_labels_type_and_place(kind, warp_folder, warp_out
 
 
 def test_itk_moves_points_with_the_tissue(box, warp_out):
-    """ITK's own forward field, through the NRRD, moves points: no sign and no axis is mixed up."""
+    """Forward field of ITK from the NRRD file: no sign and no axis is swapped."""
     field = sitk.ReadImage(str(warp_out / "field_modeling.nrrd"), sitk.sitkVectorFloat64)
     transform = sitk.DisplacementFieldTransform(field)
     now = 1e-3 * LPS * np.array([transform.TransformPoint((1e3 * blob * LPS).tolist()) for blob in BLOBS])
@@ -286,7 +286,7 @@ def test_intensities_given_as_labels_give_a_warning(folder, box):
         assert ("as intensities do: give them by --image" in said) == doubted
 
 
-def test_empty_share_is_by_volume_not_vertices(folder, box):
+def test_empty_share_of_image_is_computed_by_volume(folder, box):
     index = np.rint((1e3 * box.mesh.nodes - AFFINE[:3, 3]) / 2.0).astype(int)
     values = np.ones((40, 40, 32), np.float32)
     values[tuple(index.T)] = 0.0  # one voxel round each vertex

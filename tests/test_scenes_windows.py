@@ -1,4 +1,4 @@
-"""Episodes read by others: windows of frames, decoded pictures, workers, and files that are not what they seem."""
+"""Windows of frames for other programs: decoded images, batches, and damaged files."""
 
 import pickle
 import struct

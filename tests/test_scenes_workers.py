@@ -1,4 +1,4 @@
-"""Whoever is killed, and whenever: no finished episode is lost, none is made twice, and no half file looks whole."""
+"""Killed processes: no finished episode is lost or made twice, and no partial file looks complete."""
 
 import os
 import random

@@ -1,4 +1,4 @@
-"""What `sulcus convert --to xdmf` writes is read by ParaView's own readers: surfaces, times, and every number."""
+"""XDMF files of `sulcus convert`, read by ParaView: surfaces, times and values."""
 
 import os
 import subprocess
