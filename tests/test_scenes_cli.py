@@ -57,7 +57,7 @@ def test_demo_page_opens_during_compilation_and_then_plays(name, box, tmp_path, 
 @pytest.mark.parametrize(
     ("cores", "said", "most"), [(64, None, "4"), (2, None, "2"), (64, "7", "7"), (None, None, "1")]
 )
-def test_thread_limit_applies_unless_environment_sets_it(monkeypatch, cores, said, most):
+def test_limit_threads_keeps_limits_of_the_environment(monkeypatch, cores, said, most):
     monkeypatch.setattr("os.cpu_count", lambda: cores)
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
     for name in names:

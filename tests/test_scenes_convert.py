@@ -16,7 +16,7 @@ from sim.runtime.partial_files import to_partial_path
 
 
 @pytest.mark.parametrize("name", ["lerobot", "folder", "xdmf"])
-def test_convert_rejects_folder_that_is_not_empty(name, folder, tmp_path, capsys):
+def test_convert_rejects_non_empty_folder(name, folder, tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine").write_text("mine")

@@ -37,7 +37,7 @@ def test_craniotomy_frame_is_at_requested_site_pointing_inwards(site):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_scenes_touch_open_cortex_of_another_head(name, site):
+def test_scenes_act_on_open_cortex_of_another_head(name, site):
     scene, cortex = find_scene(name), site.anatomy.mesh.nodes[site.anatomy.open_surface]
     check_causes(scene.get_effects_on(site.anatomy), scene.build_loads(site, scene.path(0.0), 0.0))
     stage = Stage(scene, site)

@@ -92,7 +92,7 @@ def test_template_files_match_and_pass_the_checks(capsys):
     assert "fem" not in [row["deformer"] for row in report["scenes"]]
 
 
-def test_scene_uses_the_deformer_family_it_names(theatre):
+def test_scene_uses_its_selected_deformer_family(theatre):
     scene = replace(find_scene("press"), deformer="condensed")
     assert theatre.select_default(scene) == "condensed"
     player = theatre.build_player("condensed", scene)

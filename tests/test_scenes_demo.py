@@ -243,7 +243,7 @@ def test_images_are_coarse_in_motion_and_sharp_at_rest(demo):
     assert not now.coarse
 
 
-def test_demo_reports_a_long_solve_while_it_runs(demo, monkeypatch):
+def test_demo_reports_a_running_long_solve(demo, monkeypatch):
     answer, said = Learned.deform, []
     monkeypatch.setattr(demo.browser, "show_status", said.append)
 

@@ -189,7 +189,7 @@ class TestBrainShift:
         assert turned.outcome[0].good and way[0][1] < -0.8 * np.linalg.norm(way[0])
         assert way[1][0] < way[0][0] - 5e-4
 
-    def test_cortex_sliding_below_the_bone_is_drawn_below_it(self):
+    def test_cortex_sliding_below_the_bone_is_hidden_by_the_bone(self):
         theatre, scene = template_theatre(), small("brain_shift")
         site, held = theatre.site, replace(scene, effects=(Elasticity(), Held()))
         moved = theatre.anatomy.mesh.nodes + 8e-3 * site.right

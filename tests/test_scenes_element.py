@@ -113,7 +113,7 @@ def test_curved_mesh_of_negative_orientation_is_mirrored(solve, seen: str) -> No
     np.testing.assert_allclose(found, plain * mirror, rtol=0, atol=1e-8 * np.abs(plain).max())
 
 
-def test_mid_edge_node_is_fixed_only_where_file_fixes_it(solve) -> None:
+def test_mid_edge_nodes_are_fixed_only_by_the_file(solve) -> None:
     corners = BASE & (np.arange(ALL) < COUNT)
     found = solve(STRAIGHT, {"fixed": corners.astype(int), "force": FORCE})[2]
     assert not found[corners].any() and (np.abs(found[BASE & ~corners]).max(axis=1) > 0.0).all()

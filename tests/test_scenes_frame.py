@@ -14,7 +14,7 @@ from benchmarks.studies.frame import STAGES, WARM_UP, batch_rate, frames_of, mea
 from scenes.play.player import Player
 
 
-def test_benchmark_draws_each_frame_once_and_sends_it(box, monkeypatch):
+def test_benchmark_draws_and_sends_each_frame_once(box, monkeypatch):
     drawn, sent, play, put_sight = [], [], Player.draw_frame, Browser.put_sight
 
     def seen(player, number, *rest):

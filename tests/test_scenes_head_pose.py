@@ -19,7 +19,7 @@ class TestLying:
         assert (np.diff(levels) < 0.0).all()
 
     @pytest.mark.parametrize("direction", [SUPINE, (0.0, 0.0, -3.0), (-1.0, -1.0, 0.2)])
-    def test_full_fluid_level_covers_all_nodes_and_empty_none(self, box, direction):
+    def test_full_head_lies_in_fluid_and_drained_head_does_not(self, box, direction):
         nodes = box.mesh.nodes
         for fluid, wet in ((1.0, len(nodes)), (0.0, 0)):
             found = HeadPose(direction, fluid).build_posture(nodes)

@@ -94,7 +94,7 @@ def test_inspection_warns_of_suspicious_labels_and_spaces(tmp_path, capsys):
     assert "stored LAS (mirrored, as many scanners do; sides from its affine)" in text and "warnings:" in text
 
 
-def test_inspection_creates_missing_folder_or_rejects_it(tmp_path, capsys):
+def test_inspection_creates_missing_folder_unless_path_is_a_file(tmp_path, capsys):
     ball(tmp_path)
     (tmp_path / "file").touch()
     words = ["patient", str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--inspect", "--out"]

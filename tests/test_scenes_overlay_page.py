@@ -154,7 +154,7 @@ def test_camera_image_dims_when_stale_and_recovers(follower, stage):
             page.watch(iter([replace(first, grey=first.grey[::2])]), 0.1)
 
 
-def test_overlay_page_serves_video_and_demo_rejects_it(capsys):
+def test_overlay_page_serves_video_and_demo_rejects_video(capsys):
     given = [f"--camera={FILM}/camera.yaml", f"--registration={FILM}/registration.json", "--device", "cpu"]
     film, port = str(FILM / "film.mp4"), str(free_port())
     assert main(["overlay", film, *given, "--page", "--port", port, "--seconds", "2"]) == 1  # nobody knows the motion

@@ -25,7 +25,7 @@ def changed(row, column, value):
         (matrix((0.0, 2e4, 0.0)), "more than 10 m"),
     ],
 )
-def test_matrix_that_is_not_rigid_is_rejected(T, why):
+def test_non_rigid_matrix_is_rejected(T, why):
     with pytest.raises(BadMessageError, match=why):
         to_rigid(T)
 

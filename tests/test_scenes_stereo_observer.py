@@ -100,7 +100,7 @@ def test_tracking_error_moves_all_stereo_points_rigidly(observer, shot, seen):
     assert np.linalg.norm(turn - np.eye(3), 2) == pytest.approx(np.radians(1.0), rel=0.3)
 
 
-def test_tool_hides_stereo_points_and_moves_none(observer, moved, seen):
+def test_tool_hides_stereo_points_without_moving_others(observer, moved, seen):
     site, scene = observer.stage.site, observer.stage.scene
     inward, tip = site.axis, site.origin + 3e-3 * site.right - 2e-3 * site.axis
     corners = observer.stage.compute_corners(scene.tool.pose(tip, inward, site.right))

@@ -51,13 +51,13 @@ class TestPaths:
         along = (motion[:, :2] - START) @ np.subtract(END, START)
         assert (np.diff(along) >= 0.0).all() and not motion[:, 3:].any()
 
-    def test_draw_tilts_the_force_and_holds_it(self):
+    def test_draw_tilts_the_force_and_keeps_its_direction(self):
         motion = sampled(PATHS["draw"], np.linspace(0.0, 2.5, 251))
         assert motion[0, 3] == 0.0 and (np.diff(motion[:, 3]) >= 0.0).all() and not motion[:, 4].any()
         held = motion[np.linspace(0.0, 2.5, 251) >= 1.5]
         assert np.allclose(held[:, 2], 0.3) and np.allclose(held[:, 3], 0.6)
 
-    def test_lay_tilts_the_tool_towards_x_and_holds_it(self):
+    def test_lay_tilts_the_tool_towards_x_and_keeps_the_pose(self):
         path = lay(3e-3, tilt=0.4, rise=1.0, at=(0.002, -0.001))
         assert path(-1.0).depth == path(0.0).depth == -IDLE_HEIGHT and path(0.5).depth == pytest.approx(
             0.5 * (3e-3 - IDLE_HEIGHT)

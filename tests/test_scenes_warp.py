@@ -308,7 +308,7 @@ def test_lps_image_labelled_as_ras_gives_a_warning(folder, box):
         assert any("LPS marked as RAS" in warning for warning in warnings) == (name == "wrong")
 
 
-def test_warp_rejects_folder_that_is_not_empty(folder, capsys):
+def test_warp_rejects_non_empty_folder(folder, capsys):
     located = "--located", folder / "located.vtu"
     mine = folder / "mine" / "notes.txt"
     mine.parent.mkdir()
