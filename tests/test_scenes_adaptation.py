@@ -1,4 +1,4 @@
-"""Bodies, materials and scenes to which trained models are adapted: what has to be made again."""
+"""Tests of studies after debulking: mesh, loads solved again, learners trained again and recorded time."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from surrogate.training.train import train
 
 
 class TestAdapting:
-    def test_debulked_body_lacks_a_fifth_of_tumour(self, study_box):
+    def test_debulk_tumour_removes_a_fifth_of_the_tumour(self, study_box):
         after = debulk_tumour(study_box)
         volume = [body.mesh.volumes[body.mesh.region == 2].sum() for body in (after, study_box)]
         element = study_box.mesh.volumes[study_box.mesh.region == 2].max()
@@ -29,7 +29,7 @@ class TestAdapting:
             after.mesh.nodes[after.craniotomy], study_box.mesh.nodes[study_box.craniotomy]
         )  # the cavity is inside
 
-    def test_elements_are_set_up_and_learners_trained_anew(self, study, study_rows):
+    def test_debulked_study_solves_all_loads_and_retrains_learners(self, study, study_rows):
         reported = []
         simulate_debulked(study, reported.append)
         simulate_debulked(study, reported.append)
@@ -47,7 +47,7 @@ class TestAdapting:
         assert any("L-BFGS" in line for line in study_rows[0].plan) and not row.plan
         assert study_rows[2].adapt is None  # no data of the debulked body yet
 
-    def test_a_run_that_was_stopped_has_no_time(self, study, monkeypatch):
+    def test_interrupted_simulation_has_no_recorded_time(self, study, monkeypatch):
         path = build_debulked_study(study).data
         path.unlink(missing_ok=True)
         path.with_suffix(".json").unlink(missing_ok=True)

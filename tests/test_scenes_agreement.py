@@ -1,4 +1,4 @@
-"""Agreement of two trackers: the places that are kept."""
+"""Agreement of two trackers: the stored positions."""
 
 import numpy as np
 from test_scenes_error_parts import shifted
@@ -7,7 +7,7 @@ from ar.tracking.pose import Pose
 from scenes.tracked.agreement import Agreement
 
 
-def test_agreement_keeps_the_last_30_places_that_are_known():
+def test_agreement_keeps_last_30_accurate_positions():
     found, body = Agreement(), Pose(np.eye(4), np.zeros((6, 6)), 0.0, 4)
     for number in range(80):
         deviation = 3e-3 if number % 2 else 1e-3

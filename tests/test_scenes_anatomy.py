@@ -1,4 +1,4 @@
-"""`sulcus anatomy` as a user runs it."""
+"""`sulcus anatomy` on the command line: meshes of the template and of label maps, and rejected input."""
 
 import json
 
@@ -24,7 +24,7 @@ def brain(tmp_path):
     return tmp_path
 
 
-def test_the_template_with_its_intensities_round_trip(tmp_path, capsys):
+def test_template_anatomy_with_intensities_round_trips(tmp_path, capsys):
     out = tmp_path / "brain.vtu"
     code, text, _ = run(capsys, "--nodes", 2000, "--preset", "superficial", "--json", "--out", out)
     summary = json.loads(text)
@@ -45,7 +45,7 @@ def test_the_template_with_its_intensities_round_trip(tmp_path, capsys):
     assert read_anatomy(tmp_path / "second.vtu").digest == anatomy.digest
 
 
-def test_a_users_volume_with_and_without_intensities(brain, capsys):
+def test_anatomy_command_meshes_labels_with_and_without_t1(brain, capsys):
     out = brain / "mine.vtu"
     words = ("--labels", brain / "labels.nii.gz", "--brain", "1", "--tumour", "2", "--nodes", 2000, "--out", out)
     code, text, noted = run(capsys, *words, "--t1", brain / "t1.nii.gz")
@@ -73,7 +73,7 @@ def test_a_users_volume_with_and_without_intensities(brain, capsys):
         (("--labels", "none.nii.gz", "--brain", "1", "--tumour", "2"), "no such file"),
     ],
 )
-def test_bad_input_is_a_sentence_and_nothing_is_written(brain, capsys, monkeypatch, words, reason):
+def test_anatomy_command_rejects_bad_input_and_writes_nothing(brain, capsys, monkeypatch, words, reason):
     monkeypatch.chdir(brain)
     before = sorted(brain.iterdir())
     code, text, error = run(capsys, *words, "--out", "mine.vtu")
@@ -82,6 +82,6 @@ def test_bad_input_is_a_sentence_and_nothing_is_written(brain, capsys, monkeypat
     assert sorted(brain.iterdir()) == before
 
 
-def test_a_name_that_is_no_mesh_is_refused_at_once(tmp_path, capsys):
+def test_anatomy_command_rejects_unsupported_file_extension(tmp_path, capsys):
     code, _, error = run(capsys, "--out", tmp_path / "brain.stl")
     assert code == 2 and ".vtu" in error

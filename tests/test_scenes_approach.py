@@ -1,4 +1,4 @@
-"""A scene's tool goes in where a planned trajectory enters, and along it; what does not fit the opening is refused."""
+"""Planned trajectories: entry and direction of the tool, and rejected trajectories outside the craniotomy."""
 
 import argparse
 import json
@@ -55,8 +55,8 @@ def planned(
 
 @pytest.mark.parametrize("swapped", [False, True])
 @pytest.mark.parametrize(("right", "up", "tilt"), [(0.0, 0.0, (0.0, 0.0)), (9e-3, -6e-3, (0.5, -0.3))])
-def test_the_tool_enters_there_and_pushes_along_it(site, tmp_path, right, up, tilt, swapped):
-    """Whichever end was drawn first; the scene's own places and tilts are added."""
+def test_tool_follows_entry_and_direction_of_trajectory(site, tmp_path, right, up, tilt, swapped):
+    """For both drawing orders of the line; the scene's own positions and tilts are added."""
     entry, way, line = planned(site, right, up, tilt)
     approach = approach_of(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
     touch = approach.follow(press(0.3))(2.0)
@@ -70,14 +70,14 @@ def test_the_tool_enters_there_and_pushes_along_it(site, tmp_path, right, up, ti
     assert np.tan(aside.tilt[0]) == pytest.approx(np.tan(touch.tilt[0]) + np.tan(0.2))
 
 
-def test_a_point_is_an_entry_straight_inwards(site, tmp_path):
+def test_single_point_gives_entry_without_tilt(site, tmp_path):
     entry, _, _ = planned(site, 5e-3, 5e-3, (0.0, 0.0))
     approach = approach_of(read_markup(marked(tmp_path, entry[None] - 2e-3 * site.axis, "Fiducial")), site)
     assert approach.tilt == pytest.approx((0.0, 0.0), abs=1e-12)
     assert np.hypot(approach.x - 5e-3, approach.y - 5e-3) < 2e-3
 
 
-def test_a_line_that_ends_near_the_cortex_is_drawn_out(site, tmp_path):
+def test_trajectory_ending_near_the_cortex_is_extended(site, tmp_path):
     entry, way, _ = planned(site, 9e-3, -6e-3, (0.5, -0.3))
     through, *short = (
         approach_of(read_markup(marked(tmp_path, entry + np.outer(ends, way))), site)
@@ -88,8 +88,8 @@ def test_a_line_that_ends_near_the_cortex_is_drawn_out(site, tmp_path):
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.5, -0.3), (-0.2, 0.6)])
-def test_a_shaft_lies_along_a_line_and_the_ball_stays(site, tmp_path, tilt):
-    """That of a probe; a point, and a blade, leave the tool as it is."""
+def test_probe_shaft_aligns_with_trajectory(site, tmp_path, tilt):
+    """Points and blades leave the orientation of the tool unchanged."""
     entry, way, line = planned(site, 4e-3, 2e-3, tilt)
     approach = approach_of(read_markup(marked(tmp_path, line)), site)
     held, plain = approach.align_tool(PALPATION), PALPATION
@@ -103,7 +103,7 @@ def test_a_shaft_lies_along_a_line_and_the_ball_stays(site, tmp_path, tilt):
     assert point.align_tool(plain) == plain and approach.align_tool(Blade()) == Blade()
 
 
-def test_what_misses_the_opening_is_refused(site, tmp_path):
+def test_trajectory_outside_the_craniotomy_is_rejected(site, tmp_path):
     _, _, line = planned(site, 0.0, 0.0, (0.0, 0.0))
     beside = line + 60e-3 * site.right
     oblique = site.origin + np.outer([-40e-3, 40e-3], site.compute_direction(Touch(tilt=(1.3, 0.0))))
@@ -125,8 +125,8 @@ def test_what_misses_the_opening_is_refused(site, tmp_path):
             approach_of(read_markup(marked(tmp_path, points, kind)), site)
 
 
-def test_commands_play_scenes_along_it(site, tmp_path, capsys):
-    """The push of `press`; near the rim the bone stops the tool and that is said; a scene without a tool stays."""
+def test_trajectory_option_moves_the_tool_of_the_scene(site, tmp_path, capsys):
+    """Scene `press`; near the rim a message names the stop at the bone; scenes without a tool are unchanged."""
     from scenes.options.theatre_options import add_theatre, build_requested_scene
 
     def asked(name: str, line: np.ndarray):
@@ -150,7 +150,7 @@ def test_commands_play_scenes_along_it(site, tmp_path, capsys):
     assert "sag has no tool that could follow" in capsys.readouterr().err
 
 
-def test_it_is_an_option_of_the_command(site, tmp_path, capsys):
+def test_render_command_rejects_trajectory_off_the_cortex(site, tmp_path, capsys):
     write_anatomy(tmp_path / "a.vtu", site.anatomy)
     line = marked(tmp_path, planned(site, 0.0, 0.0, (0.0, 0.0))[2] + 60e-3 * site.right)
     words = ["render", "press", "--anatomy", str(tmp_path / "a.vtu"), "--out", str(tmp_path / "out"), "--device", "cpu"]
@@ -158,7 +158,7 @@ def test_it_is_an_option_of_the_command(site, tmp_path, capsys):
     assert "mm from the open cortex" in capsys.readouterr().err
 
 
-def test_a_patient_says_how_its_scenes_follow_it(site, tmp_path):
+def test_opening_options_give_trajectory_only_for_lines(site, tmp_path):
     parser = argparse.ArgumentParser()
     add_opening_arguments(parser)
     line = planned(site, 0.0, 0.0, (0.0, 0.0))[2]
@@ -172,5 +172,5 @@ def test_a_patient_says_how_its_scenes_follow_it(site, tmp_path):
     assert to_opening_options(parser.parse_args([])) == words[:1]
 
 
-def test_no_trajectory_is_the_middle():
+def test_approach_at_origin_leaves_the_path_unchanged():
     assert Approach(0.0, 0.0).follow(short().path)(0.7) == short().path(0.7)

@@ -12,7 +12,7 @@ from scenes.page.effect_costs import EFFECT_COSTS
 from sim.errors import InputError
 
 
-def test_a_study_shows_each_text_and_starts_again():
+def test_background_study_shows_each_text_and_restarts():
     shown, turn = [], threading.Lock()
     study = BackgroundStudy(lambda: iter(["one", "two"]), turn, shown.append)
     for _ in range(2):
@@ -22,7 +22,7 @@ def test_a_study_shows_each_text_and_starts_again():
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_closed_study_shows_nothing_more(fails):
+def test_closed_background_study_shows_no_further_text(fails):
     shown = []
 
     def work():
@@ -38,7 +38,7 @@ def test_a_closed_study_shows_nothing_more(fails):
     assert shown == ["one"]
 
 
-def test_bad_input_is_shown_as_a_warning():
+def test_background_study_shows_input_error_as_warning():
     def work():
         raise InputError("a < b")
         yield ""
@@ -50,7 +50,7 @@ def test_bad_input_is_shown_as_a_warning():
     assert shown == ['<p class="warn">a &lt; b</p>']
 
 
-def test_costs_rename_the_switches_that_the_page_has():
+def test_effect_costs_change_labels_of_existing_switches():
     button, none = SimpleNamespace(label=""), cast("Any", None)
     page = Mock(controls=SimpleNamespace(handles={"Gravity": button}), note=lambda key, send: send())
     page.rename = partial(Browser.rename, page)

@@ -1,4 +1,4 @@
-"""Regions of an own anatomy in a plan: they are drawn as so many times as stiff, and what is not there is not said."""
+"""Regions of an anatomy in a plan: sampled stiffness, and weak models in the data sheet."""
 
 import json
 import math
@@ -61,7 +61,7 @@ def plan(tmp_path):
     return load_plan(str(tmp_path / "own.toml"))
 
 
-def test_a_body_is_made_of_what_is_drawn_for_its_regions(plan, tmp_path):
+def test_body_has_the_sampled_stiffness_of_its_regions(plan, tmp_path):
     write_body(tmp_path / "made", plan, 1, 0, "cpu")
     body = read_body(tmp_path / "made")
     young = {label: tissue.young for label, tissue in body.tissue.regions.items()}
@@ -71,7 +71,7 @@ def test_a_body_is_made_of_what_is_drawn_for_its_regions(plan, tmp_path):
     assert "bodies.tissue.ventricles_ratio" not in body.drawn
 
 
-def test_a_body_that_was_made_before_has_no_such_regions(plan, tmp_path):
+def test_tissue_of_older_body_file_has_no_oedema_region(plan, tmp_path):
     write_body(tmp_path / "made", plan, 1, 0, "cpu")
     older = {name: value for name, value in read_body(tmp_path / "made").drawn.items() if "oedema" not in name}
     assert PART_LABELS["oedema"] not in get_tissue(older).regions
@@ -87,7 +87,7 @@ def made(tmp_path_factory):
     return above / "set", anatomy
 
 
-def test_a_model_is_weak_by_what_it_states():
+def test_reported_errors_above_the_limit_mark_a_weak_model():
     def left_out(mean, p999=None):
         return ReportedErrors(1.0, HeldOutErrors(mean, 0.0, p999, 0.0))
 
@@ -102,7 +102,7 @@ def test_a_model_is_weak_by_what_it_states():
     assert str(left_out(0.042, 3e-4)).endswith("); 99.9th percentile 0.3 mm (limit 0.2 mm)")
 
 
-def test_the_worst_are_named_first_and_not_all_of_many():
+def test_weak_models_are_listed_worst_first_and_truncated():
     many = {number: ReportedErrors(1e-5 * number, None) for number in range(35)}
     first, *named = describe_weak(many)
     assert first.startswith("14 of 35 bodies with a model have a weak one")
@@ -110,7 +110,7 @@ def test_the_worst_are_named_first_and_not_all_of_many():
     assert describe_weak({0: ReportedErrors(0.0, None)}) == [] == to_weak_json({0: ReportedErrors(0.0, None)})
 
 
-def test_files_say_what_their_models_state(made):
+def test_model_errors_are_read_from_model_files(made):
     folder, anatomy = made
     path = to_body_path(folder, 0) / "anatomy.model.npz"
     (model,) = load(path, anatomy).values()
@@ -123,7 +123,7 @@ def test_files_say_what_their_models_state(made):
     to_body_path(folder, 1).rmdir()
 
 
-def test_the_run_the_card_and_validate_name_them(made, capsys):
+def test_datasheet_and_validate_list_weak_models(made, capsys):
     folder, _ = made
     write_episode(folder / "episode_000000.h5", made[1])
     bound = f"- body 0: {list_model_errors(folder)[0]}"

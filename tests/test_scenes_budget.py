@@ -1,4 +1,4 @@
-"""`sulcus budget`: every part of the overlay's error, and bad input."""
+"""`sulcus budget`: all parts of the overlay's error, and rejected input."""
 
 import json
 
@@ -10,7 +10,7 @@ from scenes.script.uncertainty import SURROGATE
 from sim.bodies.meshfile import write_anatomy
 
 
-def test_the_command_names_every_part_and_refuses_bad_input(box, tmp_path, capsys):
+def test_budget_command_lists_all_parts_and_rejects_bad_input(box, tmp_path, capsys):
     body, own = tmp_path / "box.vtu", tmp_path / "brief.py"
     write_anatomy(body, box)
     own.write_text(

@@ -1,4 +1,4 @@
-"""`sulcus calibrate`: what it finds in files, what it writes, and what it refuses by name."""
+"""`sulcus calibrate`: camera, pivot and hand-eye calibration from files, and rejected input."""
 
 import json
 import zlib
@@ -63,7 +63,7 @@ def test_image_folder_gives_camera_and_covariance(folder, tmp_path, capsys):
     assert len(report["used"]) == 10 and report["left_out"] == [] and report["looked_at"] == 11
 
 
-def test_a_video_gives_the_same_camera(pictures, tmp_path, capsys):
+def test_video_gives_same_camera_as_image_folder(pictures, tmp_path, capsys):
     film = tmp_path / "board.mp4"
     write_video(film, (np.repeat(grey[..., None], 3, axis=2) for grey in pictures), 10.0)
     assert main(["calibrate", str(film), "--out", str(tmp_path / "camera.yml"), "--json"]) == 0
@@ -102,7 +102,7 @@ def test_images_without_the_board_are_rejected(folder, pictures, tmp_path, capsy
     assert not list(tmp_path.glob("camera*"))
 
 
-def test_files_of_others_are_kept(folder, tmp_path, capsys):
+def test_calibrate_keeps_existing_files_without_force(folder, tmp_path, capsys):
     for name in ("camera.yaml", "camera.json"):
         mine = tmp_path / name
         mine.write_text("image_width: 3")
@@ -113,7 +113,7 @@ def test_files_of_others_are_kept(folder, tmp_path, capsys):
     assert "give --out K.yaml" in refused([folder], capsys)
 
 
-def test_one_thing_is_calibrated_at_a_time(folder, tmp_path, capsys):
+def test_calibrate_rejects_conflicting_inputs(folder, tmp_path, capsys):
     assert "give a video or" in refused([], capsys)
     assert "give a video or" in refused([folder, "--pivot", tmp_path / "a.csv", "--out", "k.yaml"], capsys)
     assert "--out and --size require" in refused(["--pivot", tmp_path / "a.csv", "--out", "k.yaml"], capsys)
@@ -131,7 +131,7 @@ def turned(count, seed=0):
     return Rotation.from_rotvec(0.5 * np.random.default_rng(seed).normal(size=(count, 3)))
 
 
-def test_a_tip_is_found_from_a_file(tmp_path, capsys):
+def test_pivot_calibration_finds_tip_from_pose_file(tmp_path, capsys):
     turns, tip = turned(20), np.array([0.001, 0.002, -0.15])
     path = write_poses(tmp_path / "poses.csv", turns, [0.1, 0.2, 0.3] - turns.apply(tip), f"{HEAD},note", ",good")
     assert main(["calibrate", "--pivot", str(path)]) == 0
@@ -145,7 +145,7 @@ def test_a_tip_is_found_from_a_file(tmp_path, capsys):
     assert "few.csv: 5 poses are too few" in refused(["--pivot", few], capsys)
 
 
-def test_two_bodies_are_found_from_two_files(tmp_path, capsys):
+def test_hand_eye_calibration_finds_transform_from_two_files(tmp_path, capsys):
     turns, places = turned(20), np.random.default_rng(1).normal(size=(20, 3))
     X = Rotation.from_rotvec([0.3, -0.5, 0.9])
     shift = np.array([0.05, -0.02, 0.12])
@@ -208,7 +208,7 @@ def test_pivot_with_one_wrong_row_names_the_row(tmp_path, capsys):
         (None, None, "in row 9 of {one}. Leave out wrong rows, and give"),
     ],
 )
-def test_hand_eye_that_does_not_fit_is_rejected(tmp_path, capsys, first, second, hint):
+def test_hand_eye_with_inconsistent_poses_is_rejected(tmp_path, capsys, first, second, hint):
     turns, places = turned(20), np.random.default_rng(1).normal(size=(20, 3))
     others = places + turns.apply([0.05, -0.02, 0.12])
     others[7] += 0.3 * (first is second is None)
@@ -223,7 +223,7 @@ def test_hand_eye_that_does_not_fit_is_rejected(tmp_path, capsys, first, second,
     assert "mm (rms): at most 2 and 10 are required" in line and hint.format(one=one, other=other) in line
 
 
-def test_pivot_in_metres_is_noted(tmp_path):
+def test_pivot_positions_in_metres_give_a_warning(tmp_path):
     turns, places = pivoting()
     words = ["calibrate", "--pivot", str(write_poses(tmp_path / "poses.csv", turns, 1e-3 * places))]
     with pytest.warns(UserWarning, match=r"poses\.csv: positions move by only 0\.25 mm: are they metres\?"):

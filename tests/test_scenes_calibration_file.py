@@ -1,4 +1,4 @@
-"""Files of calibrations: what comes from outside is read, or refused with its path, a reason and a remedy."""
+"""Calibration files: round trip, and rejected files with path, reason and remedy."""
 
 import os
 
@@ -13,14 +13,14 @@ SOME = Calibration((820.5, 818.25), (321.0, 236.5), 640, 480, Lens(-0.31, 0.12, 
 
 
 @pytest.mark.parametrize("form", ["opencv", "ros"])
-def test_a_file_is_read_as_it_was_written(tmp_path, form):
+def test_calibration_file_round_trips(tmp_path, form):
     path = tmp_path / "camera.yaml"
     write_calibration(path, SOME, form)
     assert read_calibration(path) == SOME == read_calibration(str(path))
     assert [each.name for each in tmp_path.iterdir()] == ["camera.yaml"]
 
 
-def test_files_that_are_none_are_refused(tmp_path):
+def test_read_calibration_rejects_missing_and_invalid_files(tmp_path):
     wrong = tmp_path / "wrong.yaml"
     with pytest.raises(InputError, match=r"wrong\.yaml: cannot be read as a camera's calibration: no such file.* Give"):
         read_calibration(wrong)
@@ -42,7 +42,7 @@ def test_files_that_are_none_are_refused(tmp_path):
             read_calibration(wrong)
 
 
-def test_what_cannot_be_written_is_refused(tmp_path):
+def test_write_calibration_rejects_bad_name_format_and_path(tmp_path):
     with pytest.raises(InputError, match=r"written as \.yaml or \.yml"):
         write_calibration(tmp_path / "camera.xml", SOME)
     with pytest.raises(InputError, match="opencv or ros, not as 'matlab'"):

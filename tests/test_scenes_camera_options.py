@@ -1,4 +1,4 @@
-"""Options of a scene's camera: a calibration, a path, an eye."""
+"""Options of a scene's camera: calibration, path and eye."""
 
 from argparse import ArgumentParser
 
@@ -12,17 +12,17 @@ from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import write_calibration
 
 
-def test_names_on_the_command_line_are_those_of_paths():
+def test_path_names_of_the_command_line_match_camera_paths():
     assert tuple(PATHS) == camera_options.PATHS
 
 
-def test_a_tracked_camera_takes_its_distance():
+def test_distance_option_sets_the_viewpoint_distance_in_metres():
     camera_options.add_camera(parser := ArgumentParser())
     args = parser.parse_args(["--distance", "250"])
     assert camera_options.add_targets(args, find_scene("press")).viewpoint.distance == 0.25
 
 
-def test_a_calibrated_camera_renders_checks_and_collects(theatre, tmp_path, capsys):
+def test_calibrated_camera_works_in_render_check_and_collect(theatre, tmp_path, capsys):
     path, out, body = tmp_path / "camera.yaml", tmp_path / "frames", put(theatre, tmp_path / "box.vtu")
     write_calibration(path, REAL, "ros")
     seen = ["--camera", str(path), "--path", "microscope", "--eye", "right", "--device", "cpu", "--anatomy", str(body)]

@@ -1,4 +1,4 @@
-"""Paths of a camera over a scene: pure functions of time, smooth, and rejected where they cannot be."""
+"""Camera paths over a scene: deterministic and smooth functions of time, and rejected parameters."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from scenes.script.viewpoint import OBLIQUE_VIEWPOINT
 from sim.errors import InputError
 
 
-def test_a_path_that_cannot_be_is_refused():
+def test_camera_path_with_invalid_parameters_is_rejected():
     for wrong in (
         lambda: HandHeld(-1),
         lambda: Orbit(period=0.0),
@@ -44,7 +44,7 @@ def test_hand_motion_is_deterministic_per_seed(site):
     assert PATHS["hand-held"](5) == HandHeld(5)
 
 
-def test_a_hand_moves_as_far_as_it_says_and_breathes(site):
+def test_hand_held_path_has_given_amplitude_and_breathing(site):
     ways = np.array([sample_wandering(seed, time) for seed in range(6) for time in np.arange(0.0, 60.0, 0.05)])
     assert ways.std(axis=0) == pytest.approx(np.ones(6), rel=0.15) and np.abs(ways.mean(axis=0)).max() < 0.1
     calm = replace(OBLIQUE_VIEWPOINT, path=HandHeld(0, shift=0.0, turn=0.0, breath=2e-3))
@@ -53,7 +53,7 @@ def test_a_hand_moves_as_far_as_it_says_and_breathes(site):
     assert np.allclose(low - start, start - top)
 
 
-def test_an_orbit_looks_at_its_target_from_as_far(site):
+def test_orbit_keeps_target_in_centre_at_constant_distance(site):
     view = replace(OBLIQUE_VIEWPOINT, path=Orbit(np.radians(25.0), 2.0))
     target, still = OBLIQUE_VIEWPOINT.find_target(site), OBLIQUE_VIEWPOINT.build_camera(site)
     for time in TIMES:
@@ -65,7 +65,7 @@ def test_an_orbit_looks_at_its_target_from_as_far(site):
     assert np.degrees(np.arccos(ways[0] @ ways[1])) == pytest.approx(25.0)
 
 
-def test_a_microscope_moves_along_its_axis_zooms_and_focuses(site):
+def test_microscope_path_moves_along_axis_zooms_and_focuses(site):
     view = replace(OBLIQUE_VIEWPOINT, path=Microscope())
     start, zoomed, far = (view.build_camera(site, time) for time in (0.0, 1.5, 2.8))
     target = OBLIQUE_VIEWPOINT.find_target(site)

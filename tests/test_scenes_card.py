@@ -13,7 +13,7 @@ from scenes.episodes.exports.card import keep_card
 from scenes.episodes.run_folder import list_finished
 
 
-def test_a_card_says_what_there_is(folder, tmp_path, capsys):
+def test_card_lists_episodes_and_failures_of_data_set(folder, tmp_path, capsys):
     (folder / "failed").mkdir(exist_ok=True)
     (folder / "failed/episode_000002.json").write_text("{}")
     run = {
@@ -54,7 +54,7 @@ def test_a_card_says_what_there_is(folder, tmp_path, capsys):
     assert main(["convert", str(folder), "--to", "card", "--force"]) == 0
 
 
-def test_a_card_is_kept_as_episodes_come(box, tmp_path, monkeypatch):
+def test_card_is_updated_when_episodes_are_added(box, tmp_path, monkeypatch):
     def kept(changed):
         return keep_card(tmp_path, list_finished(tmp_path), changed)
 

@@ -1,4 +1,4 @@
-"""Each check fails when what it guards is perturbed, and passes when nothing is."""
+"""Scene checks: perturbed frames fail, unperturbed frames pass."""
 
 import json
 from dataclasses import replace
@@ -81,7 +81,7 @@ def shifted(frame, by):
     return replace(frame, deformation=replace(answer, displacement=answer.displacement + by))
 
 
-def test_every_bound_has_its_sentence():
+def test_each_bound_has_a_violation_message():
     assert GOOD.find_violations(Bounds()) == []
     assert set(SENTENCES) == set(GOOD.to_row()) - {"leaked", "bond", "doubt"}  # stated, and held to nothing
     for name, (value, words) in SENTENCES.items():
@@ -92,14 +92,14 @@ def test_every_bound_has_its_sentence():
     assert json.loads(json.dumps(GOOD.to_row())) == GOOD.to_row()
 
 
-def test_what_passes_the_skull_is_reported(play, frames, truth):
+def test_volume_outside_the_skull_is_reported_as_leaked(play, frames, truth):
     leaky = replace(truth, leaked=np.linspace(0.0, 0.35, len(truth)))
     assert measure(play, play.get_camera, frames, leaky).leaked == 0.35
     assert measure(play, play.get_camera, frames, truth).leaked == truth.leaked.max() < 1e-5
 
 
 @by_each
-def test_what_was_not_perturbed_passes(play, frames, truth):
+def test_unperturbed_frames_pass_all_checks(play, frames, truth):
     sentences, figures = broken(play, frames, truth)
     assert not sentences
     assert figures.overlap > 0.97 and figures.pixels < 1e-9 and figures.motion_mm > 0.4
@@ -132,44 +132,44 @@ def compute_error(camera, columns, rows):
 
 
 class TestThePictureItself:
-    """What was answered is right; what was drawn is not."""
+    """Correct solution, wrong image."""
 
     def pixels(self, play, frames, truth, wrong):
         """Sentences and figures where the middle frame's picture is another."""
         sentences, figures = broken(play, [frames[0], frames[1], wrong, *frames[3:]], truth)
         return sentences, figures
 
-    def test_drawn_again_as_it_was_it_passes(self, play, frames, truth):
+    def test_unchanged_image_passes_the_pixel_check(self, play, frames, truth):
         again = drawn(play, frames[2], play.compute_positions(frames[2].deformation))
         assert not self.pixels(play, frames, truth, again)[0]
 
-    def test_of_the_undeformed_tumour_it_fails(self, play, frames, truth):
+    def test_image_of_undeformed_tumour_fails_the_pixel_check(self, play, frames, truth):
         wrong = drawn(play, frames[2], play.site.anatomy.mesh.nodes)
         sentences, figures = self.pixels(play, frames, truth, wrong)
         assert about(sentences, "outline") and figures.drawn > 2.0
 
-    def test_with_the_answer_a_millimetre_away_it_fails(self, play, frames, truth):
-        """Picture and answer agree, and both differ from the finite elements."""
+    def test_image_of_tumour_shifted_by_1_mm_fails(self, play, frames, truth):
+        """Image and solution agree, and both differ from FEM."""
         away = shifted(frames[2], 1e-3 * play.site.right)
         sentences, figures = self.pixels(
             play, frames, truth, drawn(play, away, play.compute_positions(away.deformation))
         )
         assert about(sentences, "outline") and figures.drawn > 2.0
 
-    def test_of_an_earlier_frame_it_fails(self, play, frames, truth):
+    def test_image_of_an_earlier_frame_fails(self, play, frames, truth):
         late = replace(frames[2], shown=frames[1].shown)
         assert about(self.pixels(play, frames, truth, late)[0], "does not show its frame number")
         wrong = drawn(play, frames[2], play.compute_positions(frames[0].deformation))
         assert about(self.pixels(play, frames, truth, wrong)[0], "outline")
 
     @pytest.mark.parametrize("off", [(3.0, 0.0), (0.0, 8.0), (60.0, 40.0)])
-    def test_shifted_it_fails(self, play, frames, truth, off):
+    def test_image_from_a_shifted_camera_fails(self, play, frames, truth, off):
         camera = compute_error(play.camera, *off)
         wrong = drawn(play, frames[2], play.compute_positions(frames[2].deformation), camera)
         sentences, figures = self.pixels(play, frames, truth, wrong)
         assert about(sentences, "outline") and figures.drawn > 2.0
 
-    def test_without_an_overlay_it_fails(self, play, frames, truth):
+    def test_image_without_an_overlay_fails(self, play, frames, truth):
         bare = replace(frames[2], shown=frames[2].picture.colour)
         sentences, figures = self.pixels(play, frames, truth, bare)
         assert (
@@ -178,25 +178,25 @@ class TestThePictureItself:
             and figures.drawn == np.inf
         )
 
-    def test_with_another_number_it_fails(self, play, frames, truth):
+    def test_image_with_a_wrong_tip_distance_fails(self, play, frames, truth):
         deep = frames[2].tip + 0.4e-3 * play.site.axis
         wrong = drawn(play, frames[2], play.compute_positions(frames[2].deformation), tip=deep)
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not show its frame number")
 
-    def test_with_a_number_ten_times_too_large_it_fails(self, play, frames, truth, monkeypatch):
+    def test_image_with_a_tenfold_tip_distance_fails(self, play, frames, truth, monkeypatch):
         monkeypatch.setattr(
             "ar.overlay.gauge.format_millimetres", lambda length, error=None: format_millimetres(10.0 * length, error)
         )
         wrong = drawn(play, frames[2], play.compute_positions(frames[2].deformation))
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not show its frame number")
 
-    def test_with_another_frame_s_number_it_fails(self, play, frames, truth):
+    def test_image_with_a_wrong_frame_number_fails(self, play, frames, truth):
         wrong = drawn(play, replace(frames[2], number=59), play.compute_positions(frames[2].deformation))
         assert about(self.pixels(play, frames, truth, replace(wrong, number=60))[0], "does not show its frame number")
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
-def test_a_camera_turned_by_half_a_degree_fails(play, frames, truth, axis):
+def test_camera_rotated_by_half_a_degree_fails_the_checks(play, frames, truth, axis):
     off = [replace(frame, camera=frame.camera.perturb(0.5, axis)) for frame in frames]
     sentences, figures = broken(play, off, truth)
     assert about(sentences, "pixels off") and figures.pixels > 0.2
@@ -208,7 +208,7 @@ def test_a_camera_turned_by_half_a_degree_fails(play, frames, truth, axis):
 
 @by_each
 @pytest.mark.parametrize("direction", ["right", "up", "axis"])
-def test_a_tumour_off_by_a_millimetre_fails(play, frames, truth, direction):
+def test_tumour_shifted_by_1_mm_fails_the_checks(play, frames, truth, direction):
     by = 1e-3 * getattr(play.site, direction)
     sentences, figures = broken(play, [frames[0], shifted(frames[1], by), *frames[2:]], truth)
     assert about(sentences, "error") and figures.error_mm == pytest.approx(1.0, abs=0.1)
@@ -216,7 +216,7 @@ def test_a_tumour_off_by_a_millimetre_fails(play, frames, truth, direction):
         assert about(sentences, "overlap")
 
 
-def test_a_stale_frame_fails(play, frames, truth):
+def test_frame_with_an_earlier_deformation_fails_the_checks(play, frames, truth):
     stale = [frames[0], replace(frames[1], deformation=frames[0].deformation), *frames[2:]]
     assert about(broken(play, stale, truth)[0], "at another time")
     # Even if it claims the right time: the tumour is elsewhere.
@@ -226,12 +226,12 @@ def test_a_stale_frame_fails(play, frames, truth):
     assert about(sentences, "error") and not about(sentences, "at another time")
 
 
-def test_frames_in_another_order_fail(play, frames, truth):
+def test_frames_in_wrong_order_fail_the_checks(play, frames, truth):
     assert about(broken(play, [frames[1], frames[0], *frames[2:]], truth)[0], "at another time")
 
 
 @by_each
-def test_what_is_not_finite_fails(play, frames, truth):
+def test_non_finite_depth_or_displacement_fails_the_checks(play, frames, truth):
     for poison in (np.nan, np.inf):
         depth = frames[1].picture.depth.copy()
         depth[3, 5] = poison
@@ -245,7 +245,7 @@ def test_what_is_not_finite_fails(play, frames, truth):
         assert about(broken(play, [frames[0], off, *frames[2:]], truth)[0], "not finite")
 
 
-def test_a_bad_outcome_fails_on_either_side(play, frames, truth):
+def test_bad_solver_outcome_fails_for_frame_and_reference(play, frames, truth):
     doubtful = replace(frames[1].deformation, outcome=(Outcome.EXTRAPOLATED,))
     off = [frames[0], replace(frames[1], deformation=doubtful), *frames[2:]]
     why = Outcome.EXTRAPOLATED.value
@@ -256,7 +256,7 @@ def test_a_bad_outcome_fails_on_either_side(play, frames, truth):
     assert broken(play, off, stopped)[0].pop().endswith(" (1 more)")
 
 
-def test_nothing_but_idle_frames_prove_nothing(play, frames, truth):
+def test_frames_without_motion_fail_the_checks(play, frames, truth):
     assert about(broken(play, frames[:1], truth.select(np.array([0])))[0], "never moves")
 
 
@@ -271,8 +271,8 @@ def anatomy(small_theatre, tmp_path_factory):
 
 
 class TestCommand:
-    def test_passes_and_says_so(self, anatomy, capsys):
-        """All but the blades, which strain 1 ml of so small a body beyond what was measured, or invert tetrahedra."""
+    def test_check_command_reports_every_scene_as_json(self, anatomy, capsys):
+        """Blade scenes fail: they strain this small body beyond the measured range, or invert tetrahedra."""
         assert main(["check", "--anatomy", str(anatomy), "--every", "60", "--json"]) == 1
         out, err = capsys.readouterr()
         report = json.loads(out)
@@ -289,14 +289,14 @@ class TestCommand:
         assert err.count("passes") == len(plain) - 1  # all but two, and a film whose markers are lost and found
         assert report["tracking"]["broken"] == [] and report["tracking"]["pictures"] == 16
 
-    def test_one_scene_by_finite_elements(self, anatomy, capsys):
+    def test_check_command_passes_one_scene_solved_by_fem(self, anatomy, capsys):
         words = ["check", "draw", "--anatomy", str(anatomy), "--every", "40", "--deformer", "fem", "--device", "cpu"]
         assert main(words) == 0
         solver, verdict = capsys.readouterr().out.splitlines()[:2]
         assert solver == "draw by finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
         assert verdict.split()[:2] == ["draw", "passes"]
 
-    def test_a_wrong_model_fails_with_its_figures(self, small_theatre, anatomy, tmp_path, capsys):
+    def test_check_command_fails_for_model_with_doubled_modes(self, small_theatre, anatomy, tmp_path, capsys):
         linear = small_theatre.models["linear"]
         parts = [replace(part, basis=replace(part.basis, modes=2 * part.basis.modes)) for part in linear.parts]
         wrong = replace(small_theatre, models={"linear": replace(linear, parts=tuple(parts))})
@@ -310,6 +310,6 @@ class TestCommand:
         out = capsys.readouterr().out
         assert "FAILS" in out and "mm is above" in out
 
-    def test_idle_frames_alone_fail(self, anatomy, capsys):
+    def test_check_command_fails_for_frames_without_motion(self, anatomy, capsys):
         assert main(["check", "press", "--anatomy", str(anatomy), "--every", "1000"]) == 1
         assert "never moves" in capsys.readouterr().out

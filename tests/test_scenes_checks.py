@@ -1,4 +1,4 @@
-"""A scene's picture in every style: honest about drape and bone, legible, in colours that all eyes tell apart."""
+"""Images of a scene in each style: drape and bone, legible text, and colours for colour-blind eyes."""
 
 from dataclasses import replace
 from functools import cache
@@ -118,7 +118,7 @@ def again(frame, play, opening, gauge=None, style="window"):
     return replace(frame, shown=over.colour)
 
 
-def test_what_the_drape_covers_must_be_drawn_so():
+def test_overlay_below_the_drape_must_be_drawn_as_covered():
     frame, play = build_tool_frame(), player((640, 360))
     seen = "as if it were visible"
     assert broken(again(frame, play, OPENING), play) == []
@@ -132,7 +132,7 @@ def test_what_the_drape_covers_must_be_drawn_so():
     assert any(seen in sentence for sentence in broken(shaded, play))
 
 
-def test_the_number_must_be_whole_and_near_the_tip():
+def test_tip_distance_text_must_be_complete_and_near_the_tip():
     frame, play = build_tool_frame(), player((640, 360))
     text = str(Gauge(frame.tip, frame.tip, frame.distance, frame.tumour_error.bound))
     left, top, right, foot = find_text(frame.shown, text, NUMBER_SCALE)
@@ -147,20 +147,20 @@ def test_the_number_must_be_whole_and_near_the_tip():
         assert any("cut off, or far" in sentence for sentence in broken(replace(frame, shown=shown), play))
 
 
-def test_a_panel_leaves_the_tool_in_sight_in_a_low_picture():
+def test_cost_label_does_not_cover_the_tool_in_a_low_image():
     frame = build_tool_frame()
     changed = (add_cost_label(frame, "series-gp") != frame.shown).any(axis=2)
     assert changed.sum() > 5000 and not changed[frame.picture.segmentation == TOOL].any()
 
 
-def test_a_panel_hides_neither_a_scale_nor_a_legend():
+def test_cost_label_does_not_cover_the_legend():
     for size in ((640, 360), (640, 480)):
         frame = build_tool_frame(size, "depth")
         changed = (add_cost_label(frame, "series-gp") != frame.shown).any(axis=2)
         assert (frame.taken == SHEET_VALUE).any() and changed.any() and not changed[frame.taken == SHEET_VALUE].any()
 
 
-def test_a_tip_in_the_tumour_is_found_to_be():
+def test_gauge_reports_tip_inside_the_tumour():
     play = player((640, 360))
     rest = play.stage.tumour_at_rest
     middle, corners = rest.vertices.mean(axis=0), rest.vertices[rest.triangles]
@@ -169,7 +169,7 @@ def test_a_tip_in_the_tumour_is_found_to_be():
     assert str(measure_gauge(middle, rest)).startswith("inside, ")
 
 
-def test_the_same_frame_is_the_same_picture():
+def test_frame_drawn_twice_gives_identical_image():
     play = player((640, 360), "rings")
     frame = build_tool_frame(style="rings")
     anew = play.draw(40, float(play.scene.times[40]), play.get_touch(40))
@@ -177,7 +177,7 @@ def test_the_same_frame_is_the_same_picture():
     assert np.abs(frame.shown.astype(int) - build_tool_frame().shown).max() > 50
 
 
-def test_what_is_not_composed_is_the_picture_and_says_the_same():
+def test_frame_without_overlay_keeps_scene_image_and_values():
     frame, play = build_tool_frame(), player((640, 360))
     bare = replace(play, composed=False).draw(frame.number, frame.time, frame.touch)
     np.testing.assert_array_equal(bare.shown, bare.picture.colour)
@@ -186,7 +186,7 @@ def test_what_is_not_composed_is_the_picture_and_says_the_same():
     assert (bare.distance, bare.moved, bare.tumour_error) == (frame.distance, frame.moved, frame.tumour_error)
 
 
-def test_the_commands_name_all_styles(capsys):
+def test_command_help_lists_all_overlay_styles(capsys):
     for command in ("render", "demo", "check", "collect"):
         with pytest.raises(SystemExit):
             main([command, "--help"])

@@ -1,4 +1,4 @@
-"""Checksums of an episode: what is changed, gone or came later is named."""
+"""Checksums of an episode: changed, removed and added arrays are named."""
 
 import h5py
 
@@ -6,7 +6,7 @@ from scenes.episodes.checksums import write_checksums
 from scenes.episodes.reading.validation import validate_episode
 
 
-def test_content_that_is_not_what_was_written_is_named(whole, tmp_path):
+def test_validation_names_array_with_changed_content(whole, tmp_path):
     path = tmp_path / whole.name
     path.write_bytes(whole.read_bytes())
     with h5py.File(path, "a") as file:
@@ -17,7 +17,7 @@ def test_content_that_is_not_what_was_written_is_named(whole, tmp_path):
     assert validate_episode(path).problems == ["/force: is not as it was written."]
 
 
-def test_arrays_that_are_gone_or_came_later_are_named(whole, tmp_path):
+def test_validation_names_removed_and_added_arrays(whole, tmp_path):
     path = tmp_path / whole.name
     path.write_bytes(whole.read_bytes())
     with h5py.File(path, "a") as file:

@@ -1,4 +1,4 @@
-"""The program from the outside: help of every command, bad input as one sentence, and the start of `sulcus demo`."""
+"""Command line: help of each command, rejected input, and the start of `sulcus demo`."""
 
 import os
 import subprocess
@@ -21,8 +21,8 @@ from scenes.play.waiting_notice import Busy
 from sim.bodies.meshfile import write_anatomy, write_mesh
 
 
-def test_help_texts_come_without_warp_and_scipy():
-    """They take a second to import."""
+def test_help_of_commands_does_not_import_warp_or_scipy():
+    """Importing them takes a second."""
     code = (
         "import sys; from scenes.cli import make_parsers\n"
         "for name in sys.argv[1:]:\n"
@@ -35,8 +35,8 @@ def test_help_texts_come_without_warp_and_scipy():
 
 
 @pytest.mark.parametrize("name", ["linear", "fem"])
-def test_page_opens_during_compilation_then_plays(name, box, tmp_path, monkeypatch):
-    """A model's first answer belongs to what is made ready."""
+def test_demo_page_opens_during_compilation_and_then_plays(name, box, tmp_path, monkeypatch):
+    """Preparation includes the first prediction of a model."""
     done, predicted = [], SceneSolvers.predict
     opened = threading.Event()
 
@@ -57,7 +57,7 @@ def test_page_opens_during_compilation_then_plays(name, box, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("cores", "said", "most"), [(64, None, "4"), (2, None, "2"), (64, "7", "7"), (None, None, "1")]
 )
-def test_libraries_use_few_threads_unless_somebody_asks_for_more(monkeypatch, cores, said, most):
+def test_limit_threads_keeps_limits_of_the_environment(monkeypatch, cores, said, most):
     monkeypatch.setattr("os.cpu_count", lambda: cores)
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
     for name in names:
@@ -141,7 +141,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("words", "reason"), CASES, ids=[" ".join(words) for words, _ in CASES])
-def test_bad_input_is_a_sentence_and_nothing_is_written(folder, monkeypatch, capsys, words, reason):
+def test_commands_reject_bad_input_and_write_nothing(folder, monkeypatch, capsys, words, reason):
     monkeypatch.chdir(folder)
     before = {path: path.stat().st_mtime_ns for path in sorted(folder.rglob("*"))}
     assert main(words) == 2
@@ -154,7 +154,7 @@ def test_bad_input_is_a_sentence_and_nothing_is_written(folder, monkeypatch, cap
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself(name, capsys):
+def test_each_command_prints_its_help(name, capsys):
     with pytest.raises(SystemExit) as end:
         main([name, "--help"])
     out = capsys.readouterr().out
@@ -162,14 +162,14 @@ def test_every_command_explains_itself(name, capsys):
 
 
 @pytest.mark.parametrize("words", [[], ["dance"], ["check", "--every", "often"], ["collect", "press"]])
-def test_words_that_are_no_command_are_refused(words, capsys):
+def test_unknown_command_is_rejected_with_usage(words, capsys):
     with pytest.raises(SystemExit) as end:
         main(words)
     assert end.value.code == 2 and "usage: sulcus" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [[], ["throughput", "--count", "4"], ["--help"]])
-def test_bench_names_what_replaces_it(words, capsys):
+def test_bench_command_names_its_replacement(words, capsys):
     assert main(["bench", *words]) == 2
     said = capsys.readouterr().err
     assert "`python -m benchmarks NAME`" in said and said.count("\n") == 1

@@ -1,4 +1,4 @@
-"""Clients of a live link: newest messages first, bad messages and storms, over 127.0.0.1 and a free port."""
+"""Clients of a live link on 127.0.0.1: newest messages, invalid messages and many connections."""
 
 import asyncio
 import socket
@@ -28,7 +28,7 @@ async def until(what):
             await asyncio.sleep(0.005)
 
 
-def test_every_client_receives_the_newest():
+def test_each_client_receives_the_newest_message():
     async def scene():
         async with served() as (clients, port):
             clients.publish("a", [pack_message("STRING", "A", encode_string("one"), NOW)])
@@ -44,7 +44,7 @@ def test_every_client_receives_the_newest():
     played(scene())
 
 
-def test_slow_client_gets_newest_and_blocks_nobody():
+def test_slow_client_gets_newest_message_and_blocks_no_other():
     count, large = 200, bytes(200_000)
 
     async def scene():
@@ -80,7 +80,7 @@ def test_slow_client_gets_newest_and_blocks_nobody():
         (HEADER.pack(1, b"POINT", b"A", 0, 1 << 60, 0), "announces 1152921504606846976 bytes", False),
     ],
 )
-def test_what_is_no_good_message_is_said_to_its_sender_alone(sent, why, goes_on):
+def test_invalid_message_is_reported_to_its_sender_only(sent, why, goes_on):
     heard = []
 
     def receive(number, header, content):
@@ -107,7 +107,7 @@ def test_what_is_no_good_message_is_said_to_its_sender_alone(sent, why, goes_on)
     played(scene())
 
 
-def test_a_storm_of_clients_is_bounded_and_passes():
+def test_number_of_clients_is_limited_during_many_connections():
     async def scene():
         async with served(most=4) as (clients, port), peers(port, 1) as (first,):
             await until(lambda: len(clients) == 1)
@@ -133,7 +133,7 @@ def test_a_storm_of_clients_is_bounded_and_passes():
     played(scene())
 
 
-def test_a_client_that_asks_is_sent_that_and_nothing_else():
+def test_client_request_returns_only_the_requested_message():
     async def scene():
         async with served() as (clients, port), peers(port, 1) as (one,):
             surfaces = [

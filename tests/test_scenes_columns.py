@@ -1,4 +1,4 @@
-"""Columns of exports: twists, rates of frames and what is held out."""
+"""Columns of exports: twists, frame rates and held-out bodies."""
 
 from types import SimpleNamespace
 
@@ -23,7 +23,7 @@ def poses_after(first, steps):
     return np.stack(found)
 
 
-def test_twists_lead_from_pose_to_pose(folder):
+def test_twists_transform_each_pose_into_the_next(folder):
     tool = read_episodes(folder, ["T_world_tool"], window=9).get_window(1, 0)["T_world_tool"]
     steps = build_twists(tool)
     assert np.allclose(poses_after(tool[0], steps), tool, atol=1e-6) and not steps[-1].any() and steps[:-1].any()
@@ -37,7 +37,7 @@ def test_twists_lead_from_pose_to_pose(folder):
 
 
 @pytest.mark.parametrize("off", [2e-3, 2e-4, 5e-5])
-def test_rate_of_frames_is_that_of_even_steps_to_100_us(off, tmp_path):
+def test_frame_rate_requires_even_steps_within_100_us(off, tmp_path):
     contents, time = SimpleNamespace(path=tmp_path / "e.h5"), 0.04 * np.arange(26)
     time[10] += off
     if off < 1e-4:
@@ -47,7 +47,7 @@ def test_rate_of_frames_is_that_of_even_steps_to_100_us(off, tmp_path):
         compute_frame_rate(contents, time)
 
 
-def test_every_tenth_body_is_held_out(folder):
+def test_each_tenth_body_is_held_out(folder):
     contents = read_contents(folder / "episode_000000.h5")
     assert mark_held_out([contents]) == [False] and mark_held_out([contents] * 3) == [False, False, True]
     assert [number for number, out in enumerate(mark_held_out([contents] * 25)) if out] == [9, 19]

@@ -1,4 +1,4 @@
-"""Verdict on the present load, and accuracy against time on the page."""
+"""Comparison of deformers on the page: error for the current load, and error against time."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -43,8 +43,8 @@ def test_deformers_are_ranked_on_common_loads():
     assert "over the same 2 loads" in words and words.count("class=best") == 2
 
 
-def test_without_a_common_load_nobody_is_ranked():
-    """One on frames without force, the other at full force: the medians are no comparison."""
+def test_deformers_without_common_load_are_not_ranked():
+    """One was timed without force, the other at full force: their medians are not comparable."""
     tally = AccuracyTimeTable()
     shown(tally, "resting", "ab", 1.0, 0.002)
     assert [row.best for row in tally.rows] == [None]
@@ -54,7 +54,7 @@ def test_without_a_common_load_nobody_is_ranked():
     assert "not comparable" in words and "best" not in words
 
 
-def test_repeated_load_counts_once_and_old_ones_expire():
+def test_repeated_load_counts_once_and_old_loads_expire():
     tally = AccuracyTimeTable()
     for load in range(MAX_RECENT_LOADS):
         shown(tally, "a", [str(load)], 9.0, 9.0)
@@ -63,7 +63,7 @@ def test_repeated_load_counts_once_and_old_ones_expire():
     assert tally.rows == [ComparisonRow("a", 4.0, 1.0, MAX_RECENT_LOADS, None)]
 
 
-def test_an_error_too_small_to_print_is_not_reported_as_none():
+def test_error_below_a_micrometre_is_not_printed_as_zero():
     rows = [ComparisonRow("a", 1.0, 4e-4, 3, None), ComparisonRow("b", 1.0, 1.234e-3, 3, None)]
     words = format_cost_plot(rows)
     assert "a: 1.0 ms, error under 0.001 mm" in words and "b: 1.0 ms, error 0.001 mm, 3 loads" in words
@@ -73,27 +73,27 @@ def test_an_error_too_small_to_print_is_not_reported_as_none():
 class TestVerdict:
     JUDGED = Comparison(28, 0.35, "", 1e-3, 1e-4, 2e-4)
 
-    def test_of_the_present_load_it_stands_plainly(self):
+    def test_comparison_for_current_load_is_shown_without_mark(self):
         said = format_comparison(self.JUDGED, False, "waits")
         assert "mean 0.100, maximum 0.200 mm" in said and "stale" not in said and "waits" not in said
 
-    def test_of_another_load_it_is_greyed_and_says_so(self):
+    def test_comparison_for_previous_load_is_greyed_and_labelled(self):
         said = format_comparison(self.JUDGED, True, "waits")
         assert said.startswith('<p class="stale">previous load') and "frame 28" in said and "waits" in said
 
-    def test_an_answer_short_of_its_tolerance_is_not_relied_on(self):
+    def test_comparison_warns_when_solver_did_not_converge(self):
         said = [
             format_comparison(replace(self.JUDGED, doubt=doubt), False, "waits")
             for doubt in ("", describe_outcome(Outcome.BUDGET))
         ]
         assert ["do not rely on it" in each for each in said] == [False, True]
 
-    def test_before_any_it_says_what_is_waited_for(self):
+    def test_empty_comparison_shows_waiting_message(self):
         assert format_comparison(None, True, "waits") == '<p class="stale">waits</p>'
 
 
-def test_a_verdict_is_the_error_in_millimetres(theatre):
-    """Of a model whose answer is 0.2 mm off everywhere, and of the finite elements' own distance."""
+def test_comparison_with_fem_gives_error_in_millimetres(theatre):
+    """For a solution with a constant error of 0.2 mm, and for the solution of FEM."""
     scene = short()
     whole = Player(Stage(scene, theatre.site), theatre.build_fem(scene, LIVE))
     loads = whole.build_loads(3)

@@ -1,4 +1,4 @@
-"""What a live link says on its console, and how often it sends the same STATUS."""
+"""Console output of a live link, and its rate limits."""
 
 import asyncio
 import re
@@ -70,8 +70,8 @@ def test_status_changes_are_logged_once(follower):
         assert sum(each in line for line in lines) == 1, (each, lines)
 
 
-def test_link_slow_solver_reports_each_second_and_empties(follower):
-    """No answer to a pose older than `stale` is shown, and no STATUS is late, while one solution takes 2 s."""
+def test_link_reports_slow_solver_and_drops_old_results(follower):
+    """Results older than `stale` are not sent, and each STATUS is on time, while one solution takes 2 s."""
     registration = read_registration(FILM / "registration.json")
     poses = registration.T_patient_scan @ solve_reference_frames(follower.motion.stage).T_scan_tool
     beside = in_mm(poses[10] @ np.linalg.inv(follower.tool.T_cube_tool))

@@ -1,4 +1,4 @@
-"""The contents of files that are not what they seem."""
+"""Contents of damaged episode files."""
 
 import h5py
 import pytest
@@ -41,7 +41,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_files_that_are_not_what_they_seem_are_refused(name, box, tmp_path):
+def test_read_contents_rejects_damaged_episode_files(name, box, tmp_path):
     how, words = BROKEN[name]
     path = write_episode(tmp_path / "x.h5", box)
     spoil(path, how)
@@ -53,7 +53,7 @@ def test_files_that_are_not_what_they_seem_are_refused(name, box, tmp_path):
     assert str(caught.value).startswith(str(path))
 
 
-def test_what_is_no_hdf5_is_named(tmp_path, box):
+def test_read_contents_rejects_truncated_hdf5_file(tmp_path, box):
     path = write_episode(tmp_path / "x.h5", box)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(InputError, match=r"x.h5: cannot be read as an episode"):

@@ -18,7 +18,7 @@ ACTIONS = print, print, Fold("physics effects", ()), print
 
 
 class TestControls:
-    def test_the_sliders_end_where_the_bone_stops_the_tool(self, theatre):
+    def test_position_sliders_end_at_the_bone_edge(self, theatre):
         scene, site = short(), theatre.site
         assert scene.tool is not None
         found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), *ACTIONS)
@@ -28,14 +28,14 @@ class TestControls:
         assert all(control.low == -control.high and control.hint for control in places)
         assert all(any(f"to {letter}" in control.words for letter in "LRAPSI") for control in places)
 
-    def test_no_code_name_is_shown(self, theatre):
+    def test_effect_switches_have_readable_labels(self, theatre):
         for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
             found = build_controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), *ACTIONS)
             folds = *found, build_effect_fold(theatre, small(name), Requests("fem", Touch()), print)
             switches = [inner for control in folds if isinstance(control, Fold) for inner in control.controls]
             assert switches and all(inner.words and inner.words != inner.label for inner in switches)
 
-    def test_the_overlay_comes_before_the_tool_s_sliders(self, theatre):
+    def test_overlay_control_comes_before_tool_sliders(self, theatre):
         labels = [
             control.label
             for control in build_controls(short(), theatre.site, ("fem",), Requests("fem", Touch()), *ACTIONS)
@@ -45,7 +45,7 @@ class TestControls:
             "registration",
         ]
 
-    def test_every_overlay_style_is_offered(self, theatre):
+    def test_overlay_control_offers_each_style(self, theatre):
         wish = Requests("fem", Touch())
         found = build_controls(short(), theatre.site, ("fem",), wish, *ACTIONS)
         overlay = next(control for control in found if isinstance(control, Dropdown) and control.label == "overlay")
@@ -79,7 +79,7 @@ class TestControls:
             each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, *ACTIONS)
         }
 
-    def test_which_scenes_go_on_by_themselves(self, theatre):
+    def test_is_animated_is_true_for_time_dependent_scenes(self, theatre):
         found = {
             name: is_animated(find_scene(name), theatre.site) for name in ("press", "palpate", "retract", "pulsation")
         }
@@ -87,14 +87,14 @@ class TestControls:
 
 
 class TestHand:
-    def test_still_hand_pauses_script_and_play_resumes(self):
+    def test_manual_control_pauses_the_script_until_play(self):
         wish = Requests("svr", Touch())
         wish.take_over(force=0.2)
         assert not wish.plays and wish.read_current()[2] == Touch(force=0.2)
         wish.play(True)
         assert wish.plays and wish.read_current()[2] is None
 
-    def test_where_time_goes_on_the_hand_keeps_the_tool(self):
+    def test_manual_tool_is_kept_during_play_of_timed_scene(self):
         wish = Requests("fem", Touch(), clocked=True)
         wish.take_over(depth=1e-3)
         wish.play(True)

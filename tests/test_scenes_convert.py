@@ -1,4 +1,4 @@
-"""Episodes in the formats of others: what is written is what was read."""
+"""Conversion of episodes: output folders, interrupted runs and full disks."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ from sim.runtime.partial_files import to_partial_path
 
 
 @pytest.mark.parametrize("name", ["lerobot", "folder", "xdmf"])
-def test_folders_are_not_mixed_with_others(name, folder, tmp_path, capsys):
+def test_convert_rejects_non_empty_folder(name, folder, tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine").write_text("mine")
@@ -26,7 +26,7 @@ def test_folders_are_not_mixed_with_others(name, folder, tmp_path, capsys):
     assert main(words) == 0 and [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_conflicting_options_give_message_and_no_file(folder, box, tmp_path, capsys):
+def test_convert_rejects_incompatible_episodes_without_output(folder, box, tmp_path, capsys):
     wide = write_episode(tmp_path / "in/wide.h5", box, Wanted(4, width=48))
     bare = write_episode(tmp_path / "in/bare.h5", box, Wanted(4))
     with h5py.File(bare, "a") as file:
@@ -41,14 +41,14 @@ def test_conflicting_options_give_message_and_no_file(folder, box, tmp_path, cap
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 
 
-def test_what_is_interrupted_leaves_nothing(tmp_path):
+def test_interrupted_folder_write_leaves_no_files(tmp_path):
     with pytest.raises(KeyboardInterrupt), write_folder_atomically(tmp_path / "out", 10) as partial:
         (partial / "a").write_text("a")
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
 
 
-def test_what_a_killed_run_left_is_removed_and_what_runs_is_not(tmp_path):
+def test_partial_folder_of_killed_run_is_removed(tmp_path):
     out, code = tmp_path / "out", (
         "import os, sys; from pathlib import Path; from sim.runtime.atomic_files import write_folder_atomically\n"
         "with write_folder_atomically(Path(sys.argv[1]), 10) as partial: (partial / 'a').mkdir(); "
@@ -64,7 +64,7 @@ def test_what_a_killed_run_left_is_removed_and_what_runs_is_not(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"out", "other"}
 
 
-def test_a_folder_that_another_run_is_writing_is_rejected(tmp_path):
+def test_folder_being_written_by_another_run_is_rejected(tmp_path):
     folder = tmp_path / "out"
     other = to_partial_path(folder).with_name(to_partial_path(folder).name.replace(str(os.getpid()), str(os.getppid())))
     other.mkdir()
@@ -74,7 +74,7 @@ def test_a_folder_that_another_run_is_writing_is_rejected(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
-def test_a_full_disk_is_said_and_nothing_stays(tmp_path):
+def test_full_disk_is_reported_and_leaves_no_files(tmp_path):
     with pytest.raises(InputError, match="No space left"), write_folder_atomically(tmp_path / "out", 10) as partial:
         (partial / "a").write_text("a")
         with open("/dev/full", "w") as full:

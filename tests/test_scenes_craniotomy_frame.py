@@ -1,4 +1,4 @@
-"""The built-in scenes' place on a head of another shape, opened at the left side: a long ellipsoid."""
+"""Craniotomy frame of the built-in scenes on a head of another shape: a long ellipsoid opened on the left."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def site(tmp_path_factory):
     return build_craniotomy_frame(read_anatomy(folder / "long.vtu"))
 
 
-def test_craniotomy_axis_points_inwards_at_request(site):
+def test_craniotomy_frame_is_at_requested_site_pointing_inwards(site):
     middle = site.anatomy.mesh.nodes.mean(axis=0)
     assert np.linalg.norm(site.origin - 1e-3 * np.array([-42.0, 18.0, 12.0])) < 6e-3
     assert site.axis @ (middle - site.origin) > 0.02 and site.axis[0] > 0.9
@@ -37,7 +37,7 @@ def test_craniotomy_axis_points_inwards_at_request(site):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_scenes_touch_open_cortex_of_another_head(name, site):
+def test_scenes_act_on_open_cortex_of_another_head(name, site):
     scene, cortex = find_scene(name), site.anatomy.mesh.nodes[site.anatomy.open_surface]
     check_causes(scene.get_effects_on(site.anatomy), scene.build_loads(site, scene.path(0.0), 0.0))
     stage = Stage(scene, site)

@@ -1,4 +1,4 @@
-"""Croissant metadata, read by its own reader."""
+"""Croissant metadata, read by mlcroissant."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ FOREIGN = os.environ.get("SULCUS_FORMATS_PYTHON")
 
 
 @pytest.mark.skipif(FOREIGN is None, reason="needs SULCUS_FORMATS_PYTHON, a Python with mlcroissant")
-def test_mlcroissant_finds_nothing_wrong_and_reads_the_episodes(folder):
+def test_mlcroissant_reads_metadata_without_errors(folder):
     write_card(folder)
     read = (
         "import sys, mlcroissant; data = mlcroissant.Dataset(sys.argv[1])\n"

@@ -10,13 +10,13 @@ from scenes.cli import main
 from scenes.episodes.exports.datasheet import format_counts
 
 
-def test_a_sheet_names_what_is_there_most_often():
+def test_datasheet_lists_most_frequent_values_first():
     lines = list(format_counts("tool", ["a", "b", "b", *map(str, range(20))]))
     assert lines[:2] == ["- tool: b (in 2)", "- tool: a (in 1)"] and lines[-1] == "- tool: 10 others (in 10)"
     assert list(format_counts("tool", ["a"])) == ["- tool: a (in 1)"]
 
 
-def test_a_card_says_whose_brain_it_is_and_what_played(box, tmp_path):
+def test_datasheet_states_anatomy_and_deformer(box, tmp_path):
     path = write_episode(tmp_path / "in/episode_000000.h5", box)
     drawn = {"bodies.anatomies": "template", "bodies.tumour.radius_mm": 12.0, "force_n": 0.2}
     with h5py.File(path, "a") as file:

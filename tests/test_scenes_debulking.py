@@ -1,4 +1,4 @@
-"""The debulking of a tumour: its corridor, and what is refused."""
+"""Debulking of a tumour: its corridor, and rejected numbers of steps."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from sim.errors import InputError
 
 
 @pytest.mark.parametrize(("asked", "wide"), [(1e-4, 6e-3), (9e-3, 9e-3)])
-def test_the_corridor_is_free_from_the_cortex_to_the_tumour(box, asked, wide):
-    """As wide as it is asked for, and never narrower than an edge of the mesh, which is 6 mm here."""
+def test_corridor_reaches_from_cortex_to_tumour(box, asked, wide):
+    """Width as requested, but at least one mesh edge, which is 6 mm here."""
     corridor = np.array(Debulking(SURGERY.times, corridor=asked).build_resection(box).steps[0])
     middle = box.mesh.nodes[box.mesh.tets].mean(axis=1)
     brain, across = box.mesh.region != TUMOUR_LABEL, np.linalg.norm(middle[:, :2], axis=1)
@@ -21,6 +21,6 @@ def test_the_corridor_is_free_from_the_cortex_to_the_tumour(box, asked, wide):
     assert np.isin(corridor, np.flatnonzero(brain & (across < 1.05 * wide))).all() and len(corridor) < 1.2 * len(outer)
 
 
-def test_a_tumour_of_fewer_elements_is_a_sentence(box):
+def test_debulking_with_more_steps_than_elements_is_rejected(box):
     with pytest.raises(InputError, match="mesh finer"):
         Debulking(times=tuple(np.arange(5000.0))).build_resection(box)

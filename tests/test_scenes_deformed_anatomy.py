@@ -1,4 +1,4 @@
-"""Moments of a body: displacement, bound and time of a frame."""
+"""Deformed anatomies: displacement, bound and time of a frame."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ from scenes.play.deformers import PatientSetup
 from scenes.warp.deformed_anatomy import Played
 
 
-def test_warp_bound_is_that_of_the_frame_in_time(box, monkeypatch):
+def test_warp_uses_error_bound_at_the_time_of_the_frame(box, monkeypatch):
     grows = SimpleNamespace(evaluate=lambda time: SimpleNamespace(prior=1e-3 * (1.0 + time)))
     monkeypatch.setattr(PatientSetup, "estimate_uncertainty", lambda theatre, scene: grows)
     scene = small()

@@ -1,4 +1,4 @@
-"""Theatres read from their files, and the models in them."""
+"""Patient setups read from files, and the models in them."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ from sim.material import Material
 from surrogate.model.store import save
 
 
-def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
+def test_patient_setup_is_read_from_its_files(theatre, tmp_path):
 
     again = open_theatre(put(theatre, tmp_path / "box.vtu"), device="cpu")
     assert again.anatomy.digest == theatre.anatomy.digest and again.list_deformers(short()) == (
@@ -47,7 +47,7 @@ def test_a_theatre_is_read_from_its_files(theatre, tmp_path):
         bare.build_deformer("linear", short())
 
 
-def test_models_of_a_scene_are_read_beside_the_others(theatre, tmp_path):
+def test_open_theatre_also_reads_models_of_one_scene(theatre, tmp_path):
     path = put(theatre, tmp_path / "box.vtu")
     save(to_model_path(path, "spatula"), {"linear": theatre.models["svr"], "gp": theatre.models["linear"]})
     found = open_theatre(path, device="cpu").models
@@ -56,14 +56,14 @@ def test_models_of_a_scene_are_read_beside_the_others(theatre, tmp_path):
     assert list(open_theatre(path, to_model_path(path), "cpu").models) == list(theatre.models)
 
 
-def test_the_default_scene_is_one_that_a_model_supports():
+def test_default_scene_is_supported_by_a_model():
     theatre = open_theatre(device="cpu")
     assert theatre.select_default_scene() == "spatula"
     assert replace(theatre, models={"ann": theatre.models["ann"]}).select_default_scene() == "press"
     assert replace(theatre, models={}).select_default_scene() == "press"
 
 
-def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_path):
+def test_open_theatre_rejects_model_of_another_anatomy(theatre, template, tmp_path):
 
     put(theatre, tmp_path / "box.vtu")
     write_anatomy(tmp_path / "box.vtu", template.anatomy)
@@ -75,7 +75,7 @@ def test_files_that_do_not_belong_together_are_refused(theatre, template, tmp_pa
         open_theatre(device="abacus")
 
 
-def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
+def test_template_files_match_and_pass_the_checks(capsys):
     assert (
         to_model_path(get_template_path()).stat().st_size <= 40_000_000
         and to_intensity_path(get_template_path()).is_file()
@@ -92,7 +92,7 @@ def test_what_ships_fits_together_and_passes_its_own_checks(capsys):
     assert "fem" not in [row["deformer"] for row in report["scenes"]]
 
 
-def test_a_scene_is_played_by_a_family_that_it_names(theatre):
+def test_scene_uses_its_selected_deformer_family(theatre):
     scene = replace(find_scene("press"), deformer="condensed")
     assert theatre.select_default(scene) == "condensed"
     player = theatre.build_player("condensed", scene)
@@ -119,7 +119,7 @@ def write_report(path, digest, **change):
     path.write_text(json.dumps({"machine": "a card, 16 cores", "sections": [part]}))
 
 
-def test_recorded_family_is_timed_and_chosen_by_its_error(theatre, tmp_path):
+def test_family_within_error_limit_is_timed_and_selected(theatre, tmp_path):
     scene, said = short(), []
     put(theatre, tmp_path / "box.vtu")
     write_report(tmp_path / "box.report.json", theatre.anatomy.digest)
@@ -135,7 +135,7 @@ def test_recorded_family_is_timed_and_chosen_by_its_error(theatre, tmp_path):
         choose_within(here, scene, (1e-3, 1e-3), said.append)
 
 
-def test_families_without_figures_of_the_scene_are_not_offered(theatre, tmp_path):
+def test_families_without_recorded_errors_are_not_offered(theatre, tmp_path):
     write_report(tmp_path / "box.report.json", theatre.anatomy.digest)
     assert read_family_figures(tmp_path / "box.vtu", "another") == read_family_figures(tmp_path / "no.vtu", "") == {}
     figures = read_family_figures(tmp_path / "box.vtu", theatre.anatomy.digest)
@@ -155,13 +155,13 @@ BROKEN = (
 
 
 @pytest.mark.parametrize("change", BROKEN)
-def test_a_broken_report_is_rejected_in_one_sentence(tmp_path, change):
+def test_damaged_report_of_families_is_rejected(tmp_path, change):
     write_report(tmp_path / "box.report.json", "1", **change)
     with pytest.raises(InputError, match=r"box.report.json: cannot be read as a report: .*Delete it\. `sulcus report"):
         read_family_figures(tmp_path / "box.vtu", "1")
 
 
-def test_template_report_has_the_recorded_figures_of_families(template):
+def test_template_report_matches_benchmark_record_of_families(template):
     figures = open_theatre(device="cpu").select_recorded(find_scene("press"))
     recorded = json.loads((Path(__file__).parents[1] / "benchmarks/records/families.json").read_text())["figures"]
     assert list(figures) == list(FAMILIES)

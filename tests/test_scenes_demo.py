@@ -1,4 +1,4 @@
-"""The page alive, without a browser: it plays, listens, is refereed, and goes away."""
+"""Page of `sulcus demo` without a browser: playback, comparison with FEM, controls and shutdown."""
 
 import threading
 import time
@@ -40,7 +40,7 @@ def running(demo):
     assert sum(drawn) > 5
 
 
-def test_it_plays_by_itself_and_is_refereed(demo, theatre):
+def test_demo_plays_and_shows_difference_from_fem(demo, theatre):
     assert demo.run(2.0) > 1
     demo.wish.set(plays=False)
     # The error belongs to the frame that the finite elements answered, and says which.
@@ -63,8 +63,8 @@ def test_it_plays_by_itself_and_is_refereed(demo, theatre):
     assert len(np.unique(demo.browser.shown[1])) > 50
 
 
-def test_how_the_finite_elements_solve_a_load_can_be_read(demo, monkeypatch):
-    """While a model answers and where they do; nothing where none have a plan."""
+def test_demo_shows_the_solver_plan_of_fem(demo, monkeypatch):
+    """With a model and with FEM as deformer; nothing for deformers without a plan."""
     folder, text = demo.browser.controls.notes[PLAN]
     assert not folder.visible
     demo.wish.set(plays=False)
@@ -77,7 +77,7 @@ def test_how_the_finite_elements_solve_a_load_can_be_read(demo, monkeypatch):
     assert wait_for(lambda: demo.run(0.3) and not folder.visible)
 
 
-def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):
+def test_page_text_and_image_have_the_same_frame_number(demo, monkeypatch):
     shown = []
     monkeypatch.setattr(demo.browser, "show", lambda *said: shown.append(said[:3]))
     demo.run(1.0)
@@ -88,8 +88,8 @@ def test_the_words_beside_a_picture_are_of_its_frame(demo, monkeypatch):
         assert pictures.setdefault(number, colour) is colour
 
 
-def test_playing_goes_on_after_a_pause(demo, monkeypatch):
-    """In the middle of a run: the frame that it paused at is shown already, and so nothing new is asked for."""
+def test_play_continues_from_the_paused_frame(demo, monkeypatch):
+    """Inside a run: the paused frame is shown already, and no new solution is requested."""
     demo.wish.set(plays=False, number=20)
     seen = []
 
@@ -104,7 +104,7 @@ def test_playing_goes_on_after_a_pause(demo, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_finite_elements_that_fail_are_not_waited_for(demo, monkeypatch):
+def test_demo_reports_failed_fem_solver(demo, monkeypatch):
     def overflowing(fem, loads, start=None, at=None):
         raise RuntimeError("out of memory")
 
@@ -112,7 +112,7 @@ def test_finite_elements_that_fail_are_not_waited_for(demo, monkeypatch):
     assert wait_for(lambda: demo.run(0.3) and "do not solve any more (out of memory)" in report(demo))
 
 
-def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
+def test_error_is_computed_once_per_fem_solution(demo, monkeypatch):
     demo.wish.set(plays=False, number=30)
     answer, asked = Learned.deform, []
 
@@ -126,7 +126,7 @@ def test_the_error_is_found_once_for_each_answer(demo, monkeypatch):
     assert sum(model is shown for model in asked) == 2  # for the picture, and for the error
 
 
-def test_visitors_take_over_scrub_and_switch(running):
+def test_visitor_can_move_tool_select_frame_and_deformer(running):
     demo, visitor = running
     page = demo.browser
     visitor.set(page.inputs["force [N]"], 0.31)
@@ -149,8 +149,8 @@ def test_visitors_take_over_scrub_and_switch(running):
     assert f"frame {number} of 120" in report(demo)
 
 
-def test_the_menu_says_who_has_the_tool(demo):
-    """The script gets the tool back while a slider's word that the hand has it is still on its way to the menu."""
+def test_tool_menu_shows_who_controls_the_tool(demo):
+    """Case: the script takes the tool while a slider's message of manual control is still being processed."""
     visitor, inputs = Visitor(demo.browser, 1200), demo.browser.inputs
     visitor.set(inputs["force [N]"], 0.2)
     assert wait_for(lambda: inputs["tool"].value == HAND)
@@ -162,7 +162,7 @@ def test_the_menu_says_who_has_the_tool(demo):
     visitor.wire.close()
 
 
-def test_a_page_that_cannot_be_served_leaves_nothing_behind(theatre, scene):
+def test_demo_at_invalid_address_leaves_no_threads(theatre, scene):
     before = set(threading.enumerate())
     for host, port, kind in (("127.0.0.1", 70000, ValueError), ("no.such.host.invalid", 8080, OSError)):
         with pytest.raises(kind):
@@ -172,7 +172,7 @@ def test_a_page_that_cannot_be_served_leaves_nothing_behind(theatre, scene):
     assert set(threading.enumerate()) <= before
 
 
-def test_the_scene_changes_without_a_new_server(demo):
+def test_scene_change_keeps_the_page_address(demo):
     page, address = demo.browser, demo.browser.address
     assert demo.run(0.3) >= 1 and "tool" in page.meshes
     demo.wish.set(scene="brain_shift", plays=False, deformer="fem")
@@ -187,14 +187,14 @@ def test_the_scene_changes_without_a_new_server(demo):
     )  # its own, not that of the scene before
 
 
-def test_unplayable_scene_is_reported_and_old_one_stays(demo):
+def test_unknown_scene_keeps_the_current_scene(demo):
     demo.wish.set(scene="no such scene")
     demo.run(0.5)
     assert demo.stage.scene is demo.first and demo.wish.scene == "press"
     assert wait_for(lambda: demo.run(0.3) and "force 0." in report(demo))
 
 
-def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
+def test_style_change_does_not_solve_the_load_again(demo, monkeypatch):
     demo.wish.set(plays=False, number=30)
     asked = []
     answer = Learned.deform
@@ -219,7 +219,7 @@ def test_the_overlay_changes_without_a_new_answer(demo, monkeypatch):
         assert (moment.picture != before).any() == moves and asked == []
 
 
-def test_images_in_motion_are_coarse_and_get_sharp_at_rest(demo):
+def test_images_are_coarse_in_motion_and_sharp_at_rest(demo):
     now = PageState(max_render_time=0.0, still_time=1.0)  # every renderer is slow
     demo.wish.set(plays=False, number=29)
     demo.update_page(now)
@@ -243,7 +243,7 @@ def test_images_in_motion_are_coarse_and_get_sharp_at_rest(demo):
     assert not now.coarse
 
 
-def test_a_long_solve_is_reported_while_it_lasts(demo, monkeypatch):
+def test_demo_reports_a_running_long_solve(demo, monkeypatch):
     answer, said = Learned.deform, []
     monkeypatch.setattr(demo.browser, "show_status", said.append)
 

@@ -1,4 +1,4 @@
-"""Every key of a plan: the page's table has its meaning, and rejections name its limits."""
+"""Keys of a plan: their meaning in the table of the docs, and their limits in messages."""
 
 import importlib.util
 import sys
@@ -49,7 +49,7 @@ def with_value(key, value):
 
 
 @pytest.mark.parametrize("key", LIMITED, ids=lambda key: key.name)
-def test_a_refusal_names_the_key_and_its_limits(key):
+def test_plan_value_beyond_limits_is_rejected_with_its_limits(key):
     step = max(1, round(1e-3 * key.about.high)) if isinstance(key.default, int) or key.name == "size" else 1e-3
     for value in (key.about.low - step, key.about.high + step):
         with pytest.raises(InputError) as refused:

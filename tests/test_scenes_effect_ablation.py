@@ -1,4 +1,4 @@
-"""What each effect costs and changes, and the list of scenes with its sheet."""
+"""Cost and influence of each effect of a scene."""
 
 import json
 import re
@@ -44,14 +44,14 @@ def printed(small_box, tmp_path_factory):
     return out.getvalue(), error.getvalue()
 
 
-def test_a_scene_is_left_without_one_effect():
+def test_remove_effect_removes_one_effect_of_a_scene():
     scene = sinking()
     assert Gravity() not in remove_effect(scene, Gravity()).effects and len(remove_effect(scene, Held()).effects) == 3
     cut = find_scene("resection")
     assert remove_effect(cut, object()).surgery is None and remove_effect(cut, Held()).surgery is not None  # type: ignore
 
 
-def test_each_effect_has_its_row(small_theatre):
+def test_measure_effects_returns_one_row_per_effect(small_theatre):
     both = replace(short(), effects=(*short().effects, Gravity()), lying=sinking().lying)
     found = {row.effect: row for row in measure_effects(small_theatre, both, 1)}
     assert list(found) == [ALL, "Elasticity", "Held", "Bonded", "ToolForce", "Gravity"]
@@ -66,7 +66,7 @@ def test_each_effect_has_its_row(small_theatre):
     assert whole.milliseconds > 0.0 and whole.held_mb > 0.1
 
 
-def test_bytes_are_the_same_in_every_run(small_theatre):
+def test_measured_bytes_are_equal_in_repeated_runs(small_theatre):
     held = [run(replace(small_theatre, models={}), sinking(), 3).held for _ in range(3)]
     assert held[0] == held[1] == held[2] > 100_000
     assert held[0] == pytest.approx(counted(small_theatre, sinking(), 3), rel=0.02)
@@ -83,8 +83,8 @@ def counted(theatre, scene, every):
     return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in new)
 
 
-def test_the_memory_that_is_printed_is_that_of_arrays(small_theatre, printed):
-    """Of every row, in the table and in JSON, by bytes that are counted without `scenes.play.effect_ablation.rows`."""
+def test_printed_memory_equals_size_of_device_arrays(small_theatre, printed):
+    """Each row of table and JSON, against bytes counted without `scenes.play.effect_ablation.rows`."""
     out, error = printed
     table = [[cell.strip() for cell in line.split("|")] for line in error.splitlines() if line.startswith("| ")]
     scene = find_scene("brain_shift")
@@ -98,8 +98,8 @@ def test_the_memory_that_is_printed_is_that_of_arrays(small_theatre, printed):
     assert {cells[name] for name, held in reported.items() if held is None} == {""}
 
 
-def test_the_change_is_that_between_the_answers(small_theatre):
-    """By another way: an effect that does all that is done."""
+def test_effect_change_is_difference_between_solutions(small_theatre):
+    """Independent check: an effect that causes the whole motion."""
     scene = sinking()
     found = {row.effect: row for row in measure_effects(small_theatre, scene, 2)}
     alone = run(replace(small_theatre, models={}), scene, 2)
@@ -109,13 +109,13 @@ def test_the_change_is_that_between_the_answers(small_theatre):
     assert found[ALL].held_mb == pytest.approx(1e-6 * alone.held, rel=0.01)
 
 
-def test_a_frame_that_is_not_answered_is_a_sentence(theatre):
+def test_ablation_rejects_scene_with_unsolved_frame(theatre):
     scene = replace(short(), accuracy=replace(short().accuracy, outer=1, inner=1, steps=0))
     with pytest.raises(InputError, match=r"the frame at 0\.\d+ s is not solved: stopped"):
         run(theatre, scene, 1)
 
 
-def test_unphysical_frames_are_counted(small_theatre, monkeypatch):
+def test_ablation_counts_frames_with_inverted_elements(small_theatre, monkeypatch):
     solve, inverted = Fem.deform, (Outcome.INVERTED,)
     monkeypatch.setattr(Fem, "deform", lambda *args, **named: replace(solve(*args, **named), outcome=inverted))
     rows = list(measure_effects(small_theatre, short(), 3, ["ToolForce"]))
@@ -123,7 +123,7 @@ def test_unphysical_frames_are_counted(small_theatre, monkeypatch):
     assert build_record(small_theatre, short(), rows, 3, "").unphysical == 6
 
 
-def test_bytes_are_those_of_arrays_that_live():
+def test_list_device_arrays_finds_new_array_without_views():
     before = list_device_arrays()
     array = wp.zeros(1_000_000, dtype=wp.float32, device="cpu")
     view = array[:500_000]
@@ -131,7 +131,7 @@ def test_bytes_are_those_of_arrays_that_live():
     assert new == [array] and array.capacity == 4_000_000 and len(view) == 500_000
 
 
-def test_the_command_tells_rows(theatre, anatomy, printed, capsys):
+def test_effects_command_prints_one_row_per_effect(theatre, anatomy, printed, capsys):
     out, error = printed
     reported = json.loads(out)
     asked = [type(effect).__name__ for effect in find_scene("brain_shift").get_effects_on(theatre.anatomy)]
@@ -152,7 +152,7 @@ SCENE = replace(press, name="hopeless", accuracy=replace(press.accuracy, outer=1
 """
 
 
-def test_a_scene_that_is_not_solved_does_not_end_the_command(small_box, tmp_path, capsys):
+def test_effects_command_continues_after_unsolved_scene(small_box, tmp_path, capsys):
     write_anatomy(tmp_path / "small.vtu", small_box)
     (tmp_path / "hopeless.py").write_text(HOPELESS)
     record, where = tmp_path / "small.effects.json", ["--anatomy", str(tmp_path / "small.vtu"), "--device", "cpu"]

@@ -1,4 +1,4 @@
-"""Costs of the effects: record that ships with the template, and what the page shows of it and measures."""
+"""Costs of the effects: the record of the template, and the costs that the page shows and measures."""
 
 import json
 import threading
@@ -31,7 +31,7 @@ def words_of(theatre, scene):
     return {control.label: control.words for control in fold.controls}
 
 
-def test_each_effect_of_a_scene_is_measured(theatre):
+def test_measure_costs_measures_each_switchable_effect(theatre):
     shown, scene = [], short()
     costs = BackgroundStudy(lambda: measure_costs(theatre, scene), threading.Lock(), shown.append)
     costs.start()
@@ -44,8 +44,8 @@ def test_each_effect_of_a_scene_is_measured(theatre):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_the_template_record_has_the_effects_of_each_scene(template, name):
-    """Otherwise: `sulcus effects --out scenes/data/template.effects.json`."""
+def test_template_record_has_each_effect_of_each_scene(template, name):
+    """If it fails: `sulcus effects --out scenes/data/template.effects.json`."""
     scene = find_scene(name)
     record = template.find_effect_record(scene)
     assert record is not None and set(record.effects) == {ALL, *list_switchable_effects(scene, template.anatomy)}
@@ -55,7 +55,7 @@ def test_the_template_record_has_the_effects_of_each_scene(template, name):
     assert not any("not measured" in said for said in words.values())
 
 
-def test_a_record_is_shown_of_the_same_scene_and_anatomy_alone(template, theatre):
+def test_cost_record_is_shown_for_same_scene_and_anatomy_only(template, theatre):
     scene = find_scene("press")
     stiffer = scene.replace_tissue(Material("linear", young=4000.0, poisson=0.49), None)
     records = template.effect_records
@@ -64,7 +64,7 @@ def test_a_record_is_shown_of_the_same_scene_and_anatomy_alone(template, theatre
         assert words["ToolForce"] == "push of the tool: not measured" and "not measured" in words[EFFECT_COSTS]
 
 
-def test_a_record_is_written_and_read(theatre, tmp_path):
+def test_cost_record_round_trips(theatre, tmp_path):
     path = tmp_path / "box.effects.json"
     lost = AblationRow("Gravity", refused="it <moves>.", unphysical=2)
     found = build_record(theatre, short(), (*ROWS, lost), 2, "a machine")
@@ -89,7 +89,7 @@ BAD = (
 
 
 @pytest.mark.parametrize(("change", "reason"), BAD)
-def test_a_damaged_record_is_rejected(tmp_path, change, reason):
+def test_damaged_cost_record_is_rejected(tmp_path, change, reason):
     path = tmp_path / "box.effects.json"
     good = {"scene": "press", "mark": "1", "day": "2026", "machine": "m", "frames": 3, "effects": {ALL: [1, 2]}}
     path.write_text(json.dumps({"format": FORMAT, "scenes": [good | change]}))

@@ -1,4 +1,4 @@
-"""What acts in a scene follows from its effects, and a learnt model answers none that it was not trained on."""
+"""Effects of a scene: their causes, scenes without a tool, switches on the page, and brain shift."""
 
 import re
 from dataclasses import replace
@@ -48,15 +48,15 @@ class TestCauses:
             ((*EFFECTS, Gravity(), ToolForce()), [Posture, Pushed]),
         ],
     )
-    def test_they_follow_from_the_effects(self, theatre, effects, causes):
+    def test_loads_have_the_causes_of_the_scene_effects(self, theatre, effects, causes):
         loads = replace(short(), effects=effects).build_loads(theatre.site, Touch(force=0.2), 0.5)
         assert [type(cause) for cause in loads.causes] == causes and loads.times.tolist() == [0.5]
 
-    def test_a_force_without_a_tool_is_refused(self):
+    def test_tool_force_in_scene_without_tool_is_rejected(self):
         with pytest.raises(InputError, match="has no tool"):
             replace(short(), tool=None)
 
-    def test_they_are_reported_in_words(self, theatre):
+    def test_acting_forces_are_described_in_text(self, theatre):
         both = replace(short(), effects=(*EFFECTS, Gravity(), ToolForce()))
         height = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.04]])  # from -32 to 0 mm against gravity
         words = format_acting(
@@ -77,7 +77,7 @@ STUDIES = "measure costs", "refine the error"
 
 
 class TestWithoutATool:
-    def test_none_is_drawn_or_measured(self, frames, monkeypatch):
+    def test_scene_without_tool_draws_no_tool_and_no_distance(self, frames, monkeypatch):
         for frame in frames:
             assert frame.pose is frame.tip is frame.distance is None
             assert not (frame.picture.segmentation == TOOL).any()
@@ -90,7 +90,7 @@ class TestWithoutATool:
         assert any(re.search(r"towards the left, 30 deg back, CSF level \d+ %", line) for line in lines)
         assert not any("0.00 N" in line for line in lines)
 
-    def test_it_can_be_checked(self, theatre, frames):
+    def test_scene_without_tool_passes_the_checks(self, theatre, frames):
         play = player(theatre, sinking(), "fem")
         figures = measure(
             play,
@@ -100,7 +100,7 @@ class TestWithoutATool:
         )
         assert not figures.find_violations(Bounds()) and figures.motion_mm > 0.01
 
-    def test_its_episode_tells_the_posture(self, theatre, tmp_path):
+    def test_episode_of_scene_without_tool_stores_posture(self, theatre, tmp_path):
         collect(tmp_path / "a.h5", theatre, player(theatre, sinking(), "fem"), "fem", iter)
         with h5py.File(tmp_path / "a.h5") as file:
             assert not {"force", "contact", "tip", "T_world_tool"} & set(file)
@@ -108,7 +108,7 @@ class TestWithoutATool:
             assert file["csf_level"].attrs["unit"] == UNITS["csf_level"] == "m"
             assert np.diff(file["csf_level"][:4]).max() < 0.0
 
-    def test_the_page_offers_no_hand(self, theatre):
+    def test_page_of_scene_without_tool_has_no_tool_controls(self, theatre):
         demo = Demo(theatre, sinking(), "fem", "127.0.0.1", free_port())
         try:
             assert (
@@ -131,7 +131,7 @@ class TestSwitches:
         yield demo
         demo.close()
 
-    def test_effects_go_off_and_on_and_the_change_is_reported(self, demo, theatre):
+    def test_page_reports_change_when_effects_are_switched(self, demo, theatre):
         page, visitor = demo.browser, Visitor(demo.browser, 1200)
         assert {"ToolForce", "Gravity"} < set(page.inputs) and not {"Held", "Elasticity"} & set(page.inputs)
         assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in page.shown[2])
@@ -154,7 +154,7 @@ class TestSwitches:
         assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in page.shown[2])
         visitor.wire.close()
 
-    def test_without_any_nothing_moves(self, demo):
+    def test_tumour_does_not_move_with_all_effects_off(self, demo):
         demo.wish.switch("Gravity", False)
         demo.wish.switch("ToolForce", False)
         assert wait_for(
@@ -172,7 +172,7 @@ def coarse():
 
 
 class TestBrainShift:
-    def test_the_brain_sinks_as_far_as_in_patients(self, coarse):
+    def test_brain_shift_matches_published_patient_range(self, coarse):
         """Cortex 6.1 +- 3.4 mm in 61 patients; 5.1, and the tumour 3.5, over 1,000 computed cases."""
         theatre, anatomy, scene = coarse, coarse.anatomy, find_scene("brain_shift")
         fem, cortex = theatre.build_fem(scene, scene.accuracy), np.unique(anatomy.open_surface)
@@ -189,7 +189,7 @@ class TestBrainShift:
         assert turned.outcome[0].good and way[0][1] < -0.8 * np.linalg.norm(way[0])
         assert way[1][0] < way[0][0] - 5e-4
 
-    def test_cortex_that_slides_under_the_bone_is_not_drawn_above_it(self):
+    def test_cortex_sliding_below_the_bone_is_hidden_by_the_bone(self):
         theatre, scene = template_theatre(), small("brain_shift")
         site, held = theatre.site, replace(scene, effects=(Elasticity(), Held()))
         moved = theatre.anatomy.mesh.nodes + 8e-3 * site.right
@@ -198,8 +198,8 @@ class TestBrainShift:
         low = (drawn - true) @ site.axis
         assert (low[beyond < 0.0] == 0.0).all() and (low[beyond > 2e-3] > 5e-3).all() and (beyond > 2e-3).sum() > 20
 
-    def test_its_border_stays_hidden(self, coarse):
-        """The cortex that moves out from under the bone is drawn too: nothing is seen through the hole beside it."""
+    def test_border_of_the_visible_cortex_stays_below_the_bone(self, coarse):
+        """Cortex that slides out from below the bone is drawn too: no gap at the rim of the hole."""
         playing = coarse.build_player("fem", small("brain_shift"))
         still, sunk = (playing.draw(0, time, Touch()) for time in (0.0, 3.0))
         seen = still.picture.segmentation == CORTEX

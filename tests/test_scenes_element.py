@@ -1,4 +1,4 @@
-"""--element from the outside: quadratic meshes as input, the same body by different files, refusals."""
+"""Option --element: quadratic meshes as input, equal bodies from different files, and rejected input."""
 
 import json
 from itertools import combinations
@@ -46,7 +46,7 @@ def solve(tmp_path: Path, capsys: pytest.CaptureFixture):
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_a_linear_mesh_by_every_element(solve, element: str) -> None:
+def test_linear_mesh_is_solved_with_each_element(solve, element: str) -> None:
     data = {"fixed": BASE[:COUNT].astype(int), "force": FORCE[:COUNT]}
     code, report, found, _ = solve(LINEAR, data, "--element", element)
     assert code == 0 and found.shape == (COUNT, 3)
@@ -70,8 +70,8 @@ def middles_held_by_the_rule(held: np.ndarray) -> np.ndarray:
     return out
 
 
-def test_a_linear_mesh_by_p2_is_the_straight_quadratic_mesh(solve) -> None:
-    """Held nodes that make a wall, and some that do not; prescribed values are linear along the edges of the wall."""
+def test_linear_mesh_with_p2_equals_straight_quadratic_mesh(solve) -> None:
+    """Fixed nodes of a wall and single ones; prescribed values are linear along the edges of the wall."""
     held = np.repeat(BASE[:COUNT, None], 3, axis=1)
     wall = LINEAR.nodes[:, 0] < 1e-9
     held[wall, 0] = True  # slides in its plane
@@ -91,7 +91,7 @@ def test_a_linear_mesh_by_p2_is_the_straight_quadratic_mesh(solve) -> None:
     assert np.abs(found).max() > 1e-3
 
 
-def test_a_curved_mesh_is_in_equilibrium_by_independent_formulas(solve) -> None:
+def test_curved_mesh_equilibrium_by_independent_formulas(solve) -> None:
     force = FORCE + top_forces(CURVED, TOTAL / 2.0)[0]  # on mid-edge nodes too
     data = {"fixed": BASE.astype(int), "force": force}
     code, report, found, _ = solve(CURVED, data, "--material", "neo-hookean", "--young", "2500", "--poisson", "0.4")
@@ -102,7 +102,7 @@ def test_a_curved_mesh_is_in_equilibrium_by_independent_formulas(solve) -> None:
 
 @pytest.mark.parametrize("seen", ["in a mirror", "with corners exchanged"])
 def test_curved_mesh_of_negative_orientation_is_mirrored(solve, seen: str) -> None:
-    """Corners are turned; every middle stays on its edge, or the curved elements would be others."""
+    """Corners are swapped; each mid-edge node stays on its edge, to keep the curved elements."""
     data = {"fixed": BASE.astype(int), "force": FORCE}
     plain = solve(CURVED, data)[2]
     mirror = np.array([-1.0, 1.0, 1.0]) if seen == "in a mirror" else np.ones(3)
@@ -113,7 +113,7 @@ def test_curved_mesh_of_negative_orientation_is_mirrored(solve, seen: str) -> No
     np.testing.assert_allclose(found, plain * mirror, rtol=0, atol=1e-8 * np.abs(plain).max())
 
 
-def test_mid_edge_node_is_fixed_only_where_file_fixes_it(solve) -> None:
+def test_mid_edge_nodes_are_fixed_only_by_the_file(solve) -> None:
     corners = BASE & (np.arange(ALL) < COUNT)
     found = solve(STRAIGHT, {"fixed": corners.astype(int), "force": FORCE})[2]
     assert not found[corners].any() and (np.abs(found[BASE & ~corners]).max(axis=1) > 0.0).all()
@@ -122,7 +122,7 @@ def test_mid_edge_node_is_fixed_only_where_file_fixes_it(solve) -> None:
     assert code == 0 and not found[BASE & ~corners].any() and found[corners].any()
 
 
-def test_a_body_whose_every_vertex_is_held_moves_between_them(solve) -> None:
+def test_body_with_all_vertices_fixed_deforms_at_mid_edges(solve) -> None:
     """Only mid-edge nodes are free: the coarse level of the preconditioner is empty."""
     slope = np.array([[0.1, 0.0, 0.02], [0.0, -0.1, 0.0], [0.0, 0.2, 0.05]])
     own = {"fixed": np.ones(COUNT, int), "prescribed": LINEAR.nodes @ slope}
@@ -136,14 +136,14 @@ def test_a_body_whose_every_vertex_is_held_moves_between_them(solve) -> None:
     assert np.linalg.norm(force[~corners]) <= 1e-8 * np.linalg.norm(force[corners])
 
 
-def test_a_stray_node_among_quadratic_tetrahedra_stays(solve) -> None:
+def test_node_outside_quadratic_tetrahedra_does_not_move(solve) -> None:
     data = {"fixed": np.append(BASE, False).astype(int), "force": np.vstack([FORCE, np.ones(3)])}
     code, _, found, errors = solve(CURVED, data, points=np.vstack([CURVED.nodes, np.full(3, 0.5)]))
     assert code == 0 and "1 nodes belong to no tetrahedron" in errors and not found[-1].any()
 
 
 def test_element_folded_at_mid_edge_counts_as_inverted(solve) -> None:
-    """All corners stay where they are: their tetrahedra look sound."""
+    """All corners stay fixed: their linear tetrahedra are valid."""
     assert STRAIGHT.middles is not None
     node = STRAIGHT.middles[0, 0]
     ends = STRAIGHT.nodes[STRAIGHT.tets[0, :2]]
@@ -157,18 +157,18 @@ def test_element_folded_at_mid_edge_counts_as_inverted(solve) -> None:
 
 
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_linear_elements_on_a_quadratic_mesh_are_refused(solve, element: str) -> None:
+def test_linear_element_on_quadratic_mesh_is_rejected(solve, element: str) -> None:
     code, _, _, errors = solve(CURVED, {"fixed": BASE.astype(int), "force": FORCE}, "--element", element)
     assert code == 2 and f"not {element}: use p2" in errors
 
 
-def test_a_mesh_of_both_kinds_is_refused(solve) -> None:
+def test_mesh_of_linear_and_quadratic_tetrahedra_is_rejected(solve) -> None:
     cells = [("tetra", CURVED.tets[:5]), ("tetra10", CURVED.table[5:])]
     code, _, _, errors = solve(CURVED, {"fixed": BASE.astype(int), "force": FORCE}, cells=cells)
     assert code == 2 and "tetra and tetra10" in errors
 
 
-def test_a_quadratic_mesh_that_folds_at_rest_is_refused(solve) -> None:
+def test_quadratic_mesh_folded_at_rest_is_rejected(solve) -> None:
     assert STRAIGHT.middles is not None
     nodes = STRAIGHT.nodes.copy()
     nodes[STRAIGHT.middles[0, 0]] = nodes[STRAIGHT.tets[0, :2]].T @ [0.95, 0.05]
@@ -176,7 +176,7 @@ def test_a_quadratic_mesh_that_folds_at_rest_is_refused(solve) -> None:
     assert code == 2 and "folded over" in errors
 
 
-def test_an_unknown_element_is_refused(solve) -> None:
+def test_unknown_element_is_rejected(solve) -> None:
     with pytest.raises(SystemExit) as caught:
         solve(LINEAR, {}, "--element", "cubic")
     assert caught.value.code == 2

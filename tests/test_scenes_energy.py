@@ -1,4 +1,4 @@
-"""Under loads that stay, with mass, no built-in scene gains energy, be its effects what they are."""
+"""Energy of the built-in scenes with mass under constant loads."""
 
 from dataclasses import replace
 from functools import cache
@@ -101,7 +101,7 @@ def potential(fem: Fem, loads: Loads, answer: Deformation) -> float:
 
 @pytest.mark.parametrize(("step", "damping"), [(1e-3, 0.0), (1e-2, 0.0), (1e-2, 5.0)])
 @pytest.mark.parametrize("name", SCENES)
-def test_energy_does_not_grow(name: str, step: float, damping: float) -> None:
+def test_total_energy_does_not_grow_under_constant_load(name: str, step: float, damping: float) -> None:
     body, effects, loads, answer = posed(name)
     fem = Fem(body, (*effects, Inertia(damping=damping)), TIGHT, "cpu", element="p1")
     mass, begun = compute_lumped_mass(Inertia().density, fem.space), answer.time

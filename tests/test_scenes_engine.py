@@ -1,4 +1,4 @@
-"""Thousands of episodes by many processes: what is there is skipped, what fails is kept, marked and counted."""
+"""Episodes by many processes: existing episodes are skipped, failures are recorded and counted."""
 
 import json
 import os
@@ -54,7 +54,7 @@ def test_existing_episodes_are_skipped_in_any_order(workers, undisturbed, tmp_pa
     assert (tmp_path / "plan.toml").read_text() == PLAN and read_run(tmp_path) == tiny_run()
 
 
-def test_what_another_client_makes_meanwhile_is_not_made_again(workers, undisturbed, tmp_path):
+def test_episodes_of_another_client_are_not_made_again(workers, undisturbed, tmp_path):
     def others(kind, outcome, count):
         for name, content in undisturbed.items():
             (tmp_path / name).write_bytes(content)
@@ -63,7 +63,7 @@ def test_what_another_client_makes_meanwhile_is_not_made_again(workers, undistur
     assert tally.made + tally.skipped == 12 and tally.skipped >= 5 and held(tmp_path) == undisturbed
 
 
-def test_failures_are_kept_marked_and_counted(workers, tmp_path):
+def test_failed_episodes_are_recorded_and_counted(workers, tmp_path):
     trouble = Trouble({1: "does not converge", 2: "broken"}, {1: "does not mesh"})
     tally = played(tmp_path, workers, 11, trouble)
     assert (tally.made, tally.failed, tally.lost) == (4, 6, 1)
@@ -81,15 +81,15 @@ def test_failures_are_kept_marked_and_counted(workers, tmp_path):
     assert (tally.made, tally.skipped, tally.failed) == (6, 5, 0) and not list_failures(tmp_path)
 
 
-def test_a_full_disk_ends_the_run_and_says_so(workers, tmp_path):
+def test_full_disk_ends_the_run_with_a_message(workers, tmp_path):
     with pytest.raises(InputError, match="No space left on device"):
         played(tmp_path, workers, 12, Trouble({1: "full"}))
     assert sum(line.startswith("1 ") for line in tried(tmp_path)) == 1 and not list_failures(tmp_path)
     assert played(tmp_path, workers, 12).failed == 0 and len(held(tmp_path)) == 12
 
 
-def test_each_process_has_its_gpu_and_is_replaced(undisturbed, tmp_path):
-    """A card that has failed answers nothing any more; the number of an episode that broke it is tried anew."""
+def test_each_worker_uses_one_gpu_and_is_replaced_after_failure(undisturbed, tmp_path):
+    """After a failed GPU its process is replaced, and the episode is tried again."""
     with start_own_workers(["cuda:0", "cuda:1"]) as workers:
         tally = played(tmp_path, workers, 12, Trouble({3: "broken once"}, seconds=0.05))
     assert tally.made == 12 and tally.failed == tally.lost == 0 and held(tmp_path) == undisturbed
@@ -116,7 +116,7 @@ def test_scheduler_rejects_clients_without_its_keys(workers):
             urlopen(f"http://127.0.0.1:{served}{page}", timeout=5.0)
 
 
-def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path):
+def test_running_scheduler_accepts_more_workers_and_may_stop(undisturbed, tmp_path):
     address = "tcp://127.0.0.1:9"
     with pytest.raises(InputError, match=f"--scheduler {address}: no Dask scheduler at this address"):
         connect_workers(address, "cpu", patience=0.5).__enter__()
@@ -154,7 +154,7 @@ def test_a_running_scheduler_gets_more_workers_and_may_end(undisturbed, tmp_path
             played(folder, workers, 30, Trouble(seconds=0.1), ending)
 
 
-def test_a_folder_is_one_runs_own(tmp_path):
+def test_run_folder_rejects_a_run_with_other_settings(tmp_path):
     folder = tmp_path / "new"
     assert begin(folder, tiny_run(), PLAN) and not begin(folder, tiny_run(), PLAN)
     for changed, words in (
@@ -179,7 +179,7 @@ def test_a_folder_is_one_runs_own(tmp_path):
         begin(tmp_path, tiny_run(), PLAN)
 
 
-def test_what_is_missing_is_known_by_name_alone(tmp_path):
+def test_missing_episodes_are_found_by_file_name(tmp_path):
     for number in (1, 3, 1234567):
         (tmp_path / f"episode_{number:06d}.h5").touch()
     (tmp_path / ".sulcus-0-0-episode_000002.h5").touch()
@@ -193,7 +193,7 @@ def test_what_is_missing_is_known_by_name_alone(tmp_path):
     assert not to_body_path(tmp_path, 0).exists()
 
 
-def test_of_what_failed_only_what_is_said_is_read(tmp_path, monkeypatch):
+def test_failed_episodes_are_listed_by_file_name_only(tmp_path, monkeypatch):
     for number in (3, 5):
         mark_failed(tmp_path, Failure(number, f"no {number}", lost=False))
     assert list_failed(tmp_path) == {3, 5} and read_failure(tmp_path, 5) == Failure(5, "no 5", lost=False)

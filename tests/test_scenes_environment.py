@@ -1,4 +1,4 @@
-"""Surgical tasks as Gymnasium environments: one alone, many together, and what they refuse."""
+"""Surgical tasks as Gymnasium environments: single, vectorised, and rejected input."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from sim.errors import InputError
 
 
 @pytest.mark.parametrize("observation", ["states", "rgbd"])
-def test_gymnasium_finds_nothing_wrong(observation, boxed):
+def test_gymnasium_checker_accepts_all_environments(observation, boxed):
     for name, given in (("Palpate", {}), ("Retract", {"anatomy": boxed}), ("Debulk", {"anatomy": boxed})):
         environment = made(name, observation=observation, render_mode="rgb_array", **given)
         check_env(environment.unwrapped)
@@ -19,7 +19,7 @@ def test_gymnasium_finds_nothing_wrong(observation, boxed):
 
 
 def test_same_seed_and_actions_give_same_bytes():
-    """Alone, and second of three, whose neighbours do something else; pictures too."""
+    """Single, and second of three with other actions; images too."""
     alone = played(made(observation="rgbd"), 7, 18)
     vector = many(3, observation="rgbd")
     seen, _ = vector.reset(seed=[0, 7, 3])
@@ -32,7 +32,7 @@ def test_same_seed_and_actions_give_same_bytes():
     assert np.linalg.norm(truth["force"][1]) > 0.01  # the tool touches by now
 
 
-def test_a_vector_begins_anew_what_is_over():
+def test_vector_environment_resets_finished_episodes():
     vector = many(2, max_episode_steps=3)
     first, _ = vector.reset(seed=5)
     for _ in range(2):
@@ -49,8 +49,8 @@ def test_a_vector_begins_anew_what_is_over():
     assert np.array_equal(one.reset()[0], seen[0])
 
 
-def test_a_vector_is_what_gymnasium_makes_of_single_ones():
-    """Byte for byte, over the end of episodes; the truth too."""
+def test_vector_environment_equals_gymnasium_sync_vector():
+    """Byte for byte, across the end of episodes; ground truth too."""
     vectors = [many(2, max_episode_steps=4), many(2, max_episode_steps=4, vectorization_mode="sync")]
     assert vectors[0].metadata["autoreset_mode"] == vectors[1].metadata["autoreset_mode"]
     random = np.random.default_rng(0)
@@ -79,14 +79,14 @@ def test_a_vector_is_what_gymnasium_makes_of_single_ones():
         ({"task": "retract", "model": "nowhere.npz"}, "nowhere.npz"),
     ],
 )
-def test_what_cannot_be_had_is_said(given, said):
+def test_environment_rejects_invalid_options(given, said):
     from scenes.gym.environment import Operation
 
     with pytest.raises(InputError, match=said.replace("(", r"\(")):
         Operation(**({"device": "cpu", "size": SIZE} | given))
 
 
-def test_hostile_input_is_refused():
+def test_environment_rejects_invalid_actions_and_reset_options():
     environment, vector = made().unwrapped, many(2)
     with pytest.raises(InputError, match=r"call reset\(\)"):
         environment.step(DOWN)
@@ -104,8 +104,8 @@ def test_hostile_input_is_refused():
         compute_scripted_actions("juggle", np.zeros(24))
 
 
-def test_spatula_model_is_used_alone_and_among_others():
-    """Byte for byte, through contact; and with a process of its own."""
+def test_spatula_model_gives_same_bytes_alone_and_in_vector():
+    """Byte for byte, during contact; and in a separate process."""
     alone = played(made("Retract"), 2, 16, "retract")
     vector = many(2, "Retract")
     seen, _ = vector.reset(seed=[5, 2])

@@ -1,4 +1,4 @@
-"""Scenes as files: episodes that read back, frames and films."""
+"""Scenes as files: stored episodes, frames and videos."""
 
 import json
 from dataclasses import replace
@@ -55,7 +55,7 @@ def decode_recorded(file, name, number, flag=cv2.IMREAD_UNCHANGED):
 
 
 class TestEpisode:
-    def test_pictures_read_back(self, episode):
+    def test_stored_images_match_rendered_images(self, episode):
         _, file, _, frames = episode
         assert file.attrs["depth_scale_m"] == DEPTH_SCALE and len(file["pictures/colour"]) == len(frames) == 7
         for frame in frames:
@@ -70,15 +70,15 @@ class TestEpisode:
             assert np.array_equal(depth == 0, frame.picture.depth == 0.0)
             assert np.array_equal(decode_recorded(file, "segmentation", frame.number), frame.picture.segmentation)
 
-    def test_validation_finds_nothing_wrong_and_knows_every_array(self, episode, box):
+    def test_validation_accepts_new_episode_and_all_its_arrays(self, episode, box):
         _, file, _, _ = episode
         path = Path(file.filename)
         assert validate_episode(path).problems == []
         assert mask_findings(file, read_contents(path), box) == ([], [])
         assert set(file["pictures"]) <= set(PICTURES) and set(file) - {"pictures"} <= set(ARRAYS)
 
-    def test_a_frame_is_recomputed_from_its_attributes_alone(self, episode, box):
-        """Tissue, element, tool and load are those that the file names; so is what solved it."""
+    def test_frame_is_recomputed_from_attributes_of_the_file(self, episode, box):
+        """Tissue, element, tool, load and solver are those in the file's attributes."""
         _, file, _, _ = episode
         said, number = file.attrs, 3
         effects = (read_tissue_statement({name: str(text) for name, text in said.items()}), Held(), ToolForce())
@@ -90,7 +90,7 @@ class TestEpisode:
         assert np.linalg.norm(moved - found) < 2e-3 * np.linalg.norm(found) > 0.0
         assert len(said["model_digest"]) == 16 and said["date"][:2] == "20" and "Probe" in said["tool"]
 
-    def test_the_distance_is_that_of_the_picture(self, episode):
+    def test_stored_tip_distance_equals_distance_of_the_frame(self, episode):
         _, file, _, frames = episode
         for name in ("distance", "distance_error"):
             expected = [np.nan if getattr(frame, name) is None else getattr(frame, name) for frame in frames]
@@ -98,7 +98,7 @@ class TestEpisode:
         assert np.isfinite(file["distance"][:]).all()
 
     @pytest.mark.parametrize("attribute", ["unit", "meaning"])
-    def test_every_data_set_says_what_it_is(self, episode, attribute):
+    def test_each_array_has_a_description_attribute(self, episode, attribute):
         _, file, _, _ = episode
         bare = []
         file.visititems(lambda name, item: bare.append(name) if attribute not in item.attrs else None)
@@ -118,7 +118,7 @@ class TestEpisode:
             for pixels, corners in ((rows, row), (columns, column)):
                 assert abs(pixels.min() - corners.min()) <= 2 and abs(pixels.max() - corners.max()) <= 2
 
-    def test_depth_and_camera_give_back_the_cortex(self, episode):
+    def test_depth_and_camera_reconstruct_the_cortex(self, episode):
         _, file, play, frames = episode
         camera = Camera(file["K"][:], file["T_camera_world"][0], frames[0].camera.width, frames[0].camera.height)
         pixels = np.argwhere(decode_recorded(file, "segmentation", 0) == CORTEX)
@@ -126,7 +126,7 @@ class TestEpisode:
         height = camera.unproject(pixels[:, ::-1].astype(float), depth) @ play.site.axis
         assert len(height) > 1000 and np.abs(height).max() < 2e-5  # the box is flat, its top at zero
 
-    def test_motion_is_that_of_the_frames(self, episode, theatre):
+    def test_stored_motion_equals_motion_of_the_frames(self, episode, theatre):
         _, file, play, frames = episode
         nodes = theatre.anatomy.tumour_nodes
         rest = theatre.anatomy.mesh.nodes[nodes]
@@ -149,7 +149,7 @@ class TestEpisode:
         assert file["seconds"].shape == (7, 3) and tuple(file["seconds"].attrs["stages"]) == STAGES
         assert file["tumour_left"][:].all()  # nothing is cut in this scene
 
-    def test_everything_says_what_it_is(self, episode, theatre):
+    def test_episode_arrays_have_units_and_metadata(self, episode, theatre):
         report, file, _, _ = episode
         units = {name: file[name].attrs["unit"] for name in file if "unit" in file[name].attrs}
         assert units == {
@@ -171,7 +171,7 @@ class TestEpisode:
         assert report["frames"] == 7 and report["fem"] == {"converged": 7}
 
     @pytest.mark.parametrize("blow", [KeyboardInterrupt, RuntimeError])
-    def test_an_interrupted_episode_leaves_nothing(self, theatre, tmp_path, blow):
+    def test_interrupted_episode_leaves_no_file(self, theatre, tmp_path, blow):
         def stop(frames):
             for number, frame in enumerate(frames):
                 if number == 2:
@@ -182,21 +182,21 @@ class TestEpisode:
             collect(tmp_path / "press.h5", theatre, player(theatre, short(), "linear"), "linear", stop)
         assert not list(tmp_path.iterdir())
 
-    def test_an_earlier_episode_survives_an_interruption(self, theatre, tmp_path):
+    def test_interruption_keeps_the_existing_episode_file(self, theatre, tmp_path):
         path = tmp_path / "press.h5"
         path.write_bytes(b"earlier")
         with pytest.raises(ZeroDivisionError):
             collect(path, theatre, player(theatre, short(), "linear"), "linear", lambda frames: [1 / 0])
         assert path.read_bytes() == b"earlier" and list(tmp_path.iterdir()) == [path]
 
-    def test_a_folder_that_cannot_hold_it_is_a_sentence(self, theatre, tmp_path):
+    def test_collect_rejects_a_folder_that_is_a_file(self, theatre, tmp_path):
         (tmp_path / "file").touch()
         with pytest.raises(InputError, match="Choose another folder"):
             collect(tmp_path / "file" / "a.h5", theatre, player(theatre, short(), "linear"), "linear", iter)
 
     @pytest.mark.parametrize(("size", "most"), [(40_000, 4), (150_000, 7)])
-    def test_a_full_disk_is_a_sentence(self, theatre, tmp_path, size, most, monkeypatch):
-        """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
+    def test_collect_reports_a_full_disk_as_input_error(self, theatre, tmp_path, size, most, monkeypatch):
+        """HDF5 aborts the process on a failed write: it does not write to the disk itself."""
         # The check before the start finds enough space.
         monkeypatch.setattr("scenes.episodes.episode.check_disk_space", lambda *asked: None)
         drawn, play = [], player(theatre, short(), "linear")
@@ -208,7 +208,7 @@ class TestEpisode:
         assert not list(tmp_path.iterdir())
         assert len(drawn) <= most  # the rest is not drawn in vain
 
-    def test_the_command(self, brief, anatomy, tmp_path, capsys):
+    def test_collect_command_writes_episode_and_json_report(self, brief, anatomy, tmp_path, capsys):
         out = tmp_path / "new" / "press.h5"
         words = ["collect", "press", "--anatomy", str(anatomy), "--deformer", "fem", "--out", str(out), "--json"]
         assert main(words) == 0
@@ -223,7 +223,7 @@ RENDER = ("render", "press", "--deformer", "linear", "--anatomy")
 
 
 class TestRender:
-    def test_frames_and_film(self, brief, anatomy, tmp_path, capsys):
+    def test_render_command_writes_frames_and_video(self, brief, anatomy, tmp_path, capsys):
         frames, film = tmp_path / "a" / "frames", tmp_path / "film.mp4"
         words = [*RENDER, str(anatomy), "--out", str(frames), "--every", "2", "--json"]
         assert main([*words, "--film", str(film)]) == 0
@@ -239,7 +239,7 @@ class TestRender:
         video.release()
         assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "film.mp4"]
 
-    def test_plain_frames_have_no_panel(self, brief, anatomy, theatre, tmp_path, capsys):
+    def test_render_plain_writes_frames_without_cost_label(self, brief, anatomy, theatre, tmp_path, capsys):
         words = [*RENDER, str(anatomy), "--every", "3", "--plain", "--out", str(tmp_path)]
         assert main(words) == 0
         assert "3 frames by linear" in capsys.readouterr().out
@@ -247,7 +247,7 @@ class TestRender:
         for number, colour in zip((0, 3, 6), shown, strict=True):
             assert np.array_equal(cv2.imread(str(tmp_path / f"frame_{number:04d}.png"))[..., ::-1], colour)
 
-    def test_doubtful_answers_are_reported_by_the_exit_code(self, anatomy, tmp_path, monkeypatch, capsys):
+    def test_render_exits_with_1_for_unreliable_solutions(self, anatomy, tmp_path, monkeypatch, capsys):
         strong = replace(short(), path=press(0.8, rise=0.1, hold=0.0))
         monkeypatch.setattr("scenes.script.scene.find_scene", lambda name: strong)
         words = ["render", "press", "--deformer", "linear", "--anatomy", str(anatomy), "--out", str(tmp_path), "--json"]
@@ -255,7 +255,7 @@ class TestRender:
         assert 2 <= json.loads(capsys.readouterr().out)["not_good"] <= 5
 
 
-def test_oversized_episode_is_reported_before_work(theatre, tmp_path):
+def test_oversized_episode_is_rejected_at_the_start(theatre, tmp_path):
     play = player(theatre, short(), "linear")
     with files_below(100_000), pytest.raises(InputError, match=r"files are limited to 0\.1 MB"):
         collect(tmp_path / "press.h5", theatre, play, "linear", iter)

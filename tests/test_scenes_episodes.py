@@ -1,4 +1,4 @@
-"""`sulcus episodes`: what it refuses, how it stops, what it plans on paper, and its script for a cluster."""
+"""`sulcus episodes`: rejected input, interruption, data sheet and script for a cluster."""
 
 import json
 import os
@@ -27,7 +27,7 @@ from scenes.episodes.run_folder import Failure, begin, mark_failed, unmark
         (["small", "--slurm", "2", "--device", "cpu", "--workers", "2"], "leave --workers and --scheduler out"),
     ],
 )
-def test_bad_input_is_one_sentence_and_leaves_nothing(words, said, tmp_path, capsys):
+def test_episodes_command_rejects_bad_input_and_writes_nothing(words, said, tmp_path, capsys):
     out = tmp_path / "data"
     assert main(["episodes", *words, "--count", "2", "--out", str(out)]) == 2
     assert said in (error := capsys.readouterr().err) and error.count("\n") == 1
@@ -35,7 +35,7 @@ def test_bad_input_is_one_sentence_and_leaves_nothing(words, said, tmp_path, cap
 
 
 @pytest.mark.parametrize("words", [["--count", "0"], ["--count", "2.5"], ["--count", "2", "--first", "-1"]])
-def test_counts_are_whole_numbers(words, tmp_path, capsys):
+def test_episodes_command_rejects_non_integer_counts(words, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["episodes", "small", *words, "--out", str(tmp_path / "data")])
     assert "is no whole number from" in capsys.readouterr().err
@@ -91,8 +91,8 @@ def test_signal_stops_processes_and_keeps_resumable_work(number, tmp_path):
     assert (folder / "run.json").exists() and not list(folder.glob("episode_*"))
 
 
-def test_a_clusters_script_is_one_command_for_all_machines(tmp_path, capsys):
-    """Run by bash, with a program that prints what it was given."""
+def test_slurm_script_starts_one_command_on_each_machine(tmp_path, capsys):
+    """Run by bash, with a program that prints its arguments."""
     words = ["episodes", "small", "--count", "9", "--out", str(tmp_path / "a b"), "--device"]
     assert main([*words, "cuda", "--slurm", "3"]) == 0
     text = capsys.readouterr().out

@@ -55,13 +55,13 @@ def filmed(box):
     )  # fmt: skip
 
 
-def test_nothing_is_off_where_nobody_contributes(filmed):
+def test_error_is_zero_without_error_sources(filmed):
     none = sample_errors(filmed, [], 20)
     for values in (none.across, none.along, none.pixels, none.worst):
         assert np.abs(values).max() < 1e-12
 
 
-def test_error_sources_have_their_stated_size(filmed):
+def test_error_sources_have_their_given_size(filmed):
     moved = sample_errors(filmed, [REGISTRATION], COUNT)
     assert np.sqrt(np.mean(moved.middle**2)) == pytest.approx(np.sqrt(3.0) * REGISTRATION_PRIOR.range[1], rel=0.1)
     assert np.sqrt(np.mean(moved.along**2)) == pytest.approx(REGISTRATION_PRIOR.range[1], rel=0.15)
@@ -74,7 +74,7 @@ def test_error_sources_have_their_stated_size(filmed):
     assert sample_errors(alike, [MESH, PARAMETERS], COUNT).worst.max() == pytest.approx(0.2 * off, rel=0.02)
 
 
-def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
+def test_latency_error_equals_camera_motion_during_the_delay(filmed):
     moving = replace(filmed, viewpoint=replace(VIEW, path=sideways), latency=0.02, clock=0.0)
     found = sample_errors(moving, [LATENCY], 20)
     np.testing.assert_allclose(found.across, 0.02 * SPEED, rtol=0.05)
@@ -82,7 +82,7 @@ def test_latency_costs_what_the_camera_moves_meanwhile(filmed):
     assert sample_errors(replace(filmed, latency=0.02), [LATENCY], 20).worst.max() < 1e-12  # nothing moves
 
 
-def test_latency_costs_what_the_tumour_moves_meanwhile(filmed):
+def test_latency_error_equals_tumour_motion_during_the_delay(filmed):
     sunk = replace(filmed, velocity=np.tile(SPEED * filmed.site.axis, (60, 1)), latency=0.02, clock=0.0)
     found = sample_errors(sunk, [LATENCY], 20)
     for each in (found.middle, found.worst):
@@ -92,8 +92,8 @@ def test_latency_costs_what_the_tumour_moves_meanwhile(filmed):
     assert sample_errors(sunk, [SHUTTER], 20).worst.max() < 1e-12
 
 
-def test_coverage_of_patients_with_other_bodies_is_low(filmed):
-    """Bodies that differ six times as much, that is, not those from which the band comes."""
+def test_coverage_is_low_for_patients_with_larger_deviations(filmed):
+    """Deviations are six times those from which the band is computed."""
     alike, others = (
         compute_budget(filmed, 100, twins=replace(filmed, bodies=k * filmed.bodies), progress=lambda names: ()).held
         for k in (1.0, 6.0)
@@ -102,15 +102,15 @@ def test_coverage_of_patients_with_other_bodies_is_low(filmed):
     assert others[1] is not None and 0.0 < others[1] < 0.1
 
 
-def test_worst_error_is_that_of_the_farthest_point(filmed):
+def test_worst_error_is_taken_at_the_farthest_point(filmed):
     bodies = np.tile(filmed.field, (100, 1, 1))
     bodies[:, 7] += 3e-3 * filmed.site.right
     found = sample_errors(replace(filmed, bodies=bodies, meshes=np.zeros(100)), [PARAMETERS], 10)
     assert found.worst == pytest.approx(3e-3, rel=0.02) and found.middle == pytest.approx(3e-3 / 60, rel=0.05)
 
 
-def test_deviation_of_coverage_counts_bodies_and_not_samples(filmed):
-    """Of two bodies one is always covered, the other never: the deviation of a ratio of two clusters."""
+def test_deviation_of_coverage_is_computed_over_bodies(filmed):
+    """One of two bodies is always covered, the other never: deviation of a ratio of two clusters."""
     bodies = np.stack([filmed.field, filmed.field + 0.1 * filmed.site.right])
     share, deviation = compute_budget(
         filmed, 60, twins=replace(filmed, bodies=bodies, meshes=np.zeros(2)), progress=lambda names: ()
@@ -119,8 +119,8 @@ def test_deviation_of_coverage_counts_bodies_and_not_samples(filmed):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
-    """The reference is turned by 90 degrees in the scan: about an axis through the tumour a turn moves no middle."""
+def test_registration_error_uses_axes_of_the_reference_frame(filmed, axis):
+    """The reference is rotated by 90 degrees; rotation about an axis through the tumour moves no centroid."""
     T, middle = filmed.T_scan_patient.copy(), (filmed.rest + filmed.field).mean(axis=0)
     T[:3, :3] = Rotation.from_euler("xyz", [90.0, 0.0, 90.0], degrees=True).as_matrix() @ T[:3, :3]
     turn, shift = np.full(6, 1e-16), np.full(6, 1e-16)
@@ -135,7 +135,7 @@ def test_registration_errs_along_the_axes_of_the_reference(filmed, axis):
     assert np.std(found.along) == pytest.approx(1e-3 * abs(toward @ T[:3, axis]), rel=0.15, abs=2e-6)
 
 
-def test_rolling_shutter_error_from_camera_motion(filmed):
+def test_rolling_shutter_error_grows_with_camera_motion(filmed):
     calibration = replace(USUAL_CALIBRATION, readout=0.02)
     moving = replace(filmed, viewpoint=replace(VIEW, calibration=calibration, path=sideways), duration=0.1)
     camera, middle = VIEW.build_camera(moving.site), (filmed.rest + filmed.field).mean(axis=0)
@@ -173,7 +173,7 @@ def test_calibration_covariance_and_wrong_images_raise_error(filmed):
     assert np.median(worse.worst) > 5.0 * np.median(sample_errors(filmed, TECHNICAL[:1], 50).worst)
 
 
-def test_band_covers_twins_but_not_other_bodies(filmed):
+def test_error_band_covers_twins_but_not_other_bodies(filmed):
     here, other = (
         1e-3 * np.random.default_rng(seed).normal(size=(600, 1, 3)) + np.zeros_like(filmed.rest) for seed in (2, 3)
     )
@@ -184,7 +184,7 @@ def test_band_covers_twins_but_not_other_bodies(filmed):
     assert (sample_errors(replace(twins, bodies=6.0 * other), CLINICAL, 200, 1).worst <= band).mean() < 0.8
 
 
-def test_parts_add_up_in_quadrature_and_the_largest_is_named(filmed):
+def test_error_parts_add_in_quadrature_and_largest_is_named(filmed):
     budget = compute_budget(filmed, 100, twins=filmed)
     technical, clinical = (np.median(each.middle) for each in (budget.technical, budget.clinical))
     assert technical < clinical and set(budget.alone) == set(CLINICAL)
@@ -193,7 +193,7 @@ def test_parts_add_up_in_quadrature_and_the_largest_is_named(filmed):
     assert budget.find_largest("middle") == REGISTRATION and budget.held is not None and budget.held[0] > 0.8
 
 
-def test_a_reference_out_of_sight_is_said(filmed):
+def test_reference_outside_the_camera_view_is_rejected(filmed):
     away = filmed.T_scan_patient.copy()
     away[:3, 3] += 0.5
     with pytest.raises(InputError, match="does not see the patient's reference"):

@@ -1,4 +1,4 @@
-"""Parts of an overlay's error that are known exactly: registration, clock, and covariances that are turned."""
+"""Exactly known parts of an overlay's error: registration, hand-eye calibration, tool and model."""
 
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -39,7 +39,7 @@ def six(shift):
 
 @pytest.mark.parametrize("shift", [1e-6 * np.eye(3), np.diag([1e-6, 0.0, 0.0])])
 def test_link_bound_of_registration_is_2_80_sigma(shift):
-    """The ball that holds 95 % of an isotropic error of 1 mm along each axis."""
+    """Ball with 95 % of an isotropic error of 1 mm along each axis."""
     follower, names = follower_of(template_theatre().build_stage(find_scene("palpate"))), TransformNames()
     given = replace(follower.registration, covariance=six(shift))
     pose = solve_reference_frames(follower.motion.stage).T_scan_tool[10] @ np.linalg.inv(follower.tool.T_cube_tool)
@@ -49,8 +49,8 @@ def test_link_bound_of_registration_is_2_80_sigma(shift):
     assert found.known.band == pytest.approx(np.hypot(2.7955e-3, found.known.motion.error), rel=1e-4)
 
 
-def test_hand_eye_error_is_that_of_a_camera_moved_by_it():
-    """A small shift and turn of the camera, in the axes of what carries it, along one direction of all six."""
+def test_hand_eye_error_equals_shift_of_the_camera():
+    """Small shift and rotation of the camera in its mount's frame, along one direction of six."""
     times, step = np.zeros(1), 1e-4 * np.array([1.0, -2.0, 3.0, 5.0, -3.0, 2.0])
     T, far = (
         turned("zx", [30.0, 50.0]) @ shifted(0.3),
@@ -87,7 +87,7 @@ class Sinking:
         return build_prediction(moved, nodes, loads, [False] * len(depth), 0.0, np.full((2, len(depth)), np.nan), "")
 
 
-def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
+def test_tool_error_comes_from_a_deeper_tool_pose():
     stage = template_theatre().build_stage(find_scene("palpate"))
     sinking, pose = Sinking(stage), np.eye(4)
     pose[:3, 3] = stage.site.origin
@@ -98,7 +98,7 @@ def test_tool_error_is_of_a_deeper_tool_and_each_start_the_last():
 
 
 @pytest.mark.parametrize(("bound", "expected", "doubt"), [(3e-4, 3e-4, ""), (np.inf, 0.0, NO_ERROR_WARNING)])
-def test_model_error_without_a_bound_is_the_models_own(bound, expected, doubt, monkeypatch):
+def test_missing_error_bound_is_replaced_by_bound_of_model(bound, expected, doubt, monkeypatch):
     model = SimpleNamespace(bound=bound)
     monkeypatch.setattr("scenes.tracked.tool_motion.find_first_model", lambda deformer, answer: model)
     stage = template_theatre().build_stage(find_scene("palpate"))

@@ -7,7 +7,7 @@ from scenes.page.error_refinement import refine_error
 from scenes.script.tool_paths import Touch
 
 
-def test_a_stronger_load_moves_more_and_has_a_larger_error(theatre):
+def test_larger_force_gives_larger_motion_and_error(theatre):
     found = []
     for force in (0.05, 0.2):
         *progress, last = refine_error(theatre, short(), Touch(force=force), 0.1, count=8)

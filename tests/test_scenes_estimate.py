@@ -1,4 +1,4 @@
-"""The time that a run of episodes takes, as planned from what was measured."""
+"""Estimated time of a run of episodes from measured rates."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scenes.episodes.tasks import TaskOutcome
 from sim.errors import InputError
 
 
-def test_a_run_is_planned_from_what_was_measured(tmp_path):
+def test_run_time_is_estimated_from_measured_rates(tmp_path):
     (tmp_path / "rates").mkdir()
     with write_rates(tmp_path) as note:
         for number, (seconds, first) in enumerate(((30.0, "process"), (10.0, "no"), (40.0, "process"), (14.0, "no"))):

@@ -6,7 +6,7 @@ import json
 import SimpleITK as sitk  # noqa: N813
 
 
-def test_itk_finds_no_fold(warp_out):
+def test_itk_jacobian_of_exported_fields_is_positive(warp_out):
     for name in ("field_resampling.nii.gz", "field_modeling.nrrd"):
         field = sitk.ReadImage(str(warp_out / name), sitk.sitkVectorFloat64)
         least = sitk.GetArrayFromImage(sitk.DisplacementFieldJacobianDeterminant(field)).min()

@@ -1,4 +1,4 @@
-"""The page docs/extend.md: its code runs in a folder outside the packages, and it names only what there is."""
+"""Page docs/extend.md: its code runs outside the packages, and its names exist."""
 
 import argparse
 import importlib
@@ -41,14 +41,14 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_the_first_block_is_a_scene(folder):
+def test_first_code_block_of_extend_page_defines_a_scene(folder):
     (folder / "my_scene.py").write_text(BLOCKS[0])
     scene = find_scene(str(folder / "my_scene.py"))
     assert scene.name == "stiff" and "my_scene.py" in PAGE
 
 
-def test_the_code_of_each_section_runs_by_itself(folder):
-    """In an interpreter that runs elsewhere; no section knows a name of another. Veins hold tissue back."""
+def test_code_of_each_section_runs_separately(folder):
+    """In an interpreter in another folder; no section uses names of another. Veins stiffen the tissue."""
     assert len(SECTIONS) == 7
     (folder / "page.py").write_text(
         f"for section in {SECTIONS[1:]!r}:\n    exec(section, {{'__name__': '__main__'}})\n"
@@ -72,7 +72,7 @@ def test_example_plugin_has_a_complete_project_file():
 
 
 def test_own_mesh_is_converted_to_an_anatomy(tmp_path, monkeypatch, box):
-    """The code of docs/own_mesh.md, on a file in millimetres."""
+    """Code of docs/own_mesh.md, on a file in millimetres."""
     (code,) = blocks_of(PATIENT)
     mesh = box.mesh
     cells, region = [("tetra", mesh.tets)], [mesh.region]
@@ -87,7 +87,7 @@ def test_own_mesh_is_converted_to_an_anatomy(tmp_path, monkeypatch, box):
     assert answer.outcome[0].good and np.abs(answer.displacement[0, own.tumour_nodes]).max() > 1e-5
 
 
-def test_the_command_says_how_large_the_tumour_is(capsys):
+def test_example_command_prints_the_tumour_volume(capsys):
     (block,) = (block for block in BLOCKS if "def add_arguments" in block)
     names = {}
     exec(block, names)
@@ -97,7 +97,7 @@ def test_the_command_says_how_large_the_tumour_is(capsys):
     assert float(capsys.readouterr().out.removesuffix(" ml\n")) == pytest.approx(4 / 3 * np.pi * 1.2**3, rel=0.05)
 
 
-def test_custom_parts_on_the_page_exist():
+def test_parts_named_on_the_extend_page_exist():
     for part in ("nearest", "sucker", "veins", "yeoh"):
         assert f"examples/{part}.py" in PAGE
     names = set(re.findall(r"`((?:sim|scenes|surrogate)(?:\.[a-z_]+)*)\.([A-Z]\w+)`", PAGE))

@@ -1,4 +1,4 @@
-"""What an overlay has from elsewhere: another tracker's poses and clock, past midnight too, and a camera's errors."""
+"""External trackers: interpolated poses, clock offset, daily clocks, and the camera's calibration error."""
 
 import json
 from dataclasses import replace
@@ -71,7 +71,7 @@ def twist(found, true):
 
 
 @pytest.mark.parametrize(("rate", "late"), [(20.0, 0.08), (30.0, 0.05), (60.0, 0.03)])
-def test_pose_interpolation_beats_newest_sample(rate, late):
+def test_pose_interpolation_is_closer_than_newest_sample(rate, late):
     rng = np.random.default_rng(int(rate))
     stream = sampled(swung, np.arange(0.0, 4.0, 1.0 / rate), rng)
     plain, found, inside = [], [], []
@@ -87,7 +87,7 @@ def test_pose_interpolation_beats_newest_sample(rate, late):
     assert np.mean(inside) > 0.93
 
 
-def test_pose_gap_extrapolates_for_a_moment_only():
+def test_pose_extrapolation_ends_after_a_time_limit():
     times = np.concatenate([np.arange(0.0, 1.0, 0.04), np.arange(1.3, 2.0, 0.04)])
     stream = sampled(swung, times)
     last = times[times < 1.0][-1]
@@ -106,7 +106,7 @@ def test_pose_gap_extrapolates_for_a_moment_only():
         build_pose_stream(np.array([0.0, 2.0, 1.0]), np.tile(np.eye(4), (3, 1, 1)), np.tile(NONE, (3, 1, 1)))
 
 
-def test_a_clock_of_24_hours_goes_on_at_midnight():
+def test_daily_clock_continues_at_midnight():
     times = np.arange(0.0, 2.0, 0.025)
     stamps = (times + DAY - 1.0) % DAY
     stream = build_pose_stream(stamps, np.stack([swung(time) for time in times]), np.tile(NONE, (len(times), 1, 1)))
@@ -118,7 +118,7 @@ def test_a_clock_of_24_hours_goes_on_at_midnight():
     assert epoch.interpolate(1.7e9 + 0.5) is not None and epoch.interpolate(1.7e9 + 0.5 + DAY) is None
 
 
-def test_clocks_are_compared_by_motion_with_an_error_that_holds():
+def test_clock_offset_from_motion_has_a_valid_error():
     rng, off = np.random.default_rng(4), []
     samples = np.arange(0.0, 5.0, 1.0 / 40.0)
     others = np.stack([swung(time)[:3, 3] for time in samples])
@@ -182,7 +182,7 @@ def tips(follower, elsewhere, truth):
     return np.array(out).T
 
 
-def test_a_tool_in_a_film_is_where_another_tracker_has_it(follower, stage, bodies):
+def test_tool_pose_in_video_matches_external_tracker(follower, stage, bodies):
     truth = read_truth(FILM / "truth.npz", stage.anatomy.digest, len(stage.tumour_vertices))
     rng, late = np.random.default_rng(0), 0.06
     times = np.arange(-0.5, 3.5, 1.0 / 30.0)
@@ -201,7 +201,7 @@ def test_a_tool_in_a_film_is_where_another_tracker_has_it(follower, stage, bodie
     np.testing.assert_allclose(replace(right, eye=riding).find_reference(0.0).T_camera_target, looked.T_camera_target)
 
 
-def test_a_picture_without_poses_is_stale(follower, bodies):
+def test_image_without_external_poses_is_stale(follower, bodies):
     times = np.arange(0.0, 0.45, 0.025)
     other = ExternalTracker(*(sampled(bodies[name], times) for name in ("tool", "patient")))
     one, known, said = replace(follower, elsewhere=other), None, []
@@ -228,7 +228,7 @@ def followed(follower, other, until=1.0):
     return [known for known in out if known.state is not TumourState.NO_REFERENCE]
 
 
-def test_poses_are_held_against_the_targets_that_pictures_show(follower, bodies, stage):
+def test_external_poses_are_compared_with_visible_targets(follower, bodies, stage):
     times = np.arange(-0.5, 3.5, 0.025)
     tool, patient = (sampled(bodies[name], times) for name in ("tool", "patient"))
     right = ExternalTracker(tool, patient)
@@ -264,7 +264,7 @@ def truth_of_camera(stage):
     return read_truth(FILM / "truth.npz", stage.anatomy.digest, len(stage.tumour_vertices)).T_camera_scan[0]
 
 
-def test_poses_of_another_clock_say_by_how_much_it_differs(follower, bodies):
+def test_clock_difference_of_external_poses_is_reported(follower, bodies):
     times = np.arange(-0.5, 3.5, 0.025)
     tool, patient = (
         sampled(bodies[name], times, offset=offset) for name, offset in (("tool", 0.0), ("patient", 100.0))
@@ -282,7 +282,7 @@ def test_poses_of_another_clock_say_by_how_much_it_differs(follower, bodies):
     )
 
 
-def test_a_tool_deep_in_the_brain_is_of_other_poses(stage, follower):
+def test_tool_pose_deep_in_the_brain_is_reported(stage, follower):
     nodes = stage.anatomy.mesh.nodes
     pose = np.eye(4)
     pose[:3, 3] = nodes.mean(axis=0)
@@ -315,7 +315,7 @@ def written(path, stream):
     return str(path)
 
 
-def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys):
+def test_overlay_command_estimates_clock_of_pose_files(bodies, tmp_path, capsys):
     times, rng = np.arange(-0.5, 3.5, 0.025), np.random.default_rng(2)
     streams = ((name, sampled(bodies[name], times, rng, DAY - 1.0)) for name in ("tool", "patient"))
     files = [written(tmp_path / f"{name}.csv", stream) for name, stream in streams]
@@ -348,7 +348,7 @@ def test_the_command_takes_poses_and_finds_their_clock(bodies, tmp_path, capsys)
         read_hand_eye(tmp_path / "h.json")
 
 
-def test_calibration_error_in_band_unless_reference_absorbs_it(follower, stage, tmp_path):
+def test_calibration_error_in_band_unless_cancelled_by_reference(follower, stage, tmp_path):
     follower = replace(follower, motion=replace(follower.motion, deformer=Still()))
     first, deviations = (
         next(iter(read_video(FILM / "film.mp4", 30.0))),

@@ -1,4 +1,4 @@
-"""Every combination of what is not known: which factors decide, alone and together."""
+"""Factorial study of unknown parameters: variance shares of single factors and interactions."""
 
 import csv
 import json
@@ -29,8 +29,8 @@ def made(rule):
     return [Cell(each, rule(each), 1.0) for each in combinations]
 
 
-def test_a_factor_that_multiplies_acts_alone():
-    """The motion's logarithm is a sum, so that its variance is that of its parts."""
+def test_multiplicative_factors_have_no_interaction():
+    """The logarithm of the motion is a sum, and so is its variance."""
     found = compute_variance_shares(
         made(lambda at: 2.0 * (3.0 if at["skull"] == "slide" else 1.0) * (np.e if at["nu"] == 0.45 else 1.0))
     )
@@ -39,20 +39,20 @@ def test_a_factor_that_multiplies_acts_alone():
     assert list(found)[:2] == ["skull", "nu"] and max(list(found.values())[2:]) < 1e-12
 
 
-def test_what_acts_only_together_is_an_interaction():
+def test_joint_effect_of_two_factors_is_an_interaction():
     found = compute_variance_shares(made(lambda at: np.e if (at["skull"] == "slide") == (at["nu"] == 0.45) else 1.0))
     assert found["nu x skull"] == pytest.approx(1.0) and next(iter(found)) == "nu x skull"
     assert found["opening [mm]"] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_what_did_not_converge_is_left_out():
+def test_variance_shares_ignore_cells_without_convergence():
     found = made(lambda at: np.nan if at["opening [mm]"] == 30.0 else 1.0 + (at["nu"] == 0.45))
     assert "opening [mm]" not in compute_variance_shares(found) and compute_variance_shares(found)[
         "nu"
     ] == pytest.approx(1.0)
 
 
-def test_every_combination_is_solved(few):
+def test_factorial_study_solves_each_combination(few):
     assert [(cell.levels["skull"], cell.levels["nu"]) for cell in few] == list(product(FEW["skull"], FEW["nu"]))
     motion = {(cell.levels["skull"], cell.levels["nu"]): cell.force for cell in few}
     assert motion["slide", 0.49] > motion["bonded", 0.49] > 0.1 and motion["bonded", 0.45] > motion["bonded", 0.49]
@@ -62,7 +62,7 @@ def test_every_combination_is_solved(few):
     assert softer.levels["nu"] == 0.45 and softer.motion < 0.98 * softer.force
 
 
-def test_the_command_writes_table_and_plot(few, tmp_path, monkeypatch, capsys):
+def test_factorial_command_writes_table_and_plot(few, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(factorial, "solve_cells", lambda nodes, device: iter(few))
     words = ["sensitivity", "--factorial", "--out", str(tmp_path / "all.csv")]
     assert main(words) == 0

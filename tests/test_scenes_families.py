@@ -1,11 +1,11 @@
-"""Families of episodes in the plans that ship."""
+"""Families of episodes in the shipped plans."""
 
 from scenes.episodes.families import FAMILIES, FamilyMotions
 from scenes.episodes.plan import list_shipped, load_plan
 from scenes.episodes.scripted import sample_episode
 
 
-def test_the_plans_that_ship_can_be_drawn_from():
+def test_shipped_plans_sample_all_bodies_and_families():
     assert list_shipped() == ["hard", "small", "standard"]
     families = set()
     for name in list_shipped():

@@ -1,4 +1,4 @@
-"""Finite elements that answer tools and cuts of environments."""
+"""FEM responses to tools and cuts of the environments."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -16,8 +16,8 @@ from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
 
 
-def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):
-    """Half way between two levels of the fluid, of which the lower one finds no equilibrium."""
+def test_cut_body_is_reliable_if_both_fluid_levels_converge(box, tmp_path):
+    """Fluid level halfway between two solved levels; the lower one has no equilibrium."""
     write_anatomy(tmp_path / "box.vtu", box)
     setting, solved = open_setting(DEBULK, str(tmp_path / "box.vtu"), "auto", "cpu", (48, 36)), []
 
@@ -34,8 +34,8 @@ def test_cut_elements_are_reliable_where_both_levels_are(box, tmp_path):
         solved.clear()
 
 
-def test_finite_elements_answer_together_what_they_answer_apart(boxed):
-    """A spatula on a box: each tool goes its own way, and the second begins anew in between."""
+def test_batched_fem_responses_equal_separate_responses(boxed):
+    """Spatulas on a box with different paths; the second environment is reset in between."""
     vectors = [many(2, "Retract", anatomy=boxed, together=each) for each in (False, True)]
     seen = [vector.reset(seed=[0, 1]) for vector in vectors]
     touched = np.zeros(2, bool)

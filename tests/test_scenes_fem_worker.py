@@ -1,4 +1,4 @@
-"""Reference solutions of the page: those of the newest request, and of the frame that is shown."""
+"""FEM solutions of the page: newest request and displayed frame."""
 
 import threading
 
@@ -8,8 +8,8 @@ from visitor import run_until, wait_for
 from scenes.page.fem_worker import FemWorker
 
 
-def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypatch):
-    """The frame was drawn before the finite elements answered it: no further one brings their tumour along."""
+def test_paused_page_shows_fem_solution_that_arrives_later(demo, monkeypatch):
+    """The frame is drawn before its FEM solution exists, and no further frame updates the tumour."""
     asked = []
     monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
     demo.wish.set(plays=False, number=90)
@@ -28,7 +28,7 @@ def test_while_it_is_paused_the_answer_that_comes_later_is_shown(demo, monkeypat
     assert len(asked) == 1 and seen[:5] == [None] * 5
 
 
-def test_the_referee_answers_the_newest_question(theatre, scene):
+def test_fem_worker_solves_the_newest_request(theatre, scene):
     referee = FemWorker(theatre, scene, threading.Lock())
     for number in range(60):
         referee.ask(number, None)

@@ -1,4 +1,4 @@
-"""Films of a scene as files: time stamps in their pixels, and all that belongs to a film."""
+"""Synthetic videos as files: time stamps in the pixels, and ground truth."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ from sim.tools import Ball
 SMALL = USUAL_CALIBRATION.resize_calibration(800, 600, scale=True)
 
 
-def test_stamp_is_read_under_noise_and_not_elsewhere():
+def test_time_stamp_is_read_despite_noise_and_absent_otherwise():
     random = np.random.default_rng(0)
     picture = random.integers(0, 256, (100, 500), np.uint8)
     assert read_stamp(picture) is None and read_stamp(picture[:4]) is None
@@ -45,7 +45,7 @@ def test_stamp_is_read_under_noise_and_not_elsewhere():
         stamp_time(picture[:, :100], 1.0)
 
 
-def test_a_film_and_all_that_belongs_to_it_are_written(tmp_path, capsys):
+def test_synthetic_video_is_written_with_its_ground_truth(tmp_path, capsys):
     write_calibration(tmp_path / "k.yaml", SMALL)
     out = tmp_path / "film"
     words = ["film", "press", "--deformer", "series-gp", "--camera", str(tmp_path / "k.yaml"), "--out", str(out)]

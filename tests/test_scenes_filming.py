@@ -1,4 +1,4 @@
-"""Films of a scene as a camera takes them: targets, troubles, and an erroneous registration."""
+"""Synthetic videos of a scene: targets, disturbances and registration errors."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def grey(shot):
     return cv2.cvtColor(shot.colour, cv2.COLOR_RGB2GRAY)
 
 
-def test_both_targets_are_seen_where_they_are(player, shots):
+def test_both_targets_are_tracked_at_their_true_poses(player, shots):
     mounts = mount_targets(player)
     seen = Tracker(SMALL.build_camera(np.eye(4)), TARGETS).track(grey(shots[0]))
     wanted = {"tool": shots[0].T_scan_tool @ np.linalg.inv(mounts.tool.T_cube_tool), "patient": mounts.T_scan_patient}
@@ -61,7 +61,7 @@ def test_both_targets_are_seen_where_they_are(player, shots):
     assert len(np.unique(Detector(TARGETS).detect(grey(shots[0]))["tool"].face)) >= 2
 
 
-def test_what_goes_wrong_does_and_nothing_else(shots):
+def test_disturbances_hide_only_the_named_targets(shots):
     detector = Detector(TARGETS)
     found = [set(detector.detect(grey(shot))) for shot in shots]
     both = {"tool", "patient"}
@@ -78,7 +78,7 @@ def test_invalid_disturbance_is_rejected():
         Trouble("gap", 1.0, 0.5)
 
 
-def test_a_registration_is_off_as_it_says(player):
+def test_registration_error_has_the_reported_covariance(player):
     mounts, found = mount_targets(player), []
     for seed in range(200):
         one = register_with_error(player.site, mounts, 0.5, 0.4, seed)

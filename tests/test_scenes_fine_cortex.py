@@ -1,4 +1,4 @@
-"""The fine cortex: gyri, sulci and vessels that the FEM surface carries, on any anatomy."""
+"""Fine cortex on the FEM surface of any anatomy: gyri, sulci and vessels."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def test_fine_vertices_stay_below_the_drape_and_inside_the_brain(stage):
     assert ((found - base) @ stage.site.axis)[inside].min() > -1e-9
 
 
-def test_body_without_a_scan_has_gyri():
+def test_cortex_without_scan_has_gyri():
     anatomy = coarse_brain()
     site = build_craniotomy_frame(anatomy)
     stage = Stage(small(), site)
@@ -93,7 +93,7 @@ def test_walls_of_a_cavity_have_no_gyri():
     assert np.isfinite(after.build_visible(nodes).vertices).all()
 
 
-def test_data_sets_keep_the_plain_look(stage):
+def test_data_set_scenes_use_the_plain_appearance(stage):
     theatre = template_theatre()
     assert not PLAIN_APPEARANCE.natural and not Appearance(vessels=3).natural
     assert {name for name in SCENES if not find_scene(name).look.natural} == {"microscope"}

@@ -1,4 +1,4 @@
-"""`sulcus report`: which rows are measured at the same time, and what happens when one of them stops."""
+"""`sulcus report`: rows measured in parallel, and interruption."""
 
 import subprocess
 import sys
@@ -58,14 +58,14 @@ def test_learners_run_together_with_fem_on_a_gpu(study, cores, learners):
     assert (set(run.begun[:4]) == begun_first) is (cores == 4)
 
 
-def test_a_stop_beside_a_card_ends_the_learners_too(study):
+def test_interrupted_gpu_measurement_ends_the_learners(study):
     run, many = Rows("fem 1"), tuple(LearnerSpec(f"learner {k}") for k in range(200))
     with pytest.raises(KeyboardInterrupt):
         list(measure_rows(study, (*SPECS[:4], *many), run, 16, on_card=True))
     assert len([name for name in run.begun if name.startswith("learner")]) < len(many)
 
 
-def test_what_is_measured_in_this_process_is_measured_one_by_one(study, monkeypatch):
+def test_rows_in_this_process_are_measured_one_by_one(study, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 16)
     run = Rows()
     assert len(list(measure_rows(study, SPECS, run))) == len(SPECS)
@@ -73,7 +73,7 @@ def test_what_is_measured_in_this_process_is_measured_one_by_one(study, monkeypa
 
 
 @pytest.mark.parametrize("cores", [2, 16])
-def test_after_a_stop_no_row_begins(study, cores):
+def test_no_row_starts_after_an_interruption(study, cores):
     run = Rows("learner 1")
     with pytest.raises(KeyboardInterrupt):
         list(measure_rows(study, SPECS, run, cores))
@@ -82,8 +82,8 @@ def test_after_a_stop_no_row_begins(study, cores):
     assert {spec.name for spec in SPECS[:6]} <= set(run.begun)
 
 
-def test_a_row_has_its_turn_when_its_process_is_ready(study, tmp_path):
-    """What cannot be had is said, and the turn is given back."""
+def test_row_process_reports_error_and_releases_its_turn(study, tmp_path):
+    """An unknown law is reported in the state of the row."""
     turns = []
 
     @contextmanager
@@ -96,8 +96,8 @@ def test_a_row_has_its_turn_when_its_process_is_ready(study, tmp_path):
     assert turns == ["begins", "ends"] and "odd" in row.state and row.state != "measured"
 
 
-def test_a_process_of_a_row_starts_without_the_notes_of_warp():
-    """They would stand before the line of --json."""
+def test_row_process_prints_no_output_of_warp():
+    """Such lines would precede the line of --json."""
     code = (
         "from types import SimpleNamespace as Study; from scenes.report.rows import prepare_rows\n"
         "prepare_rows('cpu', Study(on_card=False)); import warp as wp; wp.zeros(1, device='cpu')"

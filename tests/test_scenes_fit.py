@@ -1,4 +1,4 @@
-"""`sulcus fit` as a user calls it, its file where an ensemble is drawn, and what its bench says of known tissue."""
+"""`sulcus fit`: the command, its file in an ensemble, and its benchmark on known tissue."""
 
 import json
 
@@ -45,7 +45,7 @@ def by_formula(body, loads, *_):
     return Responses(nodes, motion)
 
 
-def test_the_command_writes_what_it_says(body, folder, monkeypatch, capsys):
+def test_fit_command_writes_the_reported_tissue(body, folder, monkeypatch, capsys):
     monkeypatch.setattr(fit, "solve_responses", by_formula)
     words = ["fit", str(folder / "box.vtu"), str(folder / "1.csv"), str(folder / "2.csv")]
     (folder / "box.fit.parts").mkdir()
@@ -68,7 +68,7 @@ def test_the_command_writes_what_it_says(body, folder, monkeypatch, capsys):
     assert "times as stiff as the brain" in said
 
 
-def test_bad_input_is_one_sentence(folder, capsys):
+def test_fit_command_rejects_bad_input_with_a_message(folder, capsys):
     body, first = str(folder / "box.vtu"), str(folder / "1.csv")
     (folder / "tools.csv").write_text("frame,x,y,z\n2,1,2,3\n")
     assert main(["fit", body, first, first, "--force"]) == 2
@@ -79,7 +79,7 @@ def test_bad_input_is_one_sentence(folder, capsys):
     assert "--region tumour: its stiffness is what `sulcus fit` finds" in capsys.readouterr().err
 
 
-def test_fitted_tissue_lies_beside_its_anatomy(tmp_path):
+def test_fitted_tissue_is_found_next_to_its_anatomy(tmp_path):
     share = np.full((3, 13, 33), 1.0 / (3 * 13 * 33))
     save_tissue(tmp_path / "a.tissue.json", FittedTissue("digest", 5, share, np.zeros(0)))
     found = find_fitted_tissue(None, tmp_path / "a.vtu", "digest")
@@ -91,7 +91,7 @@ def test_fitted_tissue_lies_beside_its_anatomy(tmp_path):
         find_fitted_tissue(tmp_path / "c.json", tmp_path / "a.vtu", "digest")
 
 
-def test_a_row_counts_what_was_right(body):
+def test_benchmark_row_counts_correct_estimates(body):
     tools = places(body)
     one = patient(tools, 0, 0, 2, 3)
     assert one == patient(tools, 0, 0, 2, 3) != patient(tools, 0, 1, 2, 3)

@@ -1,4 +1,4 @@
-"""What is known of a picture: registration, tool, and what makes it stale."""
+"""Tracking results of images: registration, tool and stale states."""
 
 from dataclasses import replace
 from itertools import islice
@@ -40,7 +40,7 @@ def test_registration_without_anatomy_is_not_reliable(follower):
     assert known.band == follower.step(first.grey, 0.0).band
 
 
-def test_a_camera_that_repeats_a_picture_or_stops_is_stale(follower):
+def test_repeated_image_or_stopped_camera_is_stale(follower):
     few = [each.picture for each in islice(pictures(), 2)]
     known = follower.step(few[0].grey, 0.0)
     assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats an image")
@@ -50,7 +50,7 @@ def test_a_camera_that_repeats_a_picture_or_stops_is_stale(follower):
     assert old.state is TumourState.STALE and "0.5 s old" in old.words and to_aged(known, 0.1) is known
 
 
-def test_a_reference_that_was_never_seen_has_no_overlay(follower, stage):
+def test_reference_never_detected_gives_no_overlay(follower, stage):
     blank = np.full((720, 960, 3), 120, np.uint8)
     known = follower.step(blank[..., 0], 0.0)
     assert known.state is TumourState.NO_REFERENCE and known.camera is None and "not seen yet" in known.words
@@ -66,7 +66,7 @@ def test_a_reference_that_was_never_seen_has_no_overlay(follower, stage):
         follower.step(blank[::2, ::2, 0], 0.0)
 
 
-def test_a_slow_film_is_stale_where_its_own_pictures_are_missing(follower):
+def test_slow_video_is_stale_at_missing_images_only(follower):
     blank, known, states = np.full((720, 960), 120, np.uint8), None, []
     first = next(iter(pictures())).picture.grey
     for moment in (0.0, 0.3, 0.6, 0.9, 1.8, 2.1):
@@ -81,8 +81,8 @@ PARTS = np.array([1e-3, 2e-3, 3e-3])
 
 
 @pytest.mark.parametrize("source", ["tracking", "tool", "registration"])
-def test_tip_covariance_is_turned_into_the_scan(source):
-    """A quarter turn of the registration, another one of the cube; an error along (1, 2, 3) in its own frame."""
+def test_tip_covariance_is_rotated_into_the_scan_frame(source):
+    """Registration and cube are rotated by 90 degrees; the error lies along (1, 2, 3) in its own frame."""
     T_patient_scan, T_patient_cube = turned("z", 90.0), turned("x", 90.0)
     own, none = np.outer(PARTS, PARTS), np.zeros((3, 3))
     into_patient = T_patient_cube[:3, :3] if source == "tool" else np.eye(3)
@@ -109,8 +109,8 @@ def looking(motion, **given):
     return follower, known[1:]
 
 
-def test_pace_is_across_the_view_and_fades_in_seconds():
-    """10 mm along the view, then 10 mm across it, then nothing: each in 40 ms."""
+def test_pace_is_measured_across_the_view_and_decays():
+    """Motion of 10 mm along the view, 10 mm across it, then none: each in 40 ms."""
     _, known = looking([shifted(0.0), shifted(0.0, 0.01), shifted(0.01, 0.01), shifted(0.01, 0.01)])
     assert [each.pace for each in known] == [None, *(pytest.approx(pace) for pace in (0.0, 0.25, 0.25 * 0.1**0.04))]
 

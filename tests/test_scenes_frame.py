@@ -1,4 +1,4 @@
-"""`python -m benchmarks frame`: every stage of a page's frame is timed, and the page gets the pictures."""
+"""`python -m benchmarks frame`: time of each stage of a frame, and images sent to the page."""
 
 import json
 from functools import partial
@@ -14,7 +14,7 @@ from benchmarks.studies.frame import STAGES, WARM_UP, batch_rate, frames_of, mea
 from scenes.play.player import Player
 
 
-def test_each_frame_is_drawn_once_in_order_and_sent(box, monkeypatch):
+def test_benchmark_draws_and_sends_each_frame_once(box, monkeypatch):
     drawn, sent, play, put_sight = [], [], Player.draw_frame, Browser.put_sight
 
     def seen(player, number, *rest):
@@ -35,14 +35,14 @@ def test_each_frame_is_drawn_once_in_order_and_sent(box, monkeypatch):
     assert len(pictures) == WARM_UP + 4 and len(set(pictures)) > 3
 
 
-def test_a_frame_is_the_sum_of_its_stages():
+def test_frame_time_is_the_sum_of_its_stages():
     rows = table([(1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (3.0, 2.0, 3.0, 4.0, 5.0, 6.0)])
     assert [row.stage for row in rows] == [*STAGES, "frame"]
     assert (rows[0].median, rows[-1].median, rows[-1].mean) == (2000.0, 22000.0, 22000.0)
     assert rows[-1].p95 == pytest.approx(22900.0)
 
 
-def test_a_batch_is_of_so_many_frames_and_cameras(box, monkeypatch):
+def test_batch_has_the_given_number_of_frames_and_cameras(box, monkeypatch):
     asked, pictures = [], Renderer.render_batch
 
     def heard(renderer, vertices, cameras):
@@ -56,7 +56,7 @@ def test_a_batch_is_of_so_many_frames_and_cameras(box, monkeypatch):
     assert len({camera.T_camera_world.tobytes() for camera in cameras}) == len(cameras) == len(vertices) == 3
 
 
-def test_the_command_says_the_size_and_every_stage(box, tmp_path, capsys, monkeypatch):
+def test_frame_benchmark_reports_size_and_each_stage(box, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(frame, "batch_rate", partial(frame.batch_rate, seconds=0.01))
     words = ["frame", "--anatomy", str(put(theatre_of(box), tmp_path / "box.vtu")), "--device", "cpu"]
     words += ["--deformer", "linear", "--size", "160x120", "--frames", "2"]
@@ -69,7 +69,7 @@ def test_the_command_says_the_size_and_every_stage(box, tmp_path, capsys, monkey
 
 
 @pytest.mark.parametrize("text", ["640", "0x480", "640x-1", "640x480x3", "9999x10", "axb"])
-def test_what_is_no_size_is_refused(text, capsys):
+def test_invalid_image_size_is_rejected(text, capsys):
     assert main(["frame", "--size", text]) == 2
     assert "--size" in capsys.readouterr().err
     assert measure_size("1280X720") == (1280, 720)

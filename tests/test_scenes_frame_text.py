@@ -1,4 +1,4 @@
-"""An ensemble of few draws, or of loads beyond the tissue's law, is shown as a rough estimate."""
+"""Rough estimates of the tumour error: few draws, or loads beyond the tissue's law."""
 
 from dataclasses import replace
 
@@ -22,12 +22,12 @@ PARTS = {"E": (0.0, 3e-3), "registration": (2e-3, 2e-3)}
         ({"folded": 1}, True),
     ],
 )
-def test_what_few_draws_or_folded_tissue_say_is_a_guess(counts, guess):
+def test_few_draws_or_inverted_tissue_give_a_rough_estimate(counts, guess):
     found = Uncertainty("press", "mark", 9, 1, **LISTS, parts=PARTS, **counts)
     assert found.guess == found.evaluate(0.5).guess == guess and found.few == (counts.get("numbers") == 5)
 
 
-def test_a_guess_is_called_so_and_blames_no_part():
+def test_rough_estimate_is_labelled_without_largest_part():
     alone, seen = TumourError(4.11e-3, "E", guess=True), TumourError(4.11e-3, "E", 1e-3, guess=True)
     assert format_errors(None, alone, False)[-1] == "tumour position error <= 4.2 mm (95 %), rough estimate"
     assert format_tumour_error(seen).endswith(

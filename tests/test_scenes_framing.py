@@ -1,4 +1,4 @@
-"""The camera is chosen by the tumour: its outline lies inside the craniotomy, and its error band inside the image."""
+"""Camera framing by the tumour: outline inside the craniotomy, error band inside the image."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def grow(anatomy):
 
 
 @pytest.mark.parametrize("size", [(640, 480), (400, 900), (1600, 300)])
-def test_outline_in_the_craniotomy_and_band_in_the_image(size):
+def test_outline_lies_in_craniotomy_and_band_in_image(size):
     site = template_theatre().site
     view = Viewpoint(width=size[0], height=size[1])
     camera = view.build_camera(site)
@@ -46,6 +46,6 @@ def test_view_has_the_largest_tilt_that_shows_the_cortex():
     assert down.outward == pytest.approx(-site.axis) and down.visible >= MIN_VISIBLE
 
 
-def test_calibrated_camera_is_far_enough():
+def test_calibrated_camera_shows_the_tumour_with_its_error_band():
     site, view = template_theatre().site, USUAL_VIEWPOINT.calibrate(replace(REAL, lens=None))
     assert count_inside(view.build_camera(site), grow(site.anatomy)) == 1.0

@@ -1,4 +1,4 @@
-"""What the command line says before, while and after it works."""
+"""Messages of the command line: help, examples, progress and missing CUDA."""
 
 import argparse
 
@@ -20,7 +20,7 @@ def helped(words, capsys):
     return capsys.readouterr().out
 
 
-def test_the_version_is_reported(capsys):
+def test_version_option_prints_the_version(capsys):
     assert helped(["--version"], capsys).startswith("sulcus 0.")
 
 
@@ -34,7 +34,7 @@ def arguments_of(name, parser):
             yield f"{name} {(*action.option_strings, action.dest)[0]}", action.help
 
 
-def test_every_argument_of_every_command_has_help():
+def test_each_argument_of_each_command_has_help():
     parsers = {**make_parsers(*COMMANDS)[1], "benchmarks": make_parser(*BENCHMARKS)}
     known = dict(each for name, parser in parsers.items() for each in arguments_of(name, parser))
     assert len(known) > 200 and "solve --precision" in known and "benchmarks live --frames" in known
@@ -44,7 +44,7 @@ def test_every_argument_of_every_command_has_help():
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_help_has_examples_that_parse_and_says_what_next(name, capsys, monkeypatch):
+def test_each_help_has_valid_examples_and_next_step(name, capsys, monkeypatch):
     text = helped([name, "--help"], capsys)
     assert "next: " in text and set(EXAMPLES) == set(COMMANDS)
     examples = [line.split()[1:] for line in EXAMPLES[name].splitlines() if line.startswith("  sulcus ")]
@@ -56,23 +56,23 @@ def test_every_help_has_examples_that_parse_and_says_what_next(name, capsys, mon
     assert (NAMES in text) == (name in PLAYING_COMMANDS)
 
 
-def test_scenes_are_those_that_there_are():
+def test_scene_names_in_help_match_the_scenes():
     assert tuple(NAMES.split(", ")) == SCENES
 
 
-def test_a_point_may_begin_with_a_minus():
+def test_point_option_accepts_negative_coordinates():
     assert join_points(["--opening-at", "-3,4.5,-6", "--nodes", "-3"]) == ["--opening-at=-3,4.5,-6", "--nodes", "-3"]
     assert join_points(["--out", "-x", "-1,2,3"]) == ["--out", "-x", "-1,2,3"]
 
 
-def test_it_is_said_why_there_is_no_cuda():
+def test_find_device_reports_reason_for_missing_cuda():
     if wp.is_cuda_available():
         pytest.skip("there is")
     with pytest.raises(InputError, match="no NVIDIA driver"):
         find_device("cuda", "float32")
 
 
-def test_checking_shows_how_far_it_is(box_folder, monkeypatch, capsys):
+def test_check_command_shows_progress(box_folder, monkeypatch, capsys):
     monkeypatch.chdir(box_folder)
     assert main(["check", "press", "--anatomy", "box.vtu", "--device", "cpu", "--every", "60"]) in (0, 1)
     assert "press: " in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The posture of the head, and how its fluid drains."""
+"""Posture of the head, and drainage of its fluid."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scenes.script.tool_paths import Touch
 
 
 class TestLying:
-    def test_the_fluid_falls_wholly_and_then_the_head_turns(self):
+    def test_fluid_drains_completely_before_the_head_turns(self):
         lie, angle = build_drained_turn(2.0, 1.0, 3.0, 0.5), 0.5
         assert lie(0.0) == HeadPose(SUPINE, 1.0) == get_supine_pose(7.0)
         assert lie(2.0) == HeadPose(SUPINE, 0.0) == lie(3.0) and 0.4 < lie(1.0).fluid < 0.6
@@ -19,13 +19,13 @@ class TestLying:
         assert (np.diff(levels) < 0.0).all()
 
     @pytest.mark.parametrize("direction", [SUPINE, (0.0, 0.0, -3.0), (-1.0, -1.0, 0.2)])
-    def test_a_full_head_is_wet_and_a_drained_one_dry(self, box, direction):
+    def test_full_head_lies_in_fluid_and_drained_head_does_not(self, box, direction):
         nodes = box.mesh.nodes
         for fluid, wet in ((1.0, len(nodes)), (0.0, 0)):
             found = HeadPose(direction, fluid).build_posture(nodes)
             assert np.linalg.norm(found.direction) == pytest.approx(1.0)
             assert (-nodes @ found.direction[0] < found.csf_level[0]).sum() == wet
 
-    def test_a_head_that_lies_as_in_the_scan_is_at_rest(self, theatre):
+    def test_head_in_scan_posture_has_no_displacement(self, theatre):
         frame = player(theatre, sinking(), "fem").draw(0, 0.0, Touch())
         assert not frame.deformation.displacement.any()

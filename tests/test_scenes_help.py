@@ -21,14 +21,14 @@ def test_help_has_sections_defaults_and_metavars():
     assert text.endswith("output options: --out NAME output file")
 
 
-def test_each_default_is_written_once():
+def test_help_states_each_default_once():
     for name, parser in make_parsers(*COMMANDS)[1].items():
         text = " ".join(parser.format_help().split())
         assert not re.search(r"\(default: [^()]*\) \(default", text), name
         assert "[default" not in text and "(default " not in text.replace("(default shape", ""), name
 
 
-def test_present_names_of_options_exist():
+def test_replacements_of_former_options_exist():
     parsers = make_parsers(*COMMANDS)[1]
     for command, pairs in FORMER.items():
         for pair in pairs.split():

@@ -1,4 +1,4 @@
-"""The page in one file: its model against Python's, its lines against Python's camera, and its controls."""
+"""Page in one file: its model and outline against Python, and its controls."""
 
 import base64
 import json
@@ -96,7 +96,7 @@ def assert_alike(answer, wanted):
 
 
 @pytest.mark.parametrize(("name", "cortex"), [("ann", True), ("ann", False), ("svr", True), ("linear", True)])
-def test_the_page_answers_as_the_model(theatre, tmp_path, name, cortex):
+def test_html_page_predicts_as_the_python_model(theatre, tmp_path, name, cortex):
     if NODE is None:
         pytest.skip("node is not installed")
     out, script = tmp_path / "page.html", tmp_path / "harness.js"
@@ -114,7 +114,7 @@ def test_the_page_answers_as_the_model(theatre, tmp_path, name, cortex):
     assert_alike(json.loads(done.stdout), theatre.models[name].deform(loads, at=nodes))
 
 
-def test_the_page_is_small_and_loads_nothing(page):
+def test_html_page_is_small_and_loads_no_resources(page):
     text = page.read_text(encoding="ascii")
     assert len(text) <= MAX_BYTES and len(SCRIPTS) == len(list(FOLDER.glob("*.js")))
     assert not re.search(r"https?:|//\w+\.\w+/|\bimport\b|src=|href=|url\(", text)
@@ -123,7 +123,7 @@ def test_the_page_is_small_and_loads_nothing(page):
     assert sum((FOLDER / each).read_text().count("\n") for each in SCRIPTS) <= 800
 
 
-def test_names_in_the_page_are_text(theatre):
+def test_html_page_escapes_names(theatre):
     bad = "</script><img src=x>"
     model = replace(theatre.models["ann"], training={**theatre.models["ann"].training, "learner": bad})
     other = replace(theatre, models={bad: model})
@@ -160,7 +160,7 @@ def outline_of(player, touch, scale):
 
 
 @pytest.mark.parametrize(("x", "y", "force"), [(0.0, 0.0, 0.3), (4e-3, -5e-3, 0.35), (-6e-3, 3e-3, 0.2)])
-def test_the_outline_is_where_python_projects_it(theatre, window, x, y, force):
+def test_html_page_outline_matches_python_projection(theatre, window, x, y, force):
     player = theatre.build_player("ann", find_scene("press"))
     settle(window, f"page.moveTo({x}, {y}); page.press({force})")
     edge = np.array(window.value("page.state.edge"))
@@ -182,7 +182,7 @@ def test_the_outline_is_where_python_projects_it(theatre, window, x, y, force):
     assert words(moved.tumour_error.bound, 1) in window.value("document.getElementById('position').textContent")
 
 
-def test_the_tool_rests_where_python_draws_it(theatre, window):
+def test_html_page_tool_tip_matches_python(theatre, window):
     player = theatre.build_player("ann", find_scene("press"))
     for x, y, force in ((0.0, 0.0, 0.0), (0.0, 0.0, 0.38), (7e-3, 5e-3, 0.2)):
         settle(window, f"page.moveTo({x}, {y}); page.press({force})")
@@ -190,7 +190,7 @@ def test_the_tool_rests_where_python_draws_it(theatre, window):
         assert np.linalg.norm(np.array(window.value("page.state.result.tip")) - tip) < 0.1e-3
 
 
-def test_a_load_outside_the_training_is_marked(theatre, window):
+def test_html_page_marks_load_outside_training_range(theatre, window):
     settle(window, "page.moveTo(0, 0); page.press(0.5)")
     assert window.value("document.getElementById('doubt').textContent") == OUTCOME_WARNINGS[Outcome.EXTRAPOLATED]
     assert "error not known" in window.value("document.getElementById('result').textContent")
@@ -200,7 +200,7 @@ def test_a_load_outside_the_training_is_marked(theatre, window):
     assert window.value("document.body.className + document.getElementById('doubt').textContent") == ""
 
 
-def test_pointer_keys_and_wheel_move_the_tool(window):
+def test_pointer_keys_and_wheel_move_the_tool_in_html_page(window):
     settle(window, "page.moveTo(0, 0); page.press(0.3)")
     place = "(p => [p[0] / page.state.view.ratio, p[1] / page.state.view.ratio])"
     contact = f"{place}(page.project(page.state.result.contact.point, page.state.view))"
@@ -228,7 +228,7 @@ def test_pointer_keys_and_wheel_move_the_tool(window):
 
 
 @pytest.mark.parametrize("size", [SIZES[0], SIZES[1], SIZES[3]], ids=lambda size: f"{size[0]}x{size[1]}")
-def test_the_page_fits(window, size):
+def test_html_page_fits_the_window(window, size):
     window.size(*size)
     assert window.wait(f"innerWidth == {size[0]}")
     settle(window, "page.moveTo(0, 0); page.press(0.3)")
@@ -241,7 +241,7 @@ def test_the_page_fits(window, size):
     window.size(*SIZES[1])
 
 
-def test_what_no_page_can_hold_is_a_sentence(theatre, page, tmp_path, capsys):
+def test_export_rejects_options_unsuitable_for_html(theatre, page, tmp_path, capsys):
     out = str(tmp_path / "page.html")
     for given, said in (
         (["--out", str(page)], "exists. Give --force"),

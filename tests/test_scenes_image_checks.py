@@ -1,4 +1,4 @@
-"""Overlay in register under each camera path, and in episodes, by OpenCV alone."""
+"""Overlay registration on each camera path and in episodes, checked by OpenCV alone."""
 
 from dataclasses import replace
 
@@ -46,8 +46,8 @@ def drawn_by_opencv(camera, layer, fine=8, times=4):
 
 
 @pytest.mark.parametrize("path", [None, *PATHS])
-def test_the_overlay_is_in_register_under_each_path(theatre, path):
-    """The outline found again in the picture, against the tumour as OpenCV projects it."""
+def test_overlay_matches_opencv_projection_on_each_camera_path(theatre, path):
+    """Outline found in the image, against the tumour projected by OpenCV."""
     play = filmed(theatre, path=None if path is None else PATHS[path](1))
     frames = list(play.play_frames(every=25))
     assert len({id(frame.camera) for frame in frames}) == (1 if path is None else len(frames))
@@ -78,7 +78,7 @@ def test_scene_checks_pass_on_path_and_fail_on_other_camera(theatre, path):
     )
 
 
-def test_episodes_hold_the_lens_and_the_camera_of_each_frame(theatre, tmp_path):
+def test_episodes_store_lens_and_camera_of_each_frame(theatre, tmp_path):
     from scenes.episodes.episode import collect
 
     play = filmed(theatre, path=Microscope((Focus(0.0, 1.2, 1.5),), 0.2))

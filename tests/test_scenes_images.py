@@ -1,4 +1,4 @@
-"""ANTs reads the field as it is: runs where SULCUS_ANTS_PYTHON names a Python that has antspyx."""
+"""Fields read by ANTs: runs where SULCUS_ANTS_PYTHON names a Python that has antspyx."""
 
 import json
 import os
@@ -24,7 +24,7 @@ print(json.dumps([float(apart.max()), float(numpy.abs(scan.numpy() - ours.numpy(
 
 
 @pytest.mark.skipif(ANTS is None, reason="SULCUS_ANTS_PYTHON names no Python with antspyx")
-def test_ants_deforms_an_oblique_image_as_we_do(tmp_path, box):
+def test_ants_deforms_oblique_image_as_warp_command(tmp_path, box):
     write_anatomy(tmp_path / "box.vtu", box)
     share = np.clip(1.0 - (np.linalg.norm(box.mesh.nodes[:, :2], axis=1) / 25e-3) ** 2, 0.0, 1.0)
     moved = np.outer(share * (1.0 + box.mesh.nodes[:, 2] / 42e-3), [1e-3, 0.0, -4e-3])

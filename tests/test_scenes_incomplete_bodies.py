@@ -1,4 +1,4 @@
-"""Bodies of data sets that were interrupted: loads that were solved are kept, and the files have the same bytes."""
+"""Interrupted bodies of data sets: solved loads are kept, and the files have identical bytes."""
 
 import os
 import signal
@@ -100,8 +100,8 @@ def killed(folder, plan, after):
     assert not to_body_path(folder, 0).exists()
 
 
-def test_a_killed_body_goes_on_and_has_the_same_bytes(plan, undisturbed, solved, tmp_path):
-    """Killed among the unit responses, and by a worker of another machine once all was solved."""
+def test_killed_body_resumes_with_identical_files(plan, undisturbed, solved, tmp_path):
+    """Killed during the unit responses, and on another machine after all loads were solved."""
     elsewhere, tmp_path = tmp_path / "elsewhere", tmp_path / "here"
     assert begin(tmp_path, tiny_run(), "")
     killed(tmp_path, plan, 64)
@@ -128,8 +128,8 @@ def full(*given, **more):
     raise InputError("no memory is left just now") from MemoryError()
 
 
-def test_a_series_that_was_tabulated_is_not_tabulated_again(plan, tmp_path, monkeypatch):
-    """An error comes once it is there; the model has the same bytes as without any."""
+def test_tabulated_series_is_reused_after_an_error(plan, tmp_path, monkeypatch):
+    """The error occurs after the table is written; the model has the same bytes as without an error."""
     text = plan.text.replace('"linear"', '"series"').replace("loads = 70", "loads = 40")
     again = replace(plan_from(text, "own", plan.folder), own=plan.own)
 
@@ -144,7 +144,7 @@ def test_a_series_that_was_tabulated_is_not_tabulated_again(plan, tmp_path, monk
     assert files_of(tmp_path) == files_of(tmp_path / "other")
 
 
-def test_an_error_that_passes_keeps_what_was_solved(plan, undisturbed, solved, tmp_path, monkeypatch):
+def test_temporary_error_keeps_solved_loads(plan, undisturbed, solved, tmp_path, monkeypatch):
     with monkeypatch.context() as held:
         held.setattr(bodies, "train", full)
         with pytest.raises(InputError, match="just now"):
@@ -157,7 +157,7 @@ def test_an_error_that_passes_keeps_what_was_solved(plan, undisturbed, solved, t
     assert files_of(tmp_path) == undisturbed and not partial.exists()
 
 
-def test_fullest_data_set_is_used(tmp_path):
+def test_resume_uses_the_most_complete_data_set(tmp_path):
     stated, folders = {"seed": "1"}, [tmp_path / str(number) for number in range(4)]
     for folder, size in zip(folders, (0, 10, 30, 50), strict=True):
         folder.mkdir()

@@ -1,4 +1,4 @@
-"""`sulcus patient --inspect`: what would be made is shown as it is, in figures and a picture, and nothing is made."""
+"""`sulcus patient --inspect`: figures, image and warnings before an anatomy is made."""
 
 import json
 
@@ -28,8 +28,8 @@ def compute_middle(panel, colour):
     return columns.mean() / SIDE, rows.mean() / SIDE
 
 
-def test_the_sheet_shows_where_things_are(tmp_path, capsys):
-    """A ball of 55 mm round the origin, and one of 10 mm in it, 20 mm to the right and up."""
+def test_inspection_reports_volumes_depth_and_directions(tmp_path, capsys):
+    """Ball of 55 mm at the origin, with a ball of 10 mm, 20 mm to the right and up."""
     ball(tmp_path)
     found, picture = inspect_subject(capsys, tmp_path, tmp_path / "labels.nii.gz", "--brain", 1, "--tumour", 2)
     assert found["brain_ml"] == pytest.approx(4 / 3 * np.pi * 55**3 / 1e3, rel=0.01)
@@ -62,7 +62,7 @@ def test_the_sheet_shows_where_things_are(tmp_path, capsys):
     assert np.sqrt(whole.sum() / shadow.sum()) == pytest.approx(50.0 / 22.0, rel=0.15)
 
 
-def test_what_looks_wrong_is_said(tmp_path, capsys):
+def test_inspection_warns_of_suspicious_labels_and_spaces(tmp_path, capsys):
     ball(tmp_path)
     image = nibabel.load(tmp_path / "labels.nii.gz")
     labels, affine = np.asarray(image.dataobj).copy(), np.diag([-1.0, 1.0, 1.0, 1.0]) @ image.affine
@@ -94,7 +94,7 @@ def test_what_looks_wrong_is_said(tmp_path, capsys):
     assert "stored LAS (mirrored, as many scanners do; sides from its affine)" in text and "warnings:" in text
 
 
-def test_missing_folder_is_made_or_rejected(tmp_path, capsys):
+def test_inspection_creates_missing_folder_unless_path_is_a_file(tmp_path, capsys):
     ball(tmp_path)
     (tmp_path / "file").touch()
     words = ["patient", str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--inspect", "--out"]
@@ -114,8 +114,8 @@ def moved(folder, name, to, affine, crop=None):
     return folder / to
 
 
-def test_a_scan_in_lps_that_is_stated_as_ras_is_refused(tmp_path, capsys):
-    """On the grid of the labels, whichever of both is wrong; and on one of its own, which then misses the brain."""
+def test_inspection_rejects_lps_scan_labelled_as_ras(tmp_path, capsys):
+    """On the grid of the labels, with either file wrong; and on a separate grid, which misses the brain."""
     ball(tmp_path)
     labels, affine = tmp_path / "labels.nii.gz", nibabel.load(tmp_path / "labels.nii.gz").affine
     far = affine.copy()
@@ -132,7 +132,7 @@ def test_a_scan_in_lps_that_is_stated_as_ras_is_refused(tmp_path, capsys):
             assert said in (error := capsys.readouterr().err) and "one of the two states LPS as RAS" in error
 
 
-def test_tumour_side_is_printed_where_not_obvious(tmp_path, capsys):
+def test_inspection_notes_tumour_side_of_differing_grid(tmp_path, capsys):
     ball(tmp_path)
     labels = tmp_path / "labels.nii.gz"
     own = moved(tmp_path, "labels", "own.nii", nibabel.load(labels).affine, -2)

@@ -1,4 +1,4 @@
-"""The natural look: instruments with the contact shape at their tips, a folded drape, and effects of the camera."""
+"""Natural appearance: instruments with the contact shape at their tips, folded drape and camera effects."""
 
 from dataclasses import replace
 from typing import get_args
@@ -24,7 +24,7 @@ def stage():
 
 @pytest.mark.parametrize("kind", get_args(BallInstrument))
 @pytest.mark.parametrize("radius", [3e-3, 7e-3, 10e-3])
-def test_lower_half_of_an_instrument_is_its_ball(kind, radius):
+def test_lower_end_of_an_instrument_is_its_contact_ball(kind, radius):
     vertices = np.concatenate([part.vertices for part in build_instrument(Probe(radius), kind, TOOL)])
     low = vertices[vertices[:, 2] < radius]
     away = np.linalg.norm(low - (0.0, 0.0, radius), axis=1)
@@ -34,7 +34,7 @@ def test_lower_half_of_an_instrument_is_its_ball(kind, radius):
 
 
 @pytest.mark.parametrize("blade", [Blade(), Blade(16e-3, 28e-3, 2e-3)])
-def test_spatula_is_the_blade_where_it_touches(blade):
+def test_spatula_surface_equals_blade_in_contact_region(blade):
     vertices, core = build_instrument(blade, "dissector", TOOL)[0].vertices, get_core(blade.shape)
     beyond = np.maximum(np.abs(vertices - core.centre) - core.half, 0.0)
     away = np.linalg.norm(beyond, axis=1) - core.radius
@@ -46,7 +46,7 @@ def test_spatula_is_the_blade_where_it_touches(blade):
     assert away[vertices[:, 2] < blade.edge].max() < 1e-6  # the bend stays inside as well
 
 
-def test_unusual_tools_are_drawn_as_they_are(stage):
+def test_tools_without_instrument_use_their_own_mesh(stage):
     class Mine(Probe):
         """A shape of its own."""
 
@@ -66,7 +66,7 @@ def test_plain_look_has_the_simple_tool_and_drape(stage):
     assert len(natural[1].triangles) > 5 * len(simple[1].triangles)
 
 
-def test_folds_leave_the_hole_of_the_drape_open(stage):
+def test_folds_of_the_drape_leave_its_hole_open(stage):
     rest, camera = stage.anatomy.mesh.nodes, stage.camera
     folded, plain = (each.render(camera, rest, None).segmentation for each in (stage, stage.plain))
     changed = (folded == DRAPE) & (plain != DRAPE) & (plain != 0)

@@ -1,4 +1,4 @@
-"""`sulcus demo` ends at a signal, however long what it computes takes."""
+"""Signals end `sulcus demo` during a long solve."""
 
 import signal
 import subprocess
@@ -64,8 +64,8 @@ def started(what):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
-def test_a_signal_closes_the_page_and_waits_for_no_solve(number, code):
-    """Page's loop and referee are in a solve of 100 s; the limit on this test is far below, and far above a second."""
+def test_signal_closes_the_page_without_waiting_for_solver(number, code):
+    """Page and FEM worker are in a solve of 100 s; the test's time limit is far shorter."""
     process = started("computing")
     try:
         assert process.stdout is not None and any("playing" in line for line in process.stdout)
@@ -77,12 +77,12 @@ def test_a_signal_closes_the_page_and_waits_for_no_solve(number, code):
     assert "page closed" in out and "all closed" not in out and error == ""
 
 
-def test_at_its_own_end_everything_is_closed():
+def test_finished_demo_closes_all_resources():
     out, error = (process := started("ending")).communicate(timeout=60)
     assert process.returncode == 0 and "all closed" in out and error == ""
 
 
-def test_what_goes_wrong_is_reported_and_handlers_are_given_back():
+def test_error_is_raised_and_signal_handlers_are_restored():
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     closed = []
 
@@ -98,7 +98,7 @@ def test_what_goes_wrong_is_reported_and_handlers_are_given_back():
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_that_a_finaliser_swallows_is_not_lost(number):
+def test_interrupt_inside_a_finaliser_is_raised_later(number):
     class Signalling:
         def __del__(self):
             signal.raise_signal(number)

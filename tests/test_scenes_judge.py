@@ -1,4 +1,4 @@
-"""Models judged with the element and the tissue that they were trained on."""
+"""Model evaluation with the element and the tissue of the training."""
 
 from dataclasses import replace
 
@@ -39,8 +39,8 @@ def physics(theatre: PatientSetup, scene: Scene) -> tuple[str, Tissue | None]:
     return fem.space.element, elasticity.default
 
 
-def test_models_are_judged_with_what_they_were_trained_on(box, body, tmp_path) -> None:
-    """Through the model file, and for the truth of frames as for the page's finite elements."""
+def test_models_are_evaluated_with_their_training_tissue(box, body, tmp_path) -> None:
+    """Through the model file, for reference solutions of frames and for FEM of the page."""
     words = "--element", "smoothed", "--material", STIFF.law, "--young", "9000", "--poisson", "0.3"
     provenance = read_dataset(simulated(body, tmp_path, *words)).provenance
     models = theatre_of(box).models
@@ -63,13 +63,13 @@ def test_models_are_judged_with_what_they_were_trained_on(box, body, tmp_path) -
     assert np.array_equal(found.displacement, right.displacement) and found.displacement.any()
 
 
-def test_the_scene_names_tissue_and_element(box) -> None:
+def test_without_models_scene_gives_tissue_and_element(box) -> None:
     bare = replace(theatre_of(box), models={})
     assert physics(bare, small()) == (RECOMMENDED, BRAIN)
     assert physics(bare, replace(small(), element="p1")) == ("p1", BRAIN)
 
 
-def test_a_tissue_that_cannot_be_read_is_a_sentence(box) -> None:
+def test_model_with_unreadable_tissue_is_rejected(box) -> None:
     theatre = theatre_of(box)
     model = theatre.models["linear"]
     for text in ("jelly", "{}", "[]"):

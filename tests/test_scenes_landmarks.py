@@ -1,4 +1,4 @@
-"""Landmarks of a warp: places in tissue, or of a hollow tumour the nearest."""
+"""Landmarks of a warp: points in tissue, or the nearest tissue of a hollow tumour."""
 
 import json
 
@@ -23,7 +23,7 @@ def test_landmarks_are_tissue_points_moved_by_field(warp_out):
         assert np.linalg.norm(points[f"{name}, in the scan"] - now) > 1.0
 
 
-def test_the_landmarks_of_a_tumour_that_is_hollow_say_so(box):
+def test_hollow_tumour_landmark_is_labelled_as_nearest_tissue(box):
     middles = box.mesh.nodes[box.mesh.tets].mean(axis=1)
     tumour = np.flatnonzero(box.mesh.region == 2)
     hollow = box.remove_elements(tumour[np.linalg.norm(middles[tumour] + [0.0, 0.0, 22e-3], axis=1) < 5e-3])

@@ -1,4 +1,4 @@
-"""Regions with their own tissue: by `--region` in every command, and those that models beside an anatomy learned."""
+"""Regions with their own tissue: option `--region` of each command, and regions of trained models."""
 
 import argparse
 import json
@@ -52,11 +52,11 @@ def asked(theatre, scene, *words):
 
 
 class TestScenes:
-    def test_have_what_the_models_learned(self, theatre):
+    def test_scenes_have_the_regions_of_the_models(self, theatre):
         scene = asked(theatre, short())
         assert scene.elasticity == TISSUE and theatre.list_rejections(scene) == {"series-gp": None}
 
-    def test_other_scenes_keep_settings_and_reject_model(self, theatre, capsys):
+    def test_scenes_keep_region_tissue_and_reject_other_model(self, theatre, capsys):
         scene = asked(theatre, short(), "--region", "5:400")
         assert scene.elasticity == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF, NECROSIS_LABEL: replace(BRAIN, young=400.0)})
         kept = "press keeps the tissue from the models' training data: region 2 (tumour): neo-hookean, E 9 kPa, nu 0.49"
@@ -67,7 +67,7 @@ class TestScenes:
             theatre.build_deformer("series-gp", scene)
         assert theatre.list_rejections(short())["series-gp"] is not None  # as the scene has it, without a command
 
-    def test_of_another_brain_have_it_as_many_times_as_stiff(self, theatre):
+    def test_scenes_scale_region_stiffness_with_the_brain(self, theatre):
         for scene in (asked(theatre, short(), "--young", "2100", "--poisson", "0.45"), find_scene("brain_shift")):
             found = asked(theatre, scene).elasticity
             assert found.default == Material(BRAIN.law, 2100.0, 0.45)
@@ -75,24 +75,24 @@ class TestScenes:
         minutes = asked(theatre, short(), "--material", "minutes").elasticity
         assert minutes.get_law(NECROSIS_LABEL) == minutes.default  # Ogden's constants are no Young's modulus
 
-    def test_that_relax_do_so_in_every_region(self, theatre):
+    def test_scenes_with_relaxing_brain_relax_in_all_regions(self, theatre):
         found = asked(theatre, find_scene("retract")).elasticity
         assert found.default == RELAXING_BRAIN
         assert found.get_law(NECROSIS_LABEL) == replace(SOFT, prony=RELAXING_BRAIN.prony)
 
-    def test_keep_what_they_say_themselves(self, theatre):
+    def test_scenes_keep_their_own_region_tissue(self, theatre):
         own = find_scene("sag").elasticity
         found = asked(theatre, find_scene("sag")).elasticity
         assert found.get_law(TUMOUR_LABEL) == own.get_law(TUMOUR_LABEL) != STIFF and found.get_law(
             NECROSIS_LABEL
         ) != own.get_law(5)
 
-    def test_of_a_region_that_is_not_there_are_refused(self, theatre):
+    def test_scenes_reject_region_absent_from_the_mesh(self, theatre):
         for word in ("oedema:2000", "3:2000", "-1:5"):
             with pytest.raises(InputError, match=r"the mesh has no region .* It has region 1 \(brain\), region 2"):
                 asked(theatre, short(), f"--region={word}")
 
-    def test_draw_bodies_that_are_as_many_times_as_stiff(self):
+    def test_samples_scale_region_stiffness_with_the_brain(self):
         scene = small().replace_regions({NECROSIS_LABEL: SOFT})
         assert get_tissue(scene) == BRAIN
         draw = PatientSample(stiffness=2.0, poisson=0.45, ratio=3.0, skull=0.5, tip=(0.0, 0.0, 0.0), mesh=0.0)
@@ -121,7 +121,7 @@ RUN = "--count", "2", "--device", "cpu", "--element", "p1", "--json"
 
 
 class TestData:
-    def test_are_of_the_regions_tissue_and_state_it(self, data):
+    def test_data_set_is_solved_with_and_states_region_tissue(self, data):
         found = read_dataset(data)
         assert read_tissue_statement(found.provenance) == TISSUE
         truth = Fem(found.anatomy, build_push_effects(found.anatomy, TISSUE), TRAIN, "cpu", element="p1").deform(
@@ -130,7 +130,7 @@ class TestData:
         stored = found.read_displacement(np.arange(len(found.anatomy.mesh.nodes)))
         assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
 
-    def test_are_reported_in_every_law_of_it(self, data):
+    def test_report_converts_region_tissue_to_each_law(self, data):
         study = ReportStudy(data, data.parent)
         assert study.tissue == TISSUE
         linear = tissue_of_law(study.tissue, "linear")
@@ -138,17 +138,17 @@ class TestData:
         whole = study.anatomy.remove_elements(np.flatnonzero(study.anatomy.mesh.mark_elements(NECROSIS_LABEL)))
         assert study.get_tissue_on(whole) == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})
 
-    def test_are_trained_on_with_it(self, data):
+    def test_expansion_is_trained_with_region_tissue(self, data):
         assert TISSUE in Expansion(read_dataset(data), "cpu").build_fem().effects
 
-    def test_do_not_go_on_with_another(self, data, capsys):
+    def test_simulate_rejects_resuming_with_other_region_tissue(self, data, capsys):
         command = ["simulate", str(data.with_name("body.vtu")), "--out", str(data), *RUN]
         assert main([*command, "--region", "necrosis:600"]) == 2
         assert "was made with effects" in capsys.readouterr().err
 
 
 class TestPatient:
-    def test_hands_them_on(self, tmp_path, monkeypatch):
+    def test_patient_command_passes_regions_to_each_step(self, tmp_path, monkeypatch):
         steps: list[list[str]] = []
         monkeypatch.setattr("scenes.cli.main", lambda step: steps.append(step) or 0)
         labels = ["a.nii", "--brain", "1", "--tumour", "3", "--necrosis", "6", *WORDS, "--region", "oedema:2000"]
@@ -156,7 +156,7 @@ class TestPatient:
         assert "--necrosis=6" in steps[0] and "--regions=oedema,necrosis" in steps[0]
         assert steps[1][-3:] == ["--region=necrosis:500", "--region=tumour:9000", "--region=oedema:2000"]
 
-    def test_shows_them_first(self, tmp_path, capsys):
+    def test_patient_inspection_shows_region_tissue(self, tmp_path, capsys):
         path = necrotic_labels(tmp_path)
         words = f"patient {path} --brain 1 --tumour 3 --necrosis 6 --out {tmp_path / 'a.vtu'}".split()
         assert main([*words, "--inspect"]) == 0
@@ -165,7 +165,7 @@ class TestPatient:
         made = {"tumour": "as stiff as the brain", "necrosis": "neo-hookean, E 0.5 kPa, nu 0.49"}
         assert json.loads(capsys.readouterr().out)["regions"] == made
 
-    def test_shows_the_tumours_and_doubts_what_no_tissue_has(self, tmp_path, capsys):
+    def test_patient_inspection_warns_of_implausible_stiffness(self, tmp_path, capsys):
         words = ["patient", str(necrotic_labels(tmp_path)), "--brain", "1", "--tumour", "3", "--necrosis", "6"]
         words += ["--out", str(tmp_path / "a.vtu"), "--inspect", "--region", "necrosis:500", "--region"]
         assert main([*words, "tumour:9000"]) == 0
@@ -177,7 +177,7 @@ class TestPatient:
         assert found["regions"]["tumour"] == "neo-hookean, E 0.009 kPa, nu 0.49"
         assert any(one.startswith("tumour: a Young's modulus of 9 Pa") for one in found["warnings"])
 
-    def test_refuses_a_region_that_no_patient_has(self, tmp_path, capsys):
+    def test_patient_command_rejects_unknown_region(self, tmp_path, capsys):
         words = "patient", "a.nii", "--brain", "1", "--tumour", "3", "--out", str(tmp_path / "a.vtu")
         assert main([*words, "--region", "7:300"]) == 2
         assert "a patient has no such region. Choose from tumour, oedema" in capsys.readouterr().err

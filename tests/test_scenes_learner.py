@@ -1,4 +1,4 @@
-"""`sulcus report`: what a row knows of the loads that it is held to, which is nothing."""
+"""`sulcus report`: held-out loads do not influence the training of a row."""
 
 from dataclasses import replace
 
@@ -20,8 +20,8 @@ def study(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["linear", "series-gp"])
-def test_no_answer_to_a_load_of_the_discs_reaches_a_row(study, tmp_path, name, monkeypatch):
-    """Bit for bit, the table of the series made anew: wild answers to the loads of the discs change figures alone."""
+def test_held_out_solutions_do_not_influence_training(study, tmp_path, name, monkeypatch):
+    """Bitwise equal after a new tabulation: wrong held-out solutions change only the error figures."""
     monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})
     path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])

@@ -1,4 +1,4 @@
-"""LeRobot data sets: what is written is what was read."""
+"""LeRobot data sets: layout, images and statistics equal those of the episodes."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def lerobot(folder, tmp_path_factory):
     return out
 
 
-def test_lerobot_has_its_layout_and_the_pictures_own_bytes(lerobot, folder):
+def test_lerobot_export_has_layout_and_original_image_bytes(lerobot, folder):
     info = json.loads((lerobot / "meta/info.json").read_text())
     assert "RAS [m]" in json.loads((lerobot / "meta/spaces.json").read_text())["spaces"]
     assert info["codebase_version"] == "v3.0" and info["fps"] == 30 and info["total_frames"] == 16
@@ -69,7 +69,7 @@ def test_lerobot_has_its_layout_and_the_pictures_own_bytes(lerobot, folder):
 
 
 @pytest.mark.skipif(FOREIGN is None, reason="needs SULCUS_FORMATS_PYTHON, a Python with lerobot")
-def test_lerobots_own_reader_reads_what_ours_reads(lerobot, folder, tmp_path):
+def test_lerobot_reader_matches_read_episodes(lerobot, folder, tmp_path):
     out = tmp_path / "read.npz"
     words = [str(FOREIGN), "-c", READ, str(lerobot), str(tmp_path / "cache"), str(out)]
     done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, "HF_HUB_OFFLINE": "1"}, check=False)
@@ -83,7 +83,7 @@ def test_lerobots_own_reader_reads_what_ours_reads(lerobot, folder, tmp_path):
         assert np.allclose(read["tumour"], ours["tumour_predicted"][0], atol=1e-7)
 
 
-def test_without_pyarrow_lerobot_names_what_to_install(folder, tmp_path):
+def test_missing_pyarrow_message_names_the_extra(folder, tmp_path):
     code = (
         "import sys; sys.modules['pyarrow'] = None\nfrom scenes.cli import main\n"
         "sys.exit(main(['convert', sys.argv[1], '--to', 'lerobot', '--out', sys.argv[2]]))"
@@ -93,7 +93,7 @@ def test_without_pyarrow_lerobot_names_what_to_install(folder, tmp_path):
     assert done.returncode == 2 and ".[data]" in done.stderr
 
 
-def test_statistics_of_parts_are_those_of_the_whole():
+def test_combined_row_statistics_equal_statistics_of_all_rows():
     rows = np.random.default_rng(0).normal(size=(20, 3))
     rows[3, 1] = np.nan
     said = (RowStatistics.compute(rows[:7]) + RowStatistics.compute(rows[7:])).to_lists()

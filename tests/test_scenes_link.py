@@ -1,4 +1,4 @@
-"""Command of the live link: it serves this machine, measures a solution, and refuses what cannot be served."""
+"""Command of the live link: local server, measured solution, and rejected options."""
 
 import signal
 import socket
@@ -17,7 +17,7 @@ from scenes.script.shipped_files import get_template_path
 SELF = "localhost", "127.0.0.1", socket.gethostname()
 
 
-def test_server_is_local_and_stops_on_signal():
+def test_link_server_is_local_and_stops_on_signal():
     words = ["link", get_template_path(), "--tool", FILM / "tool.json", "--deformer", "rest", "--port", "0"]
     command = [sys.executable, "-m", "scenes.cli", *map(str, words), "--device", "cpu"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -71,11 +71,11 @@ def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay
         ),
     ],
 )
-def test_what_cannot_be_served_is_refused(words, why, capsys):
+def test_link_command_rejects_invalid_options(words, why, capsys):
     assert main(["link", str(get_template_path()), "--device", "cpu", *words]) == 2
     assert why in capsys.readouterr().err
 
 
-def test_a_bench_of_no_poses_is_refused(capsys):
+def test_link_benchmark_rejects_rate_of_zero(capsys):
     assert main(["benchmarks", "link", "--rate", "0"]) == 2
     assert "--rate and --seconds" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`sulcus locate`: files in, a mesh and numbers out, and what is wrong with a file in one sentence."""
+"""`sulcus locate`: mesh and figures from point files, and rejected files."""
 
 import json
 from dataclasses import replace
@@ -52,7 +52,7 @@ def files(body, tmp_path_factory):
     return folder, truth
 
 
-def test_the_result_is_a_mesh_and_numbers_in_millimetres(files, body, capsys):
+def test_locate_writes_mesh_and_figures_in_millimetres(files, body, capsys):
     folder, truth = files
     out = folder / "located.vtu"
     words = ["locate", str(folder / "box.vtu"), str(folder / "vessels.csv"), "--out", str(out), "--json"]
@@ -74,8 +74,8 @@ def test_the_result_is_a_mesh_and_numbers_in_millimetres(files, body, capsys):
     assert json.loads(capsys.readouterr().out)["centroid_mm"] == said["centroid_mm"]
 
 
-def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
-    """Of no rigid error none is found; what no tracker does is refused before anything is written."""
+def test_rigid_option_takes_millimetres_and_rejects_bad_values(files, capsys):
+    """Zero gives no rigid error; implausible values are rejected before output is written."""
     folder, _ = files
     out, bias = folder / "rigid.vtu", []
     words = f"locate {folder / 'box.vtu'} {folder / 'plain.csv'} --out {out} --json --force --rigid".split()
@@ -88,7 +88,7 @@ def test_what_a_tracker_is_known_to_do_is_given_in_millimetres(files, capsys):
     assert bias[0] < 1e-4 < bias[1] < bias[2]
 
 
-def test_metre_input_is_rejected_and_zero_has_no_sign(files, tmp_path, capsys):
+def test_locate_rejects_points_in_metres_and_accepts_zero_motion(files, tmp_path, capsys):
     """Motions of exactly zero are accepted."""
     folder, _ = files
     table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "seen.csv"
@@ -102,7 +102,7 @@ def test_metre_input_is_rejected_and_zero_has_no_sign(files, tmp_path, capsys):
         assert "-0.0" not in said.out and ("by 0.0, 0.0, 0.0 mm" in said.out) is (times == 0.0)
 
 
-def test_uninformative_points_are_rejected_unless_few(files, tmp_path, capsys):
+def test_locate_rejects_mostly_uncertain_points(files, tmp_path, capsys):
     folder, _ = files
     table, path = np.loadtxt(folder / "vessels.csv", delimiter=",", skiprows=1), tmp_path / "unsure.csv"
     for unsure, code in ((len(table) - 1, 2), (len(table) // 5, 0)):
@@ -113,8 +113,8 @@ def test_uninformative_points_are_rejected_unless_few(files, tmp_path, capsys):
         assert ("have a sigma of 30 mm or more" in capsys.readouterr().err) is (code == 2)
 
 
-def test_json_has_the_warnings_and_regions(files, body, tmp_path, capsys):
-    """Sentences of warning, and the regions that the locator knows."""
+def test_locate_json_has_warnings_and_regions(files, body, tmp_path, capsys):
+    """Warnings of outliers, and regions of the locator."""
     folder, _ = files
     path = tmp_path / "own.npz"
     save_locator(path, replace(load_locator(folder / "box.locator.npz", body), regions=TUMOUR))
@@ -136,7 +136,7 @@ def test_json_has_the_warnings_and_regions(files, body, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("words", [["plain.csv"], ["cloud.csv"], ["cloud.csv", "--tool", "tips.csv"]])
-def test_people_read_sentences(files, capsys, words):
+def test_locate_prints_results_as_text(files, capsys, words):
     folder, _ = files
     words = [str(folder / word) if word.endswith(".csv") else word for word in words]
     assert main(["locate", str(folder / "box.vtu"), *words, "--out", str(folder / "other.vtu"), "--force"]) == 0
@@ -163,7 +163,7 @@ def test_people_read_sentences(files, capsys, words):
         ("\x00\x01", "its first line"),
     ],
 )
-def test_bad_files_are_one_sentence_and_write_nothing(files, tmp_path, capsys, text, reason):
+def test_locate_rejects_bad_files_and_writes_nothing(files, tmp_path, capsys, text, reason):
     folder, _ = files
     path = tmp_path / "bad.csv"
     path.write_text(text)
@@ -181,8 +181,8 @@ def seen_dent(body, truth, count):
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_of_very_many_points_some_are_looked_at(files, body, named):
-    """They say the same alone, and others cost nothing; those that are off are counted among them."""
+def test_locate_uses_a_subset_of_many_points(files, body, named):
+    """Unused points do not change the result; outliers are counted in the subset."""
     folder, truth = files
     locator = load_locator(folder / "box.locator.npz", body)
     rest, motion = seen_dent(body, truth, 20_000)
@@ -195,8 +195,8 @@ def test_of_very_many_points_some_are_looked_at(files, body, named):
     assert some[7] in found.outliers and found.outliers.tolist() == some[alone.outliers].tolist()
 
 
-def test_half_a_cloud_of_another_place_is_refused(files, body):
-    """No cortex moves by 40 mm: such points are left out, rather than explained by a registration."""
+def test_locate_rejects_points_half_off_the_cortex(files, body):
+    """No cortex moves by 40 mm: such points are outliers, not a registration error."""
     folder, truth = files
     rest, motion = seen_dent(body, truth, 60)
     now = rest + motion
@@ -205,7 +205,7 @@ def test_half_a_cloud_of_another_place_is_refused(files, body):
         load_locator(folder / "box.locator.npz", body).locate(Observation(now))
 
 
-def test_points_of_which_each_has_two_motions_are_refused(files, body):
+def test_locate_rejects_points_with_contradictory_motions(files, body):
     folder, truth = files
     rest, motion = seen_dent(body, truth, 60)
     twice = Observation(np.concatenate([rest + 3.0 * motion, rest - 3.0 * motion]), np.tile(rest, (2, 1)))
@@ -213,20 +213,20 @@ def test_points_of_which_each_has_two_motions_are_refused(files, body):
         load_locator(folder / "box.locator.npz", body).locate(twice)
 
 
-def test_an_observation_of_nothing_or_from_beyond_is_refused(body):
+def test_empty_or_infinite_observation_is_rejected(body):
     rest = body.mesh.nodes[np.unique(body.open_surface)]
     for now, match in ((np.zeros((0, 3)), "0 points say too little"), (rest * 1e200, "not finite, or beyond")):
         with pytest.raises(InputError, match=match):
             to_evidence(body, Observation(now))
 
 
-def test_a_folder_is_no_file_of_points(files, tmp_path, capsys):
+def test_locate_rejects_folder_as_point_file(files, tmp_path, capsys):
     assert main(["locate", str(files[0] / "box.vtu"), str(tmp_path)]) == 2
     assert "is a folder. Give a CSV file with the header x,y,z" in capsys.readouterr().err
 
 
-def test_what_cannot_be_placed_does_not_wait_for_a_locator(tmp_path, capsys, body):
-    """The anatomy has none, and none is begun."""
+def test_locate_rejects_distant_points_before_building_locator(tmp_path, capsys, body):
+    """The anatomy has no locator, and none is built."""
     write_anatomy(tmp_path / "box.vtu", body)
     far = tmp_path / "far.csv"
     far.write_text("x,y,z\n" + "".join(f"{300 + 9 * (k % 3)},{9 * (k // 3)},{k % 2}\n" for k in range(9)))
@@ -235,7 +235,7 @@ def test_what_cannot_be_placed_does_not_wait_for_a_locator(tmp_path, capsys, bod
     assert sorted(path.name for path in tmp_path.iterdir()) == ["box.vtu", "far.csv"]
 
 
-def test_a_small_locator_has_no_result_of_every_vertex(files, body, tmp_path, capsys):
+def test_restricted_locator_rejects_mesh_output(files, body, tmp_path, capsys):
     folder, _ = files
     path = tmp_path / "small.npz"
     save_locator(path, load_locator(folder / "box.locator.npz", body).restrict())
@@ -253,7 +253,7 @@ def test_a_small_locator_has_no_result_of_every_vertex(files, body, tmp_path, ca
     assert alone["out"] is None and alone["centroid_mm"] == pytest.approx(both["centroid_mm"], abs=1e-6)
 
 
-def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, monkeypatch):
+def test_locator_command_writes_file_next_to_anatomy(files, body, tmp_path, capsys, monkeypatch):
     folder, _ = files
     whole, asked = load_locator(folder / "box.locator.npz", body), []
 
@@ -279,8 +279,8 @@ def test_a_locator_is_made_beside_its_anatomy(files, body, tmp_path, capsys, mon
     assert main(["locator", str(path)]) == 2 and "box.locator.npz: exists. Give --force" in capsys.readouterr().err
 
 
-def test_a_locator_that_knows_other_regions_is_refused(files, body, tmp_path, capsys):
-    """Of a patient's regions, those count that the locator was made with."""
+def test_locator_of_other_regions_is_rejected(files, body, tmp_path, capsys):
+    """Compared are the regions of the locator alone."""
     folder, _ = files
     write_anatomy(tmp_path / "box.vtu", body)
     seen = [str(tmp_path / "box.vtu"), str(folder / "vessels.csv"), "--json"]
@@ -292,8 +292,8 @@ def test_a_locator_that_knows_other_regions_is_refused(files, body, tmp_path, ca
     assert "has no region 3 (oedema)" in capsys.readouterr().err
 
 
-def test_regions_are_those_that_the_models_beside_learned(body, tmp_path, capsys, monkeypatch):
-    """A patient's own stiffness is said once, where the models are made."""
+def test_locator_uses_regions_of_the_trained_models(body, tmp_path, capsys, monkeypatch):
+    """Users give the stiffness once, where the models are made."""
     asked = []
 
     def make(anatomy, seed, device, causes, folder, progress):

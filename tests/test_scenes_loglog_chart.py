@@ -1,4 +1,4 @@
-"""Charts: what is drawn lies where it belongs, and what cannot be drawn is refused."""
+"""Log-log charts: positions of curves, dots and labels, and rejected values."""
 
 import re
 import sys
@@ -23,7 +23,7 @@ def ink(picture, colour):
     return np.argwhere((np.abs(picture.astype(int) - colour) < 12).all(axis=-1))
 
 
-def test_points_that_rise_by_a_power_lie_on_a_line():
+def test_power_law_points_lie_on_a_straight_line():
     rows, columns = ink(draw_panels([panel((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))]), FULL).T
     assert np.ptp(columns) > 0.6 * WIDTH and np.ptp(rows) > 0.6 * HEIGHT
     slope, start = np.polyfit(columns, rows, 1)
@@ -31,7 +31,7 @@ def test_points_that_rise_by_a_power_lie_on_a_line():
     assert np.abs(rows - slope * columns - start).max() < 6.0
 
 
-def test_panels_stand_side_by_side_and_are_the_same_every_time():
+def test_panels_are_side_by_side_and_deterministic():
     one = panel((1.0, 2.0), marks=((1.5, "here"),))
     picture = draw_panels([one, one])
     assert picture.shape == (HEIGHT, 2 * WIDTH, 3) and picture.dtype == np.uint8
@@ -40,14 +40,14 @@ def test_panels_stand_side_by_side_and_are_the_same_every_time():
 
 
 @pytest.mark.parametrize("points", [(), ((0.0, 1.0),), ((1.0, -1.0),)])
-def test_what_has_no_logarithm_is_refused(points):
+def test_chart_rejects_non_positive_values_and_no_panels(points):
     with pytest.raises(ValueError, match="positive"):
         draw_panels([panel(*points)])
     with pytest.raises(ValueError, match="nothing"):
         draw_panels([])
 
 
-def test_dots_lie_where_curves_do_and_pale_ones_are_pale():
+def test_dots_have_data_positions_and_given_opacity():
     points = ((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))
     dots = tuple(Dot("", "", x, y, pale=x == 1e2) for x, y in points)
     picture = draw_panels([ChartPanel("title", "x", "y", dots=dots)])
@@ -57,8 +57,8 @@ def test_dots_lie_where_curves_do_and_pale_ones_are_pale():
     assert full[:, 0].min() < centre[0] - 50
 
 
-def test_names_of_dots_near_each_other_do_not_cover_each_other():
-    """Ink of two names beside two dots that touch: as much as of each alone."""
+def test_labels_of_adjacent_dots_do_not_overlap():
+    """Two labels at touching dots have as many dark pixels as both drawn separately."""
 
     def dark(*names):
         dots = tuple(Dot(name, "g", 10.0 + 0.5 * k, 1.0) for k, name in enumerate(names))
@@ -68,8 +68,8 @@ def test_names_of_dots_near_each_other_do_not_cover_each_other():
     assert dark("horse", "tiger") - bare > 0.95 * (dark("horse", "") - bare + dark("", "tiger") - bare)
 
 
-def test_a_pale_dot_without_room_has_no_name():
-    """Where 60 dots crowd; the one in full colour is named all the same."""
+def test_pale_dot_in_a_dense_cluster_has_no_label():
+    """In a cluster of 60 dots; the dot in full colour keeps its label."""
 
     def picture(pale, full, crowd=60):
         pales = [Dot(pale, "g", 10.0 + 0.01 * k, 1.0 + 0.01 * k, pale=True) for k in range(crowd)]
@@ -82,7 +82,7 @@ def test_a_pale_dot_without_room_has_no_name():
     assert changed(picture("horse", "tiger"), picture("horse", ""))
 
 
-def test_dots_of_an_svg_show_their_hints_and_the_front():
+def test_svg_chart_has_dot_tooltips_and_pareto_front():
     dots = tuple(Dot(f"row {k}", "g", 10.0**k, 10.0**-k, hint=f"<{k}> ms", y_range=(1e-3, 10.0)) for k in range(3))
     bare, text = (
         draw_svg(ChartPanel("t", "x", "y", dots=dots, front=front)) for front in ((), ((1.0, 1.0), (10.0, 0.1)))
@@ -92,12 +92,12 @@ def test_dots_of_an_svg_show_their_hints_and_the_front():
     assert text.count("<path") == bare.count("<path") + 1
 
 
-def test_a_panel_has_its_size():
+def test_panels_have_their_given_size():
     panels = [ChartPanel("t", "x", "y", dots=(Dot("one", "g", 1.0, 2.0),), size=(300 + 100 * k, 360)) for k in range(2)]
     assert draw_panels(panels).shape == (360, 700, 3)
 
 
-def test_a_chart_without_matplotlib_names_the_extra(monkeypatch, capsys):
+def test_missing_matplotlib_message_names_the_extra(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
     for name in ("loglog_chart", "factorial"):
         monkeypatch.delitem(sys.modules, f"scenes.analysis.{name}", raising=False)

@@ -1,4 +1,4 @@
-"""The making of one body of a data set."""
+"""Making of one body of a data set."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def plan(box, tmp_path):
     return load_plan(str(tmp_path / "own.toml"))
 
 
-def test_where_nothing_can_be_renamed_nothing_is_left(plan, tmp_path, monkeypatch):
+def test_failed_rename_leaves_no_files(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "rename", fails)
     with pytest.raises(InputError, match=r"bodies/0000: cannot be written \(Operation not permitted\). Choose another"):
         make_body(tmp_path / "set", plan, 1, 0, "cpu")
@@ -35,13 +35,13 @@ def test_where_nothing_can_be_renamed_nothing_is_left(plan, tmp_path, monkeypatc
     assert not to_body_path(tmp_path / "set", 0).exists()
 
 
-def test_a_body_that_is_not_whole_is_named(plan, tmp_path):
+def test_incomplete_body_folder_is_reported(plan, tmp_path):
     to_body_path(tmp_path, 0).mkdir(parents=True)
     assert "bodies/0000: is no whole body. Remove it" in make_body(tmp_path, plan, 1, 0, "cpu").failed
 
 
-def test_noise_has_its_deviation_and_no_mean():
-    """Away from black and white, up to the greatest that a plan may ask for."""
+def test_image_noise_has_given_deviation_and_zero_mean():
+    """At medium grey, up to the largest deviation of a plan."""
     grey = np.full((200, 200, 3), 128, np.uint8)
     for deviation in (1.0, 6.0, 40.0):
         added = add_noise(grey, deviation, np.random.default_rng(3)).astype(float) - 128.0
@@ -51,7 +51,7 @@ def test_noise_has_its_deviation_and_no_mean():
     assert np.mean(dark == 0) == pytest.approx(0.5, abs=0.02)
 
 
-def test_sensed_poses_err_by_the_stated_degrees_and_millimetres():
+def test_sensed_poses_have_the_given_rotation_and_shift_error():
     true = np.eye(4)
     true[:3, :3], true[:3, 3] = Rotation.from_rotvec([1.0, -0.5, 0.3]).as_matrix(), (0.4, -0.2, 0.3)
     columns = {name: np.tile(true, (4000, 1, 1)) for name in ("T_world_tool", "T_camera_world")}

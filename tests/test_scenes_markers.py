@@ -1,4 +1,4 @@
-"""`sulcus markers`: what it writes, and what it does not write over."""
+"""`sulcus markers`: written files, and existing files that are kept."""
 
 import json
 
@@ -8,7 +8,7 @@ from ar.tracking.pages import describe_targets
 from scenes.cli import main
 
 
-def test_pages_and_their_list_are_written_and_written_again(tmp_path, capsys):
+def test_markers_command_writes_and_overwrites_its_files(tmp_path, capsys):
     out = tmp_path / "new" / "markers"
     for words in ([], ["--force"]):
         assert main(["markers", "--out", str(out), *words]) == 0
@@ -20,7 +20,7 @@ def test_pages_and_their_list_are_written_and_written_again(tmp_path, capsys):
         assert picture.size == (4200, 5940)
 
 
-def test_files_of_others_are_kept(tmp_path, capsys):
+def test_markers_command_keeps_existing_files_without_force(tmp_path, capsys):
     for name in ("markers.pdf", "tool.png", "targets.json"):
         mine = tmp_path / name
         mine.write_bytes(b"mine")

@@ -1,4 +1,4 @@
-"""Where the skull is opened, as drawn in 3D Slicer: points, trajectories and outlines of `.mrk.json`."""
+"""Craniotomies from `.mrk.json` files of 3D Slicer: points, trajectories and outlines."""
 
 import json
 
@@ -45,7 +45,7 @@ def fcsv(path, system, *rows, end="\n"):
     return path
 
 
-def test_what_lies_within_an_outline_is_on_its_side_of_the_head():
+def test_points_within_outline_are_on_its_side_of_the_head():
     square = np.array([[-1.0, -1.0, 2.0], [1.0, -1.0, 2.1], [1.0, 1.0, 2.0], [-1.0, 1.0, 2.1]])
     points = np.array([[0.0, 0.0, 2.0], [0.9, -0.9, 2.5], [1.1, 0.0, 2.0], [0.0, -1.2, 2.0], [0.0, 0.0, -2.0]])
     assert find_within_outline(points, square).tolist() == [True, True, False, False, False]
@@ -66,7 +66,7 @@ class TestOpenings:
         said = capsys.readouterr()
         return np.array(json.loads(said.out)["opening"]["at_mm"]) if code == 0 else said.err
 
-    def test_at_a_point_and_where_a_trajectory_enters(self, folder, capsys):
+    def test_opening_lies_at_point_or_entry_of_trajectory(self, folder, capsys):
         top = [0.0, 0.0, RADIUS]
         old = fcsv(folder / "given.fcsv", "RAS", "1,0,0,60,0,0,0,1,1,1,0,F-1,,")
         assert point_or_file(str(old)) == old
@@ -80,7 +80,7 @@ class TestOpenings:
         over = self.found(folder, capsys, "--opening-over", [[0.0, 30.0, 70.0], [0.0, 25.0, 25.0]], "Line")
         np.testing.assert_allclose(over, RADIUS / np.sqrt(2.0) * np.array([0.0, 1.0, 1.0]), atol=3.5)
 
-    def test_what_lies_elsewhere_or_is_of_another_kind_is_refused(self, folder, capsys):
+    def test_opening_rejects_distant_or_unsupported_markups(self, folder, capsys):
         for option, points, kind, reason in (
             ("--opening-at", [[0.0, 0.0, 90.0]], "Fiducial", "from the nearest cortex"),
             ("--opening-at", [[0.0, 0.0, 55.0]] * 2, "Fiducial", "holds a list of 2 points; --opening-at takes one"),
@@ -92,8 +92,8 @@ class TestOpenings:
         ):
             assert reason in self.found(folder, capsys, option, points, kind)
 
-    def test_an_outline_is_the_opening_of_the_mesh(self, folder, capsys):
-        """An ellipse twice as wide as high: what is open lies within it, and all that lies well within is open."""
+    def test_opening_of_the_mesh_follows_the_outline(self, folder, capsys):
+        """Ellipse with axes 2 : 1: open nodes lie within it, and nodes well within are open."""
         file = markup(folder / "outline.mrk.json", curve(), "ClosedCurve")
         words = f"anatomy --labels {folder / 'labels.nii.gz'} --brain 1 --tumour 2 --nodes 2500".split()
         assert main([*words, "--opening-at", str(file), "--out", str(folder / "a.vtu"), "--json"]) == 0

@@ -1,4 +1,4 @@
-"""What a scene keeps on the device is what its effects keep, byte by byte: counted, not sampled."""
+"""Device memory of a scene: the exact sum of the memory of its effects."""
 
 import gc
 from types import FunctionType, ModuleType
@@ -76,7 +76,7 @@ def kept(scene: Scene) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("name", DISTINCT)
-def test_without_an_effect_its_own_bytes_are_gone_and_no_others(name):
+def test_removing_an_effect_frees_only_its_own_memory(name):
     scene = find_scene(name)
     whole = kept(scene)
     assert min(whole.values()) > 1_000
@@ -90,5 +90,5 @@ def test_without_an_effect_its_own_bytes_are_gone_and_no_others(name):
         assert less == {term: size for term, size in whole.items() if term != own} and (own is None or own in whole)
 
 
-def test_the_same_scene_keeps_the_same():
+def test_memory_of_a_scene_is_reproducible():
     assert kept(find_scene("press")) == kept(find_scene("press"))

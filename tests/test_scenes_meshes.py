@@ -1,4 +1,4 @@
-"""Meshes of a warp as trimesh and others read them: their space and their unit."""
+"""Meshes of a warp, read by trimesh: coordinate space and unit."""
 
 import struct
 from xml.etree import ElementTree
@@ -8,7 +8,7 @@ import trimesh
 from warped import LPS, bump
 
 
-def test_meshes_say_their_space(box, warp_out):
+def test_mesh_files_state_their_coordinate_space(box, warp_out):
     now = 1e3 * (box.mesh.nodes + bump(box.mesh.nodes))[box.tumour_surface]
     stl = (warp_out / "tumour.stl").read_bytes()
     assert b"SPACE=LPS" in stl[:80] and not stl.startswith(b"solid")

@@ -1,4 +1,4 @@
-"""OpenIGTLink's messages as pyigtl and the C++ library have them, both ways; and what is no message."""
+"""OpenIGTLink messages against pyigtl and the C++ library, and malformed messages."""
 
 import struct
 import warnings
@@ -66,7 +66,7 @@ def ours(message, version=1, **metadata):
     return header, read_content(header, raw[HEADER.size :])
 
 
-def test_what_we_send_is_what_pyigtl_reads():
+def test_pyigtl_reads_sent_messages():
     assert theirs("TRANSFORM", "TumourToRas", transform(matrix())).matrix == pytest.approx(matrix(), abs=1e-5)
     assert theirs("STRING", "TipToTumour", encode_string("12.3 +- 0.4 mm")).string == "12.3 +- 0.4 mm"
     places = RANDOM.normal(size=(3, 3))
@@ -78,7 +78,7 @@ def test_what_we_send_is_what_pyigtl_reads():
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_what_pyigtl_sends_is_what_we_read(version):
+def test_pyigtl_messages_are_read(version):
     more = {} if version == 1 else {"ToolTransformStatus": "OK", "a": "b"}
     sent = pyigtl.TransformMessage(matrix(), timestamp=1_700_000_000.25, device_name="StylusTipToReference")
     header, content = ours(sent, version, **more)
@@ -95,7 +95,7 @@ def test_what_pyigtl_sends_is_what_we_read(version):
     assert np.array_equal(read_image(content)[..., 2], colour[0, ..., 0])
 
 
-def test_polydata_and_status_have_the_layout_of_the_protocol():
+def test_polydata_and_status_messages_have_protocol_layout():
     corners = RANDOM.normal(size=(4, 3)).astype(np.float32)
     body = encode_polydata(corners, SentMesh.from_triangles(np.array([[0, 1, 2], [0, 2, 3]])))
     assert struct.unpack(">10I", body[:40]) == (4, 0, 0, 0, 0, 2, 32, 0, 0, 0)
@@ -105,20 +105,20 @@ def test_polydata_and_status_have_the_layout_of_the_protocol():
     assert struct.unpack(">Hq20s", body[:30])[0] == 13 and body[30:] == b"no pose yet\0"
 
 
-def test_a_position_is_a_place_and_a_quaternion():
-    """As `igtl_position.h` has it; pyigtl writes that of points."""
+def test_position_message_has_translation_and_quaternion():
+    """Layout of `igtl_position.h`; pyigtl writes the layout of points instead."""
     numbers = [*matrix()[:3, 3], *Rotation.from_matrix(matrix()[:3, :3]).as_quat()]
     assert read_position(struct.pack(">7f", *numbers)) == pytest.approx(matrix(), abs=1e-5)
     with pytest.raises(BadMessageError, match="wrong size: 12 bytes"):
         read_position(bytes(12))
 
 
-def test_a_time_stamp_goes_through_to_its_last_bit():
+def test_time_stamp_round_trips_exactly():
     raw = pack_message("TRANSFORM", "A", transform(np.eye(4)), STAMP + 1)
     assert read_header(raw[:58]).stamp == STAMP + 1
 
 
-def test_the_checksum_is_that_of_the_catalogue():
+def test_message_checksum_matches_published_crc64():
     assert read_header(pack_message("STRING", "A", b"123456789", 0)[:58]).checksum == 0x6C40DF5F0B497347
 
 
@@ -130,7 +130,7 @@ def messaged(value, value_size=None, count=1):
     return read_header(raw[: HEADER.size]), body
 
 
-def test_metadata_stands_behind_the_content():
+def test_metadata_follows_the_message_content():
     header, body = messaged("OK\0")
     assert read_content(header, body) == b"content" and read_metadata(header, body) == {"key": "OK"}
     assert read_metadata(*messaged("", count=1)) == {"key": ""}
@@ -160,12 +160,12 @@ def body_of(raw):
         (lambda: read_image(encode_image(np.zeros((4, 4, 2), np.uint8))), "not one complete 8-bit image"),
     ],
 )  # fmt: skip
-def test_what_is_no_message_is_refused(read, why):
+def test_malformed_message_is_rejected(read, why):
     with pytest.raises(BadMessageError, match=why):
         read()
 
 
-def test_a_body_is_known_while_its_transforms_are_new():
+def test_pose_is_known_while_its_transforms_are_recent():
     names = TransformNames()
     heard = ReceivedTransforms(names, 0.3)
     assert heard.find_relative(names.tool, 0.0) == "no StylusTipToReference yet"

@@ -1,4 +1,4 @@
-"""Trained models that answer tools of environments, against finite elements and Hertz."""
+"""Responses of trained models to tools of the environments, against FEM and Hertz."""
 
 from dataclasses import replace
 
@@ -13,8 +13,8 @@ from scenes.gym.tissue_requests import TissueRequest
 from sim.material import MATERIALS
 
 
-def test_the_model_has_the_force_of_the_finite_elements():
-    """By pose, at 3 mm: its force within 25 %, the tumour's nodes within a quarter of their motion."""
+def test_model_force_and_motion_match_fem():
+    """At a depth of 3 mm: force within 25 %, tumour nodes within a quarter of their motion."""
     site = open_setting(PALPATE, "template", "model", "cpu", SIZE).site
     poses = [PALPATE.tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (-2e-3, 3e-3)]
     found = []
@@ -31,7 +31,7 @@ def test_the_model_has_the_force_of_the_finite_elements():
     assert np.linalg.norm(motion - true, axis=1).max() < 0.25 * np.linalg.norm(true, axis=1).max()
 
 
-def test_many_answered_together_are_as_each_alone():
+def test_batched_model_responses_equal_separate_responses():
     setting = open_setting(PALPATE, "template", "model", "cpu", SIZE)
     site = setting.site
     tips = [site.origin + 1e-3 * depth * site.axis for depth in (-3.0, 0.5, 2.0, 4.0)]
@@ -43,7 +43,7 @@ def test_many_answered_together_are_as_each_alone():
     assert unbound.compute_responses(asked[2:3])[0].error == 7e-4  # loads without a bound have the model's
 
 
-def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):
+def test_aspirator_force_on_healthy_tissue_follows_hertz(boxed):
     setting = open_setting(DEBULK, boxed, "auto", "cpu", SIZE)
     site, ball = setting.site, Hertz(DEBULK.tool.radius, MATERIALS["drained"].tissue)
     for depth in (1e-3, DEBULK.tool.radius + 1e-3):  # its middle above a flat top, and below it
@@ -59,7 +59,7 @@ def test_an_aspirator_presses_on_healthy_tissue_by_hertz(boxed):
     ) == pytest.approx(0.0)
 
 
-def test_a_pose_that_the_model_refuses_ends_an_episode():
+def test_pose_outside_the_model_range_ends_the_episode():
     setting = open_setting(RETRACT, "template", "model", "cpu", SIZE)
     site, tool = setting.site, RETRACT.tool
     poses = [tool.pose(site.origin + depth * site.axis, site.axis, site.right) for depth in (2e-3, 40e-3)]

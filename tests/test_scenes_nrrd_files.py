@@ -11,7 +11,7 @@ from warped import LPS, bump
 from sim.geometry.tetmesh import compute_signed_volumes
 
 
-def test_slicer_is_said_what_the_fields_are(warp_out):
+def test_nrrd_and_nifti_headers_describe_fields_for_slicer(warp_out):
     values, header = nrrd.read(str(warp_out / "field_modeling.nrrd"))
     assert header["kinds"] == ["vector", "domain", "domain", "domain"] and header["space"] == "left-posterior-superior"
     assert header["displacement field type"] == "modeling" and header["intent_code"] == "1006"

@@ -1,4 +1,4 @@
-"""Observations of the environments: tracked, felt and seen with noise."""
+"""Observations of the environments: poses, forces and noise."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from scenes.gym.observation import FORCE_NOISE, POSITION_NOISE
 from scenes.gym.tasks import PALPATE
 
 
-def test_what_is_observed_is_the_truth_with_its_noise():
-    """In the axes of the twists."""
+def test_observed_states_are_truth_plus_given_noise():
+    """In the axes of the actions."""
     environment = made()
     environment.reset(seed=3)
     episode, off = environment.unwrapped.episode, []

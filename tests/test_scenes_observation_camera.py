@@ -1,4 +1,4 @@
-"""Pictures of the environments."""
+"""Images of the environments."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from gym_examples import made
 from scenes.gym.tasks import PALPATE
 
 
-def test_pictures_show_the_tool_where_it_is():
+def test_observation_images_show_the_tool_at_its_pose():
     environment = made(observation="rgbd", render_mode="rgb_array")
     seen, truth = environment.reset(seed=2)
     camera, ball = environment.unwrapped.pictures.camera, PALPATE.tool.radius

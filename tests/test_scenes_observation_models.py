@@ -1,4 +1,4 @@
-"""Locating a tumour in scenes: what an image and the page show of it, and how it is checked."""
+"""Tumour localisation in scenes: image, page text and checks."""
 
 import json
 from dataclasses import replace
@@ -64,7 +64,7 @@ def truth(theatre, scene, frames):
     return solve_reference_frames(theatre, scene, [frame.loads for frame in frames])
 
 
-def test_what_the_tool_hides_is_not_seen_and_where_it_touches_is(still, play):
+def test_observer_omits_only_points_hidden_by_the_tool(still, play):
     observer, rest = still
     held = play.place_tool(play.scene.tool, play.get_touch(40), rest)
     corners = np.asarray(play.scene.tool.mesh.vertices) @ held.pose[:3, :3].T + held.pose[:3, 3]
@@ -77,7 +77,7 @@ def test_what_the_tool_hides_is_not_seen_and_where_it_touches_is(still, play):
     assert not len(lifted.tips) and len(seen.now) < len(lifted.now)
 
 
-def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
+def test_image_shows_estimate_truth_and_ellipsoid(play, frames):
     frame = frames[1]
     found = frame.estimate
     assert found.location is not None and found.held and found.off < 0.7 * np.linalg.norm(found.true)
@@ -94,14 +94,14 @@ def test_the_picture_shows_estimate_truth_and_ellipsoid(play, frames):
     assert "locate" in frame.seconds and frame.remark.endswith(f"estimate error {1e3 * found.off:.1f} mm")
 
 
-def test_the_checks_pass_and_tell_what_an_estimate_is_worth(play, frames, truth):
+def test_checks_pass_and_report_estimate_coverage(play, frames, truth):
     figures = measure(play, play.get_camera, frames, truth)
     assert figures.find_violations(Bounds(overlap=0.5, error=3e-3, visible=0.1)) == []
     # One frame moves, and by nothing that the locator's dents are: 14 % of it are removed.
     assert figures.covered == 1.0 and 0.1 < figures.removed < 1.0 and figures.error_mm > 0.01
 
 
-def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
+def test_checks_detect_wrong_estimates(play, frames, truth):
     frame, others = frames[1], [frames[0], *frames[2:]]
 
     def sentences(wrong):
@@ -121,7 +121,7 @@ def test_the_checks_see_what_is_wrong_of_an_estimate(play, frames, truth):
     assert sentences(frame) == ""
 
 
-def test_an_ellipsoid_holds_what_its_covariance_says(frames):
+def test_ellipsoid_encloses_95_percent_of_its_covariance(frames):
     found = frames[1].estimate
     closed, root = found.build_ellipsoid(), np.linalg.cholesky(found.location.centroid_covariance)
     at, way = found.middle + found.motion, np.array([0.6, 0.0, 0.8])
@@ -130,7 +130,7 @@ def test_an_ellipsoid_holds_what_its_covariance_says(frames):
     assert not replace(found, true=found.motion + 2.8 * root @ way).held
 
 
-def test_where_nothing_moves_that_is_said(play, frames):
+def test_estimate_without_motion_is_labelled(play, frames):
     found = frames[0].estimate
     assert not found.noticed and frames[0].remark.startswith("no significant motion detected; ")
     assert "No significant motion detected." in " ".join(describe_estimate(found))
@@ -167,7 +167,7 @@ def _estimated(observer, seen, positions):
     return replace(observer.estimate(0, positions), observation=seen, location=None, refusal=str(refusal.value))
 
 
-def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
+def test_rejected_observation_shows_warning_and_no_ellipsoid(refused, monkeypatch):
     play, frame = refused
     found, said = frame.estimate, []
     assert frame.doubt == REJECTED_WARNING and found.build_ellipsoid() is None and not found.held and frame.remark == ""
@@ -183,8 +183,8 @@ def test_what_is_refused_is_shown_as_refused(refused, monkeypatch):
     assert "Observation rejected" in report(frame, play.stage, "fem", "", (), 100)
 
 
-def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
-    """Refusals, slips, and a tumour that lies still in most frames, each with its reason; else nothing."""
+def test_check_reports_locator_rejections_and_slips(refused, frames):
+    """Rejections, slips and a tumour mostly at rest, each with its reason; otherwise nothing."""
     _, wild = refused
     best = max(frames, key=lambda frame: np.linalg.norm(frame.estimate.true))
     slipped = replace(best.estimate, location=replace(best.estimate.location, slipped=True))
@@ -198,7 +198,7 @@ def test_check_says_what_the_locator_holds_against_its_answers(refused, frames):
     assert "moves in 1 of 3 frames" in sparse and "give a smaller --every" in sparse
 
 
-def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
+def test_label_separates_simulated_and_estimated_motion(frames, monkeypatch):
     frame, said = frames[1], []
     found = frame.estimate
     monkeypatch.setattr(
@@ -221,14 +221,14 @@ def test_each_motion_in_a_picture_is_said_whose_it_is(frames, monkeypatch):
     assert not any(line.startswith("lines: ") for line in said)
 
 
-def test_numbers_and_errors_come_before_explanations(play, frames):
+def test_page_text_has_figures_and_errors_before_explanations(play, frames):
     words = report(frames[1], play.stage, "fem", "", (), 100)
     order = "estimated tumour motion", "converged", "Tumour position error", "<b>estimate</b> from", "frame "
     places = [words.index(each) for each in order]
     assert places == sorted(places)
 
 
-def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
+def test_observation_error_replaces_prior_error(play, frames):
     alone, of_frame = replace(play, motion_error=None), frames[1]
     frame = alone.draw_frame(of_frame.number, of_frame.touch, of_frame.loads, of_frame.deformation, 0.1)
     assert frame.tumour_error == TumourError(None, "", frame.estimate.worst)
@@ -241,7 +241,7 @@ def test_a_sight_tells_the_error_in_place_of_the_prior(play, frames):
     assert both.prior == pytest.approx(3e-3) and both.bound == both.observed == frame.estimate.worst
 
 
-def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
+def test_page_legend_describes_lines_and_estimate(play, frames):
     said = format_page_legend(play.scene)
     assert all(words in said for words in ("estimate", "simulated", "95 %", "scan", "tip to tumour"))
     assert "estimate" not in format_page_legend(replace(play.scene, observation_model=None))
@@ -252,7 +252,7 @@ def test_the_page_says_what_lines_are_and_what_is_estimated(play, frames):
     assert "is outside the" in " ".join(describe_estimate(replace(found, true=np.ones(3))))
 
 
-def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
+def test_missing_locator_message_names_the_command(box, tmp_path, capsys):
     with pytest.raises(InputError, match="sulcus locator"):
         PatientSetup(box, None, {}, "cpu").build_stage(replace(short(), observation_model=SIGHT))
     write_anatomy(tmp_path / "box.vtu", box)
@@ -263,21 +263,21 @@ def test_without_a_locator_it_is_said_how_to_make_one(box, tmp_path, capsys):
     assert "sulcus train" not in said and "is the truth, as finite elements have it" in said
 
 
-def test_locator_of_other_regions_is_rejected(theatre, scene):
+def test_scene_rejects_locator_of_other_region_stiffness(theatre, scene):
     other = replace(theatre)
     other.__dict__["locator"] = replace(theatre.locator, regions=(Region(PART_LABELS["oedema"], 0.5),))
     with pytest.raises(InputError, match=r"another stiffness of region 3 \(oedema\) than the scene\."):
         other.build_stage(scene)
 
 
-def test_no_trained_model_is_the_truth(scene):
+def test_observation_scene_offers_only_fem_as_truth(scene):
     theatre = open_theatre(device="cpu")
     assert theatre.list_deformers(scene) == ("fem",) and theatre.list_deformers(
         replace(scene, observation_model=None)
     ) != ("fem",)
 
 
-def test_what_ships_locates_its_tumour(capsys):
+def test_template_locator_passes_check_in_all_sighted_scenes(capsys):
     assert to_locator_path(get_template_path()).stat().st_size < 8_000_000
     assert main(["check", *SIGHTED, "--every", "40", "--device", "cpu", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["scenes"]

@@ -1,4 +1,4 @@
-"""Observations of an undeformed body: their errors, and their seeds."""
+"""Observations of an undeformed body: errors and seeds."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 
-def test_what_is_seen_has_the_errors_that_are_stated(still):
+def test_observations_have_the_given_errors(still):
     observer, rest = still
     seen = np.array([observer.observe(number, rest).now - observer.observe(number, rest).rest for number in range(40)])
     steady = seen.mean(axis=0)
@@ -28,7 +28,7 @@ def test_what_is_seen_has_the_errors_that_are_stated(still):
     assert smooth.sigmas == pytest.approx(0.5e-3)
 
 
-def test_the_same_seed_sees_the_same_and_another_does_not(still):
+def test_observations_depend_on_seed_and_frame_only(still):
     observer, rest = still
     again = replace(observer)
     other = replace(observer, observation_model=replace(observer.observation_model, seed=1))

@@ -1,4 +1,4 @@
-"""Places on and inside the tumour that a live link sends."""
+"""Points on and inside the tumour that a live link sends."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from sim.loads import Loads, Touching
 from surrogate.model.learned import build_prediction
 
 
-def test_places_inside_the_tumour_move_with_its_volume(stage):
+def test_points_inside_the_tumour_follow_volume_interpolation(stage):
     anatomy, outgoing = stage.anatomy, Outgoing(stage)
     rest = anatomy.mesh.nodes
     inner = np.setdiff1d(anatomy.tumour_nodes, anatomy.tumour_surface)
@@ -43,7 +43,7 @@ def motion_of(rest, nodes, displacement):
     return BrainMotion(positions, True, solution=answer)
 
 
-def test_tumour_points_move_with_it_and_large_input_fails(follower, registration, truth, beside):
+def test_link_moves_tumour_points_and_rejects_large_messages(follower, registration, truth, beside):
     rest = 1e3 * follower.motion.stage.tumour_at_rest.vertices
 
     async def scene():

@@ -1,4 +1,4 @@
-"""What commands may write: asked before the work, and nothing of a user's is replaced by it."""
+"""Output paths of commands: checked before the work, and existing files are kept."""
 
 import json
 from pathlib import Path
@@ -47,7 +47,7 @@ ALL = {**WRITING, **{name: (words, "x") for name, (words, _) in FOLDERS.items()}
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a file system that makes no files")
 @pytest.mark.parametrize("name", ALL)
-def test_what_cannot_be_written_is_said_before_anything_is_read(name, tmp_path, monkeypatch, capsys):
+def test_commands_check_output_path_before_reading_input(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words, out = ALL[name]
     assert main([*words, "--out", f"/proc/{out}"]) == 2
@@ -57,13 +57,13 @@ def test_what_cannot_be_written_is_said_before_anything_is_read(name, tmp_path, 
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a file system that makes no files")
-def test_permissions_alone_do_not_make_a_place_to_write(tmp_path):
+def test_check_output_rejects_path_that_cannot_be_written(tmp_path):
     with pytest.raises(InputError, match="cannot be written there"):
         check_output("/proc/x.vtu", ".vtu")
 
 
 @pytest.mark.parametrize("name", [*WRITING, "scenes", "report"])
-def test_a_file_of_the_users_is_not_replaced(name, tmp_path, monkeypatch, capsys):
+def test_commands_keep_existing_files_without_force(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words, out = WRITING.get(name) or FOLDERS[name]
     mine = tmp_path / out
@@ -75,18 +75,18 @@ def test_a_file_of_the_users_is_not_replaced(name, tmp_path, monkeypatch, capsys
     assert mine.read_text() == "my own" and list(tmp_path.iterdir()) == [mine]
 
 
-def test_by_force_it_is(tmp_path):
+def test_force_allows_an_existing_output_file(tmp_path):
     mine = tmp_path / "x.vtu"
     mine.write_text("my own")
     assert check_output_path(mine, ".vtu", force=True) == mine
 
 
-def test_asking_leaves_no_folder_behind(tmp_path):
+def test_output_check_creates_no_folder(tmp_path):
     check_output_path(tmp_path / "a" / "b" / "x.vtu", ".vtu")
     assert not list(tmp_path.iterdir())
 
 
-def test_solving_does_not_replace_its_own_mesh(tmp_path, capsys):
+def test_solve_rejects_its_input_mesh_as_output(tmp_path, capsys):
     """Its `fixed` and `force` would be lost."""
     body = base_held(cube((2, 2, 2)))
     path = tmp_path / "mesh.vtu"
@@ -105,7 +105,7 @@ def test_solving_does_not_replace_its_own_mesh(tmp_path, capsys):
     assert "displacement" in read_mesh(tmp_path / "moved.vtu").point_data
 
 
-def test_a_users_own_scan_is_neither_replaced_nor_removed(tmp_path, monkeypatch, capsys):
+def test_anatomy_command_keeps_an_existing_scan_file(tmp_path, monkeypatch, capsys):
     mine = to_intensity_path(tmp_path / "me.vtu")
     mine.write_bytes(b"my scan")
     assert main(["anatomy", "--out", str(tmp_path / "me.vtu")]) == 2
@@ -115,7 +115,7 @@ def test_a_users_own_scan_is_neither_replaced_nor_removed(tmp_path, monkeypatch,
     assert "is what this command reads" in capsys.readouterr().err and mine.read_bytes() == b"my scan"
 
 
-def test_frames_are_removed_by_force_and_other_files_stay(tmp_path):
+def test_force_selects_only_frame_files_for_removal(tmp_path):
     frame, notes = tmp_path / "frame_0000.png", tmp_path / "frame_notes.png"
     notes.write_bytes(b"mine")
     assert check_output_frames(tmp_path, force=False) == []
@@ -130,7 +130,7 @@ def put_data(path, **stated):
         file.attrs.update({"format": "sulcus data 1", **stated})
 
 
-def test_foreign_data_and_models_are_found_next_to_mesh(tmp_path):
+def test_files_of_another_anatomy_are_found_next_to_mesh(tmp_path):
     mesh = tmp_path / "me.vtu"
     assert find_foreign_files(mesh, "new") == []
     put_data(tmp_path / "me.h5", anatomy="new")
@@ -143,7 +143,7 @@ def test_foreign_data_and_models_are_found_next_to_mesh(tmp_path):
     assert len(check_no_foreign_files(mesh, "new", force=True)) == 2
 
 
-def test_force_removes_only_data_that_cannot_go_on(tmp_path):
+def test_force_removes_only_data_that_cannot_be_resumed(tmp_path):
     data = tmp_path / "me.h5"
     wanted = {"anatomy": "new", "effects": "e", "seed": "0"}
     put_data(data, **wanted, date="today")
@@ -153,7 +153,7 @@ def test_force_removes_only_data_that_cannot_go_on(tmp_path):
     assert not data.exists()
 
 
-def test_a_model_without_its_mesh_says_what_to_give(tmp_path, capsys):
+def test_export_of_model_without_mesh_names_anatomy_option(tmp_path, capsys):
     model = tmp_path / "lonely.npz"
     model.write_bytes(b"")
     assert main(["export", str(model), "--out", str(tmp_path / "x.onnx")]) == 2

@@ -1,4 +1,4 @@
-"""A film with known truth and its overlay: where it is drawn, how far off it says to be, and what is lost in it."""
+"""Overlay on a video with ground truth: outline, error band, drape and paced playback."""
 
 import csv
 import json
@@ -54,7 +54,7 @@ def shown(follower, stage):
     return list(draw_overlays(pictures(), follower, Painter(stage, follower.tool, "contour")))
 
 
-def test_every_picture_shows_what_is_known_of_it(shown, truth):
+def test_each_image_has_its_tracking_state_and_time(shown, truth):
     assert [each.known.state for each in shown] == STATES
     assert all(each.stamped for each in shown)
     assert [each.known.time for each in shown] == pytest.approx(truth.times, abs=1e-4)
@@ -66,7 +66,7 @@ def test_every_picture_shows_what_is_known_of_it(shown, truth):
     assert lost == ["reference lost: nothing is drawn"] * 4
 
 
-def test_the_outline_in_the_pixels_is_where_the_tumour_is(shown, truth, calibration, stage, follower):
+def test_drawn_outline_matches_the_true_tumour(shown, truth, calibration, stage, follower):
     vertices, triangles = follower.tool.mesh
     for each in shown:
         if not each.known.relied:
@@ -80,7 +80,7 @@ def test_the_outline_in_the_pixels_is_where_the_tumour_is(shown, truth, calibrat
         assert measure_outline_gap(each.colour, INK, mask, covered) < 2.5
 
 
-def test_under_the_drape_that_a_film_has_nothing_shines_through(shown, truth, calibration, stage, follower):
+def test_overlay_is_not_drawn_over_the_drape(shown, truth, calibration, stage, follower):
     each, known = next(islice(pictures(), 6, None)).picture, shown[6].known
     painted = Painter(stage, follower.tool).paint(each.colour, known).colour
     camera, tumour = calibration.build_camera(truth.T_camera_scan[6]), stage.build_tumour(known.motion.positions)
@@ -92,7 +92,7 @@ def test_under_the_drape_that_a_film_has_nothing_shines_through(shown, truth, ca
     assert under < 0.03 and through > 0.8
 
 
-def test_it_is_no_farther_off_than_it_says(shown, truth, calibration, stage):
+def test_overlay_error_lies_within_its_error_band(shown, truth, calibration, stage):
     errors = [compute_overlay_error(each.known, truth, calibration, stage) for each in shown]
     said = summarise_errors([each.known for each in shown], errors)
     assert said["pictures"] == 9 and said["wrong"] == 0 and said["held_percent"] == 100.0
@@ -101,7 +101,7 @@ def test_it_is_no_farther_off_than_it_says(shown, truth, calibration, stage):
     assert shown[4].known.band is None and errors[4] is errors[11] is None
 
 
-def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth, stage):
+def test_tool_error_enters_the_band_through_a_deeper_tool(follower, truth, stage):
     class Falling(Recorded):
         def deform(self, loads, start=None, at=None):
             depth = (loads.get_only(Touching).pose[0, 0, :3, 3] - truth.T_scan_tool[5, :3, 3]) @ stage.site.axis
@@ -113,7 +113,7 @@ def test_a_tool_s_error_is_in_the_band_by_what_a_deeper_one_does(follower, truth
     assert motion.tool == pytest.approx(0.2 * 1.96 * 2e-3, rel=0.01)
 
 
-def test_a_film_that_plays_as_a_camera_loses_what_comes_too_fast():
+def test_paced_video_drops_images_at_slow_processing():
     picture = np.zeros((8, 8), np.uint8)
     film = (Timed(Named(str(n), picture, 0.02 * n), False) for n in range(20))
     seen, ages = [], []
@@ -126,7 +126,7 @@ def test_a_film_that_plays_as_a_camera_loses_what_comes_too_fast():
     assert not list(pace_images(iter([])))
 
 
-def test_layers_of_a_real_picture_are_where_the_box_is(calibration):
+def test_real_image_has_layers_only_inside_the_box(calibration):
     camera = calibration.build_camera(np.eye(4))
     corners = 0.02 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     near, far = (Layer(str(n), n, corners + [0.0, 0.0, z], np.array([[0, 1, 2]])) for n, z in ((1, 0.3), (2, 0.4)))
@@ -142,7 +142,7 @@ def test_layers_of_a_real_picture_are_where_the_box_is(calibration):
         build_real_image(colour[:100], camera, [], (slice(0, 1), slice(0, 1)))
 
 
-def test_the_command_draws_a_film_and_says_how_it_went(tmp_path, capsys):
+def test_overlay_command_writes_video_table_and_report(tmp_path, capsys):
     out, table = tmp_path / "shown.mp4", tmp_path / "rows.csv"
     more = ["--truth", str(FILM / "truth.npz"), "--out", str(out), "--table", str(table), "--device", "cpu", "--json"]
     assert main(["overlay", str(FILM / "film.mp4"), *GIVEN, *more]) == 1  # nobody says how the brain moved
@@ -165,7 +165,7 @@ def test_the_command_draws_a_film_and_says_how_it_went(tmp_path, capsys):
     assert len(film) == 17 and film[0].grey.shape == (720, 960)
 
 
-def test_what_does_not_belong_together_is_refused(tmp_path, capsys):
+def test_overlay_command_rejects_incompatible_inputs(tmp_path, capsys):
     film = str(FILM / "film.mp4")
 
     def refused(*words, film=film):

@@ -1,4 +1,4 @@
-"""The page of a film or a camera: in real pictures, in words, for all visitors, and in a real browser."""
+"""Page of a video or a camera: image, text, several visitors and a real browser."""
 
 import re
 import threading
@@ -64,7 +64,7 @@ def seek(page, number):
         (12, TumourState.NO_REFERENCE, "reference not seen yet: nothing is drawn"),
     ],
 )
-def test_each_state_is_said_with_both_errors(page, number, state, words):
+def test_page_text_has_tracking_state_and_both_errors(page, number, state, words):
     assert seek(page, number)
     said = page.browser.shown[2]
     assert page.newest.known.state is state and words in said and "Tumour position error: not known" in said
@@ -79,7 +79,7 @@ def test_each_state_is_said_with_both_errors(page, number, state, words):
         assert sample.values == sample.errors[:1] + (None,) == (None, None)
 
 
-def test_a_style_is_had_on_a_picture_that_stands(page):
+def test_style_change_redraws_a_paused_image(page):
     assert seek(page, 6)
     before = page.browser.shown[1]
     visitor = Visitor(page.browser, 1200)
@@ -99,7 +99,7 @@ def test_a_style_is_had_on_a_picture_that_stands(page):
     assert wait_for(lambda: page.browser.visitors == 0)
 
 
-def test_a_film_plays_on_and_after_its_end_anew(follower, stage):
+def test_video_page_restarts_after_the_last_image(follower, stage):
     film = SeekableFilm(FILM / "film.mp4", 30.0)
     film.count = 40  # as a file may say
     with opened(follower, stage, film.count) as page:
@@ -154,7 +154,7 @@ def test_camera_image_dims_when_stale_and_recovers(follower, stage):
             page.watch(iter([replace(first, grey=first.grey[::2])]), 0.1)
 
 
-def test_video_and_camera_pages_differ_from_demo(capsys):
+def test_overlay_page_serves_video_and_demo_rejects_video(capsys):
     given = [f"--camera={FILM}/camera.yaml", f"--registration={FILM}/registration.json", "--device", "cpu"]
     film, port = str(FILM / "film.mp4"), str(free_port())
     assert main(["overlay", film, *given, "--page", "--port", port, "--seconds", "2"]) == 1  # nobody knows the motion
@@ -179,7 +179,7 @@ def window(page):
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-def test_the_page_fits_and_is_in_register(page, window, size):
+def test_overlay_page_fits_window_and_registers_with_image(page, window, size):
     assert seek(page, 6)
     window.size(*size)
     said = f"document.getElementById('{SAID}').innerText"

@@ -1,4 +1,4 @@
-"""The words in a scene's picture: clear of lines, of the border and of each other, and in their places."""
+"""Text in a scene's image: no overlap with lines, border or other text, and fixed places."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -107,8 +107,8 @@ def lined(play, frame):
         ("draw", Touch(0.008, -0.005, force=0.4)),
     ],
 )
-def test_no_word_stands_on_a_line_at_the_border_or_on_another(monkeypatch, name, touch, size):
-    """On the body that ships, under the scene's own camera; also of a tool that the bone stops, and of a wild push."""
+def test_image_text_avoids_lines_border_and_other_text(monkeypatch, name, touch, size):
+    """On the template with the scene's camera; also for a tool stopped at the bone and for a large force."""
     play, frame, words = seen(monkeypatch, name, size, touch)
     lines, (height, width) = lined(play, frame), frame.shown.shape[:2]
     for word in words:
@@ -128,10 +128,10 @@ def test_no_word_stands_on_a_line_at_the_border_or_on_another(monkeypatch, name,
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_letters_and_motion_keep_their_places(monkeypatch, size):
-    """Whatever the tool does: letters a quarter of the width from the corners or half way up, the motion at the foot.
+def test_direction_letters_and_motion_text_have_fixed_places(monkeypatch, size):
+    """For any tool pose: letters a quarter of the width from the corners or halfway up, motion text at the bottom.
 
-    At the middles of top and foot a tool comes in, and a tumour reaches down.
+    The middle of the top is free for the tool, the middle of the bottom for the tumour.
     """
     width, height = size
     for touch in (None, Touch(), Touch(-0.03), Touch(force=1.0)):
@@ -151,7 +151,7 @@ def test_letters_and_motion_keep_their_places(monkeypatch, size):
 
 
 @pytest.mark.parametrize("style", Style.__args__)
-def test_a_doubt_is_in_the_picture_whatever_the_overlay(monkeypatch, style):
+def test_warning_is_in_the_image_for_each_overlay_style(monkeypatch, style):
     _, frame, words = seen(monkeypatch, "press", (480, 360), Touch(force=1.0), style=style)
     said = " ".join(word.text for word in words)
     assert frame.doubt and DOUBT in said and ("moved" in said) is (style != "none")

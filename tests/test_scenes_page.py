@@ -1,4 +1,4 @@
-"""What the page says and offers: the words of an answer and of a brain; sliders that the opening allows."""
+"""Text of the page: values of the frame, and the digest of loads."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ def answer(outcome: Outcome, bound: float = 1e-3):
 
 
 class TestDigestOfLoads:
-    def test_it_is_of_the_load_and_not_of_the_frame(self, theatre):
+    def test_loads_digest_depends_on_load_and_not_on_frame(self, theatre):
         scene, site = short(), theatre.site
         one = compute_loads_digest(scene.build_loads(site, Touch(force=0.2), 0.1))
         assert one == compute_loads_digest(scene.build_loads(site, Touch(force=0.2), 0.1))
@@ -26,8 +26,8 @@ class TestDigestOfLoads:
         assert one != compute_loads_digest(scene.build_loads(site, Touch(force=0.2), 0.2))
 
 
-def test_the_page_reads_what_the_frame_holds(theatre):
-    """Distance, motion, force and milliseconds, and whose error is how large, each as a person reads it."""
+def test_page_text_has_the_values_of_the_frame(theatre):
+    """Distance, motion, force, milliseconds and errors in readable units."""
     player = theatre.build_player("linear", short())
     seconds = {"deform": 12.3e-3, "render": 4.5e-3, "overlay": 0.7e-3}
     known = {

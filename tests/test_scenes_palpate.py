@@ -1,4 +1,4 @@
-"""Scenes whose hand moves its tool: what it reads, and that nothing but time and the start decides an answer."""
+"""Palpation scenes with manual control: tool force, models, and reproducible solutions."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def untrained(anatomy: Anatomy, scene: Scene) -> Learned:
 
 
 class TestPalpate:
-    def test_the_tool_reads_the_tissue_while_it_is_in_it(self, palpated):
+    def test_tool_force_is_positive_only_during_contact(self, palpated):
         reads = np.array([-frame.deformation.reaction[0, 0, 2] for frame in palpated])
         depth = np.array([frame.touch.depth for frame in palpated])
         assert all(frame.deformation.outcome[0].good for frame in palpated)
@@ -73,25 +73,25 @@ class TestPalpate:
             positions = theatre.anatomy.mesh.nodes + frame.deformation.displacement[0]
             assert compute_distances(shape, frame.pose, positions).min() > 0.0
 
-    def test_scrubbing_back_answers_as_before(self, theatre, palpated):
-        """A frame is a function of its loads and of the answer that it starts from."""
+    def test_frame_solved_again_from_same_start_is_identical(self, theatre, palpated):
+        """Frames depend on their loads and on their start solution alone."""
         again = player(theatre, small("palpate"), "fem")
         for row in (8, 3, 6):
             frame = palpated[row]
             drawn = again.draw(frame.number, frame.time, frame.touch, palpated[row - 1].deformation)
             np.testing.assert_array_equal(drawn.deformation.displacement, frame.deformation.displacement)
 
-    def test_the_page_says_what_it_reads(self, palpated):
+    def test_page_text_has_the_tool_force(self, palpated):
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
         assert frame.acts == f"tool force {reads:.2f} N"
 
-    def test_what_a_learnt_model_does_not_know_is_not_said(self, palpated):
-        """Trained on where a ball is, it answers without the force that it takes."""
+    def test_model_without_force_output_shows_no_tool_force(self, palpated):
+        """The model is trained on tool positions and predicts no force."""
         frame = palpated[6]
         assert format_acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6))), NODES) == ""
 
-    def test_what_a_model_knows_of_the_force_is_said_with_its_bound(self, palpated):
+    def test_predicted_tool_force_is_shown_with_its_error_bound(self, palpated):
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
         answer = replace(frame.deformation, reaction_bound=np.array([[0.012], [0.02]]), outcome=(Outcome.PREDICTED,))
@@ -100,8 +100,8 @@ class TestPalpate:
         assert format_acting(frame.loads, far, NODES) == f"tool force {reads:.2f} N"
 
     @pytest.mark.parametrize("force", [ForceModel(), None])
-    def test_guarded_frames_are_the_model_s_or_the_finite_elements(self, theatre, palpated, force):
-        """Deeper than in training the finite elements answer: each frame, and all of them as one batch."""
+    def test_guarded_deformer_uses_fem_beyond_training_depth(self, theatre, palpated, force):
+        """For single frames and for one batch of all frames."""
         scene, anatomy = small("palpate"), theatre.anatomy
         plain = replace(untrained(anatomy, scene), bound=1e-4, force=force)
         model = replace(plain, envelope=replace(plain.envelope, force=(1e-6, 2e-3)))
@@ -141,8 +141,8 @@ class TestPalpate:
             assert (along > 0.9 * size * np.linalg.norm(found[:, 0, :3], axis=1)).all()
             assert np.isnan(file["reaction_bound"][:]).all() and file["reaction_bound"].shape == (4, 2)
 
-    def test_linear_contact_plays_it_untrained(self, theatre, palpated):
-        """Nearly as finite elements of softer tissue that stiffens do, on tumour and cortex."""
+    def test_linear_contact_model_approximates_fem(self, theatre, palpated):
+        """Against FEM of softer, stiffening tissue, on tumour and cortex."""
         scene, anatomy = small("palpate"), theatre.anatomy
         model = untrained(anatomy, scene)
         assert find_rejection(model, scene.effects) is None
@@ -156,18 +156,18 @@ class TestPalpate:
                 off = np.linalg.norm(answer.restrict(nodes).displacement - theirs)
                 assert off < most * np.linalg.norm(theirs)
 
-    def test_learnt_models_of_pushes_do_not_know_it(self, theatre):
+    def test_push_models_are_rejected_for_palpation(self, theatre):
         with pytest.raises(InputError, match="palpate"):
             theatre.build_deformer("linear", small("palpate"))
         assert theatre.list_deformers(small("palpate")) == ("fem",)
 
 
-def test_a_moved_tool_needs_a_hand():
+def test_tool_contact_in_scene_without_tool_is_rejected():
     with pytest.raises(InputError, match="asks for ToolContact, but has no tool"):
         replace(find_scene("palpate"), tool=None)
 
 
-def test_a_tool_in_the_air_touches_nothing(theatre):
+def test_tool_above_the_cortex_deforms_no_tissue(theatre):
     scene = small("palpate")
     fem = theatre.build_fem(scene, scene.accuracy)
     loads = scene.build_loads(theatre.site, Touch(depth=-1e-3), 0.0)

@@ -1,4 +1,4 @@
-"""Command that takes a patient from scan to models: in one go, after a stop, and what cannot be."""
+"""Command `sulcus patient`: all steps from scan to models, resumed runs, and rejected input."""
 
 import json
 
@@ -14,7 +14,7 @@ from sim.runtime.timing import time_stage
 from surrogate.model.store import load
 
 
-def test_patient_passes_options_and_checks_them_first(tmp_path, monkeypatch, capsys):
+def test_patient_command_checks_options_and_passes_them_to_steps(tmp_path, monkeypatch, capsys):
     steps = []
     monkeypatch.setattr("scenes.cli.main", lambda words: steps.append(words) or 0)
     words = ["patient", "labels.nii.gz", "--brain", "1", "--tumour", "2", "--device", "cpu"]
@@ -27,7 +27,7 @@ def test_patient_passes_options_and_checks_them_first(tmp_path, monkeypatch, cap
     assert "me.model.npz" in capsys.readouterr().err and not (tmp_path / "me.vtu.partial").exists()
 
 
-def test_a_stopped_patient_goes_on_after_the_steps_that_are_done(tmp_path, monkeypatch, capsys):
+def test_stopped_patient_command_resumes_after_finished_steps(tmp_path, monkeypatch, capsys):
     steps, codes = [], {"anatomy": 2, "simulate": 130, "train": 0}
     made = {"anatomy": "me.vtu", "simulate": "me.h5", "train": "me.model.npz"}
 
@@ -55,7 +55,7 @@ def test_a_stopped_patient_goes_on_after_the_steps_that_are_done(tmp_path, monke
     ("words", "expected"),
     [((), (BRAIN.law, None)), (("--element", "p2", "--material", "corotational"), ("corotational", "p2"))],
 )
-def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, expected) -> None:
+def test_patient_command_passes_tissue_and_element_to_steps(tmp_path, monkeypatch, words, expected) -> None:
     steps: list[list[str]] = []
     monkeypatch.setattr("scenes.cli.main", lambda step: steps.append(step) or 0)
     labels = ["labels.nii.gz", "--brain", "1", "--tumour", "2"]
@@ -66,7 +66,7 @@ def test_a_patient_hands_tissue_and_element_on(tmp_path, monkeypatch, words, exp
     assert steps[2][-4:] == ["--learners", "linear,series,series-gp", "--device", "cpu"]
 
 
-def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
+def test_patient_command_runs_all_steps(tmp_path, capsys, short_fits):
     ball(tmp_path, EGG)
     out = tmp_path / "me" / "brain.vtu"
     volumes = [str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--t1", str(tmp_path / "t1.nii.gz")]
@@ -93,7 +93,7 @@ def test_a_patient_in_one_go(tmp_path, capsys, short_fits):
     assert len(list((tmp_path / "frames").iterdir())) == 3
 
 
-def test_a_sample_patient_is_previewed_and_kept(tmp_path, monkeypatch, capsys):
+def test_sample_patient_inspection_writes_and_keeps_its_files(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["patient", "--sample", "--inspect"]
     assert main(words) == 0
@@ -113,7 +113,7 @@ def test_a_sample_patient_is_previewed_and_kept(tmp_path, monkeypatch, capsys):
     assert main([*words, "--force"]) == 0 and labels.exists() and t1.read_bytes() == data
 
 
-def test_a_sample_patient_gives_its_files_to_the_steps(tmp_path, monkeypatch, capsys):
+def test_sample_patient_files_are_passed_to_the_steps(tmp_path, monkeypatch, capsys):
     steps = []
     monkeypatch.setattr("scenes.cli.main", lambda step: steps.append(step) or 0)
     assert main(["patient", "--sample", "--out", str(tmp_path / "new" / "me.vtu"), "--device", "cpu", "--json"]) == 0
@@ -123,7 +123,7 @@ def test_a_sample_patient_gives_its_files_to_the_steps(tmp_path, monkeypatch, ca
     assert json.loads(capsys.readouterr().out)["anatomy"] == str(tmp_path / "new" / "me.vtu")
 
 
-def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsys):
+def test_patient_command_json_has_seconds_of_each_step(tmp_path, monkeypatch, capsys):
     def step(words):
         assert words[-1] == "--json"
         with time_stage(words[0]):
@@ -157,7 +157,7 @@ def test_a_patient_says_in_json_where_the_time_went(tmp_path, monkeypatch, capsy
         (["--sample", "--out", "a.vtu", "--count", "3"], "--count 3"),
     ],
 )
-def test_a_patient_that_cannot_be_is_a_sentence(tmp_path, monkeypatch, capsys, words, reason):
+def test_patient_command_rejects_bad_input_and_writes_nothing(tmp_path, monkeypatch, capsys, words, reason):
     ball(tmp_path)
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.iterdir())

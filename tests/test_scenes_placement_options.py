@@ -1,4 +1,4 @@
-"""Options for the opening in the skull and for the tumour: over which piece, and what may be left behind."""
+"""Options for the craniotomy and the tumour: selected piece, and kept data."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -25,7 +25,7 @@ def two_foci(folder):
     nibabel.save(nibabel.Nifti1Image(labels, image.affine), folder / "labels.nii.gz")
 
 
-def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
+def test_craniotomy_lies_over_the_selected_tumour_piece(tmp_path):
     two_foci(tmp_path)
     subject = build_volume_subject(tmp_path / "labels.nii.gz", (1,), (2,))
     large, small = subject.pieces
@@ -47,7 +47,7 @@ def test_the_skull_is_opened_over_the_piece_that_is_asked_for(tmp_path):
         place_craniotomy(replace(subject, pieces=(large,)), SimpleNamespace(**asked | {"opening_over": 2}))
 
 
-def test_anatomy_lists_pieces_and_keeps_existing_data(tmp_path, capsys):
+def test_anatomy_command_lists_tumour_pieces_and_keeps_data(tmp_path, capsys):
     two_foci(tmp_path)
     out = tmp_path / "me.vtu"
     words = ["anatomy", "--labels", str(tmp_path / "labels.nii.gz"), "--brain", "1", "--tumour", "2", "--nodes", "2000"]

@@ -1,4 +1,4 @@
-"""How exact a warp is: its error by part, the spacing that follows from it, and folds of the finite elements."""
+"""Accuracy of a warp: error by part, grid spacing and folds of FEM."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ def fields(kinked):
     return warp_fields(kinked.anatomy, kinked.displacement, 2e-3)
 
 
-def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
+def test_part_error_is_the_larger_of_both_field_errors(kinked, fields):
     places = list_places(kinked)
     errors = places.compute_errors(fields)
     assert 0.05e-3 < errors[places.tumour].max() < 1e-3 and errors[places.cortex].max() < 1e-6
@@ -51,8 +51,8 @@ def test_the_error_of_each_part_is_that_of_the_worse_field(kinked, fields):
     assert places.tumour.sum() > 4 * (kinked.anatomy.mesh.region == 2).sum()
 
 
-def test_places_in_necrosis_are_the_tumours(kinked):
-    """One half of the tumour's tetrahedra is necrosis; the places are those of the whole."""
+def test_tumour_places_include_necrosis(kinked):
+    """Half of the tumour's tetrahedra are necrosis."""
     mesh = kinked.anatomy.mesh
     region = mesh.region.copy()
     region[np.flatnonzero(region == TUMOUR_LABEL)[::2]] = NECROSIS_LABEL
@@ -60,7 +60,7 @@ def test_places_in_necrosis_are_the_tumours(kinked):
     assert np.array_equal(list_places(choose_moment(body, kinked.displacement)).tumour, list_places(kinked).tumour)
 
 
-def test_a_spacing_follows_from_the_tumours_error(kinked, fields):
+def test_finer_spacing_follows_from_the_tumour_error(kinked, fields):
     finer = find_finer_spacing(kinked, fields)
     assert MIN_SPACING <= finer < fields.grid.spacing
     assert find_finer_spacing(kinked, fields, SpacingSettings(tolerance=1.0)) is None
@@ -82,8 +82,8 @@ def dented(small_box):
     return choose_moment(small_box, moved)
 
 
-def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
-    """Points of the tetrahedra alone leave the cortex 0.9 mm off."""
+def test_dented_cortex_is_fitted_with_points_outside_the_mesh(dented):
+    """With points inside tetrahedra alone the cortex has an error of 0.9 mm."""
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = list_places(dented)
     errors = places.compute_errors(fields)
@@ -91,7 +91,7 @@ def test_a_dent_is_fitted_at_the_surface_by_what_lies_outside(dented):
     assert errors[places.cortex].max() < 0.2e-3 and errors[places.landmarks].max() < 0.1e-3
 
 
-def test_a_spacing_follows_from_the_landmarks_error_too(dented):
+def test_finer_spacing_follows_from_the_landmark_error(dented):
     fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = list_places(dented)
     assert places.compute_errors(fields)[places.tumour].max() < SpacingSettings().tolerance / 10.0
@@ -99,8 +99,8 @@ def test_a_spacing_follows_from_the_landmarks_error_too(dented):
     assert finer is not None and finer < 1.5e-3
 
 
-def test_folds_are_found_and_sorted_by_size(small_box):
-    """Two inner vertices go through a face of theirs: one of them hardly."""
+def test_folds_of_fem_are_found_and_sorted_by_size(small_box):
+    """Two inner vertices pass through a face of their tetrahedron, one of them barely."""
     mesh, moved = small_box.mesh, np.zeros_like(small_box.mesh.nodes)
     inner = np.setdiff1d(np.arange(len(mesh.nodes)), mesh.surface)
     first, last = inner[0], inner[-1]
@@ -113,7 +113,7 @@ def test_folds_are_found_and_sorted_by_size(small_box):
     assert all(fold.off > 0.1e-3 for fold in folds)
 
 
-def test_a_spacing_of_too_many_nodes_is_refused(small_box):
+def test_spacing_with_too_many_grid_nodes_is_rejected(small_box):
     with pytest.raises(InputError, match="million are the most"):
         compute_fields(choose_moment(small_box, np.full_like(small_box.mesh.nodes, 40e-3)), 0.3e-3, lambda more: None)
 
@@ -144,7 +144,7 @@ def test_fields_avoid_folds_of_fem_and_report_them(small_box, tmp_path, capsys):
     assert "WARNING: the finite elements fold" in text and "they were unfolded" in text and "nothing folds" not in text
 
 
-def test_finer_spacing_wide_field_keeps_within_32_million_nodes(kinked):
+def test_finer_spacing_keeps_grid_within_32_million_nodes(kinked):
     wide = choose_moment(kinked.anatomy, kinked.displacement + [40e-3, 0.0, 0.0])
     finer = find_finer_spacing(wide, warp_fields(wide.anatomy, wide.displacement, 5e-3))
     grids = (warp_grid(wide.anatomy, wide.displacement[None], spacing) for spacing in (finer, finer - 0.05e-3))

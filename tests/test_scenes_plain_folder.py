@@ -1,4 +1,4 @@
-"""Episodes as folders of pictures and tables."""
+"""Episodes as folders of images and tables."""
 
 import csv
 import json
@@ -9,7 +9,7 @@ import numpy as np
 from scenes.cli import main
 
 
-def test_a_folder_has_pictures_and_tables(folder, tmp_path):
+def test_folder_export_has_images_and_tables(folder, tmp_path):
     assert main(["convert", str(folder), "--to", "folder", "--out", str(tmp_path / "plain")]) == 0
     one = tmp_path / "plain/episode_000001"
     with h5py.File(folder / "episode_000001.h5") as file:

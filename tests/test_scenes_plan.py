@@ -1,4 +1,4 @@
-"""Plans of data sets: what may be drawn, that each episode is drawn by itself, and what is written of it."""
+"""Plans of data sets: limits, independent sampling of each episode, and stored parameters."""
 
 import json
 from dataclasses import replace
@@ -72,19 +72,19 @@ tool_mm = 1
         ("", "motion"),
     ],
 )
-def test_what_cannot_be_is_named(text, said):
+def test_invalid_plan_is_rejected_with_its_reason(text, said):
     with pytest.raises(InputError, match=said):
         plan_from(f'title = "x"\n{text}', "mine")
 
 
-def test_a_plan_that_is_not_there_is_named(tmp_path):
+def test_unknown_plan_is_rejected_with_known_names(tmp_path):
     with pytest.raises(InputError, match="there is no plan 'big': choose hard, small, standard"):
         load_plan("big")
     (tmp_path / "own.toml").write_text(TINY)
     assert load_plan(str(tmp_path / "own.toml")).digest == plan_from(TINY, "own").digest
 
 
-def test_a_long_name_and_a_long_plan_are_named(tmp_path):
+def test_plan_with_too_long_name_or_text_is_rejected(tmp_path):
     with pytest.raises(InputError, match="there is no plan"):
         load_plan(f"{'long' * 500}.toml")
     (tmp_path / "long.toml").write_text(f"{TINY}#{'x' * 10_000_000}")
@@ -92,7 +92,7 @@ def test_a_long_name_and_a_long_plan_are_named(tmp_path):
         load_plan(str(tmp_path / "long.toml"))
 
 
-def test_an_anatomy_beside_a_plan_is_part_of_its_digest(box, tmp_path):
+def test_plan_digest_depends_on_its_anatomy_file(box, tmp_path):
     path, text = tmp_path / "own.toml", f"{TINY}[bodies]\nanatomies = 'box.vtu'\n[bodies.learner]\nname = 'none'\n"
     path.write_text(text)
     with pytest.raises(InputError, match=r"box.vtu: cannot be read as an anatomy: no such file.*next to the plan"):
@@ -112,7 +112,7 @@ def made(tmp_path_factory):
     return folder, plan, make_episode(folder, plan, 1, 5, "cpu")
 
 
-def test_an_episode_says_what_it_was_drawn_from(made):
+def test_episode_stores_plan_seed_and_parameters(made):
     folder, plan, episode = made
     assert episode.path == to_episode_path(folder, 5) and episode.frames == 5 and not episode.failed
     with h5py.File(episode.path) as file:
@@ -132,7 +132,7 @@ def test_an_episode_says_what_it_was_drawn_from(made):
         assert "date" not in file.attrs and "seconds" not in file
 
 
-def test_the_same_episode_has_the_same_bytes_wherever_it_is_made(made, tmp_path):
+def test_episode_has_identical_bytes_in_any_folder(made, tmp_path):
     _, plan, episode = made
     make_body(tmp_path, plan, 1, 0, "cpu")
     make_episode(tmp_path, plan, 1, 6, "cpu")
@@ -142,7 +142,7 @@ def test_the_same_episode_has_the_same_bytes_wherever_it_is_made(made, tmp_path)
     assert make_episode(tmp_path, plan, 1, 5, "cpu").skipped and make_body(tmp_path, plan, 1, 0, "cpu").skipped
 
 
-def test_a_changed_number_breaks_a_checksum(made, tmp_path):
+def test_changed_value_breaks_a_checksum(made, tmp_path):
     path = tmp_path / "changed.h5"
     path.write_bytes(made[2].path.read_bytes())
     with h5py.File(path, "r+") as file:
@@ -152,7 +152,7 @@ def test_a_changed_number_breaks_a_checksum(made, tmp_path):
         assert "attributes" in find_broken(file)[1]
 
 
-def test_what_cannot_be_meshed_fails_with_its_reason(tmp_path):
+def test_body_that_cannot_be_meshed_fails_with_reason(tmp_path):
     plan = plan_from(f"{TINY}[bodies]\nanatomies = 'drawn'\n[bodies.tumour]\nradius_mm = 35\ncover_mm = 1\n", "big")
     body = make_body(tmp_path, plan, 1, 0, "cpu")
     assert "none of 6 anatomies that were drawn can be meshed; the last: a " in body.failed
@@ -161,8 +161,8 @@ def test_what_cannot_be_meshed_fails_with_its_reason(tmp_path):
         make_episode(tmp_path, plan, 1, 0, "cpu")
 
 
-def test_want_of_memory_fails_no_body_for_good(tmp_path, monkeypatch):
-    """Others on the same card may leave: the error is passed on, and the engine tries again."""
+def test_memory_shortage_is_raised_and_marks_no_failed_body(tmp_path, monkeypatch):
+    """Memory may become free: the engine tries again."""
 
     def full(*args):
         check_fits(10**9, 10**6, 1, find_device("cpu", "float64"))
@@ -173,7 +173,7 @@ def test_want_of_memory_fails_no_body_for_good(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("bodies/*"))
 
 
-def test_a_model_knows_what_the_tumour_is_made_of():
+def test_model_states_the_tissue_of_its_regions():
     tissue = Elasticity(BRAIN, {TUMOUR_LABEL: Material("neo-hookean", 9000.0, 0.49)})
     assert read_tissue_statement(describe_tissue_source(tissue)) == tissue and read_tissue_statement(
         describe_tissue_source(Elasticity(BRAIN))

@@ -1,4 +1,4 @@
-""""""
+"""Plausibility of a registration and of a tool pose."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.plausible import describe_implausible
 
 
-def test_a_registration_of_another_patient_is_noticed(follower, stage):
+def test_implausible_registration_and_tool_are_unreliable(follower, stage):
     first = next(iter(pictures())).picture
     T = follower.registration.T_patient_scan.copy()
     T[:3, 3] += [0.0, 0.0, -0.4]

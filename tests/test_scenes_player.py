@@ -1,4 +1,4 @@
-"""The loop: a tool that rests on the tissue, one picture a moment, and a picture that is a function of its moment."""
+"""Player of scenes: tool at rest on the tissue, and frames that depend on their moment alone."""
 
 import importlib
 from dataclasses import replace
@@ -38,8 +38,8 @@ def says(picture, text, ink=WHITE):
     )
 
 
-def test_the_pressing_tip_rests_on_the_deformed_surface(play):
-    """Its ball touches, and no point of the tissue is inside it."""
+def test_pressing_tip_rests_on_the_deformed_surface(play):
+    """The ball touches the tissue, and no point of the tissue is inside it."""
     touch, radius = play.scene.path(1.7), play.scene.tool.radius
     frame = play.draw(51, 1.7, touch)
     rest = play.scene.find_contact(play.site, touch).point
@@ -50,7 +50,7 @@ def test_the_pressing_tip_rests_on_the_deformed_surface(play):
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
-def test_a_place_under_the_bone_is_refused_said_and_shown(play, way):
+def test_tool_below_the_bone_stops_at_its_edge_with_remark(play, way):
     play = replace(play, style="none")  # a model of so few loads draws its bound all over the picture
     radius = play.scene.tool.radius
     frame = play.draw(0, 0.0, Touch(way * 0.1, way * 0.1, force=0.1))
@@ -61,8 +61,8 @@ def test_a_place_under_the_bone_is_refused_said_and_shown(play, way):
     assert inside.remark == "" and not says(inside.shown, frame.remark)
 
 
-def test_tissue_pressed_into_bone_is_not_reliable(theatre):
-    """Drawn aside with all that the model knows, beside the rim: the ball stays inside, and the picture says why."""
+def test_result_is_unreliable_with_tissue_pressed_into_bone(theatre):
+    """Largest force of the training range at the rim: the ball stays inside, and the image shows the warning."""
     play = player(theatre, replace(small(), viewpoint=Viewpoint()), "fem")
     reach = play.site.compute_reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
@@ -72,13 +72,13 @@ def test_tissue_pressed_into_bone_is_not_reliable(theatre):
     assert play.site.compute_axis_distance(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
 
 
-def test_lighter_touch_rests_higher_and_idle_tool_above(play):
+def test_smaller_force_gives_smaller_tip_depth(play):
     depth = [(play.draw(0, 0.0, Touch(force=force)).tip - play.site.origin) @ play.site.axis for force in (0, 0.1, 0.2)]
     assert depth[0] == pytest.approx(-4e-3) and 0.0 < depth[1] < depth[2]
 
 
 @pytest.mark.parametrize("name", PUSHING)
-def test_the_idle_tool_is_outside_the_tissue(template, name):
+def test_idle_tool_is_outside_the_tissue(template, name):
     play = on_template(name)
     tool = np.asarray(play.scene.tool.mesh.vertices)
     for number in (0, len(play.scene.times) - 1):
@@ -93,8 +93,8 @@ def test_the_idle_tool_is_outside_the_tissue(template, name):
         assert np.linalg.norm(shaft[:, None] - surface, axis=2).min() > 4e-3
 
 
-def test_drawing_is_a_function_of_its_moment(play):
-    """Whatever was drawn in between."""
+def test_frame_does_not_depend_on_frames_drawn_before(play):
+    """Another frame is drawn in between."""
     touch = play.scene.path(1.2)
     first = play.draw(36, 1.2, touch)
     play.draw(3, 0.1, Touch(0.01, 0.0, 0.1, (0.3, 0.1)))
@@ -106,7 +106,7 @@ def test_drawing_is_a_function_of_its_moment(play):
     assert first.distance == again.distance and first.touch == again.touch
 
 
-def test_frames_that_are_asked_for_together_are_the_same(theatre):
+def test_batched_frames_equal_single_frames(theatre):
     play = player(theatre, short(), "linear")
     alone, together = list(play.play_frames()), list(play.play_frames(together=4))
     assert [frame.number for frame in together] == [frame.number for frame in alone]
@@ -117,7 +117,7 @@ def test_frames_that_are_asked_for_together_are_the_same(theatre):
         assert np.mean(other.picture.segmentation == one.picture.segmentation) > 0.999
 
 
-def test_frames_are_stamped_with_their_moment(theatre):
+def test_frames_have_number_time_and_load_of_their_moment(theatre):
     for name in ("linear", "fem"):
         play = player(theatre, short(), name)
         frames = list(play.play_frames())
@@ -131,7 +131,7 @@ def test_frames_are_stamped_with_their_moment(theatre):
         assert len(pictures) == 4
 
 
-def test_warm_starts_of_the_loop_change_nothing_that_is_seen(theatre):
+def test_warm_starts_change_displacements_by_under_50_um(theatre):
     play = player(theatre, short(), "fem")
     cold = [
         play.draw(number, float(time), play.scene.path(float(time))) for number, time in enumerate(play.scene.times)
@@ -142,7 +142,7 @@ def test_warm_starts_of_the_loop_change_nothing_that_is_seen(theatre):
 
 
 @pytest.mark.parametrize("name", PUSHING)
-def test_lines_alone_cross_the_tool(name):
+def test_overlay_draws_only_lines_over_the_tool(name):
     play = on_template(name)
     for number in (20, 50, 75):
         time = float(play.scene.times[number])
@@ -157,8 +157,8 @@ def test_lines_alone_cross_the_tool(name):
         assert (changed & (frame.picture.segmentation == CORTEX)).sum() > 500
 
 
-def test_the_overlay_lies_where_the_tumour_is(play):
-    """By another way: the tumour's corners through OpenCV's camera lie inside what was changed."""
+def test_overlay_covers_the_opencv_projection_of_the_tumour(play):
+    """Independent check: tumour vertices projected by OpenCV lie inside the changed pixels."""
 
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     changed = (frame.shown != frame.picture.colour).any(axis=2)
@@ -168,7 +168,7 @@ def test_the_overlay_lies_where_the_tumour_is(play):
     assert seen.sum() > 4 and changed[row, column][seen].mean() > 0.97
 
 
-def test_frame_computes_rest_and_nearest_point_once(play, monkeypatch):
+def test_frame_computes_resting_tip_and_nearest_point_once(play, monkeypatch):
     found = []
     for place, name in (
         ("scenes.play.player", "find_resting_tip"),
@@ -187,7 +187,7 @@ def test_frame_computes_rest_and_nearest_point_once(play, monkeypatch):
     assert sorted(found) == ["find_closest_points", "find_resting_tip"] and frame.distance is not None
 
 
-def test_the_distance_is_that_from_tip_to_tumour(play):
+def test_distance_equals_sampled_distance_from_tip_to_tumour(play):
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     corners = play.compute_positions(frame.deformation)[play.site.anatomy.tumour_surface]
     share = np.random.default_rng(0).dirichlet(np.ones(3), 2000)
@@ -202,8 +202,8 @@ def test_the_distance_is_that_from_tip_to_tumour(play):
         )
 
 
-def test_learnt_and_finite_elements_are_interchangeable(theatre):
-    """The same scene, the same call: the answers agree to a fraction of the motion."""
+def test_trained_model_and_fem_give_similar_displacements(theatre):
+    """Same scene, same call: the difference is below a tenth of the motion."""
     nodes = theatre.anatomy.tumour_nodes
     fem, learnt = (
         player(theatre, small(), name).draw(51, 1.7, Touch(force=0.2)).deformation.restrict(nodes).displacement
@@ -213,7 +213,7 @@ def test_learnt_and_finite_elements_are_interchangeable(theatre):
     assert np.linalg.norm(fem - learnt, axis=2).mean() < 0.1 * np.linalg.norm(fem, axis=2).mean()
 
 
-def test_regions_of_a_tissue_of_their_own_are_named_in_short():
+def test_shortened_source_names_regions_with_own_tissue():
     own = Elasticity(regions={2: Material("neo-hookean", 9e3, 0.49), 3: Ogden(((1.0, 2.0), (3.0, 4.0)), 1e5)})
     whole = describe_solver("p1", [replace(own, regions=own.regions | {7: Material("linear", 1e3, 0.4)})])
     brief = describe_solver("p1", [Elasticity()]).removesuffix(")")

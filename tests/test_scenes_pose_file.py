@@ -1,4 +1,4 @@
-"""Files of poses: rows, counts and units."""
+"""Pose files: rows, counts and units."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from scenes.tracked.pose_file import read_poses
 from sim.errors import InputError
 
 
-def test_pose_rows_not_seen_are_counted_in_full(tmp_path):
+def test_unseen_pose_rows_of_each_kind_are_counted(tmp_path):
     path, good = tmp_path / "poses.csv", "1,2,3,0,0,0,1"
     poses = [good, good, good, "nan,nan,nan,nan,nan,nan,nan", "0,0,0,0,0,0,0", "0,0,0,0,0,0,1", good]
     cells = ["OK", "MISSING", "OUT_OF_VIEW", "OK", "OK", "OK", "OK"]
@@ -33,7 +33,7 @@ def test_pose_rows_not_seen_are_counted_in_full(tmp_path):
         ("note", ("a", "b", "c"), "0,0,0,0,0,0,1"),
     ],
 )
-def test_pose_rows_not_seen_are_dropped_and_counted(tmp_path, column, cells, pose):
+def test_unseen_pose_rows_are_removed_and_counted(tmp_path, column, cells, pose):
     path, good = tmp_path / "poses.csv", "1,2,3,0,0,0,1"
     rows = [f"{row},{good if row != 1 or pose is None else pose},{cell}" for row, cell in enumerate(cells)]
     path.write_text("\n".join([f"{HEAD},{column}", *rows]))
@@ -46,7 +46,7 @@ def test_pose_rows_not_seen_are_dropped_and_counted(tmp_path, column, cells, pos
     assert len(read_poses(path)[0]) == 2  # the tracker's own frame
 
 
-def test_poses_are_read_in_metres_and_wrong_ones_are_refused(tmp_path):
+def test_read_poses_returns_metres_and_rejects_invalid_rows(tmp_path):
     path = write_poses(tmp_path / "poses.csv", turned(3), [[0.1, 0.2, 0.3]] * 3)
     _, times, found = read_poses(path)
     np.testing.assert_allclose(times, [0.0, 0.1, 0.2])

@@ -1,4 +1,4 @@
-"""Solutions that a live link computes for poses, where it takes the camera to be, and the doubts that it reports."""
+"""Solutions of a live link for poses: camera pose, tumour position and warnings."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def test_sent_tumour_has_the_position_and_time_of_its_pose(follower, registratio
         (lambda T: np.eye(4), "identity"),
     ],
 )
-def test_a_pose_that_is_none_is_refused_and_counted(follower, registration, beside, change, why):
+def test_invalid_pose_is_rejected_and_counted(follower, registration, beside, change, why):
     async def scene():
         async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
             tracker.send("TRANSFORM", NAMES.tool, transform(change(beside[10])), NOW)
@@ -127,7 +127,7 @@ def test_distant_tool_is_marked_unreliable(follower, registration, beside):
 
 
 @pytest.mark.parametrize("state", [TumourState.GOOD, TumourState.UNSURE])
-def test_an_answer_with_a_bound_is_stale_when_it_is_old(stage, state):
+def test_old_result_is_marked_stale_without_band(stage, state):
     known = TrackingResult(0.0, state, "words", NO_TARGETS, BrainMotion(stage.anatomy.mesh.nodes), band=1e-3)
     assert add_lateness(PoseResult(NOW, known), 0.2, 0.3).known is known
     old = add_lateness(PoseResult(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
@@ -136,7 +136,7 @@ def test_an_answer_with_a_bound_is_stale_when_it_is_old(stage, state):
     )
 
 
-def test_a_tool_where_none_can_be_is_doubtful(follower, registration, beside):
+def test_implausible_tool_position_is_marked_doubtful(follower, registration, beside):
     far = beside[10].copy()
     far[:3, 3] += 1000.0
 
@@ -200,7 +200,7 @@ def test_interpolated_pose_reports_remaining_error():
     assert off(ahead, times[-1] + 0.03) <= ahead.moved < 4e-3
 
 
-def test_newest_pose_counts_with_camera_travel():
+def test_newest_pose_has_camera_motion_as_error():
     times = STEP * np.arange(12)
     middle = camera(0.0) @ [*1e3 * TUMOUR, 1.0]
     here, there = (np.linalg.inv(camera(time)) @ middle for time in times[-2:])
@@ -217,7 +217,7 @@ def test_newest_pose_counts_with_camera_travel():
     assert "alone" in at(heard_of(times[-1:]), times[-1])
 
 
-def test_poses_of_other_client_or_time_are_not_neighbours():
+def test_poses_of_other_client_or_clock_are_not_interpolated():
     heard = heard_of(STEP * np.arange(9))
     name = heard.names.camera
     taken_over = heard.add_transform(name, camera(0.4), to_stamp(BEGUN + 0.4), 1.0, 1)
@@ -238,12 +238,12 @@ def test_poses_of_other_client_or_time_are_not_neighbours():
         ("::1", ("::1", 18944)),
     ],
 )
-def test_an_address_is_a_host_or_one_of_ipv6_in_brackets(text, address):
+def test_parse_address_accepts_host_and_ipv6_in_brackets(text, address):
     assert parse_address(text) == address
     assert parse_address(format_address(*address)) == address
 
 
 @pytest.mark.parametrize("text", ["", ":18944", "[::1", "[localhost]:3", "::1:99999", "host:65536", "host:x", "a:b:1"])
-def test_an_address_that_is_none_is_refused(text):
+def test_parse_address_rejects_invalid_address(text):
     with pytest.raises(InputError, match="in brackets"):
         parse_address(text)

@@ -23,12 +23,12 @@ SAME = PatientSample(1.0, BRAIN.poisson, 1.0, 0.0, (0.0, 0.0, 0.0), 0.0)
 
 
 class TestPriors:
-    def test_each_says_what_it_is_and_where_it_is_from(self):
+    def test_each_prior_has_a_unique_name_meaning_and_source(self):
         assert len({prior.name for prior in PRIORS}) == len(PRIORS)
         assert all(prior.meaning and prior.source for prior in PRIORS)
 
-    def test_draws_cover_each_prior_evenly(self):
-        """One draw in each of so many parts of equal probability."""
+    def test_samples_cover_each_prior_evenly(self):
+        """One sample in each interval of equal probability."""
         found = sample_priors(20, 3)
         stiffness = np.sort([one.stiffness for one in found])
         edges = STIFFNESS.compute_quantiles(np.arange(21) / 20.0)
@@ -38,11 +38,11 @@ class TestPriors:
         assert np.std([one.tip for one in found]) == pytest.approx(1.06e-3, rel=0.15)
         assert found == sample_priors(20, 3) != sample_priors(20, 4)
 
-    def test_each_skull_is_as_probable(self):
+    def test_skull_models_have_equal_probability(self):
         names = [apply_sample(short(), one).effects[2] for one in sample_priors(30, 0)]
         assert [names.count(skull) for skull in SKULLS.values()] == [10, 10, 10]
 
-    def test_from_a_skull_that_lets_go_nothing_is_bonded(self):
+    def test_skull_models_of_brain_shift_exclude_bonding(self):
         assert list_skulls(find_scene("brain_shift")) == ("slide", "contact")
 
     def test_mesh_error_grows_with_sliding_and_weight(self):

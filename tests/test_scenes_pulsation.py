@@ -1,4 +1,4 @@
-"""The built-in scene of a ball on a brain that pulsates."""
+"""Built-in scene of a ball on a pulsating brain."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from sim.effects import Pulsation
 
 
 class TestPulsation:
-    def test_the_ball_reads_the_pulse(self, theatre):
+    def test_tool_force_correlates_with_the_pulsation(self, theatre):
         scene = replace(small("pulsation"), duration=3.0)
         frames = list(player(theatre, scene, "fem").play_frames(3))
         reads = np.array([-frame.deformation.reaction[0, 0, 2] for frame in frames if frame.time >= 1.0])
@@ -19,7 +19,7 @@ class TestPulsation:
         assert np.corrcoef(reads, swells)[0, 1] > 0.95
         assert reads.max() > 1.05 * reads.min() > 0.0
 
-    def test_frames_after_one_another_are_the_truth(self, theatre):
+    def test_reference_frames_converge_in_sequence(self, theatre):
         scene = small("pulsation")
         loads = [scene.build_loads(theatre.site, scene.path(time), time) for time in (0.0, 0.8, 1.25, 1.6)]
         truth = solve_reference_frames(theatre, scene, loads)

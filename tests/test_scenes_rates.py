@@ -1,4 +1,4 @@
-"""Two machines in one folder, one of which is unplugged and ended whole: nothing is lost, and nothing is made twice.
+"""Two machines that share one folder, one of them disconnected and killed: no episode is lost or made twice.
 
 Each is a network, a host name and a table of processes of its own (namespaces of Linux), on one kernel and one disk.
 """
@@ -131,7 +131,7 @@ def files(folder):
     return {path.name: path.stat().st_ino for path in folder.glob("episode_*.h5")}
 
 
-def test_a_machine_of_a_scheduler_is_lost_and_comes_again(network, plan, undisturbed, tmp_path):
+def test_run_completes_after_loss_of_a_scheduled_machine(network, plan, undisturbed, tmp_path):
     folder = tmp_path / "set"
     dask = [sys.executable, "-m", "dask"]
     work = [*dask, "worker", SCHEDULER, "--nthreads", "1", "--memory-limit", "0", "--no-nanny", "--no-dashboard"]
@@ -158,7 +158,7 @@ def test_a_machine_of_a_scheduler_is_lost_and_comes_again(network, plan, undistu
     assert len(set(numbers)) == len(numbers) <= COUNT
 
 
-def test_machines_that_know_nothing_of_each_other_share_a_folder(network, plan, undisturbed, tmp_path):
+def test_independent_machines_share_one_episode_folder(network, plan, undisturbed, tmp_path):
     folder = tmp_path / "set"
     words = [*command(plan, folder), "--workers", "1"]
     with machine(network, "one", words, folder) as one, machine(network, "two", words, folder) as two:

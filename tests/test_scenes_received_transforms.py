@@ -1,4 +1,4 @@
-"""What is heard from a tracker: matrices, units and frames."""
+"""Transforms received from a tracker: matrices, units and frames."""
 
 import numpy as np
 import pytest
@@ -25,17 +25,17 @@ def changed(row, column, value):
         (matrix((0.0, 2e4, 0.0)), "more than 10 m"),
     ],
 )
-def test_a_matrix_that_moves_no_body_is_refused(T, why):
+def test_non_rigid_matrix_is_rejected(T, why):
     with pytest.raises(BadMessageError, match=why):
         to_rigid(T)
 
 
-def test_a_rigid_matrix_of_single_precision_is_taken_in_metres():
+def test_single_precision_rigid_matrix_is_converted_to_metres():
     T = to_rigid(matrix().astype(np.float32).astype(float))
     assert T[:3, 3] == pytest.approx([0.01, -0.02, 0.03]) and T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3))
 
 
-def test_tracker_frame_bodies_map_to_reference():
+def test_poses_in_tracker_frame_are_converted_to_reference():
     names = TransformNames(tool="StylusTipToTracker")
     heard = ReceivedTransforms(names, 0.3).add_transform(names.tool, matrix(), STAMP, 1.0, 0)
     assert heard.find_relative(names.tool, 1.0) == "no ReferenceToTracker yet"

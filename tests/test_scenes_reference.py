@@ -1,4 +1,4 @@
-"""Reference solutions of a report and of frames: kept load by load, and read at the points that are compared."""
+"""Reference solutions of a report and of frames: stored by load, and evaluated at the compared points."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ from sim.loads import Pushed, push
 from surrogate.model.training_range import compute_training_range
 
 
-def test_only_loads_that_both_converged_for_are_compared(study, study_box, monkeypatch):
+def test_comparison_uses_only_loads_converged_in_both(study, study_box, monkeypatch):
     truth = ReferenceSolutions(np.full((2, len(study.drawn), 3), 1e-3), np.array([True, False]), np.ones(2))
     monkeypatch.setattr("scenes.report.row.get_reference", lambda study: truth)
     answer = np.full((2, len(study_box.tumour_nodes), 3), [[[1e-3, 1e-3, 3e-3]], [[np.nan] * 3]])
@@ -32,7 +32,7 @@ def test_only_loads_that_both_converged_for_are_compared(study, study_box, monke
     assert compare_with_reference(study, answer, np.array([False, True]), study_box.tumour_nodes) is None
 
 
-def test_a_reference_goes_on_load_by_load(study, monkeypatch):
+def test_reference_resumes_with_missing_loads_only(study, monkeypatch):
     deform = Fem.deform
     before = get_reference(study)
     lost = sorted((study.folder / "answers").glob("reference-*"))[1]
@@ -45,8 +45,8 @@ def test_a_reference_goes_on_load_by_load(study, monkeypatch):
     assert np.allclose(get_reference(study).displacement, before.displacement, atol=1e-12) and before.good.all()
 
 
-def test_a_damaged_answer_is_named(study):
-    """So is a damaged table of the series: a stopped run goes on from both."""
+def test_damaged_reference_file_is_rejected_by_name(study):
+    """Also a damaged table of the series: stopped runs resume from both."""
     get_reference(study)
     kept = study.folder / "answers"
     answer, table = min(kept.glob("reference-*")), kept / f"series-{study.digest}.npz"
@@ -57,8 +57,8 @@ def test_a_damaged_answer_is_named(study):
         path.unlink()
 
 
-def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path):
-    """On a coarse box halving every edge changes the motion by some percent, not by half."""
+def test_finer_reference_is_evaluated_at_the_same_points(study, tmp_path):
+    """On a coarse box, halved edges change the motion by some percent."""
     one, fine = (replace(study, folder=tmp_path, loads=1, fine=fine) for fine in (False, True))
     for each in (one, fine):
         solve_reference(each, nothing, TRAIN)
@@ -67,7 +67,7 @@ def test_a_finer_reference_is_read_at_the_same_points(study, tmp_path):
     assert 1e-3 < off < 0.3
 
 
-def test_what_lies_beyond_is_outside_the_envelope(study):
+def test_outside_loads_lie_beyond_the_training_range(study):
     training = study.converged.select(np.flatnonzero(study.discs.train)).get(Pushed)
     outside = study.outside.get(Pushed)
     assert not compute_training_range(study.patch, training).is_inside(study.patch, outside).any()
@@ -77,8 +77,8 @@ def test_what_lies_beyond_is_outside_the_envelope(study):
     assert get_solutions_beyond(study).displacement.shape == (study.beyond, len(study.anatomy.tumour_nodes), 3)
 
 
-def test_the_truth_of_a_frame_knows_what_went_before() -> None:
-    """Tissue that relaxes: pressed, held and all but let go, it is not where it was never pressed."""
+def test_reference_frame_depends_on_loading_history() -> None:
+    """Relaxing tissue after a press differs from tissue that was never pressed."""
     anatomy = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
     theatre = PatientSetup(anatomy, None, {}, "cpu")
     scene = replace(small(), effects=(Elasticity(RELAXING_BRAIN), Held(), Slide(), ToolForce()), element="p1")
@@ -92,7 +92,7 @@ def test_the_truth_of_a_frame_knows_what_went_before() -> None:
     assert np.linalg.norm(found[2] - alone) > 0.1 * np.linalg.norm(alone)
 
 
-def test_whoever_waits_for_the_truth_sees_it_go_by(pretender):
+def test_reference_frames_report_their_progress(pretender):
     theatre = SimpleNamespace(build_fem=lambda scene, accuracy, batch: pretender)
     loads = [push(np.array([0.001 * k, 0.0, 0.0]), np.array([0.0, 0.0, -0.1]), 6e-3) for k in range(20)]
     heard = []

@@ -1,4 +1,4 @@
-"""Command that registers a patient: the file that it writes, and the error at the tumour."""
+"""Command that registers a patient: its file, and the error at the tumour."""
 
 import json
 
@@ -11,7 +11,7 @@ from scenes.tracked.registration_file import read_registration
 from sim.bodies.meshfile import read_anatomy
 
 
-def test_the_command_writes_it_and_tells_the_error_at_the_tumour(tmp_path, capsys):
+def test_register_command_writes_file_and_error_at_tumour(tmp_path, capsys):
     pairs, out = tmp_path / "pairs.csv", tmp_path / "r.json"
     rng = np.random.default_rng(0)
     table = 1e3 * np.hstack([SCAN, moved(SCAN) + 5e-4 * rng.normal(size=SCAN.shape)])

@@ -1,4 +1,4 @@
-"""Registration files: what is written is read, and other bodies are refused."""
+"""Registration files: round trip, and rejected registrations of another body."""
 
 import json
 from dataclasses import replace
@@ -14,7 +14,7 @@ from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 
 
-def test_a_file_gives_back_what_was_written_and_damage_is_named(tmp_path):
+def test_registration_file_round_trips_and_rejects_damage(tmp_path):
     path, rng = tmp_path / "r.json", np.random.default_rng(0)
     found = register_points(SCAN, moved(SCAN) + 1e-3 * rng.normal(size=SCAN.shape))
     write_registration(path, found)
@@ -38,7 +38,7 @@ def test_a_file_gives_back_what_was_written_and_damage_is_named(tmp_path):
         assert str(caught.value).startswith(str(path))
 
 
-def test_it_is_refused_for_another_body_and_not_for_another_mesh(tmp_path):
+def test_registration_accepts_another_mesh_of_the_same_body(tmp_path):
     anatomy, path = read_anatomy(get_template_path()), tmp_path / "r.json"
     made = describe_scan(anatomy)
     found = replace(register_points(SCAN, moved(SCAN)), scanned=made)

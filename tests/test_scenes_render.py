@@ -1,10 +1,10 @@
-"""Command that renders frames: those of another run are kept, or removed by force."""
+"""Command that renders frames: existing frames are kept, or removed by force."""
 
 from ar.screen import read_png
 from scenes.cli import main
 
 
-def test_frames_that_are_there_are_kept_or_removed_by_force(box_folder, tmp_path, monkeypatch, capsys):
+def test_render_keeps_existing_frames_unless_forced(box_folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(box_folder)
     words = ["render", "press", "--anatomy", "box.vtu", "--device", "cpu", "--out", str(tmp_path), "--plain"]
     assert main([*words, "--every", "60", "--film", str(tmp_path / "press.gif")]) == 0

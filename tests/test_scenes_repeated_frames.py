@@ -1,4 +1,4 @@
-"""Frames of an episode solved again: those whose past matters after their past, and any that is wrong is named."""
+"""Frames of an episode solved again after their history: changed frames are named."""
 
 import os
 import signal
@@ -40,8 +40,8 @@ def episode(request, small_box, tmp_path_factory):
     return made.path
 
 
-def test_a_frame_is_solved_again_after_its_past(episode):
-    """Of the frames 0, 2 and 5 the last is not as it was: the others are right, and it alone is named."""
+def test_repeated_solution_detects_a_changed_frame(episode):
+    """Only the changed one of frames 0, 2 and 5 is named."""
     report = solve_again(Report(episode), 3, "cpu")
     assert report.problems == [] and report.again == 3 and report.again_mm < 0.1
     with h5py.File(episode, "a") as file:
@@ -56,7 +56,7 @@ def slow(path):
     return Report(path)
 
 
-def test_who_wants_no_more_waits_for_what_has_begun_alone(tmp_path):
+def test_closing_validation_waits_for_started_files_only(tmp_path):
     reports = validate_files([tmp_path / f"{number}.h5" for number in range(200)], 1, slow)
     assert next(reports).problems == []
     began = time.perf_counter()
@@ -72,7 +72,7 @@ def end(path):
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_file_that_ends_its_reader_ends_no_other(whole, tmp_path):
+def test_crash_on_one_file_does_not_affect_other_files(whole, tmp_path):
     broken = tmp_path / "broken.h5"
     broken.write_bytes(whole.read_bytes())
     reports = {report.path: report for report in validate_files([broken, whole], 1, end)}

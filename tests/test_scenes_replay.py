@@ -1,4 +1,4 @@
-"""Whatever a visitor does, a frame of the script is that of the straight run; plain statics need no run."""
+"""Replayed frames of a scene: equal to sequential frames in any order; static scenes need no replay."""
 
 import threading
 import time
@@ -84,7 +84,7 @@ def answer(session: ReplaySession, number: int, touch: Touch | None = None) -> D
 
 
 class TestReel:
-    def test_a_frame_is_the_sum_of_its_past_and_little_is_run_again(self) -> None:
+    def test_frame_cache_replays_few_frames(self) -> None:
         ran: Counter[int] = Counter()
 
         def step(number: int, before: tuple[int, ...] | None) -> tuple[int, ...]:
@@ -100,13 +100,13 @@ class TestReel:
             assert ran.total() - before < (101 if number == 99 else -(-100 // IN_ORDER.kept))
         assert len(ran) == 100 and len(reel.kept) <= IN_ORDER.kept
 
-    def test_one_call_takes_one_step_at_most(self) -> None:
+    def test_frame_cache_computes_at_most_one_frame_per_call(self) -> None:
         ran: list[int] = []
         reel = FrameCache(50, lambda number, before: ran.append(number))
         for calls in range(1, 20):
             assert reel.approach_frame(40)[0] == calls - 1 and ran == list(range(calls))
 
-    def test_long_jump_goes_through_frames_from_nearest(self) -> None:
+    def test_long_jump_starts_at_the_nearest_cached_frame(self) -> None:
         ran: list[tuple[int, int | None]] = []
         reel = FrameCache(
             50, lambda number, before: ran.append((number, before)) or number, ReplayOrder(6, back=True, kept=64)
@@ -129,7 +129,7 @@ class TestReel:
         assert list(reel.kept) == [0]
 
 
-def test_jumps_use_frames_where_brain_separates(theatre) -> None:
+def test_replay_order_depends_on_contact_and_history(theatre) -> None:
     """And nowhere else; tissue that relaxes is answered in order."""
     box = theatre.anatomy
     sides = box.fixed.any(axis=1) & (box.mesh.nodes[:, 2] > box.mesh.nodes[:, 2].min() + 1e-9)
@@ -147,8 +147,8 @@ def test_jumps_use_frames_where_brain_separates(theatre) -> None:
 
 
 @pytest.mark.parametrize("name", REMEMBERING)
-def test_frames_in_any_order_are_those_of_the_straight_run(theatre, name):
-    """Of two visitors' sessions in turns, with one solver, a hand in between."""
+def test_frames_in_any_order_equal_sequential_frames(theatre, name):
+    """Two visitors take turns on one solver, with manual control in between."""
     player = theatre.build_player("fem", REMEMBERING[name])
     assert player.remembers
     run = straight(player)
@@ -161,18 +161,18 @@ def test_frames_in_any_order_are_those_of_the_straight_run(theatre, name):
     assert np.abs(run[12].displacement).max() > 1e-4
 
 
-def test_what_went_before_counts(theatre):
-    """Else nothing above would say anything: from rest, or from a later frame's shape, it is another answer."""
+def test_frame_of_relaxing_tissue_depends_on_its_history(theatre):
+    """Control: solutions from rest or from a later frame differ."""
     player = theatre.build_player("fem", REMEMBERING["tissue that relaxes under a blade"])
     run = straight(player)
     alone = player.compute_deformation(player.build_loads(12))
     assert np.abs(alone.reaction - run[12].reaction)[0, 0, 2] > 0.015 * np.abs(run[12].reaction[0, 0, 2])
 
 
-def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
-    """Whichever frame its number says: held where it is, tissue goes on relaxing under the tool, and never back.
+def test_manual_tool_continues_from_the_last_solution(theatre):
+    """For any frame number: held tissue continues to relax below the tool, and never reverses.
 
-    It stays where it is in a frame that begins within the tolerance.
+    Within the tolerance of its start a frame keeps its solution.
     """
     player = theatre.build_player("fem", REMEMBERING["tissue that relaxes under a blade"])
     session = ReplaySession(player)
@@ -189,8 +189,8 @@ def test_a_hand_goes_on_from_the_last_answer_a_frame_later(theatre):
     assert np.linalg.norm(first.reaction[0, 0, :3]) == reads[1]
 
 
-def test_plain_statics_are_not_run_again(theatre, monkeypatch):
-    """One solve a frame, from whatever was shown last."""
+def test_static_scene_solves_each_frame_once(theatre, monkeypatch):
+    """One solve per frame, started from the last displayed solution."""
     player = theatre.build_player("fem", hasty("press", path=press(0.2, rise=0.2, hold=0.1)))
     asked: list[Deformation | None] = []
     solve = player.deformer.deform
@@ -204,7 +204,7 @@ def test_plain_statics_are_not_run_again(theatre, monkeypatch):
     assert len(asked) == len(ASKED)
 
 
-def test_which_scenes_remember() -> None:
+def test_remember_is_true_for_history_dependent_scenes() -> None:
     found = {name: remember(find_scene(name).effects) or bool(find_scene(name).surgery) for name in SCENES}
     assert {name for name, does in found.items() if does} == {"spatula", "palpate", "retract", "resection", "pulsation"}
     relaxing = Material("neo-hookean", 3000.0, 0.45, prony=((0.4, 1.0),))
@@ -224,7 +224,7 @@ class TestPages:
         for page in pages:
             page.close()
 
-    def test_two_pages_scrub_switch_and_play(self, theatre, pages, monkeypatch):
+    def test_two_pages_show_sequential_frames(self, theatre, pages, monkeypatch):
         scene = pages[0].stage.scene
         full = straight(theatre.build_player("fem", scene))
         less = straight(theatre.build_player("fem", remove_effect(scene, Gravity())))
@@ -263,7 +263,7 @@ class TestPages:
         assert [frame.number for frame in shown[first][:9]] == [*range(12, 19), 0, 1]
 
 
-def test_the_referee_answers_the_straight_run_too(theatre):
+def test_fem_worker_solutions_equal_sequential_frames(theatre):
     scene = REMEMBERING["tissue that relaxes under a blade"]
     full = straight(theatre.build_player("fem", scene))
     referee = FemWorker(theatre, scene, threading.Lock())

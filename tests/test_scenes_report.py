@@ -1,4 +1,4 @@
-"""`sulcus report`: its numbers by hand, the front, and a page that needs nothing."""
+"""`sulcus report`: figures recomputed independently, and a page without external resources."""
 
 import csv
 import json
@@ -34,8 +34,8 @@ def figures_by_hand(distance, truth):
     return [f(v) for v in (1e3 * distance, share) for f in (np.mean, lambda x: np.percentile(x, 95), np.max)]
 
 
-def test_numbers_are_those_recomputed_by_hand(study, page, study_box):
-    """Quadratic reference, finite elements, and a learner against those it was trained on, each from its own source."""
+def test_report_figures_match_independent_recomputation(study, page, study_box):
+    """Quadratic reference, FEM and a learner's error on its training loads, each from its own source."""
     stored = json.loads((page / "report.json").read_text())["sections"][0]["rows"]
     with open(page / "data.csv") as file:
         lines = list(csv.DictReader(file))
@@ -76,7 +76,7 @@ def test_numbers_are_those_recomputed_by_hand(study, page, study_box):
     assert stored[2]["loads"] == study.discs.train.sum() and stored[2]["units"] == 3 * study_box.craniotomy.sum()
 
 
-def test_the_page_needs_nothing_but_itself(page, study_rows):
+def test_report_page_loads_no_external_resources(page, study_rows):
     text = (page / "index.html").read_text()
     assert not re.search(r"https?:|<script|<link|@import|src=|url\((?!#)", text)
     for words in ("Reliable loads", "a model difference", "About &lt;this&gt;."):
@@ -86,8 +86,8 @@ def test_the_page_needs_nothing_but_itself(page, study_rows):
     assert [read_png(path).std() > 5.0 for path in page.glob("data-*.png")] == [True] * 7
 
 
-def test_rows_of_families_have_each_loads_error_and_outcome(study, study_rows, study_box):
-    """The table against elements to a small tolerance: of the same tissue, but linear."""
+def test_family_rows_have_error_and_outcome_of_each_load(study, study_rows, study_box):
+    """Table against linear FEM of the same tissue to a small tolerance."""
     fem, _, learner, condensed, plate = study_rows
     nodes = np.union1d(study.patch.nodes, study_box.tumour_nodes)
     effects = build_push_effects(study_box, TISSUE)
@@ -107,7 +107,7 @@ def test_rows_of_families_have_each_loads_error_and_outcome(study, study_rows, s
 
 
 @pytest.mark.parametrize("fine", [False, True])
-def test_reference_elements_differ_by_tolerance_only(study, fine):
+def test_row_with_reference_elements_differs_by_tolerance_only(study, fine):
     here = replace(study, fine=fine)
     said = {
         (element, mesh): describe_difference(here, FemVariant("it", element=element, mesh=mesh))
@@ -119,8 +119,8 @@ def test_reference_elements_differ_by_tolerance_only(study, fine):
     assert describe_difference(here, FemVariant("it", "linear", *alone)) == DIFFERENCE
 
 
-def test_page_is_written_and_missing_row_reported(study, study_rows, monkeypatch, capsys):
-    """Everything is solved already; the rows are those found."""
+def test_report_command_writes_page_and_lists_missing_row(study, study_rows, monkeypatch, capsys):
+    """All loads are solved before; the rows are those of the fixture."""
     words = ["report", "--quick", "--loads", str(study.loads), "--data", str(study.data), "--out", str(study.folder)]
     words += ["--device", "cpu"]
     monkeypatch.setattr("scenes.report.rows.measure_rows", lambda study, specs: iter(study_rows))

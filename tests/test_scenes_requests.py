@@ -1,4 +1,4 @@
-"""Wishes of visitors: who plays, seeks and holds the tool; what one of them asks ends the page for nobody."""
+"""Requests of visitors: playback, frame selection, manual control, and rejected loads."""
 
 import threading
 import time
@@ -18,7 +18,7 @@ from sim.errors import InputError
 
 
 class TestWish:
-    def test_playing_goes_round(self):
+    def test_play_repeats_from_the_first_frame(self):
         wish = Requests("linear", Touch(force=0.1))
         assert [self.played(wish) for _ in range(5)] == [0, 1, 2, 0, 1]
         wish.set(plays=False)
@@ -31,13 +31,13 @@ class TestWish:
         wish.go_on(number, 3)
         return number
 
-    def test_seek_is_not_overridden_by_current_frame(self):
+    def test_requested_frame_is_not_overridden_by_playback(self):
         wish = Requests("linear", Touch())
         wish.set(number=2)
         wish.go_on(0, 3)
         assert wish.read_current()[0] == 2
 
-    def test_the_hand_holds_what_it_does_not_change(self):
+    def test_manual_control_keeps_unchanged_values(self):
         wish = Requests("linear", Touch(force=0.1))
         assert wish.read_current()[2] is None
         wish.take_over(x=0.01)
@@ -47,8 +47,8 @@ class TestWish:
         wish.set(tool=SCRIPT, deformer="fem")
         assert wish.read_current()[1:3] == ("fem", None)
 
-    def test_two_sliders_at_once_both_count(self):
-        """The page calls each slider on a thread of its own."""
+    def test_simultaneous_slider_changes_are_both_applied(self):
+        """The page calls each slider in its own thread."""
         wish = Requests("linear", Touch(force=0.1))
         hands = [threading.Thread(target=wish.take_over, kwargs=turn) for turn in ({"right": 0.2}, {"up": -0.3})]
         with wish.lock:  # both are under way before either is heard
@@ -118,7 +118,7 @@ def test_rejected_load_is_shown_on_the_page(running, monkeypatch):
     other.wire.close()
 
 
-def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd):
+def test_defect_is_logged_in_one_line_and_play_continues(demo, monkeypatch, capfd):
     refuse(monkeypatch, lambda number, touch: number == 5, IndexError("none such"))
     demo.wish.set(plays=True, number=4)
     assert demo.run(MESSAGE_TIME + 1.5) > 1
@@ -127,7 +127,7 @@ def test_a_defect_is_said_in_a_line_and_playing_goes_on(demo, monkeypatch, capfd
     assert said.count("\n") == 1 and "sulcus demo: a defect: IndexError, none such (line" in said
 
 
-def test_loads_without_fem_solution_are_left_out(theatre, scene, monkeypatch):
+def test_loads_rejected_by_fem_are_skipped(theatre, scene, monkeypatch):
     refuse(monkeypatch, lambda number, touch: number == 7, InputError("7 is refused."))
     player = theatre.build_player("linear", scene)  # as quick to have, and asked the same way
     monkeypatch.setattr(PatientSetup, "build_player", lambda *words: player)
@@ -140,7 +140,7 @@ def test_loads_without_fem_solution_are_left_out(theatre, scene, monkeypatch):
     referee.close()
 
 
-def test_each_visitor_reads_who_has_the_tool(running):
+def test_each_visitor_sees_who_controls_the_tool(running):
     page = running.browser
     one = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -167,8 +167,8 @@ def test_each_visitor_reads_who_has_the_tool(running):
     one.wire.close()
 
 
-def test_hand_starts_where_the_script_has_the_tool(demo, monkeypatch):
-    """By a slider and by the menu; the sliders follow the script."""
+def test_manual_control_starts_at_the_scripted_tool_position(demo, monkeypatch):
+    """With a slider and with the menu; the sliders follow the script."""
     demo.wish.set(plays=False, number=100)
     path = demo.stage.scene.path
 

@@ -1,4 +1,4 @@
-"""A tumour that is taken in steps: what is cut, what is drawn of the rest, and what an episode and a page say of it."""
+"""Resection of a tumour in steps: removed elements, remaining tumour in images, episodes and on the page."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -41,7 +41,7 @@ def frames(play):
     return list(play.play_frames())
 
 
-def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
+def test_resection_removes_corridor_then_tumour_from_the_top(box, theatre):
     corridor, *shares = (np.array(step) for step in SURGERY.build_resection(box).steps)
     middle = box.mesh.nodes[box.mesh.tets].mean(axis=1)
     assert (np.linalg.norm(middle[corridor, :2], axis=1) < 6.1e-3).all() and middle[corridor, 2].max() > -4e-3
@@ -54,7 +54,7 @@ def test_the_steps_are_a_corridor_and_shares_from_the_top(box, theatre):
     assert [SURGERY.count_done(time) for time in (0.0, 0.0499, 0.05, 0.12, 9.0)] == [0, 0, 1, 2, 3]
 
 
-def test_its_effects_and_causes_are_the_body_s(theatre, scene):
+def test_resection_scene_has_resection_effect_and_cause(theatre, scene):
     assert [type(effect) for effect in scene.get_effects_on(theatre.anatomy)][-1] is Resection
     loads = scene.build_loads(theatre.site, Touch(), 0.12)
     assert [type(cause) for cause in loads.causes] == [Posture, Resected]
@@ -64,7 +64,7 @@ def test_its_effects_and_causes_are_the_body_s(theatre, scene):
     assert theatre.list_deformers(scene) == ("fem",)
 
 
-def test_the_rest_of_the_tumour_is_drawn(play, frames):
+def test_remaining_tumour_is_drawn_after_each_step(play, frames):
     areas = []
     for frame in frames:
         stage = play.stage.select_stage(frame.loads)
@@ -78,19 +78,19 @@ def test_the_rest_of_the_tumour_is_drawn(play, frames):
     assert seen[0] == pytest.approx(seen[1], rel=0.05) and seen[3] < 0.97 * seen[1]
 
 
-def test_the_corridor_is_seen_in_the_cortex(play, frames):
-    """Through the hole the camera sees deeper than the surface."""
+def test_corridor_is_visible_in_the_cortex(play, frames):
+    """Depth in the image increases in the hole."""
     before, after = frames[1].picture.depth, frames[2].picture.depth
     assert (after - before).max() > 4e-3 and (np.abs(after - before) < 1e-3).mean() > 0.9
 
 
-def test_what_was_taken_stays_where_the_scan_has_it(play, frames):
+def test_removed_tissue_has_no_displacement(play, frames):
     gone = play.stage.select_stage(frames[-1].loads).anatomy.orphaned
     moved = np.linalg.norm(frames[-1].deformation.displacement[0], axis=1)
     assert gone.any() and not moved[gone].any() and moved[~gone].max() > 1e-5
 
 
-def test_an_episode_says_what_is_left(theatre, play, scene, tmp_path):
+def test_episode_stores_the_remaining_tumour(theatre, play, scene, tmp_path):
     collect(tmp_path / "a.h5", theatre, play, "fem", iter)
     with h5py.File(tmp_path / "a.h5") as file:
         assert file["done"][:].tolist() == [SURGERY.count_done(time) for time in scene.times]
@@ -100,7 +100,7 @@ def test_an_episode_says_what_is_left(theatre, play, scene, tmp_path):
         assert not taken.any() and "Resection(steps=" in file.attrs["effects"]
 
 
-def test_the_page_shows_the_rest(theatre, scene):
+def test_page_shows_the_remaining_tumour(theatre, scene):
     demo = Demo(theatre, replace(scene, frames_per_second=30.0), "fem", "127.0.0.1", free_port())
     try:
         demo.wish.set(plays=False, number=0)
@@ -119,6 +119,6 @@ def test_the_page_shows_the_rest(theatre, scene):
         demo.close()
 
 
-def test_it_is_checked(theatre, tmp_path):
+def test_resection_scene_passes_the_check_command(theatre, tmp_path):
     words = ["check", "resection", "--anatomy", str(put(theatre, tmp_path / "box.vtu")), "--every", "75"]
     assert main([*words, "--device", "cpu"]) == 0

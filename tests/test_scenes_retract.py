@@ -1,4 +1,4 @@
-"""The built-in scene of a blade that is held."""
+"""Built-in scene of a held blade."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from sim.tools import compute_distances
 
 
 class TestRetract:
-    def test_the_blade_bears_less_and_less_while_it_is_held(self, theatre):
+    def test_force_on_held_blade_decreases_with_relaxation(self, theatre):
         frames = list(player(theatre, small("retract"), "fem").play_frames(15))
         (cause,) = frames[-1].loads.causes
         assert isinstance(cause, Retracted)
@@ -25,7 +25,7 @@ class TestRetract:
     @pytest.mark.parametrize(
         "touch", [Touch(depth=-IDLE_HEIGHT), Touch(depth=3e-3), Touch(0.0, 0.0, 0.0, (0.5, 0.0), 3e-3)]
     )
-    def test_blade_is_laid_clear_of_tissue_then_moved(self, theatre, touch):
+    def test_blade_starts_above_the_tissue_and_moves_to_its_pose(self, theatre, touch):
         scene, site = small("retract"), theatre.site
         cause = scene.build_loads(site, touch, 0.0).get(Retracted)
         apart = compute_distances(scene.tool.shape, cause.pose[0], theatre.anatomy.mesh.nodes)

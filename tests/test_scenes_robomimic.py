@@ -1,4 +1,4 @@
-"""What `sulcus convert --to robomimic` writes is read by robomimic itself, which trains on it."""
+"""Robomimic data sets of `sulcus convert`: read and trained on by robomimic."""
 
 import json
 import os

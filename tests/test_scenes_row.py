@@ -1,4 +1,4 @@
-"""What the report counts and refuses, without a study: tenths of the force, the front, data of its own."""
+"""Figures of report rows without a study: tenths of the force, Pareto front, and rejected input."""
 
 import json
 import re
@@ -17,7 +17,7 @@ from sim.bodies.meshfile import write_anatomy
 from surrogate.data.dataset import read_dataset
 
 
-def test_tenths_of_the_force_and_of_no_load_nothing():
+def test_errors_are_grouped_by_tenths_of_the_force():
     truth = np.ones((20, 2, 3))
     force = np.arange(20.0)[::-1]
     distance = np.column_stack([force, 3.0 * force]) * 1e-3
@@ -30,7 +30,7 @@ def test_tenths_of_the_force_and_of_no_load_nothing():
     assert (worst.mean, worst.p95, worst.largest) == pytest.approx((28.5, 3.0 * np.percentile(force, 95), 57.0))
 
 
-def test_the_front_is_what_nobody_beats():
+def test_pareto_front_has_rows_not_dominated():
     figures = compute_distance_figures(np.ones((1, 1)), np.ones((1, 1, 3)), np.ones(1))
 
     def row(name, time, error, against="error"):
@@ -46,7 +46,7 @@ def test_the_front_is_what_nobody_beats():
     assert len(chart.front) == 3 and build_error_chart(rows[-1:]) is None
 
 
-def test_times_are_milliseconds_and_p99_takes_a_thousand():
+def test_time_summary_has_p99_only_with_1000_values():
     seconds = 1e-3 * np.arange(1.0, 1001.0)
     found = summarise_times(seconds)
     assert found.pop("central_ms") == pytest.approx((25.975, 975.025), rel=1e-3)
@@ -54,8 +54,8 @@ def test_times_are_milliseconds_and_p99_takes_a_thousand():
     assert summarise_times(seconds[:999])["p99"] is None
 
 
-def test_every_figure_stands_under_its_head(tmp_path):
-    """Read back from the page: sets of loads, shares of them, minutes of solves and fitting."""
+def test_report_table_has_values_under_their_headings(tmp_path):
+    """Values read from the page: load sets, shares, minutes of solves and of training."""
     one = compute_distance_figures(np.full((4, 2), 1e-3), np.full((4, 2, 3), 1e-2), np.arange(4.0))
     sets = {
         name: replace(one, mm=replace(one.mm, mean=mean), loads=loads)
@@ -97,14 +97,14 @@ def test_every_figure_stands_under_its_head(tmp_path):
         (["--data", "a.h5"], "no such file"),
     ],
 )
-def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+def test_report_command_rejects_bad_input(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["report", *words]) == 2
     assert reason in capsys.readouterr().err
 
 
-def test_a_command_without_data_makes_its_own(tmp_path, monkeypatch, capsys):
-    """Neo-Hookean, smoothed, on two devices; what it says goes elsewhere than the line for machines."""
+def test_report_command_without_data_simulates_its_own(tmp_path, monkeypatch, capsys):
+    """Neo-Hookean, smoothed, on two devices; log text is not mixed with the JSON line."""
     box = make_box((6, 6, 4), tumour=9e-3, depth=14e-3, opening=20e-3)
     monkeypatch.setattr("scenes.report.rows.measure_rows", lambda study, specs: iter([]))
     write_anatomy(tmp_path / "box.vtu", box)

@@ -1,4 +1,4 @@
-"""Rows of a report: each one measured once, or a reason."""
+"""Rows of a report: measured once, or with a reason."""
 
 import json
 from dataclasses import replace
@@ -31,8 +31,8 @@ from surrogate.training.learners import SVR_CANDIDATES, Tuned
 from surrogate.training.train import train
 
 
-def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box, tmp_path, monkeypatch):
-    """Fitted here to the training rows; in the file that the report reads, answers to the discs' loads are wild."""
+def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path, monkeypatch):
+    """Trained here on the training rows; the report's file has wrong solutions of the held-out loads."""
     training, pushed, nodes = study.discs.train, study.pushed, study_box.tumour_nodes
     truth = study.dataset.read_displacement(nodes)[study.dataset.good]
     path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
@@ -65,7 +65,7 @@ def test_a_learner_is_held_to_loads_that_it_was_not_trained_on(study, study_box,
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
 
 
-def test_what_is_played_lies_in_the_discs_alone(study):
+def test_played_loads_lie_in_the_held_out_discs(study):
     every = replace(study, loads=10_000).played.get(Pushed)
     some, split = study.played.get(Pushed), study.discs
     assert len(every.point) == split.test.sum() and len(some.point) == 2
@@ -79,7 +79,7 @@ def test_what_is_played_lies_in_the_discs_alone(study):
     assert list(force) == [size.min(), size.max()]
 
 
-def test_rows_say_what_they_are(study_rows):
+def test_rows_state_error_type_and_coverage(study_rows):
     fem, law, learner = study_rows[:3]
     assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
     assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.own_fem
@@ -92,8 +92,8 @@ def test_rows_say_what_they_are(study_rows):
     assert 0.05 < measure_peak_memory() < 50.0
 
 
-def test_a_series_is_tabulated_once_for_all_its_rows(study, monkeypatch):
-    """Made of what is kept, a row has no finite elements to ask; the table's seconds are its own all the same."""
+def test_series_is_tabulated_once_for_all_rows(study, monkeypatch):
+    """A row made from the stored table needs no FEM, and keeps the table's seconds."""
     reported = []
     tabulate_series(study, lambda done, total: reported.append((done, total)))
     assert reported and reported[-1][0] == reported[-1][1]
@@ -108,8 +108,8 @@ def test_a_series_is_tabulated_once_for_all_its_rows(study, monkeypatch):
     assert {spec.name for spec in list_learner_specs()} > set(SERIES_MODELS)
 
 
-def test_only_what_lacks_is_measured_again(study, study_rows, tmp_path):
-    """Stopped in the second row, begun again; then with other inputs; then with a file that is not whole."""
+def test_only_missing_rows_are_measured_again(study, study_rows, tmp_path):
+    """Stopped in the second row and resumed; then with other inputs; then with a truncated file."""
     here = replace(study, folder=tmp_path)
     asked = []
 
@@ -139,7 +139,7 @@ def test_only_what_lacks_is_measured_again(study, study_rows, tmp_path):
     )
 
 
-def test_plans(study):
+def test_report_plans_list_unique_variants(study):
     names = [spec.name for spec in list_one_factor_variants(study)]
     assert names[0] == "FEM" and len(set(names)) == len(names) == 11 and "FEM halved edges" in names
     assert (
@@ -154,6 +154,6 @@ def test_plans(study):
     assert list_counts(300) == [64, 128, 256] and list_counts(64) == []
 
 
-def test_what_cannot_be_had_is_a_row_that_says_why(study):
+def test_row_of_unknown_element_states_the_reason(study):
     row = measure_row(study, FemVariant("odd", element="cube"))
     assert "no element is called 'cube'" in row.state and row.reference is None and row.family == "finite elements"

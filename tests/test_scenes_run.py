@@ -1,4 +1,4 @@
-"""Masks of what lies in front in a real picture: the overlay is not drawn there, and the picture says so."""
+"""Masks of objects in front of the brain in a real image: no overlay there, and the covered share is reported."""
 
 from dataclasses import replace
 from itertools import islice
@@ -35,7 +35,7 @@ def film(count):
     return islice(read_video(FILM / "film.mp4", 30.0, colour=True), count)
 
 
-def test_white_areas_stay_clear_and_share_is_reported(parts):
+def test_masked_areas_have_no_overlay_and_report_their_share(parts):
     follower, painter = parts
     (whole,) = draw_overlays(read_timed(film(1)), follower, painter)
     camera, tumour = whole.known.camera, painter.stage.tumour_at_rest
@@ -53,7 +53,7 @@ def test_white_areas_stay_clear_and_share_is_reported(parts):
     assert hidden.known.band == whole.known.band and not hidden.known.relied
 
 
-def test_what_is_frozen_is_hidden_too(parts):
+def test_frozen_overlay_is_hidden_by_the_mask(parts):
     follower, painter = parts
     (shown,) = draw_overlays(read_timed(film(1)), follower, painter)
     blank = np.full(shown.colour.shape, 120, np.uint8)
@@ -64,7 +64,7 @@ def test_what_is_frozen_is_hidden_too(parts):
     assert (painter.paint(blank, lost, covered).colour[:600] == 120).all()
 
 
-def test_there_is_one_mask_for_each_picture_of_its_size():
+def test_masks_match_images_by_number_and_size():
     black = Named("a.png", np.zeros((720, 960), np.uint8))
     assert [each.covered.any() for each in read_timed(film(2), iter([black, black]))] == [False, False]
     ones = black.grey.copy()
@@ -81,7 +81,7 @@ def test_there_is_one_mask_for_each_picture_of_its_size():
         list(read_timed(film(1), iter([Named("b.png", black.grey[1:])])))
 
 
-def test_the_command_takes_a_video_of_masks(tmp_path, capsys):
+def test_overlay_command_rejects_mask_video_with_missing_frames(tmp_path, capsys):
     masks = tmp_path / "masks.mp4"
     write_film(masks, iter([np.zeros((720, 960, 3), np.uint8)] * 2), 30.0)
     given = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]

@@ -1,4 +1,4 @@
-"""Files of a data set that somebody holds, or that cannot be written: each is a sentence, and clocks decide nothing."""
+"""Locked or unwritable files of a data set: each gives a message."""
 
 import errno
 import fcntl
@@ -21,7 +21,7 @@ def fails(*_, **__):
     raise OSError(errno.EPERM, os.strerror(errno.EPERM))
 
 
-def test_a_file_that_another_holds_is_said_to_be_locked(box, tmp_path):
+def test_locked_episode_file_is_reported(box, tmp_path):
     path = write_episode(tmp_path / "episode_000000.h5", box, Wanted(3, every=2))
     with path.open("rb") as held:
         fcntl.flock(held, fcntl.LOCK_EX)  # as HDF5 does where it writes
@@ -32,7 +32,7 @@ def test_a_file_that_another_holds_is_said_to_be_locked(box, tmp_path):
     assert validate_episode(path).problems == []
 
 
-def test_a_folder_that_takes_no_files_is_named(tmp_path, monkeypatch):
+def test_folder_without_write_access_is_reported(tmp_path, monkeypatch):
     run = RunSettings("own", "0", 1, "cpu", {})
     begin(tmp_path / "set", run, PLAN)
     with monkeypatch.context() as held:

@@ -1,4 +1,4 @@
-"""Scenes in a researcher's own files: every command that plays takes one, and a file that is none gets a sentence."""
+"""Scene files of users: played by each command, and rejected where invalid."""
 
 import json
 import sys
@@ -52,7 +52,7 @@ def folder(box, tmp_path_factory):
     ],
     ids=lambda words: words[0],
 )
-def test_a_command_plays_it(folder, monkeypatch, capsys, words):
+def test_commands_play_a_scene_file(folder, monkeypatch, capsys, words):
     monkeypatch.chdir(folder)
     done = main([words[0], "my_scene.py", *words[1:], "--anatomy", "box.vtu", "--deformer", "linear"])
     out, err = capsys.readouterr()
@@ -62,7 +62,7 @@ def test_a_command_plays_it(folder, monkeypatch, capsys, words):
         assert (reported["scenes"][0] if words[0] == "check" else reported)["scene"] == "nod"
 
 
-def test_what_its_effects_cost_is_measured(folder, small_box, monkeypatch, capsys):
+def test_effects_command_measures_a_scene_file(folder, small_box, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     write_anatomy(folder / "small.vtu", small_box)
     assert main(["effects", "my_scene.py", "--every", "1", "--anatomy", "small.vtu", "--device", "cpu", "--json"]) == 0
@@ -126,7 +126,7 @@ SCENE = replace(PRESS, effects=(Elasticity(Mine(500.0, 1500.0, 1e4)), *PRESS.eff
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_a_scene_of_a_law_that_contradicts_itself_does_not_play(tmp_path, half):
+def test_scene_is_rejected_only_for_inconsistent_law(tmp_path, half):
     (tmp_path / "yeoh.py").write_text(SUCKER.with_name("yeoh.py").read_text())
     path = tmp_path / "mine.py"
     path.write_text(WRONG.replace("HALF", str(half)))
@@ -164,7 +164,7 @@ SCENE = replace(PRESS, effects=(MINE, *PRESS.effects[1:]))
 """
 
 
-def test_derived_law_passes_conformance(tmp_path):
+def test_scene_with_wrong_derived_law_is_rejected(tmp_path):
     path = tmp_path / "derived.py"
     path.write_text(DERIVED)
     words = r"derived\.py: the law neo-hookean does not hold: .*stress is the energy's derivative"
@@ -172,7 +172,7 @@ def test_derived_law_passes_conformance(tmp_path):
         find_scene(str(path))
 
 
-def test_the_same_text_runs_once_and_a_mended_one_anew(tmp_path):
+def test_script_runs_again_only_after_a_change(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text("class Mine: pass\n")
     first = run_script(path)
@@ -209,7 +209,7 @@ IMPORT = "from scenes.script.scene import Scene"
         (f"{IMPORT}\nSCENE = Scene('a', '', lambda t: 1 / t)", "my.py, line 2: raised ZeroDivisionError"),
     ],
 )
-def test_a_file_that_makes_no_scene_is_a_sentence(tmp_path, text, words):
+def test_file_without_a_scene_is_rejected(tmp_path, text, words):
     path = tmp_path / "my.py"
     path.write_text(text)
     modules = set(sys.modules)
@@ -219,14 +219,14 @@ def test_a_file_that_makes_no_scene_is_a_sentence(tmp_path, text, words):
         assert not {name for name in set(sys.modules) - modules if name.startswith("own_my")}
 
 
-def test_a_file_that_is_not_there_is_a_sentence(tmp_path):
+def test_missing_scene_file_is_rejected(tmp_path):
     with pytest.raises(InputError, match=r"none\.py: cannot be read \(No such file or directory\)"):
         find_scene(str(tmp_path / "none.py"))
     with pytest.raises(InputError, match=r"'dance'.*MY_SCENE\.py"):
         find_scene("dance")
 
 
-def test_a_command_says_the_sentence_and_writes_nothing(tmp_path, monkeypatch, capsys):
+def test_render_rejects_failing_script_and_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my.py").write_text("SCENE = 1 / 0")
     assert main(["render", "my.py", "--out", "frames"]) == 2

@@ -1,4 +1,4 @@
-"""Label above an image, and images of a scene side by side: source, time, motion, and doubts."""
+"""Label above an image and tiled images of a scene: source, time, motion and warnings."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
 
 
-def test_the_label_is_drawn_above_the_picture(play):
+def test_cost_label_does_not_cover_the_tool(play):
     frame = play.draw(51, 1.7, play.scene.path(1.7))
     plain = add_cost_label(frame, "linear")
     assert plain.shape == frame.shown.shape
@@ -20,7 +20,7 @@ def test_the_label_is_drawn_above_the_picture(play):
     assert changed.any() and tool.any() and not changed[tool].any()
 
 
-def test_the_label_tells_source_time_and_motion(play, monkeypatch):
+def test_cost_label_has_source_time_and_motion(play, monkeypatch):
     said = []
     monkeypatch.setattr(
         "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
@@ -33,7 +33,7 @@ def test_the_label_tells_source_time_and_motion(play, monkeypatch):
     assert "linear: tumour moved 1.33 +- 5.4 mm" in said
 
 
-def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch):
+def test_cost_label_warns_of_extrapolated_solution(theatre, monkeypatch):
     shown = []
     monkeypatch.setattr(
         "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: shown.append(list(lines)) or colour
@@ -45,7 +45,7 @@ def test_the_label_says_when_an_answer_may_not_be_relied_on(theatre, monkeypatch
     assert beyond[1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
 
 
-def test_half_a_picture_keeps_its_light():
+def test_shrunken_image_keeps_mean_brightness():
     colour = np.random.default_rng(0).integers(0, 256, (8, 10, 3), dtype=np.uint8)
     small = shrink_image(colour, colour.shape[1] // 2, colour.shape[0] // 2)
     assert small.shape == (4, 5, 3)

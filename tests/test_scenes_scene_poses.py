@@ -16,7 +16,7 @@ def site():
     return build_craniotomy_frame(read_anatomy(get_template_path()))
 
 
-def test_poses_reach_as_far_and_as_deep_as_the_page_lets_a_hand(site):
+def test_sampled_poses_cover_the_range_of_manual_control(site):
     scene = find_scene("spatula")
     tool, loads = draw_scene_poses(scene, site, 64, 0)
     assert tool == scene.tool.shape
@@ -32,13 +32,13 @@ def test_poses_reach_as_far_and_as_deep_as_the_page_lets_a_hand(site):
     assert aside.max() <= reach + 1e-9 and aside.max() > 0.8 * reach
 
 
-def test_more_poses_begin_with_the_same(site):
+def test_larger_pose_sample_starts_with_the_smaller_sample(site):
     scene = find_scene("spatula")
     few, more = (draw_scene_poses(scene, site, count, 3)[1].get(Touching).pose for count in (DEPTHS, 3 * DEPTHS + 1))
     assert np.array_equal(few, more[:DEPTHS]) and not np.allclose(more[0], more[DEPTHS])
     assert not np.allclose(few, draw_scene_poses(scene, site, DEPTHS, 4)[1].get(Touching).pose)
 
 
-def test_a_scene_without_a_moved_tool_is_rejected(site):
+def test_scene_without_moved_tool_is_rejected(site):
     with pytest.raises(InputError, match="the scene press moves no ball"):
         draw_scene_poses(find_scene("press"), site, 8, 0)

@@ -1,4 +1,4 @@
-"""A page whose finite elements take their time: what is on the way is shown, and whoever jumps elsewhere goes there."""
+"""Page with slow finite elements: intermediate frames, jumps, pauses and failures."""
 
 import threading
 import time
@@ -122,7 +122,7 @@ def ask_for_frame_12(demo, gated, page, steps):
     assert wait_for(lambda: shows(page, steps - 1) and gated.solved[steps])
 
 
-def test_intermediate_frames_show_and_slider_stays(demo, gated, monkeypatch):
+def test_intermediate_frames_are_shown_and_slider_stays(demo, gated, monkeypatch):
     said, begun = [], demo.busy.begin_work
     monkeypatch.setattr(demo.busy, "begin_work", lambda what: said.append(what) or begun(what))
     with Loop(demo) as page:
@@ -143,7 +143,7 @@ def test_intermediate_frames_show_and_slider_stays(demo, gated, monkeypatch):
         visitor.wire.close()
 
 
-def test_who_jumps_elsewhere_is_not_kept_waiting(demo, gated):
+def test_jump_to_solved_frame_stops_the_pending_solve(demo, gated):
     with Loop(demo) as page:
         ask_for_frame_12(demo, gated, page, 4)
         demo.wish.set(number=1)
@@ -158,7 +158,7 @@ def test_who_jumps_elsewhere_is_not_kept_waiting(demo, gated):
         assert gated.solved == Counter(range(7))
 
 
-def test_a_pause_stops_on_the_way(demo, gated):
+def test_pause_stops_the_pending_solve(demo, gated):
     with Loop(demo) as page:
         visitor = Visitor(page, 1200)
         assert wait_for(lambda: page.button.label == "Play")
@@ -176,7 +176,7 @@ def test_a_pause_stops_on_the_way(demo, gated):
         visitor.wire.close()
 
 
-def test_without_an_effect_others_answer_and_those_before_stop(demo, gated):
+def test_effect_switch_starts_new_solver_and_stops_old_one(demo, gated):
     with Loop(demo) as page:
         ask_for_frame_12(demo, gated, page, 3)
         full = demo.referee
@@ -187,7 +187,7 @@ def test_without_an_effect_others_answer_and_those_before_stop(demo, gated):
         assert full.truth.number == 3 and wait_for(lambda: gated.solved[4] == 2)  # then they are compared
 
 
-def test_jumps_reuse_solutions_and_end_at_last_target(demo, gated):
+def test_frame_jumps_reuse_solutions_and_end_at_last_target(demo, gated):
     gated.let(10_000)
     before = set(threading.enumerate())
     with Loop(demo) as page:
@@ -201,7 +201,7 @@ def test_jumps_reuse_solutions_and_end_at_last_target(demo, gated):
         visitor.wire.close()
 
 
-def test_the_overlay_changes_while_a_solve_is_waited_for(demo, gated):
+def test_overlay_style_changes_during_a_solve(demo, gated):
     with Loop(demo) as page:
         gated.let(1)
         assert wait_for(lambda: shows(page, 0))
@@ -213,7 +213,7 @@ def test_the_overlay_changes_while_a_solve_is_waited_for(demo, gated):
         assert shows(page, 0) and gated.solved == Counter((0, 1))
 
 
-def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
+def test_undeformed_body_is_shown_while_fem_is_prepared(gated, monkeypatch):
     prepared, said = threading.Event(), []
     player = PatientSetup.build_player
 
@@ -234,8 +234,8 @@ def test_body_is_shown_while_fem_prepares(gated, monkeypatch):
     demo.close()
 
 
-def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
-    """A visitor leafs through the scenes while the first is prepared."""
+def test_skipped_scenes_are_not_prepared(demo, monkeypatch):
+    """A visitor selects several scenes while the first is prepared."""
     prepared, made = threading.Event(), []
     player = PatientSetup.build_player
 
@@ -256,7 +256,7 @@ def test_only_awaited_scenes_are_prepared(demo, monkeypatch):
     assert made == ["retract", "press"]
 
 
-def test_a_question_that_is_taken_back_is_not_prepared_for(gated, monkeypatch):
+def test_dropped_request_prepares_no_solver(gated, monkeypatch):
     made = []
     player = PatientSetup.build_player
     monkeypatch.setattr(PatientSetup, "build_player", lambda *words: made.append(words) or player(*words))
@@ -280,7 +280,7 @@ class TestFailures:
         gated.let(10_000)
         return PatientSetup(gated.anatomy, None, {}, "cpu")
 
-    def test_a_first_scene_without_finite_elements_ends_the_run(self, theatre, monkeypatch):
+    def test_first_scene_rejected_by_fem_ends_the_run(self, theatre, monkeypatch):
         def refusing(theatre, name, scene):
             raise InputError("the body is not held.")
 
@@ -291,7 +291,7 @@ class TestFailures:
         demo.close()
 
     @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-    def test_a_defect_is_said_and_frames_after_it_come(self, theatre, gated, monkeypatch):
+    def test_defect_is_reported_and_later_frames_are_solved(self, theatre, gated, monkeypatch):
         deform = Gated.deform
 
         def failing(fem, loads, start=None, at=None):

@@ -1,4 +1,4 @@
-"""Command that lists scenes: who can play them, pictures and a sheet."""
+"""Command that lists scenes: deformers, thumbnails and a sheet."""
 
 import json
 from dataclasses import replace
@@ -20,7 +20,7 @@ def anatomy(box_folder):
 
 
 class TestScenes:
-    def test_they_are_listed_with_who_can_play_them(self, anatomy, capsys):
+    def test_scenes_command_lists_scenes_with_deformers(self, anatomy, capsys):
         assert main(["scenes", "--anatomy", anatomy, "--device", "cpu", "--json"]) == 0
         reported = {row["scene"]: row for row in json.loads(capsys.readouterr().out)["scenes"]}
         assert tuple(reported) == SCENES
@@ -29,7 +29,7 @@ class TestScenes:
             assert ("ToolForce" in row["effects"]) == (ToolForce() in find_scene(name).effects)
         assert "Resection" in reported["resection"]["effects"] and "milliseconds" not in reported["press"]
 
-    def test_pictures_and_a_sheet(self, anatomy, tmp_path, capsys):
+    def test_scenes_command_writes_thumbnails_and_sheet(self, anatomy, tmp_path, capsys):
         out = tmp_path / "new" / "sheet"
         assert main(["scenes", "press", "brain_shift", "--anatomy", anatomy, "--device", "cpu", "--out", str(out)]) == 0
         assert "ms a frame by guarded; the tumour moves" in capsys.readouterr().out
@@ -38,7 +38,7 @@ class TestScenes:
         assert one.shape == (360, 480, 3) and whole.shape == (360, 1440, 3)
         assert np.array_equal(whole[:, :480], one) and (whole[:, 960:] == 12).all()
 
-    def test_a_scene_s_name_covers_no_words_at_the_foot(self, theatre):
+    def test_scene_name_does_not_cover_text_at_the_bottom(self, theatre):
         scene = short()
         wide = replace(scene, viewpoint=replace(scene.viewpoint, width=480, height=360))
         player = theatre.build_player("linear", wide)
@@ -48,7 +48,7 @@ class TestScenes:
             kept.append(words.any() and np.array_equal(foot[words], frame.shown[-40:][words]))
         assert any(kept)
 
-    def test_a_file_is_no_folder(self, anatomy, tmp_path, capsys):
+    def test_scenes_command_rejects_file_as_output_folder(self, anatomy, tmp_path, capsys):
         (tmp_path / "file").touch()
         assert main(["scenes", "--anatomy", anatomy, "--out", str(tmp_path / "file")]) == 2
         assert "need a folder" in capsys.readouterr().err

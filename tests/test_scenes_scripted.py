@@ -1,4 +1,4 @@
-"""Scripts: what an episode of a data set draws, and the policy of the environments."""
+"""Scripts: sampled motions of an episode, and the policy of the environments."""
 
 import pytest
 from gym_examples import DOWN, made, played
@@ -12,7 +12,7 @@ from scenes.gym.tasks import PALPATE
 from sim.errors import InputError
 
 
-def test_scripted_policy_palpates_until_limit():
+def test_scripted_policy_reaches_goal_and_pressing_ends_episode():
     rows = played(made(), 3, 60)
     truth = rows[-1][2]
     assert truth["success"] and truth["violations"] == 0 and abs(truth["reached"] / truth["asked"] - 1.0) < 0.15

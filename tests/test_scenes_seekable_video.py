@@ -1,4 +1,4 @@
-"""Films that are read from any frame on."""
+"""Videos that are read from any frame."""
 
 import numpy as np
 from films import FILM
@@ -7,7 +7,7 @@ from ar.tracking.image_sequences import read_video
 from scenes.tracked.seekable_video import SeekableFilm
 
 
-def test_a_film_is_gone_to_and_fro_in(tmp_path):
+def test_seekable_video_reads_frames_in_any_order(tmp_path):
     film, pictures = SeekableFilm(FILM / "film.mp4", 30.0), list(read_video(FILM / "film.mp4", 30.0, colour=True))
     assert film.count == len(pictures) == 17
     for number in (3, 4, 16, 0):

@@ -1,4 +1,4 @@
-"""What else moves the tumour: changes whose size is known beforehand, and what does not converge is counted."""
+"""Sensitivity of the tumour's motion: changes of known size, and loads without convergence."""
 
 import csv
 import json
@@ -59,7 +59,7 @@ def found(anatomy):
     return {(row.variant.factor, row.variant.now): row for row in all_rows}
 
 
-def test_every_thing_has_its_row(found):
+def test_sensitivity_study_has_one_row_per_variant(found):
     assert list(found) == [
         ("motion itself", ""), ("force or motion", "+-5 %"), ("its direction", "+-2 deg"),
         ("its position", "+-1 mm"), ("E", "-20%"), ("E", "+20%"), ("nu", "0.49"), ("nu", "0.495"),
@@ -75,8 +75,8 @@ def test_every_thing_has_its_row(found):
 
 
 @pytest.mark.parametrize(("now", "factor"), [("-20%", 1.0 / 0.8), ("+20%", 1.0 / 1.2)])
-def test_stiffness_matters_under_known_force_alone(found, now, factor):
-    """Displacement is in inverse proportion to E under dead forces, and does not depend on it where it is imposed."""
+def test_stiffness_changes_motion_under_known_force_only(found, now, factor):
+    """Displacement is inversely proportional to E under dead forces and independent of E under prescribed motion."""
     row = found["E", now]
     assert row.force.motion == pytest.approx(factor, rel=1e-6)
     assert row.force.percent == pytest.approx(100.0 * abs(factor - 1.0), rel=1e-5)
@@ -84,30 +84,30 @@ def test_stiffness_matters_under_known_force_alone(found, now, factor):
     assert row.motion.motion == pytest.approx(1.0, rel=1e-7)
 
 
-def test_a_linear_body_answers_in_proportion(found):
+def test_linear_body_has_displacement_proportional_to_load(found):
     for one in (found["force or motion", "+-5 %"].force, found["force or motion", "+-5 %"].motion):
         assert one.percent == pytest.approx(5.0, rel=1e-6)
         assert one.motion == pytest.approx(1.0, rel=1e-7)
         assert one.mean_mm == pytest.approx(0.05 * found["motion itself", ""].force.mean_mm, rel=1e-6)
 
 
-def test_known_motions_are_those_of_the_known_forces(found):
-    """The default is one and the same field."""
+def test_default_motion_and_force_give_equal_displacement(found):
+    """Both defaults are the same field."""
     whole = found["motion itself", ""]
     assert whole.force.percent == pytest.approx(100.0)
     assert whole.motion.mean_mm == pytest.approx(whole.force.mean_mm, rel=1e-6)
     assert whole.motion.largest_mm == pytest.approx(whole.force.largest_mm, rel=1e-6)
 
 
-def test_softer_tumour_and_freer_skull_move_more(found):
+def test_softer_tumour_and_looser_skull_increase_motion(found):
     motion = [found["tumour's stiffness", now].force.motion for now in ("0.5 x", "2 x", "3 x")]
     assert motion[0] > 1.0 > motion[1] > motion[2]
     assert 1.0 < found["skull", "slide"].force.motion < found["skull", "contact"].force.motion
 
 
 @pytest.mark.parametrize(("now", "times"), [("0.5 x", 0.5), ("3 x", 3.0)])
-def test_a_stiff_tumour_lies_in_the_same_brain(found, anatomy, now, times):
-    """Against finite elements that are put together here, of two tissues."""
+def test_stiff_tumour_variant_changes_only_the_tumour(found, anatomy, now, times):
+    """Against FEM with two tissues, assembled here."""
     brain = Material("linear", 3000.0, 0.45)
     tumour = Material("linear", times * 3000.0, 0.45)
     rest = (Held(), Bonded(), ToolForce())
@@ -124,8 +124,8 @@ def test_a_stiff_tumour_lies_in_the_same_brain(found, anatomy, now, times):
     assert row.mean_mm == pytest.approx(1e3 * np.linalg.norm(changed - default, axis=2).mean(), rel=1e-5)
 
 
-def test_what_does_not_converge_is_counted_and_left_out(anatomy):
-    """With a budget that suffices for none."""
+def test_loads_without_convergence_are_counted_and_omitted(anatomy):
+    """With an iteration budget too small for each load."""
     few = Accuracy(tolerance=1e-9, outer=1, inner=1, steps=0)
     study = SensitivityStudy(anatomy, draw("palpation", anatomy, 3, 0), BodyVariant(element="p1"), few, "cpu")
     one = next(measure_variants(study, []))
@@ -133,7 +133,7 @@ def test_what_does_not_converge_is_counted_and_left_out(anatomy):
     assert np.isnan(one.force.mean_mm)
 
 
-def test_a_load_counts_where_it_and_its_default_converged(pretender):
+def test_change_uses_loads_converged_in_variant_and_default(pretender):
     loads = push(np.zeros((3, 3)), np.array([[0.0, 0.0, -f] for f in (0.1, 0.2, 0.3)]), 7e-3)
     nodes = pretender.anatomy.tumour_nodes
     default, answer = (replace(pretender, fails_above=most).deform(loads, at=nodes) for most in (0.25, 0.15))
@@ -148,7 +148,7 @@ def test_a_load_counts_where_it_and_its_default_converged(pretender):
     assert (all_good.solves, all_good.failed) == (2, 1)
 
 
-def test_a_change_has_the_percentiles_that_it_says():
+def test_change_has_percentiles_over_loads_and_vertices():
     """p95 over every load x vertex; worst95 over the loads, each by its farthest vertex."""
     field = np.random.default_rng(0).normal(size=(40, 7, 3))
     default = replace(guess(np.ones((40, 7, 3))), outcome=40 * (Outcome.CONVERGED,))
@@ -158,7 +158,7 @@ def test_a_change_has_the_percentiles_that_it_says():
     assert (found.mean_mm, found.p95_mm, found.worst95_mm, found.largest_mm) == pytest.approx(wanted)
 
 
-def test_tools_are_off_by_what_is_asked(anatomy):
+def test_aim_errors_have_the_given_angle_and_shift(anatomy):
     loads, patch = draw("palpation", anatomy, 5, 1), open_patch(anatomy)
     drawn = loads.get(Pushed)
     size = np.linalg.norm(drawn.force, axis=1)
@@ -177,7 +177,7 @@ def test_tools_are_off_by_what_is_asked(anatomy):
     np.testing.assert_array_equal(shifted.force, np.tile(drawn.force, (4, 1)))
 
 
-def test_a_known_motion_is_the_footprints_mean(box, pretender):
+def test_prescribed_motion_is_mean_over_the_footprint(box, pretender):
     loads = draw("palpation", box, 2, 0)
     answer = pretender.deform(loads)
     moved, pushed = match_motion(box, loads, answer).get(Displaced), loads.get(Pushed)
@@ -188,7 +188,7 @@ def test_a_known_motion_is_the_footprints_mean(box, pretender):
         match_motion(box, match_motion(box, loads, answer), answer)
 
 
-def test_a_body_without_tumour_is_refused(anatomy):
+def test_body_without_tumour_is_rejected(anatomy):
     whole = replace(anatomy, mesh=replace(anatomy.mesh, region=np.ones_like(anatomy.mesh.region)))
     with pytest.raises(InputError, match="no tumour"):
         next(measure_variants(SensitivityStudy(whole, draw("palpation", anatomy, 1, 0), BodyVariant()), []))
@@ -199,8 +199,8 @@ def trained(anatomy):
     return knowing_nothing(anatomy, {"learner": "table", "preset": "bipolar", "element": "p2"})
 
 
-def test_the_command(tmp_path, capsys):
-    """Every figure is in the file; what the surrogate is wrong by stands beside, or that nobody knows it."""
+def test_sensitivity_command_reports_all_rows(tmp_path, capsys):
+    """Each figure is in the file, together with the surrogate's error or that it is unknown."""
     body = make_box(cells=(5, 5, 3), spacing=15e-3, tumour=16e-3, opening=40e-3)
     write_anatomy(tmp_path / "box.vtu", body)
     words = ["sensitivity", "--anatomy", str(tmp_path / "box.vtu"), "--count", "2", "--element", "p1"]
@@ -229,7 +229,7 @@ def test_the_command(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "reason"), [(["--out", "table.txt"], ".csv"), (["--anatomy", "none.vtu"], "no such file")]
 )
-def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+def test_sensitivity_command_rejects_bad_input(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["sensitivity", *words]) == 2
     assert reason in capsys.readouterr().err

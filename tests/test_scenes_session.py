@@ -1,4 +1,4 @@
-"""The link beside others' programs: the C++ library's examples, pyigtl, a camera's pictures, and Ctrl-C."""
+"""Live link with other programs: examples of the C++ library, pyigtl and camera images."""
 
 import asyncio
 import shutil
@@ -81,7 +81,7 @@ async def sending(peer, beside, beat=0.03):
         await asyncio.sleep(beat)
 
 
-def test_the_c_library_reads_what_is_sent(built, follower, registration, beside):
+def test_openigtlink_library_reads_messages_of_the_link(built, follower, registration, beside):
     receiver, asker = built("Receiver/ReceiveClient.cxx"), built("PolyData/PolyDataClient.cxx")
 
     async def scene():
@@ -102,7 +102,7 @@ def test_the_c_library_reads_what_is_sent(built, follower, registration, beside)
     played(scene())
 
 
-def test_the_c_library_sends_what_is_read(built, follower, registration):
+def test_link_reads_messages_of_openigtlink_library(built, follower, registration):
     sender, server = built("Tracker/TrackerClient.cxx"), built("Tracker/TrackerServer.cxx")
     names = TransformNames(tool="Tracker")
     with socket.socket() as free:
@@ -141,7 +141,7 @@ def test_link_tool_not_seen_by_tracker_is_counted(follower, registration, beside
     played(scene())
 
 
-def test_pyigtl_sends_and_hears(follower, registration, beside):
+def test_pyigtl_client_sends_pose_and_receives_tumour(follower, registration, beside):
     async def scene():
         async with linked(follower, registration) as port:
             client = await asyncio.to_thread(connected, port)
@@ -160,7 +160,7 @@ def test_pyigtl_sends_and_hears(follower, registration, beside):
     played(scene())
 
 
-def test_a_cameras_picture_comes_back_with_the_tumour_in_it(follower, registration, truth, beside, stage):
+def test_camera_image_is_returned_with_tumour_overlay(follower, registration, truth, beside, stage):
     picture = next(iter(read_video(FILM / "film.mp4", 30.0, colour=True))).colour
     camera = follower.calibration.build_camera(truth.T_camera_scan[0])
     placed = in_mm(registration.T_patient_scan @ np.linalg.inv(truth.T_camera_scan[0]))

@@ -1,4 +1,4 @@
-"""Settings of surgical tasks: the answering model, its tissue and the reward."""
+"""Settings of surgical tasks: model, tissue and reward."""
 
 import json
 from dataclasses import replace
@@ -23,7 +23,7 @@ from surrogate.data.solution_rows import describe_tissue_source
 STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
 
 
-def test_a_reward_is_a_difference_of_potentials_and_its_limits():
+def test_reward_is_potential_difference_minus_penalties():
     near, far = EpisodeScore(0.002, 0.1, 0, 0.5), EpisodeScore(0.012, 0.6, 0, 0.5)
     step, most = REWARD.step_penalty, REWARD.max_potential_distance
     assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - step)
@@ -49,7 +49,7 @@ def test_debulk_goal_tracks_remaining_tumour(boxed):
     assert np.linalg.norm(last["tumour_middle"] - last["tumour_nodes"].mean(axis=0)) > 1e-3
 
 
-def test_the_bench_counts_steps(boxed, capsys):
+def test_gym_benchmark_reports_rate_per_observation_kind(boxed, capsys):
     words = ["benchmarks", "gym", "debulk", "--anatomy", boxed, "--device", "cpu", "--envs", "2", "--steps", "2"]
     assert main([*words, "--repeats", "2", "--size", "32x24", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
@@ -70,7 +70,7 @@ def stiff(box, tmp_path_factory):
     return put(replace(theatre, models=learned), tmp_path_factory.mktemp("stiff") / "stiff.vtu")
 
 
-def test_a_body_has_the_tissue_of_its_models(stiff):
+def test_task_uses_the_tissue_of_the_models(stiff):
     setting = open_setting(PALPATE, str(stiff), "auto", "cpu", SIZE)
     assert isinstance(setting.answers, PressedModel) and setting.scene.elasticity == STIFF
     assert setting.answers.ball.tissue == BRAIN  # which lies over the tumour
@@ -78,7 +78,7 @@ def test_a_body_has_the_tissue_of_its_models(stiff):
     assert exact.scene.elasticity.get_law(TUMOUR_LABEL) == replace(MATERIALS["drained"].tissue, young=6300.0)
 
 
-def test_a_ball_presses_what_lies_at_the_cortex(stiff, box, tmp_path):
+def test_contact_ball_uses_tissue_at_the_cortex(stiff, box, tmp_path):
     shallow = replace(box, mesh=replace(box.mesh, region=np.full_like(box.mesh.region, TUMOUR_LABEL)))
     models = {
         name: replace(each, anatomy=shallow, training={**each.training, **describe_tissue_source(STIFF)})
@@ -89,8 +89,8 @@ def test_a_ball_presses_what_lies_at_the_cortex(stiff, box, tmp_path):
     assert setting.answers.ball.tissue == STIFF.get_law(TUMOUR_LABEL)
 
 
-def test_a_model_that_may_not_answer_is_named_with_the_reason(stiff):
-    """One that is asked for is refused; one that lies beside the body is warned of."""
+def test_inapplicable_model_is_rejected_with_reason(stiff):
+    """Requested models raise an error; models next to the body give a warning."""
     beside, force = str(to_model_path(stiff)), "it was trained on what a tool's force does, and here is none"
     with pytest.raises(InputError, match=rf"model\.npz: is not applicable .*task retract: {force}, but .*ToolContact"):
         open_setting(RETRACT, str(stiff), "auto", "cpu", SIZE, beside)

@@ -1,4 +1,4 @@
-"""Models that ship with the package: small enough for a repository that keeps each of them for ever."""
+"""Size limit of the models that ship with the package."""
 
 import pytest
 
@@ -9,5 +9,5 @@ MODELS = sorted(get_template_path().parent.glob("*.npz"))
 
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda path: path.name)
-def test_shipped_model_is_small(path):
+def test_shipped_model_file_is_below_the_size_limit(path):
     assert len(MODELS) >= 3 and path.stat().st_size < MOST

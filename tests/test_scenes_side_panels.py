@@ -1,4 +1,4 @@
-"""Chart and slices beside the image of the page."""
+"""Chart and slices next to the image of the page."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from scenes.script.tool_paths import Touch
 from scenes.script.uncertainty import TumourError
 
 
-def test_the_chart_and_the_slices_are_of_the_frame_that_is_shown(theatre):
+def test_chart_and_slices_show_the_current_frame(theatre):
     player = theatre.build_player("linear", short())
     frame = replace(player.draw(3, 0.1, Touch(force=0.25)), tumour_error=TumourError(None))
     read = sample_of(replace(frame, distance=12e-3, distance_error=np.inf), player.scene, 5.0)

@@ -1,4 +1,4 @@
-"""Command that solves loads: the element asked for, bodies without tumour, quadratic anatomies."""
+"""Command that solves loads: selected element, bodies without tumour, quadratic anatomies."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def body() -> Anatomy:
 
 
 @pytest.mark.parametrize("element", ["p1", "p2", "smoothed"])
-def test_simulate_answers_by_the_element_asked_for_and_says_so(body, tmp_path, capsys, element) -> None:
+def test_simulate_uses_and_states_the_given_element(body, tmp_path, capsys, element) -> None:
     data = read_dataset(simulated(body, tmp_path, "--element", element))
     assert data.provenance["element"] == element and data.good.all()
     effects = (Elasticity(), *(effect for effect in small().effects if not isinstance(effect, Elasticity)))
@@ -35,12 +35,12 @@ def test_simulate_answers_by_the_element_asked_for_and_says_so(body, tmp_path, c
     assert f"element {element}, but now element is {other}" in capsys.readouterr().err
 
 
-def test_simulate_of_a_body_without_tumour_says_so(tmp_path, capsys) -> None:
+def test_simulate_warns_of_body_without_tumour(tmp_path, capsys) -> None:
     simulated(make_box(cells=(6, 6, 4), spacing=12e-3, tumour=0.0), tmp_path)
     assert "has no tumour: `sulcus train` will reject the data." in capsys.readouterr().err
 
 
-def test_simulate_takes_quadratic_anatomies_as_they_are(body, tmp_path, capsys) -> None:
+def test_simulate_keeps_quadratic_anatomy_and_uses_p2(body, tmp_path, capsys) -> None:
     mesh = quadratic(body.mesh)
     more = len(mesh.nodes) - len(body.mesh.nodes)
     wall = mesh.nodes[:, 2] < body.mesh.nodes[:, 2].min() + 1e-9

@@ -1,4 +1,4 @@
-"""`sulcus solve`: from a mesh file to a mesh file, exit codes, and refusals that write nothing."""
+"""`sulcus solve`: mesh files, exit codes, and rejected input without output."""
 
 import json
 import re
@@ -63,7 +63,7 @@ def refused(run: Run, *words: str) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_equilibrium_by_independent_formulas(solve, law: str) -> None:
+def test_solution_is_in_equilibrium_by_independent_formulas(solve, law: str) -> None:
     run = solve({"fixed": BASE.astype(int), "force": FORCE}, "--material", law, "--young", "2500", "--poisson", "0.4")
     assert run.code == 0
     assert run.report["outcome"] == "converged"
@@ -77,14 +77,14 @@ def test_equilibrium_by_independent_formulas(solve, law: str) -> None:
     assert run.report["largest_displacement_mm"] == pytest.approx(largest, abs=1e-6)
 
 
-def test_the_file_written_is_the_mesh_in_metres(solve, tmp_path: Path) -> None:
+def test_solve_writes_the_mesh_in_metres(solve, tmp_path: Path) -> None:
     solve({"fixed": BASE.astype(int), "force": FORCE}, "--unit", "mm", points=1e3 * MESH.nodes)
     out = meshio.read(tmp_path / "out" / "out.vtu")
     np.testing.assert_allclose(out.points, MESH.nodes, atol=1e-15)
     np.testing.assert_array_equal(out.cells_dict["tetra"], MESH.tets)
 
 
-def test_the_solvers_are_explained_where_that_is_asked(solve) -> None:
+def test_explain_option_prints_the_solver_plan(solve) -> None:
     data = {"fixed": BASE.astype(float), "force": FORCE}
     silent, explained = solve(data), solve(data, "--explain")
     assert "plan" not in silent.report and "Newton-CG" not in silent.errors
@@ -92,7 +92,7 @@ def test_the_solvers_are_explained_where_that_is_asked(solve) -> None:
     np.testing.assert_array_equal(explained.displacement, silent.displacement)
 
 
-def test_millimetres_give_the_same_answer(solve) -> None:
+def test_mesh_in_millimetres_gives_same_displacement(solve) -> None:
     value = np.where(TOP[:, None], [0.0, 0.0, -2e-3], 0.0)
     fixed = (BASE | TOP).astype(int)
     metres = solve({"fixed": fixed, "force": FORCE, "prescribed": value})
@@ -114,14 +114,14 @@ def test_fixed_per_node_equals_fixed_per_component(solve, suffix: str) -> None:
     assert np.abs(run.displacement[TOP, 1:]).min() > 0.0
 
 
-def test_prescribed_moves_what_is_fixed(solve) -> None:
+def test_prescribed_displacement_moves_fixed_nodes(solve) -> None:
     value = np.where(TOP[:, None], [1e-3, 0.0, -2e-3], 0.0)
     run = solve({"fixed": (BASE | TOP).astype(int), "prescribed": value})
     assert run.code == 0
     np.testing.assert_allclose(run.displacement[TOP], value[TOP], atol=1e-15)
 
 
-def test_prescribed_where_nothing_is_fixed_is_said_to_be_ignored(solve) -> None:
+def test_prescribed_values_at_free_nodes_are_ignored_with_note(solve) -> None:
     value = np.zeros((COUNT, 3))
     value[TOP] = [0.0, 0.0, 5e-3]
     run = solve({"fixed": BASE.astype(int), "prescribed": value, "force": FORCE})
@@ -131,14 +131,14 @@ def test_prescribed_where_nothing_is_fixed_is_said_to_be_ignored(solve) -> None:
     np.testing.assert_array_equal(run.displacement, plain.displacement)
 
 
-def test_slide_normals(solve) -> None:
+def test_slide_normal_prevents_normal_displacement(solve) -> None:
     normal = np.where(TOP[:, None], [0.0, 0.6, 0.8], 0.0)
     run = solve({"fixed": BASE.astype(int), "force": FORCE, "slide_normal": normal})
     assert run.code == 0
     assert np.abs(run.displacement[TOP] @ [0.0, 0.6, 0.8]).max() < 1e-14
 
 
-def test_regions_have_their_own_constants(solve) -> None:
+def test_regions_use_their_own_material_constants(solve) -> None:
     upper = (MESH.nodes[MESH.tets].mean(axis=1)[:, 2] > 0.05).astype(int) * 5
     data = {"fixed": BASE.astype(int), "force": FORCE}
     flags = "--material", "neo-hookean", "--region", "5:30000,0.3", "--tolerance", "1e-9"
@@ -150,7 +150,7 @@ def test_regions_have_their_own_constants(solve) -> None:
     assert np.linalg.norm(residual) < 1e-8 * np.linalg.norm(FORCE)
 
 
-def test_turned_and_dropped_cells_are_printed(solve) -> None:
+def test_reoriented_and_removed_cells_are_reported(solve) -> None:
     tets = MESH.tets.copy()
     tets[:3] = tets[:3][:, [1, 0, 2, 3]]
     cells = [("tetra", tets), ("triangle", MESH.surface)]
@@ -162,7 +162,7 @@ def test_turned_and_dropped_cells_are_printed(solve) -> None:
     np.testing.assert_allclose(run.displacement, plain.displacement, atol=1e-8)
 
 
-def test_nodes_outside_tetrahedra_stay_and_are_reported(solve) -> None:
+def test_nodes_outside_tetrahedra_do_not_move_and_are_reported(solve) -> None:
     points = np.vstack([MESH.nodes, [[1.0, 1.0, 1.0], [2.0, 0.0, 0.0]]])
     data = {"fixed": np.append(BASE, [0, 0]).astype(int), "force": np.vstack([FORCE, np.ones((2, 3))])}
     run = solve(data, points=points)
@@ -173,7 +173,7 @@ def test_nodes_outside_tetrahedra_stay_and_are_reported(solve) -> None:
     assert not run.displacement[COUNT:].any()
 
 
-def test_no_force_at_all_is_rest(solve) -> None:
+def test_zero_force_gives_zero_displacement(solve) -> None:
     run = solve({"fixed": BASE.astype(int), "force": np.zeros((COUNT, 3))})
     assert run.code == 0
     assert run.report["iterations"] == 0
@@ -182,14 +182,14 @@ def test_no_force_at_all_is_rest(solve) -> None:
 
 
 @pytest.mark.parametrize(("times", "doubted"), [(0.5, False), (1000.0, True)])
-def test_prescribed_motion_beyond_the_body_is_doubted(solve, times: float, doubted: bool) -> None:
+def test_prescribed_motion_larger_than_body_gives_warning(solve, times: float, doubted: bool) -> None:
     motion = np.where(BASE[:, None], times * np.ptp(MESH.nodes, axis=0).max() * np.eye(3)[0], 0.0)
     run = solve({"fixed": BASE.astype(int), "prescribed": motion}, "--any-strain")
     assert ("see that it is in the unit of length of the file" in run.errors) == doubted
 
 
 @pytest.mark.parametrize(("times", "torn"), [(0.1, False), (40.0, True)])
-def test_bond_beyond_its_strength_is_noted(solve, times: float, torn: bool) -> None:
+def test_skull_bond_beyond_its_strength_is_noted(solve, times: float, torn: bool) -> None:
     side = np.where((MESH.nodes[:, 0] < 1e-9)[:, None] & ~BASE[:, None], [1.0, 0.0, 0.0], 0.0)
     data = {"fixed": BASE.astype(int), "force": times * FORCE, "slide_normal": side}
     run = solve(data, "--skull", "bonded", "--any-strain")
@@ -197,22 +197,22 @@ def test_bond_beyond_its_strength_is_noted(solve, times: float, torn: bool) -> N
     assert any("the bond" in note for note in run.report["notes"]) == torn
 
 
-def test_outcomes_are_all_on_the_page_of_checks() -> None:
+def test_verification_page_lists_all_outcomes() -> None:
     page = (Path(__file__).parents[1] / "docs/verification.md").read_text()
     rows = re.findall(r"^\| `([A-Z_]+)` \|", page, re.MULTILINE)
     assert sorted(rows) == sorted(outcome.name for outcome in Outcome)
     assert all(Outcome[name].good for name in rows[:4]) and not any(Outcome[name].good for name in rows[4:])
 
 
-def test_single_precision(solve) -> None:
+def test_single_precision_solution_matches_double_precision(solve) -> None:
     run = solve({"fixed": BASE.astype(int), "force": FORCE}, "--precision", "float32", "--tolerance", "1e-4")
     exact = solve({"fixed": BASE.astype(int), "force": FORCE}, "--tolerance", "1e-10")
     assert run.code == 0
     assert np.linalg.norm(run.displacement - exact.displacement) < 1e-3 * np.linalg.norm(exact.displacement)
 
 
-def test_missing_equilibrium_exits_1_with_finite_state(solve) -> None:
-    """The top is pressed through the base: the logarithmic law has no such state."""
+def test_solve_without_equilibrium_exits_1_with_finite_state(solve) -> None:
+    """The top is pressed through the base: the logarithmic law has no such equilibrium."""
     mesh = box((1, 1, 1), 0.1)
     top = mesh.nodes[:, 2] > 0.05
     run = solve(
@@ -232,8 +232,8 @@ def test_missing_equilibrium_exits_1_with_finite_state(solve) -> None:
     assert "of the load" in run.errors
 
 
-def test_a_first_guess_shortens_the_way(solve) -> None:
-    """In the file's unit; the answer is the same."""
+def test_start_displacement_reduces_iterations(solve) -> None:
+    """In the unit of the file; the displacement is the same."""
     first = solve(GOOD)
     assert first.report["load_fraction"] == 1.0
     mm = {**GOOD, "start": 1e3 * first.displacement}
@@ -242,7 +242,7 @@ def test_a_first_guess_shortens_the_way(solve) -> None:
     np.testing.assert_allclose(again.displacement, first.displacement, rtol=1e-12)
 
 
-def test_numbers_that_overflow_leave_no_infinity_in_the_report(solve) -> None:
+def test_overflow_gives_finite_report_and_displacement(solve) -> None:
     force = 1e30 / np.abs(FORCE).max() * FORCE
     run = solve({"fixed": BASE.astype(int), "force": force}, "--precision", "float32", "--tolerance", "1e-4")
     assert run.code == 1
@@ -253,8 +253,8 @@ def test_numbers_that_overflow_leave_no_infinity_in_the_report(solve) -> None:
 
 
 @pytest.mark.parametrize(("depth", "inverted"), [(0.05, 0), (0.11, 6)])
-def test_tetrahedra_that_end_inside_out_are_counted_and_printed(solve, depth: float, inverted: int) -> None:
-    """The stable law has a state where the top is pressed through the base: converged, but no tissue."""
+def test_inverted_tetrahedra_are_counted_and_reported(solve, depth: float, inverted: int) -> None:
+    """The stable law has an equilibrium with the top below the base, with inverted tetrahedra."""
     mesh = box((1, 1, 1), 0.1)
     top = mesh.nodes[:, 2] > 0.05
     run = solve(
@@ -297,7 +297,7 @@ GOOD = {"fixed": BASE.astype(int), "force": FORCE}
         (GOOD | {"start": np.full((COUNT, 3), np.nan)}, ["`start` is not finite"]),
     ],
 )
-def test_bad_point_data_is_refused(solve, data: dict, words: list[str]) -> None:
+def test_solve_rejects_bad_point_data(solve, data: dict, words: list[str]) -> None:
     refused(solve(data), *words)
 
 
@@ -323,18 +323,18 @@ def test_bad_point_data_is_refused(solve, data: dict, words: list[str]) -> None:
         (["--device", "tpu"], ["no device 'tpu'"]),
     ],
 )
-def test_bad_flags_are_refused(solve, flags: list[str], words: list[str]) -> None:
+def test_solve_rejects_bad_option_values(solve, flags: list[str], words: list[str]) -> None:
     refused(solve(GOOD, *flags), *words)
 
 
 @pytest.mark.parametrize("flags", [["--material", "jelly"], ["--unit", "inch"], ["--young", "soft"], ["--nonsense"]])
-def test_flags_that_the_parser_knows_to_be_wrong_exit_with_two(solve, flags: list[str]) -> None:
+def test_solve_exits_with_2_for_options_rejected_by_parser(solve, flags: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         solve(GOOD, *flags)
     assert caught.value.code == 2
 
 
-def test_a_loose_piece_is_refused(solve) -> None:
+def test_mesh_piece_without_support_is_rejected(solve) -> None:
     points = np.vstack([MESH.nodes, MESH.nodes + [1.0, 0.0, 0.0]])
     data = {"fixed": np.append(BASE, np.zeros(COUNT)).astype(int), "force": np.vstack([FORCE, FORCE])}
     run = solve(data, points=points, cells=[("tetra", np.vstack([MESH.tets, MESH.tets + COUNT]))])
@@ -342,8 +342,8 @@ def test_a_loose_piece_is_refused(solve) -> None:
 
 
 @pytest.mark.parametrize("shared", [1, 2])
-def test_a_piece_that_hangs_by_a_corner_or_an_edge_is_refused(solve, shared: int) -> None:
-    """It touches the held body, but turns about what it shares."""
+def test_piece_attached_by_corner_or_edge_is_rejected(solve, shared: int) -> None:
+    """The piece touches the fixed body, but rotates about the shared nodes."""
     top = np.flatnonzero(TOP)[:shared]
     apex = MESH.nodes[top].mean(axis=0) + [0.0, 0.0, 0.05]
     extra = apex + 0.02 * np.random.default_rng(3).normal(size=(4 - shared, 3))
@@ -367,26 +367,26 @@ def bridge(rigid: bool) -> dict:
     }
 
 
-def test_a_piece_on_three_corners_is_held_by_what_bears_it(solve) -> None:
+def test_piece_attached_at_three_corners_is_supported(solve) -> None:
     assert solve(**bridge(rigid=True)).code == 0
 
 
-def test_a_piece_on_three_corners_of_a_loose_body_is_loose(solve) -> None:
+def test_piece_attached_to_unsupported_body_is_rejected(solve) -> None:
     refused(solve(**bridge(rigid=False)), "can move rigidly in 6 ways")
 
 
-def test_bad_output_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_bad_output_name_is_rejected_before_reading_the_mesh(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["solve", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "a.txt")]) == 2
     assert ".vtu" in capsys.readouterr().err
 
 
-def test_a_missing_mesh_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_solve_rejects_missing_mesh_file(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["solve", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "new" / "a.vtu")]) == 2
     assert "no such file" in capsys.readouterr().err
     assert not (tmp_path / "new" / "a.vtu").exists()
 
 
-def test_slivers_are_warned_of(solve) -> None:
+def test_sliver_tetrahedra_give_a_warning(solve) -> None:
     with pytest.warns(MeshWarning, match="dihedral angle below 1 degree"):
         run = solve(GOOD, points=MESH.nodes * [1.0, 1.0, 0.005])
     assert run.code == 0

@@ -1,4 +1,4 @@
-"""A patient whose scan is oblique, mirrored and anisotropic: others find the tumour at one place in all its files."""
+"""Oblique, mirrored and anisotropic scan of a patient: one tumour position in all files, by other readers."""
 
 import csv
 import io
@@ -91,7 +91,7 @@ def brightest(path, more_than):
     return LPS * np.mean([image.TransformContinuousIndexToPhysicalPoint(place) for place in places.tolist()], axis=0)
 
 
-def test_meshes_say_ras_and_metres(folder):
+def test_mesh_files_state_ras_and_metres(folder):
     for name in ("patient.vtu", "located.vtu"):
         read = meshio.read(folder / name)
         assert list(read.field_data) == ["RAS, metres per unit"] and read.field_data["RAS, metres per unit"] == 1.0
@@ -101,7 +101,7 @@ def test_meshes_say_ras_and_metres(folder):
     near(1e3 * read.point_data["displacement"][np.unique(tumour)].mean(axis=0), SHIFT, 0.1)
 
 
-def test_images_lie_where_the_scan_does(folder):
+def test_images_have_the_position_of_the_scan(folder):
     near(brightest(folder / "labels.nii.gz", 1.5), TUMOUR)
     near(brightest(folder / "patient.t1.nii.gz", 190), TUMOUR)
     now = TUMOUR + SHIFT
@@ -111,7 +111,7 @@ def test_images_lie_where_the_scan_does(folder):
     assert header.get_xyzt_units()[0] == "mm" and int(header["sform_code"]) > 0
 
 
-def test_fields_lead_there_and_back(folder):
+def test_forward_and_inverse_fields_map_tumour_and_back(folder):
     now = TUMOUR + SHIFT
     for name, start, end in (("modeling.nrrd", TUMOUR, now), ("resampling.nii.gz", now, TUMOUR)):
         field = sitk.ReadImage(str(folder / f"warp/field_{name}"), sitk.sitkVectorFloat64)
@@ -121,7 +121,7 @@ def test_fields_lead_there_and_back(folder):
     assert header["space"] == "left-posterior-superior" and header["space units"] == ["mm"] * 3
 
 
-def test_surfaces_points_and_segments_follow_tumour(folder):
+def test_exported_surfaces_points_and_segments_follow_tumour(folder):
     warp, now = folder / "warp", TUMOUR + SHIFT
     near(LPS * trimesh.load(warp / "tumour.stl").center_mass, now)
     assert b"SPACE=LPS" in (warp / "tumour.stl").read_bytes()[:80]
@@ -156,8 +156,8 @@ def test_data_sets_and_registrations_name_their_spaces(folder, pretender):
     near(said["scanned"]["tumour_mm"], TUMOUR)
 
 
-def test_an_episode_shows_the_tumour_where_it_says_it_is(folder, pretender):
-    """Through the camera's matrices, the resting tumour falls on the middle of its mask in the first picture."""
+def test_episode_mask_matches_projected_tumour(folder, pretender):
+    """Projected by the camera's matrices, the undeformed tumour lies in the middle of its first mask."""
     anatomy = read_anatomy(folder / "patient.vtu")
     theatre = PatientSetup(anatomy, None, {}, "cpu")
     play = Player(Stage(short(), theatre.site, None), replace(pretender, anatomy=anatomy))
@@ -179,7 +179,7 @@ def test_an_episode_shows_the_tumour_where_it_says_it_is(folder, pretender):
 
 
 def test_tables_and_headers_name_their_spaces(tmp_path):
-    """Rows are of two pictures of a tumour of one vertex; what places are is held by tests of who writes them."""
+    """Rows of two images with a tumour of one vertex; values are tested with their writers."""
     poses, still = np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 1, 3))
     truth = VideoGroundTruth("digest", np.arange(2.0), poses, poses, still)
     write_truth(tmp_path / "truth.npz", truth)

@@ -1,4 +1,4 @@
-"""What the scan gives the picture: colours that no scanner's scale changes, a round field, the same bytes again."""
+"""Appearance from the scan: colours independent of the scanner's scale, and a deterministic vignette."""
 
 from dataclasses import replace
 from typing import cast
@@ -46,14 +46,14 @@ def test_cortex_colours_are_independent_of_scan_scale():
     assert np.median(green / red) > 0.6
 
 
-def test_a_scan_of_one_value_gives_one_colour_and_no_folds():
+def test_constant_scan_gives_uniform_cortex_colour():
     plain = seen(np.full(template_theatre().intensity.values.shape, 3, np.uint8))
     colours = plain.colour[plain.segmentation == CORTEX].astype(float)
     shares = colours[:, 1] / colours[:, 0]
     assert shares.std() < 0.03
 
 
-def test_a_scene_shows_its_field_and_the_same_bytes_again():
+def test_microscope_vignette_is_deterministic():
     theatre, scene = template_theatre(), small()
     rest = guess(np.zeros((1, *theatre.anatomy.mesh.nodes.shape)))
     views = [replace(scene.viewpoint, field=field) for field in (None, 1.0, 1.0)]

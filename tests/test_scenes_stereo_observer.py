@@ -1,4 +1,4 @@
-"""The open cortex seen by two eyes: points found in pictures, what is refused, and what an estimate is worth."""
+"""Stereo observation of the open cortex: tracked points, rejected images, and the resulting estimate."""
 
 from dataclasses import replace
 
@@ -68,7 +68,7 @@ def truly(observer, moved, points):
     return np.einsum("nc,nci->ni", place.weights, (moved - anatomy.mesh.nodes)[surface[place.triangle]])
 
 
-def test_points_move_as_the_cortex_did_within_their_errors(observer, moved, seen):
+def test_stereo_points_move_with_cortex_within_their_errors(observer, moved, seen):
     assert len(seen.now) > 60
     off = seen.now - seen.rest - truly(observer, moved, seen.rest)
     assert np.linalg.norm(off.mean(axis=0)) < 0.15e-3
@@ -77,7 +77,7 @@ def test_points_move_as_the_cortex_did_within_their_errors(observer, moved, seen
     assert 0.15 < np.sqrt(((off / seen.sigma[:, None]) ** 2).mean()) < 0.8
 
 
-def test_one_seed_gives_the_same_pictures_and_another_others(observer, moved, shot):
+def test_stereo_images_depend_on_the_seed(observer, moved, shot):
     again = observer_of()
     same, other = again.render_pair(30, moved), observer_of(replace(EXACT, seed=1)).render_pair(30, moved)
     for one, two, three in zip(shot.pictures, same.pictures, other.pictures, strict=True):
@@ -86,7 +86,7 @@ def test_one_seed_gives_the_same_pictures_and_another_others(observer, moved, sh
     assert shot.pictures[1].mean() < 0.93 * shot.pictures[0].mean()
 
 
-def test_a_tracked_microscope_is_off_as_a_whole(observer, shot, seen):
+def test_tracking_error_moves_all_stereo_points_rigidly(observer, shot, seen):
     off = observer_of(replace(EXACT, shift=1e-3, turn=np.radians(1.0))).observe(shot, NONE)
     plain = observer_of(EXACT).observe(shot, NONE)
     assert np.allclose(plain.now, seen.now)
@@ -100,7 +100,7 @@ def test_a_tracked_microscope_is_off_as_a_whole(observer, shot, seen):
     assert np.linalg.norm(turn - np.eye(3), 2) == pytest.approx(np.radians(1.0), rel=0.3)
 
 
-def test_a_tool_hides_points_and_moves_none(observer, moved, seen):
+def test_tool_hides_stereo_points_without_moving_others(observer, moved, seen):
     site, scene = observer.stage.site, observer.stage.scene
     inward, tip = site.axis, site.origin + 3e-3 * site.right - 2e-3 * site.axis
     corners = observer.stage.compute_corners(scene.tool.pose(tip, inward, site.right))
@@ -114,7 +114,7 @@ def test_a_tool_hides_points_and_moves_none(observer, moved, seen):
     assert np.quantile(np.linalg.norm(off, axis=1), 0.9) < 1.2e-3
 
 
-def test_without_names_points_are_a_cloud_on_the_moved_cortex(moved, shot):
+def test_unnamed_stereo_points_lie_on_the_moved_cortex(moved, shot):
     observer = observer_of(replace(EXACT, named=False))
     found = observer.observe(shot, NONE)
     surface = observer.stage.site.anatomy.open_surface
@@ -122,8 +122,8 @@ def test_without_names_points_are_a_cloud_on_the_moved_cortex(moved, shot):
     assert found.rest is None and len(found.now) > 60 and np.median(off) < 0.3e-3
 
 
-def test_a_cortex_without_a_scan_has_vessels_to_follow(observer):
-    """A head without T1 gets the same vessels, on even tissue; before, it was bare and nothing was found on it."""
+def test_cortex_without_scan_has_vessels_for_stereo_tracking(observer):
+    """Heads without T1 get the same vessels on uniform tissue."""
     bare = replace(observer, stage=replace(observer.stage, intensity=None))
     assert len(bare.first.rest) > 60
     plain = replace(
@@ -138,15 +138,15 @@ class TestRefusals:
             observer.observe(shot, NONE)
         return str(refused.value)
 
-    def test_an_eye_that_is_dark(self, observer, shot):
+    def test_dark_eye_is_rejected(self, observer, shot):
         dark = replace(shot, pictures=(shot.pictures[0], np.zeros_like(shot.pictures[1])))
         assert "the right eye sees nothing" in self.refusal(observer, dark)
 
-    def test_a_cortex_that_moved_farther_than_is_searched(self, observer, rest):
+    def test_motion_beyond_the_search_range_is_rejected(self, observer, rest):
         far = observer.render_pair(30, rest + 12e-3 * observer.stage.site.right)
         assert "begin with a new scan" in self.refusal(observer, far)
 
-    def test_swapped_eyes(self, observer, shot, rest):
+    def test_swapped_eyes_are_rejected(self, observer, shot, rest):
         assert "which is which" in self.refusal(observer, replace(shot, cameras=shot.cameras[::-1]))
         later = self.refusal(observer, replace(shot, pictures=shot.pictures[::-1]))
         assert "check that eyes are not swapped" in later or "calibrate the pair again" in later
@@ -156,7 +156,7 @@ class TestRefusals:
         said = self.refusal(swapped, replace(shot, pictures=shot.pictures[::-1]))
         assert "from the scan's" in said or "places of the cortex" in said or "pixels apart" in said
 
-    def test_another_calibration(self, observer, shot, rest):
+    def test_wrong_stereo_calibration_is_rejected(self, observer, shot, rest):
         turned = shot.cameras[0], shot.cameras[1].perturb(0.08, (1.0, 0.0, 0.0))
         assert "calibrate the pair again" in self.refusal(observer, replace(shot, cameras=turned))
         later = replace(shot, cameras=(shot.cameras[0], shot.cameras[1].perturb(0.1)))
@@ -166,24 +166,24 @@ class TestRefusals:
         vars(crossed)["_first_shot"] = replace(first, cameras=(first.cameras[0], first.cameras[1].perturb(0.1)))
         assert "mm from the scan's" in self.refusal(crossed, shot)
 
-    def test_no_texture(self, observer, shot):
+    def test_cortex_without_texture_is_rejected(self, observer, shot):
         plain = observer_of(replace(EXACT, vessels=False))
         assert "places of the cortex surely: check light" in self.refusal(plain, shot)
 
-    def test_a_cortex_that_is_hidden(self, observer, shot):
+    def test_hidden_cortex_is_rejected(self, observer, shot):
         near, far = shot.cameras[0].centre, observer.stage.site.origin
         middle = near + 0.3 * (far - near)
         corners = middle + 0.1 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, -1.0, -1.0]])
         faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
         assert "both eyes see 0 of" in self.refusal(observer, replace(shot, tool=(corners, faces)))
 
-    def test_sights_that_cannot_be(self):
+    def test_invalid_stereo_parameters_are_rejected(self):
         for wrong in ({"darker": 1.0}, {"points": 5}, {"noise": -1.0}, {"seed": -1}):
             with pytest.raises(InputError):
                 StereoObservation(**wrong)
 
 
-def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):
+def test_tumour_is_located_and_dark_eye_is_rejected(observer, moved):
     found = observer.estimate(30, moved)
     assert found.held and found.off < 0.6 * np.linalg.norm(found.true) and found.location.calibrated
     stage = replace(observer.stage, observer=replace(observer, observation_model=replace(EXACT, darker=0.999)))
@@ -197,7 +197,7 @@ def test_tumour_is_located_and_blind_eye_is_rejected(observer, moved):
     assert "sees nothing" in frame.estimate.refusal and frame.moved == 0.0
 
 
-def test_a_study_sums_up_what_was_refused_too(observer, moved):
+def test_study_summary_counts_rejected_frames(observer, moved):
     good, none = (
         observer.estimate(30, moved),
         replace(observer, observation_model=replace(EXACT, darker=0.999)).estimate(3, moved),
@@ -209,6 +209,6 @@ def test_a_study_sums_up_what_was_refused_too(observer, moved):
     assert found.removed == pytest.approx(1.0 - (2.0 * good.off + length) / (3.0 * length))
 
 
-def test_bench_rejects_scene_without_stereo(capsys):
+def test_microscope_benchmark_rejects_scene_without_stereo(capsys):
     assert main(["benchmarks", "microscope", "--scene", "sag", "--device", "cpu"]) == 2
     assert "no pair of eyes sees the scene sag" in capsys.readouterr().err

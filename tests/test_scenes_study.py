@@ -1,4 +1,4 @@
-"""What a step took is unknown where its note is damaged."""
+"""Recorded time of a step: unknown if its file is damaged."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from scenes.report.study import note_seconds, read_noted_seconds
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"seconds": "many"}', b"\xff"])
-def test_what_a_step_took_is_unknown_where_its_file_is_damaged(tmp_path, content):
+def test_damaged_time_file_gives_unknown_seconds(tmp_path, content):
     made = tmp_path / "made.npz"
     note_seconds(made, 1.25)
     assert read_noted_seconds(made) == 1.25

@@ -1,4 +1,4 @@
-"""Tasks that workers take."""
+"""Tasks of workers."""
 
 from test_scenes_engine import PLAN
 from tiny_work import Made, tiny_run
@@ -7,7 +7,7 @@ from scenes.episodes.run_folder import begin, describe_versions
 from scenes.episodes.tasks import try_task
 
 
-def test_a_worker_that_does_not_fit_makes_nothing(tmp_path):
+def test_worker_with_other_folder_or_version_makes_no_episode(tmp_path):
     def make(number):
         raise AssertionError
 

@@ -1,4 +1,4 @@
-"""Words of the page: trust in an answer, tissue and elements, plans and sides."""
+"""Text of the page: error bound of a solution, tissue and elements, solver plans."""
 
 from dataclasses import replace
 
@@ -27,35 +27,35 @@ from sim.material import Material
 
 
 class TestTrust:
-    def test_a_bound_is_reported_of_a_load_inside_the_range(self):
+    def test_page_reports_error_bound_inside_training_range(self):
         said = format_trust(answer(Outcome.PREDICTED), "svr")
         assert "Surrogate error (95 %): at most" in said and "1.00 mm" in said and "warn" not in said
 
     @pytest.mark.parametrize(
         "outcome", [Outcome.EXTRAPOLATED, Outcome.BUDGET, Outcome.STALLED, Outcome.NOT_FINITE, Outcome.PIERCED]
     )
-    def test_nothing_is_promised_of_an_answer_that_is_not_good(self, outcome):
-        """It stands in another colour, with the reason."""
+    def test_page_warns_of_unreliable_solution_without_bound(self, outcome):
+        """Shown in the warning colour, with the reason."""
         said = format_trust(answer(outcome), "svr")
         assert "Surrogate error" not in said and 'class="warn"' in said and "Do not rely on this result" in said
 
-    def test_a_guarded_model_says_which_of_the_two_answered(self):
+    def test_page_states_whether_guarded_used_model_or_fem(self):
         assert format_trust(answer(Outcome.PREDICTED), GUARDED).startswith("<p><b>fast model</b>: inside the range")
         assert "because the error bound of the fast model is too large</b>: converged" in format_trust(
             answer(Outcome.CONVERGED), GUARDED
         )
 
-    def test_code_names_are_not_shown(self):
+    def test_page_text_has_no_names_of_the_code(self):
         for outcome in Outcome:
             said = format_trust(answer(outcome), "fem")
             assert "_" not in said and outcome.name not in said
 
     @pytest.mark.parametrize(("bound", "words"), [(1e-7, "0.01 mm"), (6e-6, "0.01 mm"), (1.231e-3, "1.24 mm")])
-    def test_a_bound_is_not_reported_too_small(self, bound, words):
+    def test_error_bound_is_rounded_up_in_page_text(self, bound, words):
         bounded = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
         assert f"Surrogate error (95 %): at most {words} at any point" in format_trust(bounded, "svr")
 
-    def test_undeformed_brain_has_no_motion_and_no_error_of_it(self, theatre):
+    def test_undeformed_brain_has_no_motion_and_error_text(self, theatre):
         scene = small(path=press(0.2), duration=1.0)
         player = Player(theatre.build_stage(scene), theatre.build_deformer("linear", scene))
         frames = [player.draw(0, time, player.scene.path(time)) for time in (0.0, 0.9)]
@@ -63,7 +63,7 @@ class TestTrust:
         assert "tumour moved" not in said[0] and "Nothing moves the tumour" in said[0]
         assert "tumour moved" in said[1] and "Nothing moves" not in said[1]
 
-    def test_where_nothing_moves_nothing_is_promised(self):
+    def test_page_has_no_error_bound_without_motion(self):
         still = answer(Outcome.PREDICTED)
         still = replace(still, displacement=0.0 * still.displacement)
         said = format_trust(still, "svr")
@@ -71,13 +71,13 @@ class TestTrust:
 
 
 class TestWords:
-    def test_it_says_what_is_seen_and_that_it_is_research(self, theatre):
+    def test_caption_describes_lines_and_research_use(self, theatre):
         said = format_caption(theatre, short(), "the <default> brain")
         assert RESEARCH_ONLY in said and "&lt;default&gt;" in said and "<default>" not in said
         assert "predicted tumour" in said and "tumour in the scan" in said and "tip to tumour" in said
         assert "tip to tumour" not in format_caption(theatre, sinking(), "brain")
 
-    def test_tissue_and_element_are_those_that_are_solved(self, theatre):
+    def test_fem_description_states_tissue_and_element(self, theatre):
         default = "smoothed linear tetrahedra, neo-hookean tissue of Young's modulus 3 kPa"
         assert describe_fem(theatre, short()).startswith(default)
         stiff = Elasticity(Material("corotational", 5e3, 0.4, prony=()))
@@ -93,7 +93,7 @@ class TestWords:
         )
         assert "Brain: brain.vtu; " in describe_scene(theatre, short(), "brain.vtu")
 
-    def test_a_plan_is_a_list_and_only_finite_elements_have_one(self, theatre):
+    def test_solver_plan_is_an_html_list_and_only_for_fem(self, theatre):
         assert plan_words(("First <this>.", "Then that.")) == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
         assert plan_words(()) == "" == plan_words(plan_of(theatre.models["linear"]))
         scene = small("resection")

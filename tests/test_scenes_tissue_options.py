@@ -1,4 +1,4 @@
-"""The tissue on the command line: laws, named tissues, regions, and options that contradict each other."""
+"""Tissue options of the command line: laws, named tissues, regions and contradictions."""
 
 import argparse
 import json
@@ -44,7 +44,7 @@ def asked(*words: str) -> Tissue:
         (("--material", "ogden", "--ogden=-300,2; 1e3 , 4", "--bulk", "2e4"), Ogden(((-300.0, 2.0), (1e3, 4.0)), 2e4)),
     ],
 )
-def test_options_give_the_expected_tissue(words: tuple[str, ...], expected: Tissue) -> None:
+def test_tissue_options_give_the_expected_tissue(words: tuple[str, ...], expected: Tissue) -> None:
     assert asked(*words) == expected
 
 
@@ -69,13 +69,13 @@ def test_options_give_the_expected_tissue(words: tuple[str, ...], expected: Tiss
         (("--poisson", "0.5"), "Poisson's ratio is 0.5"),
     ],
 )
-def test_contradictions_are_refused_in_a_sentence(words: tuple[str, ...], sentence: str) -> None:
+def test_contradictory_tissue_options_are_rejected(words: tuple[str, ...], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence.replace("(", r"\(")) as caught:
         asked(*words)
     assert str(caught.value).endswith(".")
 
 
-def test_regions_obey_the_same_law() -> None:
+def test_region_tissues_have_the_law_of_the_brain() -> None:
     found = parse_region_tissues(["2:9000,0.3", "-1:500,0.49"], MATERIALS["seconds"].tissue)
     assert found == {2: Material("neo-hookean", 9000.0, 0.3), -1: Material("neo-hookean", 500.0, 0.49)}
     found = parse_region_tissues(["7:500,2;300,-4;1e4"], MATERIALS["minutes"].tissue)
@@ -83,7 +83,7 @@ def test_regions_obey_the_same_law() -> None:
 
 
 @pytest.mark.parametrize(("name", "text"), [("seconds", "2:9000,0.3"), ("minutes", "2:500,2;1e4")])
-def test_regions_relax_as_the_rest_does(name: str, text: str) -> None:
+def test_region_tissues_have_the_relaxation_of_the_brain(name: str, text: str) -> None:
     slow = replace(MATERIALS[name].tissue, prony=((0.3, 2.0),))
     assert parse_region_tissues([text], slow)[2].prony == ((0.3, 2.0),)
 
@@ -98,7 +98,7 @@ def test_regions_relax_as_the_rest_does(name: str, text: str) -> None:
         ("grey:500,2;1e4", "write REGION"),
     ],
 )
-def test_regions_of_another_form_are_refused(text: str, sentence: str) -> None:
+def test_region_tissue_with_wrong_format_is_rejected(text: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         parse_region_tissues([text], MATERIALS["minutes"].tissue)
 
@@ -117,7 +117,7 @@ def residual(folder: Path, tissues: dict[int, Tissue]) -> float:
     return float(np.linalg.norm(unbalanced[~BASE]) / np.linalg.norm(unbalanced))
 
 
-def test_two_terms_and_a_region_by_the_published_formula(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_two_term_ogden_and_region_match_published_formula(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert solve(tmp_path, *TWO_TERMS, "--region", "1:5000,3;9e4") == 0
     assert json.loads(capsys.readouterr().out)["outcome"] == "converged"
     tissues: dict[int, Tissue] = {0: Ogden(((1340.0, -19.0), (700.0, 2.5)), 2e4), 1: Ogden(((5000.0, 3.0),), 9e4)}
@@ -126,13 +126,13 @@ def test_two_terms_and_a_region_by_the_published_formula(tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-def test_named_tissues_by_the_published_formulas(name: str, tmp_path: Path) -> None:
+def test_named_tissues_match_published_formulas(name: str, tmp_path: Path) -> None:
     tissue = MATERIALS[name].tissue
     assert solve(tmp_path, "--material", name) == 0
     assert residual(tmp_path, {0: tissue, 1: tissue}) < 1e-8
 
 
-def test_contradictions_are_exit_code_two_and_write_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_solve_exits_with_2_for_contradictory_tissue_options(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert solve(tmp_path, *TWO_TERMS, "--young", "3000") == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("sulcus solve: --young says nothing")
     assert not (tmp_path / "out.vtu").exists()
@@ -146,7 +146,7 @@ def help_on_tissue(capsys: pytest.CaptureFixture, *command: str) -> str:
     return options.split("  --material TISSUE")[1].split("  --young PA")[0]
 
 
-def test_the_help_of_solve_names_every_tissue_with_its_source(capsys: pytest.CaptureFixture) -> None:
+def test_help_of_solve_names_each_tissue_with_its_source(capsys: pytest.CaptureFixture) -> None:
     said = "".join(help_on_tissue(capsys, "solve").split())
     for name, known in MATERIALS.items():
         assert "".join(f"{name} holds for {known.time_scale}. Source: {known.source}".split()) in said
@@ -154,7 +154,7 @@ def test_the_help_of_solve_names_every_tissue_with_its_source(capsys: pytest.Cap
 
 
 @pytest.mark.parametrize("command", ["simulate", "demo", "effects", "benchmarks robust", "benchmarks live"])
-def test_other_helps_name_the_tissues_and_say_where_more_stands(command: str, capsys: pytest.CaptureFixture) -> None:
+def test_help_of_other_commands_names_tissues_and_docs_page(command: str, capsys: pytest.CaptureFixture) -> None:
     said = help_on_tissue(capsys, *command.split())
     words = " ".join(said.replace("-\n", "-").split())
     assert len(said.splitlines()) <= 10 and "docs/concepts/physics.md" in words
@@ -164,7 +164,7 @@ def test_other_helps_name_the_tissues_and_say_where_more_stands(command: str, ca
 @pytest.mark.parametrize(
     ("young", "doubted"), [(99.0, "is below 100,"), (101.0, ""), (9.9e5, ""), (1.1e6, "above 1e+06")]
 )
-def test_a_stiffness_that_no_tissue_has_is_doubted(young, doubted):
+def test_implausible_stiffness_gives_a_warning(young, doubted):
     assert doubted in (said := check_stiffness(replace(BRAIN, young=young))) and bool(said) == bool(doubted)
     if doubted:
         with pytest.warns(UserWarning, match=doubted.replace("+", r"\+")):

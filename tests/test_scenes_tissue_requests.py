@@ -1,4 +1,4 @@
-"""Limits of Gymnasium's tasks: of force and of pressure."""
+"""Limits of Gymnasium's tasks: force and pressure."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -28,8 +28,8 @@ def test_load_is_the_share_of_the_limit_reached_first(limit, share):
 
 
 @pytest.mark.parametrize(("shares", "ends"), [("110111", "success"), ("1x", "unreliable"), ("11x", "unreliable")])
-def test_episode_is_over_after_goals_in_a_row_or_a_bad_answer(shares, ends):
-    """Shares of the force that is asked for; x: of a solution that is not good."""
+def test_episode_ends_after_successive_goals_or_bad_solution(shares, ends):
+    """Digits are shares of the goal force; x marks a bad solution."""
     environment = gymnasium.make("sulcus/Palpate-v0", device="cpu", size=(48, 36)).unwrapped
     nodes, seen = np.arange(len(environment.setting.site.anatomy.mesh.nodes)), iter(f"0{shares}")
 

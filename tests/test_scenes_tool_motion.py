@@ -1,4 +1,4 @@
-"""The motion of a tool that an action asks for."""
+"""Tool motion that an action requests."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from scenes.gym.tool_motion import MAX_HEIGHT, lay_tool, move_tool
 from scenes.script.craniotomy_frame import build_craniotomy_frame
 
 
-def test_tool_leans_and_sinks_no_farther_than_it_may(box):
+def test_tool_tilt_and_depth_are_limited(box):
     site, tool = build_craniotomy_frame(box), PALPATE.tool
     hand = lay_tool(site, tool, site.origin)
     for angle, turned in ((0.29, True), (0.31, False)):

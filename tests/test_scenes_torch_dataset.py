@@ -1,4 +1,4 @@
-"""Episodes for a loader with several workers."""
+"""Episodes for a data loader with several workers."""
 
 import os
 
@@ -19,7 +19,7 @@ def folder(box, tmp_path_factory):
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:multiprocessing.popen_fork")
 @pytest.mark.parametrize("start", ["fork", "spawn"])
-def test_workers_read_what_one_process_reads(folder, start):
+def test_loader_workers_read_same_data_as_one_process(folder, start):
     data = EpisodeDataset(folder, ["colour", "tumour_predicted"], window=2, stride=2)
     assert isinstance(data[0]["colour"], torch.Tensor) and data.get_window(1, 3)["frame"].tolist() == [3, 4]
     alone = [data[index] for index in range(len(data))]

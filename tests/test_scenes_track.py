@@ -1,4 +1,4 @@
-"""A film of printed targets, followed from the command line: rows with poses, blanks where they are lost."""
+"""`sulcus track`: poses of printed targets in a video, and blank rows where they are lost."""
 
 import csv
 import json
@@ -53,7 +53,7 @@ def read_csv(path):
         return list(csv.DictReader(file))
 
 
-def test_a_folder_gives_a_row_for_each_picture(folder, camera, tools, tmp_path, capsys):
+def test_track_command_writes_one_row_per_image(folder, camera, tools, tmp_path, capsys):
     out = tmp_path / "tool.csv"
     assert main(["track", str(folder), "--camera", camera, "--out", str(out), "--rate", "10", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -74,7 +74,7 @@ def test_a_folder_gives_a_row_for_each_picture(folder, camera, tools, tmp_path, 
         assert np.linalg.eigvalsh(matrix + matrix.T - np.diag(np.diag(matrix))).min() > 0.0
 
 
-def test_in_the_patient_s_frame_the_camera_is_of_no_account(folder, camera, tools, tmp_path, capsys):
+def test_tool_pose_in_patient_frame_is_independent_of_camera(folder, camera, tools, tmp_path, capsys):
     out = tmp_path / "tool.csv"
     wanted = f"track {folder} --camera {camera} --out {out} --frame patient --tip 1 2 -150".split()
     assert main(wanted) == 0
@@ -91,7 +91,7 @@ def test_in_the_patient_s_frame_the_camera_is_of_no_account(folder, camera, tool
     assert main(boardless) == 1 and "60.0 %  board lost: too few corners" in capsys.readouterr().out
 
 
-def test_the_camera_s_pose_is_the_inverse_of_what_it_sees(folder, camera, tmp_path):
+def test_camera_pose_is_the_inverse_of_the_patient_pose(folder, camera, tmp_path):
     one, other = tmp_path / "camera.csv", tmp_path / "plate.csv"
     words = ["track", str(folder), "--camera", camera]
     assert main([*words, "--out", str(one), "--body", "camera", "--frame", "patient", "--tip", "0", "0", "0"]) == 0
@@ -101,7 +101,7 @@ def test_the_camera_s_pose_is_the_inverse_of_what_it_sees(folder, camera, tmp_pa
     assert all(float(row["tip_off_mm"]) > 0.0 and int(row["corners"]) < 99 for row in read_csv(one))
 
 
-def test_a_video_has_its_own_times(pictures, camera, tmp_path):
+def test_track_command_uses_times_of_the_video(pictures, camera, tmp_path):
     film, out = tmp_path / "film.avi", tmp_path / "tool.csv"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (CAMERA.width, CAMERA.height))
     for picture in pictures:
@@ -113,7 +113,7 @@ def test_a_video_has_its_own_times(pictures, camera, tmp_path):
     assert [row["state"] for row in rows][:2] == ["good", "good"]
 
 
-def test_what_cannot_be_followed_is_refused(folder, camera, pictures, tmp_path, capsys):
+def test_track_command_rejects_invalid_options(folder, camera, pictures, tmp_path, capsys):
     out = tmp_path / "tool.csv"
 
     def refused(*words, camera=camera, folder=folder):
@@ -139,15 +139,15 @@ def test_what_cannot_be_followed_is_refused(folder, camera, pictures, tmp_path, 
     assert read_csv(out)[0]["state"] == "lost"
 
 
-def test_a_part_of_a_pose_is_refused(tmp_path):
+def test_incomplete_pose_row_is_rejected(tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text("time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n1,,2,3,0,0,0,1\n")
     with pytest.raises(ValueError, match="row 3 has a part of a pose"):
         read_poses(path)
 
 
-def test_times_are_those_that_pictures_hold():
-    """The file's own last time is 2.133 s: of a film at another rate."""
+def test_times_are_read_from_image_stamps():
+    """The last time by the file's frame rate is 2.133 s, which is wrong."""
     film = Path(__file__).parent / "data" / "film"
     rows = follow_body(film / "film.mp4", read_calibration(film / "camera.yaml"), "patient", "camera", 30.0)
     assert [row.time for row in rows][-2:] == pytest.approx([2.1333, 2.2667], abs=1e-4)

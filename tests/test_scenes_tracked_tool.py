@@ -1,4 +1,4 @@
-"""Files of tools that are tracked."""
+"""Files of tracked tools."""
 
 import json
 
@@ -11,7 +11,7 @@ from sim.tools import Ball, Capsule, Spatula
 
 
 @pytest.mark.parametrize("shape", [Ball(7e-3), Capsule(3e-3, 20e-3), Spatula(12e-3, 26e-3, 1.5e-3)])
-def test_tool_file_round_trip_encloses_its_shape(shape, tmp_path):
+def test_tool_file_round_trips_and_mesh_encloses_its_shape(shape, tmp_path):
     tool = TrackedTool(shape, tip_covariance=np.diag([1e-8, 2e-8, 3e-8]))
     write_tool(tmp_path / "tool.json", tool)
     again = read_tool(tmp_path / "tool.json")
@@ -33,7 +33,7 @@ def test_tool_file_round_trip_encloses_its_shape(shape, tmp_path):
         ("tip_covariance_mm2", [[-1, 0, 0], [0, 1, 0], [0, 0, 1]], "no covariance"),
     ],
 )
-def test_a_damaged_tool_is_refused(name, value, said, tmp_path):
+def test_damaged_tool_file_is_rejected(name, value, said, tmp_path):
     path = tmp_path / "tool.json"
     write_tool(path, TrackedTool(Ball(7e-3)))
     path.write_text(json.dumps(json.loads(path.read_text()) | {name: value}))

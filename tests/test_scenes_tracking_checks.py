@@ -1,4 +1,4 @@
-"""What `sulcus check` judges of lost, found and stale pictures fails where the code that it guards is perturbed."""
+"""Tracking checks of `sulcus check`: perturbed code for lost, found and stale images fails."""
 
 import json
 from dataclasses import replace
@@ -71,7 +71,7 @@ class Silent(Painter):
         return super().paint(colour, replace(known, words=""), covered)
 
 
-def test_what_was_not_perturbed_passes(film, parts):
+def test_unperturbed_tracking_passes_the_checks(film, parts):
     figures = measure_tracking(film, *parts)
     assert figures.find_violations() == []
     assert figures.pictures == 16 and figures.confident == figures.unsaid == 0 and figures.back <= 3
@@ -88,12 +88,12 @@ def test_what_was_not_perturbed_passes(film, parts):
         (Follower, Silent, "do not say that something is lost or old"),
     ],
 )
-def test_each_judgement_fails_where_it_should(film, parts, follower, painter, broken):
+def test_each_perturbation_fails_its_tracking_check(film, parts, follower, painter, broken):
     figures = measure_tracking(film, made(follower, parts[0]), made(painter, parts[1]))
     assert any(broken in sentence for sentence in figures.find_violations())
 
 
-def test_a_registration_that_is_off_by_two_millimetres_fails(film, parts):
+def test_registration_shifted_by_2_mm_fails_the_checks(film, parts):
     T = parts[0].registration.T_patient_scan.copy()
     T[:3, 3] += T[:3, :3] @ (2e-3 * film.stage.site.right)
     off = replace(parts[0], registration=replace(parts[0].registration, T_patient_scan=T))
@@ -101,7 +101,7 @@ def test_a_registration_that_is_off_by_two_millimetres_fails(film, parts):
     assert "pixels off" in sentence
 
 
-def test_what_never_comes_back_fails():
+def test_tracking_that_never_recovers_fails_the_checks():
     never = TrackingFigures(1, 0, 0, np.inf, 0.0)
     assert never.to_row()["back"] is None and len(never.find_violations()) == 1
 

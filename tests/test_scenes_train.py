@@ -9,7 +9,7 @@ from scenes.cli import main
 from scenes.commands.train import list_notes
 
 
-def test_training_notes_slow_parts_and_too_few_loads():
+def test_train_notes_warn_of_slow_learners_and_few_loads():
     few, many = (SimpleNamespace(good=np.ones(count, bool)) for count in (20, 76))
     series, bounds = list_notes(few, ["linear", "series-gp"])
     assert "minutes on a CPU" in series and "of 20 loads 5 calibrate error bounds" in bounds and "--count 76" in bounds
@@ -17,6 +17,6 @@ def test_training_notes_slow_parts_and_too_few_loads():
 
 
 @pytest.mark.parametrize("learners", ["", "linear,,svr", " "])
-def test_learners_without_a_name_are_a_sentence(learners, tmp_path, capsys):
+def test_train_command_rejects_empty_learner_name(learners, tmp_path, capsys):
     assert main(["train", "none.h5", "--out", str(tmp_path / "m.npz"), "--learners", learners]) == 2
     assert "name each learner" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Errors of an overlay against the truth: outlines, and counts beyond the band."""
+"""Errors of an overlay against the truth: outlines, and counts beyond the error band."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,8 +22,8 @@ def test_summary_counts_tumours_beyond_their_band_by_1_mm():
     assert (found["pictures"], found["wrong"]) == (3, 1) and found["held_percent"] == pytest.approx(100.0 / 3.0)
 
 
-def test_outline_error_is_the_same_both_ways():
-    """A drawn tumour that is a small piece of the true one, and a true one that is a small piece of the drawn one."""
+def test_outline_error_is_symmetric():
+    """Drawn tumour as a small part of the true one, and the reverse."""
     stage = template_theatre().build_stage(find_scene("palpate"))
     rest, calibration, truth = (
         stage.tumour_at_rest.vertices,

@@ -1,4 +1,4 @@
-"""Two errors, of the model and of the tumour: priors, the ensemble, what is stored, and what the picture says."""
+"""Errors of model and tumour: priors, ensemble, stored file, and text in the image."""
 
 import json
 from dataclasses import replace
@@ -76,7 +76,7 @@ def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
 
 
 class TestEnsemble:
-    def test_a_drawn_scene_has_what_was_drawn(self):
+    def test_sampled_scene_has_the_sampled_parameters(self):
         scene = find_scene("palpate")
         found = apply_sample(scene, PatientSample(2.0, 0.47, 0.5, 0.5, (1e-3, 2e-3, 3e-3), 0.1))
         elasticity, _, skull, _ = found.effects
@@ -86,7 +86,7 @@ class TestEnsemble:
         asked, given = scene.path(1.3), found.path(1.3)
         assert (given.x - asked.x, given.y - asked.y, given.depth - asked.depth) == pytest.approx((1e-3, 2e-3, 3e-3))
 
-    def test_stiffness_matters_under_known_force_alone(self, theatre):
+    def test_stiffness_changes_motion_under_known_force_only(self, theatre):
         """Under a known pose it cancels."""
         stiff = replace(SAME, stiffness=2.0)
         for scene, times in ((short(), 0.5), (small("palpate"), 1.0)):
@@ -102,8 +102,8 @@ class TestEnsemble:
         np.testing.assert_allclose(worst_point, [[4.5, np.hypot(3.0, 2.0)]])
         np.testing.assert_allclose(middle, [[np.hypot(2.75, 0.25), 2.5]])
 
-    def test_parts_are_found_each_by_itself(self):
-        """Fields that depend on stiffness and tool, each by itself, are found as such; of nothing else is anything."""
+    def test_contributions_of_independent_parameters_are_separated(self):
+        """Fields depend on stiffness and tool independently; other parameters contribute nothing."""
         scene, draws = short(), sample_priors(40, 5)
         random = np.random.default_rng(0)
         field, of_stiffness, of_tool = random.normal(size=(3, 6, 3))
@@ -117,8 +117,8 @@ class TestEnsemble:
         assert TOOL not in collect_contributor_values(draws, find_scene("brain_shift"))
         assert not any(column.any() for column in collect_contributor_values([SAME], scene).values())
 
-    def test_a_bound_holds_for_other_draws(self, theatre):
-        """Twins of a body whose motion is in inverse proportion to its stiffness: 95 in 100 lie within the bound."""
+    def test_error_bound_covers_95_percent_of_new_samples(self, theatre):
+        """Motion inversely proportional to stiffness: 95 of 100 new samples lie within the bound."""
         scene = short()
         random = np.random.default_rng(1)
         normals = random.normal(size=(9, 3))
@@ -144,7 +144,7 @@ class TestEnsemble:
         with pytest.raises(InputError, match="1 of 300 synthetic patients"):
             measure_coverage(scene, still, found, twins, [*answers(twins)[:1], *[None] * 299], 1)
 
-    def test_draws_without_equilibrium_are_counted(self, theatre):
+    def test_samples_without_equilibrium_are_counted(self, theatre):
         field = np.ones((9, 3))
         still, draws = SurfaceMotions((0.0,), (field,), (field,)), sample_priors(10, 0)
         answers = [SolvedMotions((field,), inverted) for inverted in [0, 0, 5, 1, 0, 0, 0, 0, 0]]
@@ -154,8 +154,8 @@ class TestEnsemble:
             estimate_uncertainty(theatre, short(), still, draws, [*answers[:7], None, None, None])
 
     @pytest.mark.parametrize(("failing", "asked"), [((), 5), ((1,), 9), ((1, 3), 4)])
-    def test_unreachable_time_is_reached_by_substeps(self, theatre, failing, asked):
-        """After a call that failed the solver is asked again from the moment before; failing again is no answer."""
+    def test_failed_time_step_is_repeated_with_substeps(self, theatre, failing, asked):
+        """After a failed call the solver starts again from the time before; a second failure gives no result."""
         hasty = Hasty(theatre, failing)
         found, whole = solve_scene(hasty, short()), solve_scene(theatre, short())
         assert len(hasty.starts) == asked
@@ -167,12 +167,12 @@ class TestEnsemble:
         if failing:
             assert hasty.starts[1] is hasty.starts[2] is not None
 
-    def test_excessive_force_counts_inverted_tetrahedra(self, theatre):
-        """The scene itself turns none; at a tenth of its stiffness some are."""
+    def test_very_soft_sample_counts_inverted_tetrahedra(self, theatre):
+        """The scene itself inverts none; a tenth of its stiffness inverts some."""
         weak = solve_scene(theatre, apply_sample(short(), replace(SAME, stiffness=0.1)))
         assert solve_scene(theatre, short()).inverted == 0 and weak is not None and weak.inverted > 0
 
-    def test_the_moments_of_a_scene_end_where_it_does(self, theatre):
+    def test_nominal_times_end_at_the_end_of_the_scene(self, theatre):
         still = solve_nominal(theatre, short())
         assert still.times[0] == 0.0 and still.times[-1] == pytest.approx(0.2)
         assert [np.linalg.norm(one, axis=1).mean() > 1e-4 for one in still.fields] == [False, True, True, True, False]
@@ -180,7 +180,7 @@ class TestEnsemble:
 
 
 class TestStored:
-    def test_a_file_is_read_as_it_was_written_and_scenes_are_added(self, theatre, tmp_path):
+    def test_uncertainty_file_round_trips_and_adds_scenes(self, theatre, tmp_path):
         path = tmp_path / "box.uncertainty.json"
         one = stated(short(), theatre)
         write_uncertainties(path, [one])
@@ -189,7 +189,7 @@ class TestStored:
         assert read_uncertainties(tmp_path / "none.json") == {}
 
     @pytest.mark.parametrize("harm", ["{", '{"format": "else", "scenes": {}}', None])
-    def test_a_torn_file_is_a_sentence(self, theatre, tmp_path, harm):
+    def test_damaged_uncertainty_file_is_rejected(self, theatre, tmp_path, harm):
         path = tmp_path / "box.uncertainty.json"
         write_uncertainties(path, [replace(stated(short(), theatre), worst=(1e-3, np.nan))])
         if harm:
@@ -197,7 +197,7 @@ class TestStored:
         with pytest.raises(InputError, match=r"box\.uncertainty\.json"):
             read_uncertainties(path)
 
-    def test_it_is_of_this_scene_tissue_element_and_brain_alone(self, theatre):
+    def test_stored_error_holds_only_for_same_scene_and_tissue(self, theatre):
         scene = short()
         knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
         assert knowing.estimate_uncertainty(scene) is not None
@@ -208,7 +208,7 @@ class TestStored:
         )  # fmt: skip
         assert [knowing.estimate_uncertainty(other) for other in others] == [None] * 5
 
-    def test_error_interpolates_between_moments_plus_model(self, theatre):
+    def test_tumour_error_is_interpolated_in_time_plus_model_error(self, theatre):
         found = stated(short(), theatre)
         for time, most, largest in ((0.0, 2e-3, "registration"), (0.15, 3.5e-3, "E")):
             error = found.evaluate(time)
@@ -218,7 +218,7 @@ class TestStored:
         assert found.evaluate(0.0, 1.5e-3).prior == pytest.approx(2.5e-3)
         assert found.evaluate(0.0, 9e-3).largest == "surrogate"
 
-    def test_perfect_registration_has_no_part_in_the_error(self, theatre):
+    def test_perfect_registration_adds_no_error(self, theatre):
         found = stated(short(), theatre)
         perfect, clinical = (found.evaluate(0.0, 0.0, registration) for registration in ("perfect", "clinical"))
         assert (perfect.prior, clinical.prior) == (pytest.approx(1e-3), pytest.approx(2e-3))
@@ -226,7 +226,7 @@ class TestStored:
         assert perfect.registration_words == "perfect registration"
         assert clinical.registration_words == "clinical registration, 1.6 mm per axis"
 
-    def test_a_file_without_the_new_lists_gets_upper_estimates(self, theatre, tmp_path):
+    def test_older_uncertainty_file_gives_upper_estimates(self, theatre, tmp_path):
         path, scene = tmp_path / "box.uncertainty.json", short()
         write_uncertainties(path, [stated(scene, theatre)])
         stored = json.loads(path.read_text())
@@ -236,7 +236,7 @@ class TestStored:
         found = read_uncertainties(path)[scene.name]
         assert found.registered == found.motion == (0.0, pytest.approx(4e-3))  # 1.96 x 3 mm exceeds the whole error
 
-    def test_other_loads_have_an_error_in_proportion_to_the_motion(self, theatre):
+    def test_error_of_other_loads_is_proportional_to_motion(self, theatre):
         found = fit_motion_error(stated(short(), theatre, moved=(0.0, 2e-3)))
         assert found.mean == pytest.approx(1.25) and found.surface == pytest.approx((3.5**2 - 1.0) ** 0.5 / 2.0)
         rest, moved = (found.evaluate(motion, 0.0, "perfect") for motion in (0.0, 2e-3))
@@ -245,7 +245,7 @@ class TestStored:
         assert found.evaluate(0.0, 0.0, "clinical").prior == pytest.approx(2e-3)
         assert fit_motion_error(stated(short(), theatre, moved=(0.0, 0.0))) is None
 
-    def test_the_template_ships_with_that_of_its_scenes(self):
+    def test_template_has_uncertainty_of_each_scene_without_observer(self):
         from scenes.play.deformers import open_theatre
 
         template = open_theatre(device="cpu")
@@ -279,7 +279,7 @@ class TestSaid:
             ),
         ],
     )  # fmt: skip
-    def test_both_are_said_apart(self, trained, promised, error, said):
+    def test_model_error_and_tumour_error_are_shown_separately(self, trained, promised, error, said):
         assert format_errors(promised, error, trained) == said
         assert format_errors(promised, error, trained, "doubt") == said[-1:]
 
@@ -292,14 +292,14 @@ class TestSaid:
             (False, None, TumourError(4.11e-3, "E", 1e-3), ["tumour <= 1.0 mm"]),
         ],
     )
-    def test_small_pictures_say_them_in_few_words(self, trained, promised, error, said):
+    def test_small_images_have_brief_error_text(self, trained, promised, error, said):
         assert format_errors(promised, error, trained, brief=True) == said
 
-    def test_the_worst_of_frames_is_known_where_all_are(self):
+    def test_worst_error_is_known_only_if_all_errors_are_known(self):
         errors = [TumourError(1e-3, "E"), TumourError(3e-3, "nu"), TumourError(2e-3, "E")]
         assert find_worst(errors) == errors[1] and find_worst([*errors, NOT_KNOWN]) == find_worst([]) == NOT_KNOWN
 
-    def test_a_picture_has_both_and_its_band_is_that_of_the_tumour(self, theatre, monkeypatch):
+    def test_image_has_both_errors_and_band_of_tumour_error(self, theatre, monkeypatch):
         scene = short()
         wide = replace(scene, viewpoint=replace(scene.viewpoint, width=640, height=480))
         knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
@@ -329,7 +329,7 @@ class TestSaid:
         for line in (*narrow.head, *moved, "frame 3"):
             assert has_text(narrow.shown, line, TEXT_SCALE)
 
-    def test_by_hand_it_follows_the_motion_in_doubt_it_is_unknown(self, theatre):
+    def test_manual_load_error_follows_motion_or_is_unknown(self, theatre):
         scene = short()
         player = replace(theatre, uncertainties={scene.name: stated(scene, theatre)}).build_player("linear", scene)
         held, doubtful = (player.draw(3, 0.1, Touch(force=force)) for force in (0.2, 0.6))
@@ -339,7 +339,7 @@ class TestSaid:
         assert held.model_error is not None and doubtful.model_error is None and doubtful.doubt
 
 
-def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, capsys):
+def test_check_and_episode_use_error_of_uncertainty_command(theatre, tmp_path, capsys):
     import h5py
 
     body = put(theatre, tmp_path / "box.vtu")
@@ -377,7 +377,7 @@ def test_the_command_writes_what_check_and_an_episode_say(theatre, tmp_path, cap
     assert "written as .json" in capsys.readouterr().err
 
 
-def test_other_tissues_are_refused(theatre, tmp_path, monkeypatch, capsys):
+def test_uncertainty_rejects_tissue_without_young_modulus(theatre, tmp_path, monkeypatch, capsys):
     from sim.material import MATERIALS
 
     scene = short().replace_tissue(MATERIALS["minutes"].tissue, None)

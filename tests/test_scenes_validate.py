@@ -1,4 +1,4 @@
-"""The command that looks at episodes before they are trusted."""
+"""Command that validates episodes."""
 
 import json
 
@@ -10,7 +10,7 @@ from scenes.cli import main
 from scenes.episodes.reading.validation import validate_episode
 
 
-def test_the_command_names_broken_files_and_ends_with_one(whole, tmp_path, capsys):
+def test_validate_command_names_broken_files_and_exits_with_1(whole, tmp_path, capsys):
     broken = tmp_path / "broken.h5"
     broken.write_bytes(whole.read_bytes()[:3000])
     assert main(["validate", str(whole), "--workers", "1"]) == 0
@@ -29,7 +29,7 @@ def test_the_command_names_broken_files_and_ends_with_one(whole, tmp_path, capsy
     assert main(["validate", str(whole), "--workers", "0"]) == 2
 
 
-def test_statistics_cover_whole_episodes_and_name_missing(box, tmp_path, capsys):
+def test_statistics_use_complete_episodes_and_name_missing_ones(box, tmp_path, capsys):
     for number in range(3):
         write_episode(tmp_path / f"episode_00000{number}.h5", box, Wanted(4 + number, every=1))
     with h5py.File(tmp_path / "episode_000000.h5", "a") as file:

@@ -1,4 +1,4 @@
-"""Episodes looked at before they are trusted: whole ones pass, and each thing that is wrong is named."""
+"""Validation of episodes: complete ones pass, and each defect is named."""
 
 import h5py
 import numpy as np
@@ -64,7 +64,7 @@ WRONG = {
 }  # fmt: skip
 
 
-def test_what_is_whole_passes_with_its_figures(whole):
+def test_complete_episode_passes_with_its_figures(whole):
     report = validate_episode(whole)
     assert report.problems == [] and not [words for words in report.skipped if "silhouettes" in words]
     assert (report.frames, report.solved, report.unsolved) == (7, 4, 0)
@@ -72,7 +72,7 @@ def test_what_is_whole_passes_with_its_figures(whole):
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_named(name, whole, tmp_path):
+def test_each_defect_of_an_episode_is_reported(name, whole, tmp_path):
     path = tmp_path / whole.name
     path.write_bytes(whole.read_bytes())
     (tmp_path / "bodies").symlink_to(whole.parent / "bodies")
@@ -83,13 +83,13 @@ def test_what_is_wrong_is_named(name, whole, tmp_path):
     assert len(problems) == 1 and words in problems[0]
 
 
-def test_frames_are_not_solved_again_without_a_plan(whole):
+def test_episode_without_plan_is_not_solved_again(whole):
     report = solve_again(validate_episode(whole), 2, "cpu")
     assert not report.problems and any("solved again: it states no" in words for words in report.skipped)
     assert report.again == 0 and report.again_mm is None
 
 
-def test_a_mask_without_its_anatomy_is_said_to_be_skipped(whole, tmp_path):
+def test_mask_check_without_anatomy_is_reported_as_skipped(whole, tmp_path):
     path = tmp_path / whole.name
     path.write_bytes(whole.read_bytes())
     report = validate_episode(path)

@@ -1,4 +1,4 @@
-"""A film that was taken by another camera, or at another zoom, is refused."""
+"""Rejected videos of another camera or of another zoom."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from scenes.tracked.video_camera import check_video
 
 
 @pytest.mark.parametrize(("factor", "way"), [(1.15, "13% shorter"), (0.85, "18% longer")])
-def test_a_film_of_another_zoom_is_refused_before_it_is_followed(factor, way, tmp_path, monkeypatch, capsys):
+def test_video_of_another_zoom_is_rejected_before_tracking(factor, way, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         "scenes.tracked.external_tracker.follow_body", lambda *given: pytest.fail("the whole film is followed")
     )
@@ -43,7 +43,7 @@ def test_a_film_of_another_zoom_is_refused_before_it_is_followed(factor, way, tm
         ((FILM / "film.mp4").read_bytes()[:2000], "it is cut off or damaged"),
     ],
 )
-def test_what_is_no_video_is_one_sentence_with_its_reason(content, why, tmp_path, capsys):
+def test_unreadable_video_is_rejected_with_reason(content, why, tmp_path, capsys):
     (tmp_path / "short.mp4").write_bytes(content)
     given = [str(tmp_path / "short.mp4"), "--camera", str(FILM / "camera.yaml")]
     assert main(["track", *given, "--out", str(tmp_path / "poses.csv")]) == 2
@@ -53,8 +53,8 @@ def test_what_is_no_video_is_one_sentence_with_its_reason(content, why, tmp_path
     )
 
 
-def test_libraries_print_nothing_of_what_is_no_video(tmp_path):
-    """In a process that has opened none: FFmpeg asks once how much it says."""
+def test_unreadable_video_gives_no_library_output(tmp_path):
+    """In a new process: FFmpeg reads its log level once."""
     (tmp_path / "short.mp4").write_text("no video")
     code = (
         "import pathlib, sys; from ar.tracking.image_sequences import read_frame_rate; "

@@ -1,4 +1,4 @@
-"""3-D view of the page: it follows the frame, and an old comparison is marked as such."""
+"""3-D view of the page: deformed tumour, and the comparison for a previous load."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from scenes.page.view import FEM_COLOUR, STALE_COLOUR, build_page_bodies, build_
 from scenes.script.craniotomy_frame import HOLE_RATIO
 
 
-def test_the_3d_view_follows(demo, theatre):
+def test_page_3d_view_shows_the_deformed_tumour(demo, theatre):
     demo.wish.set(plays=False, number=30)
     assert demo.run(1.0) >= 1
     tumour = np.asarray(demo.browser.meshes["tumour"].vertices)
@@ -30,8 +30,8 @@ def test_the_3d_view_follows(demo, theatre):
     assert tumour.shape == rest.shape
 
 
-def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
-    """A hand moves the tool: what the finite elements said of the load before it is greyed until they answer anew."""
+def test_comparison_of_previous_load_is_greyed_until_new_one(demo, monkeypatch):
+    """After manual motion the last comparison is grey until the new FEM solution."""
     demo.wish.set(plays=False, number=60)
     assert wait_for(lambda: demo.run(0.3) and "|difference from FEM: mean" in report(demo))
     assert "previous load" not in report(demo)
@@ -50,7 +50,7 @@ def test_an_old_verdict_never_stands_as_the_present_one(demo, monkeypatch):
     assert "previous load" not in report(demo) and tints[-1] == FEM_COLOUR
 
 
-def test_the_3d_view_has_craniotomy_scan_and_planes(theatre):
+def test_page_3d_view_has_craniotomy_scan_and_slice_planes(theatre):
     stage = theatre.build_stage(small())
     bodies = {body.name: body for body in build_page_bodies(stage)}
     hole = HOLE_RATIO * theatre.site.clearance

@@ -1,4 +1,4 @@
-"""Viewpoints of scenes: eyes of a microscope, and calibrations of another size."""
+"""Viewpoints of scenes: eyes of a microscope, and calibrations of another image size."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from scenes.script.viewpoint import USUAL_VIEWPOINT, Viewpoint
 from sim.errors import InputError
 
 
-def test_eyes_of_a_microscope_meet_at_the_site(site):
+def test_microscope_eyes_converge_at_the_site(site):
     left, right = (replace(USUAL_VIEWPOINT, eye=eye).build_camera(site) for eye in ("left", "right"))
     for one in (left, right):
         assert one.project(USUAL_VIEWPOINT.find_target(site))[0] == pytest.approx([319.5, 239.5])
@@ -18,7 +18,7 @@ def test_eyes_of_a_microscope_meet_at_the_site(site):
         Viewpoint(eye="third")  # type: ignore[arg-type]
 
 
-def test_a_calibration_of_another_size_is_refused():
+def test_calibration_of_another_image_size_is_rejected():
     with pytest.raises(InputError, match="480 x 360, not 640 x 480: calibrate with that size, or ask"):
         Viewpoint(calibration=REAL)
     view = Viewpoint().calibrate(REAL)

@@ -1,11 +1,11 @@
-"""The notice that a wait is long."""
+"""Notice of a long wait."""
 
 import time
 
 from scenes.play.waiting_notice import MIN_REPORTED_TIME, Busy
 
 
-def test_a_long_wait_is_reported_and_a_short_one_is_not():
+def test_long_wait_is_reported_and_short_wait_is_not():
     said: list[str] = []
     busy = Busy(said.append)
     busy.begin_work("a quick load")

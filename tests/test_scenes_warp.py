@@ -1,4 +1,4 @@
-"""Warps by `sulcus warp`: what it is asked for and refuses, and images and label maps as SimpleITK carries them."""
+"""`sulcus warp`: loads and scenes, rejected input, and images and label maps against SimpleITK."""
 
 import json
 from dataclasses import replace
@@ -47,7 +47,7 @@ def centroids(image, near):
 
 
 @pytest.mark.parametrize("kind", GRIDS)
-def test_simpleitk_landmarks_match_fem(kind, warp_folder, warp_out, middles):
+def test_simpleitk_resampled_blobs_match_fem(kind, warp_folder, warp_out, middles):
     field = sitk.ReadImage(str(warp_out / "field_resampling.nii.gz"), sitk.sitkVectorFloat64)
     transform = sitk.DisplacementFieldTransform(field)
     scan = sitk.ReadImage(str(warp_folder / f"{kind}.nii.gz"))
@@ -63,7 +63,7 @@ def test_simpleitk_landmarks_match_fem(kind, warp_folder, warp_out, middles):
 
 
 @pytest.mark.parametrize("kind", MAPPED)
-def test_label_maps_keep_their_labels_type_and_place(kind, warp_folder, warp_out, middles):
+def test_warped_label_maps_keep_labels_type_and_position(kind, warp_folder, warp_out, middles):
     before, after = (
         nibabel.load(warp_folder / f"{kind}_labels.nii.gz"),
         nibabel.load(warp_out / f"{kind}_labels_deformed.nii.gz"),
@@ -78,8 +78,8 @@ def test_label_maps_keep_their_labels_type_and_place(kind, warp_folder, warp_out
         )  # of whole voxels
 
 
-def test_points_go_the_way_that_tissue_goes(box, warp_out):
-    """ITK's own forward field, through the NRRD, moves points: no sign and no axis is mixed up."""
+def test_itk_moves_points_with_the_tissue(box, warp_out):
+    """Forward field of ITK from the NRRD file: no sign and no axis is swapped."""
     field = sitk.ReadImage(str(warp_out / "field_modeling.nrrd"), sitk.sitkVectorFloat64)
     transform = sitk.DisplacementFieldTransform(field)
     now = 1e-3 * LPS * np.array([transform.TransformPoint((1e3 * blob * LPS).tolist()) for blob in BLOBS])
@@ -119,7 +119,7 @@ def warp(folder, *words, out="out", anatomy="box.vtu"):
     return main(["warp", str(folder / anatomy), *map(str, words), "--spacing", "4", "--out", str(folder / out)])
 
 
-def test_a_load_is_solved_and_its_tip_measured(folder, box, capsys):
+def test_warp_solves_a_load_and_reports_the_tip(folder, box, capsys):
     words = "--load=1,2,0,0.1", "--device", "cpu", "--json"
     assert warp(folder, *words, out="load") == 0
     report = json.loads(capsys.readouterr().out)
@@ -141,7 +141,7 @@ def test_a_load_is_solved_and_its_tip_measured(folder, box, capsys):
     assert report["spaces"]["field_modeling.nrrd"] == "LPS, mm" and report["spaces"]["cause"] == "RAS, mm"
 
 
-def test_a_scene_is_a_sequence_in_time(folder, capsys):
+def test_warp_of_a_scene_writes_a_time_sequence(folder, capsys):
     words = "--scene", "press", "--frame", "60", "--sequence", "60", "--device", "cpu", "--json"
     assert warp(folder, *words, out="scene") == 0
     report = json.loads(capsys.readouterr().out)
@@ -155,7 +155,7 @@ def test_a_scene_is_a_sequence_in_time(folder, capsys):
     assert largest[1] > 5 * largest[0]
 
 
-def test_a_grid_that_is_coarse_for_the_tumour_is_said(folder, box, capsys):
+def test_warp_warns_of_grid_too_coarse_for_the_tumour(folder, box, capsys):
     moved = np.zeros_like(box.mesh.nodes)
     moved[box.tumour_nodes[0]] = [0.0, 0.0, 1e-3]  # of one vertex: no grid of 4 mm follows it
     write_mesh(folder / "narrow.vtu", box.mesh, {"displacement": moved})
@@ -165,7 +165,7 @@ def test_a_grid_that_is_coarse_for_the_tumour_is_said(folder, box, capsys):
         assert ("the grid is coarse" in (folder / f"{name}.warp" / "README.txt").read_text()) == coarse
 
 
-def test_intensities_keep_scale_and_type(folder, box, fields):
+def test_warped_intensities_keep_scale_and_type(folder, box, fields):
     image = nibabel.Nifti1Image(np.arange(40 * 40 * 32).reshape(40, 40, 32).astype(np.int16) % 700, AFFINE)
     image.header.set_slope_inter(0.5, -10.0)
     nibabel.save(image, folder / "scaled.nii")
@@ -177,7 +177,7 @@ def test_intensities_keep_scale_and_type(folder, box, fields):
     assert 0.1 < same.mean() < 0.9 and found.moved >= (~same).sum()
 
 
-def test_what_comes_from_outside_or_was_cut_is_zero_and_counted(box, fields):
+def test_voxels_from_outside_or_resection_are_zero_and_counted(box, fields):
     affine = np.diag([1e-3, 1e-3, 1e-3, 1.0])
     affine[:3, 3] = [-10e-3, -10e-3, -8e-3]  # its top lies below what is pushed into it
     out, counts = warp_values(np.full((20, 20, 6), 9, np.uint8), affine, fields, 1)
@@ -212,7 +212,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_an_image_that_cannot_be_warped_is_named(name, folder, capsys):
+def test_unsuitable_image_is_rejected_by_name(name, folder, capsys):
     make, reason = REFUSED[name]
     make(folder / name)
     assert warp(folder, "--located", folder / "located.vtu", "--image", folder / name, out="refused") == 2
@@ -234,13 +234,13 @@ def test_an_image_that_cannot_be_warped_is_named(name, folder, capsys):
         (["--scene", "press", "--frame", "1", "--sequence", "0"], "--sequence"),
     ],
 )
-def test_what_makes_no_sense_is_refused(words, reason, folder, capsys):
+def test_warp_rejects_contradictory_options(words, reason, folder, capsys):
     assert main(["warp", str(folder / "box.vtu"), *words, "--out", str(folder / "refused")]) == 2
     error = capsys.readouterr().err
     assert reason in error and not (folder / "refused").exists()
 
 
-def test_foreign_results_and_unknown_labels_are_rejected(folder, box, capsys):
+def test_warp_rejects_other_mesh_and_non_integer_labels(folder, box, capsys):
     other = box.remove_elements(np.arange(5)).mesh
     write_mesh(folder / "other.vtu", other, {"displacement": dimple(other.nodes)})
     for name, reason in (("other.vtu", "another mesh"), ("box.vtu", "no point data `displacement`")):
@@ -254,7 +254,7 @@ def test_foreign_results_and_unknown_labels_are_rejected(folder, box, capsys):
     assert "would both become" in capsys.readouterr().err
 
 
-def test_doubts_about_an_image_are_said(folder, box, capsys):
+def test_warp_warns_of_suspicious_images(folder, box, capsys):
     empty, part = np.zeros((40, 40, 32), np.float32), np.ones((12, 40, 32), np.float32)
     empty[:5], part[0, 0, 0] = 1.0, np.nan
     save(folder / "empty.nii.gz", empty)
@@ -269,7 +269,7 @@ def test_doubts_about_an_image_are_said(folder, box, capsys):
     assert all(word in said["part.nii.gz"] for word in ("of the brain", "without a number"))
 
 
-def test_a_map_of_a_small_tumour_raises_no_doubt(folder, box):
+def test_small_tumour_label_map_gives_no_warning(folder, box):
     values = np.zeros((40, 40, 32), np.uint8)
     values[18:23, 18:23, 12:17] = 2
     save(folder / "small.nii.gz", values)
@@ -278,7 +278,7 @@ def test_a_map_of_a_small_tumour_raises_no_doubt(folder, box):
     assert "another space" in asked and "--labels" in asked
 
 
-def test_intensities_that_are_given_as_labels_are_doubted(folder, box):
+def test_intensities_given_as_labels_give_a_warning(folder, box):
     smooth = 300.0 + 200.0 * np.sin(np.indices((40, 40, 32)).sum(axis=0) / 9.0)
     for name, values, doubted in (("scan", smooth, True), ("many", 1.0 + smooth // 50.0, False)):
         save(folder / f"{name}.nii.gz", values.astype(np.int16))
@@ -286,7 +286,7 @@ def test_intensities_that_are_given_as_labels_are_doubted(folder, box):
         assert ("as intensities do: give them by --image" in said) == doubted
 
 
-def test_empty_share_is_by_volume_not_vertices(folder, box):
+def test_empty_share_of_image_is_computed_by_volume(folder, box):
     index = np.rint((1e3 * box.mesh.nodes - AFFINE[:3, 3]) / 2.0).astype(int)
     values = np.ones((40, 40, 32), np.float32)
     values[tuple(index.T)] = 0.0  # one voxel round each vertex
@@ -294,7 +294,7 @@ def test_empty_share_is_by_volume_not_vertices(folder, box):
     assert not any("is 0" in warning for warning in read_picture(folder / "pitted.nii.gz", box, False).warnings)
 
 
-def test_lps_that_is_stated_as_ras_is_doubted(folder, box):
+def test_lps_image_labelled_as_ras_gives_a_warning(folder, box):
     moved = replace(box, mesh=replace(box.mesh, nodes=box.mesh.nodes + [0.0, 15e-3, 0.0]))
     places = np.moveaxis(np.indices((60, 60, 32)), 0, -1) * 2.0 + [-60.0, -60.0, -50.0]
     low, high = 1e3 * moved.mesh.nodes.min(axis=0), 1e3 * moved.mesh.nodes.max(axis=0)
@@ -308,7 +308,7 @@ def test_lps_that_is_stated_as_ras_is_doubted(folder, box):
         assert any("LPS marked as RAS" in warning for warning in warnings) == (name == "wrong")
 
 
-def test_a_folder_that_is_not_empty_is_left_alone(folder, capsys):
+def test_warp_rejects_non_empty_folder(folder, capsys):
     located = "--located", folder / "located.vtu"
     mine = folder / "mine" / "notes.txt"
     mine.parent.mkdir()
@@ -324,7 +324,7 @@ def test_a_folder_that_is_not_empty_is_left_alone(folder, capsys):
     assert warp(folder, *located, out="file") == 2
 
 
-def test_other_formats_give_the_same_picture_as_nifti(folder, box, fields, tmp_path):
+def test_mgh_and_nrrd_images_equal_the_nifti_image(folder, box, fields, tmp_path):
     values = np.random.default_rng(2).integers(0, 200, (40, 40, 32)).astype(np.int16)
     save(tmp_path / "a.nii.gz", values)
     nibabel.save(nibabel.MGHImage(values, AFFINE), tmp_path / "b.mgz")

@@ -1,4 +1,4 @@
-"""Episodes read by others: windows of frames, decoded pictures, workers, and files that are not what they seem."""
+"""Windows of frames for other programs: decoded images, batches, and damaged files."""
 
 import pickle
 import struct
@@ -18,7 +18,7 @@ def folder(box, tmp_path_factory):
     return write_three_episodes(tmp_path_factory.mktemp("episodes"), box)
 
 
-def test_windows_have_the_frames_that_they_say_in_one_order(folder):
+def test_windows_have_their_listed_frames_in_fixed_order(folder):
     found = read_episodes(folder, ["time", "tip", "tumour_rest"], window=3, step=2, stride=2)
     placed = [(one["episode"], one["frame"].tolist()) for one in found]
     assert placed == [(0, [0, 2, 4]), (0, [2, 4, 6]), (1, [0, 2, 4]), (1, [2, 4, 6]), (1, [4, 6, 8])]
@@ -34,7 +34,7 @@ def test_windows_have_the_frames_that_they_say_in_one_order(folder):
     assert len(read_episodes(folder, ["time"], window=20)) == 0 and len(read_episodes(folder, ["time"], stride=3)) == 8
 
 
-def test_pictures_are_decoded_to_what_was_drawn(folder, box):
+def test_decoded_images_match_drawn_images(folder, box):
     names = ("colour", "depth", "segmentation", "tumour_mask")
     window = read_episodes(folder, names, window=4).get_window(2, 0)
     at = read_episodes(folder, ["tumour_predicted"], window=4).get_window(2, 0)["tumour_predicted"]
@@ -46,7 +46,7 @@ def test_pictures_are_decoded_to_what_was_drawn(folder, box):
         assert window[name].dtype == np.uint8 and np.array_equal(window[name], drawn[name])
 
 
-def test_what_was_not_solved_is_nan(folder):
+def test_unsolved_frames_are_nan(folder):
     window = read_episodes(folder, ["tumour_fem", "outcome_fem", "tumour_predicted"], window=5).get_window(1, 2)
     assert window["fem_known"].tolist() == [False, True, False, False, True]
     off = np.linalg.norm(window["tumour_fem"] - window["tumour_predicted"], axis=2)
@@ -58,7 +58,7 @@ def test_what_was_not_solved_is_nan(folder):
     assert np.allclose(apart["tumour_fem"] - apart["tumour_predicted"], [0.0, 0.0, 1e-4])
 
 
-def test_batches_are_stacked_and_shuffled_by_a_seed(folder, box, tmp_path):
+def test_batches_are_stacked_and_shuffled_with_a_seed(folder, box, tmp_path):
     found = read_episodes(folder, ["tip"], window=2)
     plain, shuffled, again = (list(found.iterate_batches(4, seed)) for seed in (None, 3, 3))
     assert [len(one["episode"]) for one in plain] == [4, 4, 4, 4, 1] and plain[0]["tip"].shape == (4, 2, 3)
@@ -70,7 +70,7 @@ def test_batches_are_stacked_and_shuffled_by_a_seed(folder, box, tmp_path):
         next(read_episodes([folder, wide], ["colour"], stride=7).iterate_batches(9))
 
 
-def test_files_are_opened_when_they_are_read_and_not_too_many(folder):
+def test_episode_files_are_opened_on_reading_up_to_a_limit(folder):
     found = read_episodes(folder, ["time"], most_open=2)
     assert len(found.files) == 0
     for _ in found:
@@ -81,7 +81,7 @@ def test_files_are_opened_when_they_are_read_and_not_too_many(folder):
         OpenFiles(0)
 
 
-def test_keys_that_an_episode_does_not_have_are_named(folder):
+def test_unknown_episode_keys_are_rejected_by_name(folder):
     with pytest.raises(InputError, match=r"episode_000000.h5: has no 'fem_frames'. It has .*tumour_fem"):
         read_episodes(folder, ["fem_frames"])
     with pytest.raises(InputError, match="window 0"):
@@ -100,7 +100,7 @@ def spoil(path, how):
         how(file)
 
 
-def test_a_picture_that_is_broken_is_named_by_its_frame(tmp_path, box):
+def test_damaged_image_is_rejected_with_frame_number(tmp_path, box):
     path = write_episode(tmp_path / "x.h5", box)
     bomb = bytearray(packed("depth", np.zeros((8, 8), np.uint16)).tobytes())
     bomb[16:24] = struct.pack(">II", 60_000, 60_000)

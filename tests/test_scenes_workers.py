@@ -1,4 +1,4 @@
-"""Whoever is killed, and whenever: no finished episode is lost, none is made twice, and no half file looks whole."""
+"""Killed processes: no finished episode is lost or made twice, and no partial file looks complete."""
 
 import os
 import random
@@ -71,7 +71,7 @@ def ended(client, all_at_once):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds children by the system's table of processes")
-def test_fifty_kills_lose_nothing_and_double_nothing(tmp_path):
+def test_fifty_killed_processes_lose_or_repeat_no_episode(tmp_path):
     script, folder = tmp_path / "client.py", tmp_path / "killed"
     script.write_text(CLIENT)
     chance, kills = random.Random(0), {"worker": 0, "client": 0}

@@ -1,4 +1,4 @@
-"""What `sulcus convert --to xdmf` writes is read by ParaView's own readers: surfaces, times, and every number."""
+"""XDMF files of `sulcus convert`, read by ParaView: surfaces, times and values."""
 
 import os
 import subprocess
@@ -55,7 +55,7 @@ def converted(box, tmp_path_factory):
 @pytest.mark.skipif(PVPYTHON is None, reason="needs SULCUS_PVPYTHON, ParaView's pvpython")
 @pytest.mark.parametrize(("reader", "given"), [("XDMFReader", "FileNames"), ("Xdmf3ReaderS", "FileName")])
 @pytest.mark.parametrize("name", ["in/known", "other/bare"])
-def test_paraview_reads_what_the_episodes_hold(reader, given, name, converted, tmp_path):
+def test_paraview_reads_the_values_of_the_episodes(reader, given, name, converted, tmp_path):
     script, out = tmp_path / "read.py", tmp_path / "read.npz"
     script.write_text(READ)
     path = (converted / "out" / name.split("/")[1]).with_suffix(".xdmf")
@@ -75,7 +75,7 @@ def test_paraview_reads_what_the_episodes_hold(reader, given, name, converted, t
             assert (off is not None) == (frame % 3 == 0) and (off is None or np.allclose(off, 1e-4, atol=1e-7))
 
 
-def test_xdmf_refers_to_numbers_that_are_there(folder, tmp_path):
+def test_xdmf_references_existing_data(folder, tmp_path):
     out = tmp_path / "paraview"
     assert main(["convert", str(folder), "--to", "xdmf", "--out", str(out)]) == 0
     tree = ElementTree.parse(out / "episode_000001.xdmf")
