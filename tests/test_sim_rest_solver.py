@@ -1,4 +1,4 @@
-"""The rest stiffness, solved with and without a factor."""
+"""The rest stiffness, solved with and without a factorisation."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from sim.linalg.rest_solver import RestStiffnessSolver
 
 
 def test_linear_solution_is_same_without_inverse():
-    """The terms of a series: by a factor, and by conjugate gradients where none pays."""
+    """Terms of a series: by a factorisation, and by conjugate gradients where it would not pay."""
     problem, preconditioner = built("smoothed", 0.45, (2, 2, 3))
     free = problem.constraint.build_basis()
     force = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 3))
