@@ -138,7 +138,7 @@ def test_reference_contains_every_command_and_public_name(site, pages, monkeypat
     assert len({page.lower() for page in pages}) == len(pages)  # files of other case are one on macOS and Windows
 
 
-def test_formulas_use_mathml_of_the_browser(site, pages):
+def test_formulas_are_mathml_without_mathjax(site, pages):
     assert "math" in pages["concepts/physics"].names
     assert "MathJax" not in (site / "concepts/physics.html").read_text()
 

@@ -127,7 +127,7 @@ def test_record_states_its_origin(figures):
     assert listed == set(RECORDS)
 
 
-def test_chart_of_families_belongs_to_shipped_models():
+def test_chart_of_families_was_drawn_with_shipped_models():
     """Draw docs/report.png again with new models, and write their hash below the table."""
     digest = hashlib.sha256(to_model_path(get_template_path()).read_bytes()).hexdigest()[:12]
     assert digest in (HOUSE / "docs/notes/families.md").read_text()

@@ -70,6 +70,6 @@ def test_unsupported_abaqus_input_is_rejected_with_reason(tmp_path: Path, text: 
 
 
 @pytest.mark.parametrize(("line", "moved"), [("0.1, 0, -2.", (0.1, 0, -2)), (", 3,", (0, 3, 0)), ("", (0, 0, 0))])
-def test_abaqus_instance_translation_is_applied(tmp_path: Path, line: str, moved: tuple[float, ...]) -> None:
+def test_translation_of_abaqus_instance_moves_nodes(tmp_path: Path, line: str, moved: tuple[float, ...]) -> None:
     (tmp_path / "a.inp").write_text(f"{ASSEMBLY}{line}\n*END INSTANCE\n*END ASSEMBLY\n")
     np.testing.assert_allclose(read_mesh(tmp_path / "a.inp").mesh.nodes, MESH.nodes + moved, atol=1e-15)

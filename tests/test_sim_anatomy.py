@@ -151,5 +151,5 @@ def test_resected_tumour_remainder_keeps_its_law(small_box):
     assert np.abs(after - pushed(left, BRAIN)).max() > 2e-6
 
 
-def test_debulking_removes_necrosis_like_tumour(hollow, small_box):
+def test_debulking_removes_necrosis_with_the_tumour(hollow, small_box):
     assert Debulking((0.1, 0.2)).build_resection(hollow) == Debulking((0.1, 0.2)).build_resection(small_box)

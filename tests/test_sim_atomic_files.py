@@ -47,7 +47,7 @@ class TestWriting:
         assert sorted(tmp_path.iterdir()) == sorted([path, living, other])
 
     @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no such file system")
-    def test_read_only_folder_is_reported_before_work(self) -> None:
+    def test_output_to_proc_folder_is_rejected_before_work(self) -> None:
         with pytest.raises(InputError, match=r"cannot be written there \(No such file or directory\)"):
             check_output("/proc/a.txt", ".txt")
 
@@ -70,7 +70,7 @@ class TestWriting:
         assert "flags" not in str(caught.value)
 
 
-def test_output_path_that_is_folder_or_below_file_is_rejected(tmp_path: Path) -> None:
+def test_output_path_at_folder_or_below_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "folder.vtu").mkdir()
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):

@@ -40,7 +40,7 @@ def test_bond_share_is_mean_traction_over_strength(cube, element, total):
     assert answer.select(np.array([0])).bond[0] == answer.bond[0]
 
 
-def test_bonded_skull_holds_its_nodes(cube):
+def test_bonded_skull_fixes_its_nodes_like_held_nodes(cube):
     held = hold(cube.mesh, cube.slide_normal.any(axis=1))
     bonded, fast = (answered(one, Bonded(), PULL, "smoothed") for one in (cube, held))
     np.testing.assert_allclose(bonded.displacement, fast.displacement, atol=1e-12)

@@ -171,7 +171,7 @@ def test_scene_with_one_law_compiles_no_other_law(witnessed, law):
 
 
 @pytest.mark.parametrize("element", ["p2", "smoothed"])
-def test_elements_load_no_further_terms(witnessed, element):
+def test_element_choice_loads_no_additional_terms(witnessed, element):
     found = witnessed("press", "", "", element)
     check(found, effects_of("press"), get_law_name("press"))
     grids = {"sim.linalg.multigrid", "sim.linalg.block_sparse"}

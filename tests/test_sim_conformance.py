@@ -70,7 +70,7 @@ class TestLaw:
             ({"needs_positive_volume": False}, "relative error (nan|inf)"),
         ],
     )
-    def test_broken_law_is_rejected_with_violated_property(self, broken, words):
+    def test_broken_law_is_rejected_and_violated_property_named(self, broken, words):
         own_stress, own_change = YEOH.stress, YEOH.stress_change
 
         @wp.func

@@ -161,7 +161,7 @@ def test_incomplete_contact_reports_its_tool_pose() -> None:
     assert following.outcome[0].good
 
 
-def test_push_and_contact_act_together() -> None:
+def test_forces_of_push_and_contact_add_up() -> None:
     """A push far from the tool adds its own force: the base bears the sum."""
     fem = solver(Hard(()), ToolForce())
     pushed = Pushed(np.array([[0.045, 0.03, HEIGHT]]), np.array([[0.0, 0.0, -0.1]]), np.array([6e-3]))
@@ -177,7 +177,7 @@ def test_push_and_contact_act_together() -> None:
     assert only.reaction[0, 0, 2] < both.reaction[0, 1, 2] < 0.0
 
 
-def test_tool_without_touching_loads_is_absent() -> None:
+def test_tool_without_touching_load_has_no_effect() -> None:
     fem = solver(Hard(()))
     assert not fem.deform(Loads((), np.zeros(2))).displacement.any()
 

@@ -122,7 +122,7 @@ TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_matrix()
 BESIDE, AWAY = at(0.018, 0.03, HEIGHT - 3e-3), at(0.042, 0.032, HEIGHT - 2e-3, turn=TILT)
 
 
-def test_moving_body_and_tools_together_rotates_the_result() -> None:
+def test_rotation_of_body_and_tools_rotates_the_result() -> None:
     """Displacements, forces and moments rotate with the observer."""
     loads = touching(BESIDE, AWAY)
     found = body((BALL, BLADE)).deform(loads)
@@ -212,7 +212,7 @@ def test_tool_without_contact_causes_no_displacement(precision: str) -> None:
     assert not lifted.reaction.any()
 
 
-def test_retractor_agrees_with_contact_tool_on_same_path() -> None:
+def test_retractor_agrees_with_contact_tool_after_same_motion() -> None:
     laid, drawn = at(0.03, 0.03, HEIGHT + 1e-3), np.array([2e-3, 0.0, -4e-3])
     retractor = Fem(BLOCK, [Elasticity(SOFT), Held(), Retraction(BLADE)], TIGHT, "cpu", element="p1")
     held = retractor.deform(Loads((Retracted(laid[None], drawn[None]),)))
@@ -233,7 +233,7 @@ def frames(fem: Fem, poses: list[np.ndarray], start: Deformation | None = None) 
     return found
 
 
-def test_result_depends_on_loads_and_start_only() -> None:
+def test_contact_result_depends_only_on_loads_and_start() -> None:
     """Clients that alternate at one solver get the same bits as alone; a repetition gives the same bits."""
     fem = body((BALL,))
     ways = [[at(x, 0.03, HEIGHT - depth) for depth in (1e-3, 2e-3, 3e-3)] for x in (0.02, 0.04)]
@@ -246,7 +246,7 @@ def test_result_depends_on_loads_and_start_only() -> None:
             np.testing.assert_array_equal(one.reaction, alone[client][turn].reaction)
 
 
-def test_stored_result_continues_like_original(tmp_path: Path) -> None:
+def test_stored_result_is_an_equivalent_start(tmp_path: Path) -> None:
     """Displacement, time and memory are sufficient for the next frame."""
     fem, way = body((BALL,)), [at(x, 0.03, HEIGHT - 2e-3) for x in (0.02, 0.024, 0.028, 0.032)]
     straight = frames(fem, way)
@@ -261,7 +261,7 @@ def test_stored_result_continues_like_original(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames(fem, way[2:], warm)[-1].displacement, straight[-1].displacement)
 
 
-def test_many_small_steps_and_one_large_step_agree() -> None:
+def test_many_small_contact_steps_agree_with_one_large_step() -> None:
     """A ball pressed straight down has one solution, independent of the path."""
     fem = body((BALL,))
     once = fem.deform(touching(at(0.03, 0.03, HEIGHT - 4e-3)))

@@ -70,7 +70,7 @@ def sample_draw_scenario(slab):
 
 
 @pytest.mark.parametrize("load", [lambda slab: lifted(slab, 0.05), sample_draw_scenario])
-def test_skull_without_bond_strength_only_presses(slab, load):
+def test_skull_without_bond_strength_bears_only_pressure(slab, load):
     """Signorini's conditions: no penetration, no tension, and released nodes bear nothing."""
     loads = load(slab)
     found = solve_with_debonding(slab, effects(1e-6), loads, REFERENCE, "cpu", "p1")

@@ -113,7 +113,7 @@ def test_craniotomy_over_falx_is_free(said, labels, subject):
     assert anatomy.craniotomy.sum() > 6 and not anatomy.fixed[anatomy.craniotomy].any()
 
 
-def test_falx_label_counts_as_brain(labels, subject, tmp_path, capsys):
+def test_falx_and_tentorium_labels_count_as_brain(labels, subject, tmp_path, capsys):
     assert subject.notes == () and [septum.name for septum in subject.septa] == ["falx"]
     with pytest.raises(InputError, match="label 3 is named by --tumour and by --tentorium"):
         read_head_masks(Sources(labels, (1,), (3,), parts={"tentorium": (3,)}))

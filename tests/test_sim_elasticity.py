@@ -159,7 +159,7 @@ def test_small_uniaxial_tension_agrees_with_youngs_modulus(law: str, kind: str) 
 
 @pytest.mark.parametrize("kind", OWN_NODES)
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_reactions_balance_the_load(law: str, kind: str) -> None:
+def test_reaction_forces_balance_the_load(law: str, kind: str) -> None:
     (mesh, element), material = body(kind, (2, 2, 3), 0.15), tissue(law)
     total = np.array([0.05, 0.02, -0.1])
     u = solve(base_held(mesh), material, Nodal(top_forces(mesh, total)), element)

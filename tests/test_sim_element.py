@@ -61,7 +61,7 @@ class TestEveryLawAndElement:
         expected = internal_forces(mesh, laws(law), u, element)
         np.testing.assert_allclose(forces(built, u), expected, atol=1e-12 * np.abs(expected).max())
 
-    def test_rigid_motion_has_no_energy(self, law: str, element: str) -> None:
+    def test_rigid_motion_has_no_elastic_energy(self, law: str, element: str) -> None:
         """The elements' forces have no resultant and no moment; rotating the deformed body rotates them."""
         built, mesh, u = problem(law, element), BODY[element], swell(BODY[element], 1)
         f, x = forces(built, u), mesh.nodes + u

@@ -117,7 +117,7 @@ def build_hard_case(case, body):
 
 @pytest.mark.parametrize("case", ["nu 0.499", "slivers", "overload", "stiff tumour", "edge of the opening"])
 @pytest.mark.parametrize("name", sorted(FAMILIES))
-def test_hard_case_has_finite_result_and_true_outcome(name, case, body):
+def test_hard_case_has_finite_result_and_correct_outcome(name, case, body):
     body, tissue, loads = build_hard_case(case, body)
     result = build_family(name, body, build_push_effects(body, tissue), "cpu").deform(loads)
     assert np.isfinite(result.displacement).all()

@@ -160,7 +160,7 @@ class TestEveryDeformer:
             alone = deformer.deform(loads(np.array([row]))).displacement[0]
             np.testing.assert_allclose(alone, whole[row], atol=error * scale)
 
-    def test_deform_returns_selected_vertices(self, deformer: Deformer, answer: Deformation) -> None:
+    def test_deform_returns_only_selected_vertices(self, deformer: Deformer, answer: Deformation) -> None:
         picked = answer.nodes[[5, 2, 11]]
         some = deformer.deform(loads(), at=picked)
         np.testing.assert_array_equal(some.nodes, picked)
@@ -258,7 +258,7 @@ def stubborn() -> tuple[Anatomy, Loads]:
     return hold(MESH, ANATOMY.fixed.all(axis=1) | top), Loads((Prescribed(value[None]),))
 
 
-def test_load_steps_solve_case_that_newton_cannot() -> None:
+def test_load_steps_solve_case_where_newton_fails() -> None:
     anatomy, asked = stubborn()
     effects = Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held()
     patient = Fem(anatomy, effects, Accuracy(1e-8, limit_strain=False), "cpu", element="p1").deform(asked)
@@ -343,7 +343,7 @@ def test_overflow_is_reported_and_result_is_finite() -> None:
 
 
 @pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean"])
-def test_extreme_loads_converge(law: str) -> None:
+def test_solver_converges_under_extreme_loads(law: str) -> None:
     """10 N on a 10 cm box of 3 kPa: strains of several hundred per cent."""
     effects = [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()]
     force = top_forces(MESH, np.array([[3.0, 2.0, -9.0], [0.0, 0.0, 10.0], [10.0, 0.0, 0.0]]))

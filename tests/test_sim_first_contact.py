@@ -122,7 +122,7 @@ def test_ball_that_misses_the_surface_is_reported():
         find_resting_tip(CORNERS, ONE, np.array([0.02, -0.008, 0.1]), DOWN, RADIUS)
 
 
-def test_several_balls_rest_where_each_rests_alone():
+def test_several_balls_rest_at_positions_of_single_balls():
     """Separate surfaces, lines and radii; one ball misses its surface."""
     nodes, triangles = landscape(4)
     random = np.random.default_rng(4)

@@ -214,7 +214,7 @@ def test_nearest_point_is_found_in_every_chunk() -> None:
     assert np.isinf(skin.find_nearest(above, np.full(len(above), 0.9e-3))[1]).all()
 
 
-def test_finer_subdivision_gives_nearly_the_same_weights() -> None:
+def test_finer_subdivision_changes_footprint_weights_little() -> None:
     """A tool too small for the allowed subdivisions is rejected."""
     nodes, triangles = sheet(60)
     device, point, radius = find_device("cpu", "float64"), np.zeros((1, 3)), np.array([5e-3])

@@ -137,7 +137,7 @@ def test_displacement_of_kept_frame_is_read_only(fem):
         ride(fem)[-1].displacement[0, 0] = 1.0
 
 
-def test_frame_returns_selected_vertices(fem):
+def test_frame_at_selected_vertices_agrees_with_whole_frame(fem):
     last, some = ride(fem)[-1], np.array([40, 3, 7])
     picked = fem.deform(pushed(5e-3), last, at=some)
     np.testing.assert_array_equal(picked.displacement, fem.deform(pushed(5e-3), last).displacement[:, some])

@@ -63,7 +63,7 @@ def test_volume_below_plane_agrees_with_differences() -> None:
 
 @pytest.mark.parametrize("level", [0.0, 1e-300, 0.02, 0.0371, 0.05, 0.0999, 0.1, 0.3])
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_gravity_forces_do_the_work_of_the_weight(element: str, level: float) -> None:
+def test_work_of_gravity_forces_agrees_with_weight(element: str, level: float) -> None:
     """For every motion that the elements represent exactly: uniform, linear in x and z, quadratic where possible."""
     mesh = box((3, 3, 3), HEIGHT, distortion=0.2)
     force, nodes = build_nodal_forces(mesh, element, build_posture(3.0 * DOWN, level))
@@ -77,14 +77,14 @@ def test_gravity_forces_do_the_work_of_the_weight(element: str, level: float) ->
     assert not force[..., :2].any()
 
 
-def test_curved_elements_have_weight_of_their_volume() -> None:
+def test_weight_of_curved_elements_agrees_with_volume() -> None:
     mesh = quadratic(box((2, 2, 2), HEIGHT), curved=0.05)
     force, nodes = build_nodal_forces(mesh, "p2", build_posture(DOWN, -1.0))
     assert force[0, :, 2].sum() == pytest.approx(-FLUID * HEIGHT**3, rel=1e-12)
     assert force[0, :, 2] @ nodes[:, 2] == pytest.approx(-FLUID * HEIGHT**4 / 2.0, rel=1e-4)
 
 
-def test_gravity_force_follows_rotated_head() -> None:
+def test_gravity_force_changes_with_rotation_of_head() -> None:
     """Immersed in both postures: the force acts along the new direction minus the old one."""
     way = np.array([0.6, 0.0, -0.8])
     force, _ = build_nodal_forces(box((2, 2, 2), HEIGHT), "p1", build_posture(1e-20 * way, 1.0))
@@ -131,14 +131,14 @@ def errors_of_column(element: str, cells: int, level: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("level", [0.0, 0.025, 0.05])
-def test_quadratic_elements_represent_column_exactly(level: float) -> None:
+def test_column_of_quadratic_elements_is_exact_under_gravity(level: float) -> None:
     """Its displacement is quadratic in z on either side of a level that lies between elements."""
     assert errors_of_column("p2", 1, level).max() < 1e-9
 
 
 @pytest.mark.parametrize("level", [0.0, 0.042])
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_column_of_linear_elements_converges(element: str, level: float) -> None:
+def test_column_of_linear_elements_converges_under_gravity(element: str, level: float) -> None:
     """At second order in the mean square, also with a level within elements."""
     errors = [np.sqrt((errors_of_column(element, cells, level) ** 2).mean()) for cells in (2, 4, 8)]
     assert errors[-1] < 0.002

@@ -75,7 +75,7 @@ def test_field_is_continuous_and_zero_at_the_grid_edge(box, fields):
     assert np.abs(fields.grid.read(fields.forward, below)).max() < 1e-9  # a skull that holds is left where it is
 
 
-def test_field_just_outside_body_continues_the_inside(box, moved, fields):
+def test_field_is_smooth_across_the_surface_of_the_body(box, moved, fields):
     top = np.array([[2e-3, 1e-3, 0.0], [-5e-3, 4e-3, 0.0], [8e-3, -3e-3, 0.0]])
     below, at, above = (fields.grid.read(fields.forward, top + [0, 0, z]) for z in (-5e-4, 0.0, 5e-4))
     assert np.abs((above - at) - (at - below)).max() < 2e-5 < np.abs(at - below).max()
@@ -97,7 +97,7 @@ def test_inverted_region_is_unfolded():
     assert unfold(field, inside, ~inside, 1e-3) == compute_jacobians(field, 1e-3).min() > 0.0
 
 
-def test_folds_outside_a_body_are_removed_first():
+def test_unfolding_changes_field_outside_the_body_first():
     rng = np.random.default_rng(1)
     field = np.zeros((3, 20, 20, 20), np.float32)
     field[:, 8:12, 8:12, 8:12] = rng.uniform(-1.5e-3, 1.5e-3, (3, 4, 4, 4))

@@ -97,7 +97,7 @@ WRITERS = {
 
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("name", WRITERS)
-def test_head_is_the_same_in_every_format(tmp_path, name, axes):
+def test_head_mesh_is_independent_of_the_file_format(tmp_path, name, axes):
     affine, places = grid(AXES[axes])
     path = WRITERS[name](tmp_path / name, head(places), affine)
     named = ("Whole brain",), ("tumour",)
@@ -175,7 +175,7 @@ def test_freesurfer_volume_without_orientation_is_rejected(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "layers"), [("Segmentation", 1), ("SegmentationOverlapping", 2)])
-def test_slicer_segmentation_is_read_like_reference_reader(name, layers):
+def test_slicer_segmentation_agrees_with_reference_reader(name, layers):
     slicerio = pytest.importorskip("slicerio")
     import nrrd as reference
 

@@ -164,7 +164,7 @@ def test_one_long_time_step_agrees_with_static_solution(element: str) -> None:
     assert np.abs(moving.memory["inertia"]).max() < 1e-5
 
 
-def test_time_steps_may_be_split_between_solvers() -> None:
+def test_second_solver_continues_time_steps_of_first_exactly() -> None:
     """A solver keeps no state: another one continues as from the start, including mid-edge nodes."""
     effects = [Elasticity(), Held(), NodalForce(), Inertia(DENSITY, 1.0)]
     mesh = box((1, 1, 1), LENGTH)
@@ -204,7 +204,7 @@ def test_lumped_masses_are_positive_and_sum_to_total(element: str) -> None:
     assert mass.sum() == pytest.approx(DENSITY * mesh.volumes.sum(), rel=1e-13)
 
 
-def test_curved_elements_have_mass_of_their_volume() -> None:
+def test_mass_of_curved_elements_is_density_times_volume() -> None:
     """Their inner mid-edge nodes are moved: the boundary, and so the volume, is that of a box."""
     mesh: TetMesh = quadratic(box((2, 2, 2), LENGTH), curved=0.05)
     assert compute_lumped_mass(DENSITY, discretise(mesh)).sum() == pytest.approx(DENSITY * LENGTH**3, rel=1e-12)
@@ -253,7 +253,7 @@ def test_empty_batch_with_inertia_gives_empty_result() -> None:
     assert fem.deform(at()).displacement.shape == (0, len(BLOCK.mesh.nodes), 3)
 
 
-def test_zero_time_step_leaves_tools_in_place() -> None:
+def test_zero_time_step_does_not_move_tools() -> None:
     """A tool that moved through a body at rest would be inside it without contact force."""
     ball = Ball(0.02)
     fem = Fem(BLOCK, (Elasticity(), Held(), Inertia(), ToolContact((ball,))), Accuracy(), "cpu", element="p1")

@@ -30,7 +30,7 @@ def test_inverted_elements_from_rest_are_counted() -> None:
 
 
 @pytest.mark.parametrize(("law", "followed"), [("neo-hookean", True), ("stable-neo-hookean", False)])
-def test_inverted_single_tetrahedra_are_tracked(law: str, followed: bool) -> None:
+def test_inverted_tetrahedra_of_smoothed_elements_are_tracked(law: str, followed: bool) -> None:
     """A deep push inverts some tetrahedra of the averages, from any start, if the law allows it."""
     effects = (Elasticity(tissue(law)), *openings.EFFECTS)
     deep = 8.0 * np.array([[0.2, 0.1, -1.0]])

@@ -64,7 +64,7 @@ def test_missing_writable_cache_folder_is_rejected(homeless, monkeypatch):
         ensure_writable_cache()
 
 
-def test_command_runs_with_an_unwritable_home(homeless, tmp_path):
+def test_command_runs_with_unwritable_home_folder(homeless, tmp_path):
     command = [sys.executable, "-m", "scenes.cli", "scenes", "--device", "cpu"]
     done = subprocess.run(command, env=os.environ | {"TMPDIR": str(tmp_path)}, capture_output=True, text=True)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr

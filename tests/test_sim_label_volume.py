@@ -137,7 +137,7 @@ def test_unknown_labels_are_named_and_tumour_kept(tmp_path):
     assert found.notes[0] == "neither brain nor tumour: what is labelled 2" and "of holes" in found.notes[1]
 
 
-def test_unusable_label_volumes_are_rejected(tmp_path):
+def test_invalid_label_volumes_are_rejected_with_reason(tmp_path):
     affine, places = grid(AFFINES["thick slices"])
     labels = ellipsoid(places).astype(np.int16)
     with_tumour = np.where(ball(places), 3, labels)
@@ -204,7 +204,7 @@ def test_contradicting_forms_are_noted_and_sform_is_used(tmp_path, apart, said):
     assert np.linalg.norm(subject.interface.mean(axis=0) - TUMOUR) < 1e-3
 
 
-def test_qform_without_rotation_does_not_affect_valid_sform(tmp_path):
+def test_invalid_qform_does_not_affect_valid_sform(tmp_path):
     affine, places = grid(AFFINES["straight"])
     image = nibabel.Nifti1Image(np.where(ball(places), 3, ellipsoid(places)).astype(np.int16), affine)
     image.set_qform(affine, 1)
@@ -224,7 +224,7 @@ def test_brain_cut_by_the_volume_border_is_noted(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "per_millimetre"), [("meter", 1e-3), ("micron", 1e3), ("unknown", 1.0)])
-def test_units_of_a_file_do_not_change_the_brain(tmp_path, unit, per_millimetre):
+def test_brain_is_independent_of_length_unit_of_the_file(tmp_path, unit, per_millimetre):
     affine, places = grid(AFFINES["thick slices"])
     labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
     image = nibabel.Nifti1Image(labels, np.diag([*[per_millimetre] * 3, 1.0]) @ affine)

@@ -211,7 +211,7 @@ def test_lbfgs_stops_when_few_columns_remain(device: Device) -> None:
 
 
 @pytest.mark.parametrize("law", ["stable-neo-hookean", "neo-hookean"])
-def test_known_gradient_saves_the_first_evaluation(device: Device, law: str) -> None:
+def test_known_gradient_replaces_the_first_evaluation(device: Device, law: str) -> None:
     """The following steps are the same, the first of them within the domain."""
     problem = read_problem(device, law)
     solver, start = build_rest_solver(problem), device.allocate(ROWS, len(TOTAL))
@@ -231,7 +231,7 @@ def test_known_gradient_saves_the_first_evaluation(device: Device, law: str) -> 
     assert len(looks) >= found.steps.max()
 
 
-def test_batch_is_independent_of_previous_batch(device: Device) -> None:
+def test_lbfgs_batch_is_independent_of_previous_batch(device: Device) -> None:
     """A narrower workspace replaces a wider one: old values there are no scale of a residual."""
     problem = read_problem(device, total=np.tile(50.0 * TOTAL[1], (8, 1)))
     solver, few = build_rest_solver(problem), TOTAL[[0, 1, 3]]

@@ -18,7 +18,7 @@ POINT = np.array([[0.05, 0.05, 0.1], [0.04, 0.06, 0.1], [0.07, 0.05, 0.1], [0.05
 LOADS = push(POINT, FORCE, 0.02)
 
 
-def test_empty_or_repeated_causes_are_rejected() -> None:
+def test_loads_without_or_with_repeated_causes_are_rejected() -> None:
     with pytest.raises(InputError, match="causes none"):
         Loads(())
     with pytest.raises(InputError, match="each kind but Pushed once"):

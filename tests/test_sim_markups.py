@@ -43,7 +43,7 @@ def test_incomplete_fcsv_files_are_rejected(tmp_path, system, row, reason):
         read_markup(fcsv(tmp_path / "p.fcsv", system, row))
 
 
-def test_curve_is_smooth_through_its_points(tmp_path):
+def test_closed_curve_passes_smoothly_through_its_points(tmp_path):
     smooth = read_markup(markup(tmp_path / "c.mrk.json", curve(), "ClosedCurve")).fit_curve()
     np.testing.assert_allclose(1e3 * np.linalg.norm(smooth, axis=1), RADIUS, atol=0.15)
     np.testing.assert_allclose((1e3 * smooth[:, 1] / 30.0) ** 2 + (1e3 * smooth[:, 0] / 18.0) ** 2, 1.0, atol=0.04)

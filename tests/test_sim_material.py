@@ -16,7 +16,7 @@ from sim.material import (
 )
 
 
-def test_lame_constants_give_young_and_poisson_back() -> None:
+def test_lame_constants_agree_with_young_and_poisson() -> None:
     mu, lam = Material("linear", 3000.0, 0.45).lame
     assert mu * (3.0 * lam + 2.0 * mu) / (lam + mu) == pytest.approx(3000.0)
     assert lam / (2.0 * (lam + mu)) == pytest.approx(0.45)
@@ -29,7 +29,7 @@ def test_ogden_constants_give_small_strain_moduli() -> None:
     assert lam + 2.0 * mu / 3.0 == pytest.approx(5e4)
 
 
-def test_coefficients_of_a_law_have_one_length() -> None:
+def test_coefficients_of_tissues_are_padded_to_equal_length() -> None:
     tissues = Ogden(((1.0, 2.0),), 9.0), Ogden(((3.0, 4.0), (5.0, 6.0), (7.0, 8.0)), 10.0)
     rows = collect_coefficients(tissues)
     np.testing.assert_array_equal(rows, [[9, 1, 2, 0, 1, 0, 1], [10, 3, 4, 5, 6, 7, 8]])

@@ -55,7 +55,7 @@ def test_surface_fit_reduces_distance_at_same_volume(body):
     np.testing.assert_array_equal(still, body.nodes)
 
 
-def test_nodes_that_would_invert_a_tetrahedron_stay(body):
+def test_nodes_that_would_invert_a_tetrahedron_are_not_moved(body):
     inner = np.setdiff1d(np.arange(len(body.nodes)), find_single_faces(body.tets))
     thrown, pushed = inner[0], np.setdiff1d(inner, body.tets[(body.tets == inner[0]).any(axis=1)])[0]
     moved = body.nodes.copy()

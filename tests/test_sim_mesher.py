@@ -71,7 +71,7 @@ def test_too_small_tumour_pieces_are_reported(tmp_path):
         make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(factors=())))
 
 
-def test_voxel_rough_labels_are_rejected_for_smoothing(tmp_path):
+def test_too_rough_labels_are_rejected_with_advice_to_smooth(tmp_path):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(1.5, 1.2))
     plan = MeshPlan(nodes=2000, meshing=mesher.Meshing(factors=(1.25,)))
     with pytest.raises(InputError, match="too intricate for 2000 nodes: smooth the labels"):

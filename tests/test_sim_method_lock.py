@@ -93,7 +93,7 @@ def test_resected_body_shared_by_threads_is_bit_identical() -> None:
         same(one, other)
 
 
-def test_device_results_survive_later_solves() -> None:
+def test_results_on_device_are_kept_after_later_solves() -> None:
     """Frame after frame, each thread on its own path; warm data are read after others have moved on."""
     fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu", element="p1")
     fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True))

@@ -51,7 +51,7 @@ def test_factor_is_inverse_over_free_motions(precision: Precision) -> None:
 
 
 @pytest.mark.parametrize("precision", EXACT)
-def test_compliance_rows_match_unit_forces(precision: Precision) -> None:
+def test_compliance_agrees_with_solutions_of_unit_forces(precision: Precision) -> None:
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     rows = np.random.default_rng(1).choice(stiffness.shape[0], 2 * STRIP + 7, replace=False)
@@ -75,7 +75,7 @@ def test_factor_is_symmetric_in_single_precision(columns: int) -> None:
 
 
 @pytest.mark.parametrize("count", [2, FEW + 3])
-def test_only_live_columns_are_solved(count: int) -> None:
+def test_factor_solves_selected_columns(count: int) -> None:
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"), "float64")
     r = np.random.default_rng(2).normal(size=(stiffness.shape[0], count))
@@ -86,7 +86,7 @@ def test_only_live_columns_are_solved(count: int) -> None:
 
 
 @pytest.mark.parametrize("columns", [1, FEW + 1])
-def test_single_precision_solves_forces_of_any_size(columns: int) -> None:
+def test_single_precision_factor_solves_forces_of_any_size(columns: int) -> None:
     """In a double-precision solver; a column without forces stays zero. Rounding depends on the processor."""
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"))
@@ -97,7 +97,7 @@ def test_single_precision_solves_forces_of_any_size(columns: int) -> None:
     assert (np.linalg.norm(found - expected, axis=0) <= 1e-4 * np.linalg.norm(expected, axis=0)).all()
 
 
-def test_single_precision_stays_positive_definite() -> None:
+def test_single_precision_factor_is_positive_definite() -> None:
     """Where single precision holds no inverse: springs between neighbours, ten thousand million times as stiff here."""
     stiff = np.where(np.arange(299) % 3 == 0, 1e10, 1.0)
     diagonal = np.append(stiff, 0.0) + np.append(1.0, stiff)
@@ -107,7 +107,7 @@ def test_single_precision_stays_positive_definite() -> None:
     assert np.linalg.eigvalsh(gram / np.abs(gram).max())[0] > -1e-7
 
 
-def test_disconnected_blocks_are_solved_together() -> None:
+def test_factor_solves_disconnected_blocks() -> None:
     matrix = sp.csc_array(sp.block_diag([np.array([[2.0, -1.0], [-1.0, 2.0]])] * 200))
     factor = Factor(matrix, sp.csc_array(sp.eye_array(400)), np.arange(400), find_device("cpu", "float64"), "float64")
     r = np.random.default_rng(3).normal(size=(400, 1))

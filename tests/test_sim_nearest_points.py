@@ -25,7 +25,7 @@ def test_nearest_point_to_tool_core_agrees_with_lattice(half: list[float]) -> No
     np.testing.assert_allclose(np.linalg.norm(way[far > 1e-9], axis=1), 1.0)
 
 
-def test_triangle_through_blade_is_pushed_back_down() -> None:
+def test_triangle_through_blade_has_negative_distance() -> None:
     """The farther above, the deeper inside; outside the blade the nearest edge counts."""
     blade = PlacedBox(np.zeros(3), np.eye(3), np.array([4.0, 6.0, 0.0]))
     flat = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])

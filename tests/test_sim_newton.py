@@ -97,7 +97,7 @@ def test_newton_rows_are_independent_of_order(problem: Problem, batch: Found) ->
     np.testing.assert_allclose(shuffled.u, batch.u[:, order], atol=1e-10)
 
 
-def test_history_is_stored_in_its_rows(problem: Problem, batch: Found, device: Device) -> None:
+def test_history_is_stored_by_load_case(problem: Problem, batch: Found, device: Device) -> None:
     cases = cases_of()
     problem.begin(cases)
     memory = problem.end(device.upload(batch.u))
@@ -106,7 +106,7 @@ def test_history_is_stored_in_its_rows(problem: Problem, batch: Found, device: D
     np.testing.assert_allclose(memory["spring"], before + (1.0 - np.exp(-0.7)) * (u - before), atol=1e-14)
 
 
-def test_history_is_passed_on_by_the_deformer() -> None:
+def test_deformer_passes_history_to_the_next_frame() -> None:
     """Creeping spring: the displacement grows with each call, and equals that of separate steps in a batch."""
     fem = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TIGHT, "cpu", batch=2, element="p1")
     terms = (*fem.problem.terms, Spring(fem.problem.device, ROWS, 40.0))
@@ -210,7 +210,7 @@ def compressed() -> tuple[Fem, Loads]:
     return fem, Loads((Prescribed(value[None]), Nodal(force[None])))
 
 
-def test_newton_leaves_negative_curvature(device: Device) -> None:
+def test_newton_finds_stable_state_after_negative_curvature(device: Device) -> None:
     """The column buckles sideways by millimetres under a negligible load, to a stable state."""
     fem, loads = compressed()
     found = fem.deform(loads)
@@ -291,7 +291,7 @@ def test_search_that_fails_twice_is_reported_as_stalled(problem: Problem) -> Non
 
 
 @pytest.mark.parametrize(("tiny", "outcome"), [(12, Outcome.CONVERGED), (1000, Outcome.STALLED)])
-def test_steps_below_rounding_end_stalled(problem: Problem, batch: Found, tiny: int, outcome: Outcome) -> None:
+def test_only_many_tiny_steps_end_as_stalled(problem: Problem, batch: Found, tiny: int, outcome: Outcome) -> None:
     """Newton resumes after a few of them, and does not spend its budget on them."""
     problem.begin(select_rows(cases_of(), np.array([4])))
     sizes = chain(repeat(1e-20, tiny), repeat(1.0))

@@ -49,7 +49,7 @@ def walk(problem: Problem, descent: Descent, steps: int) -> list[tuple[np.ndarra
     return path
 
 
-def test_directions_are_downhill_with_predicted_slope(device: Device) -> None:
+def test_newton_cg_directions_are_downhill_and_predict_slope(device: Device) -> None:
     problem = begun(read_problem(device))
     for _, g, found in walk(problem, descent_of(problem), 8):
         slope = (g * found.d.numpy()).sum(axis=0)
@@ -57,7 +57,7 @@ def test_directions_are_downhill_with_predicted_slope(device: Device) -> None:
         np.testing.assert_allclose(found.predicted, -slope, rtol=1e-9)
 
 
-def test_memory_of_removed_columns_is_dropped(device: Device) -> None:
+def test_newton_cg_forgets_memory_of_removed_columns(device: Device) -> None:
     """Three steps together, then some columns continue as if they had always been separate."""
     rows = np.array([3, 0, 4])
     problem = begun(read_problem(device))

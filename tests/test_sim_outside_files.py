@@ -130,7 +130,7 @@ class TestMeshes:
             read_mesh(path)
 
     @pytest.mark.parametrize("name", ["a.vtu", "a.xdmf"])
-    def test_xml_entities_are_rejected_unexpanded(self, tmp_path: Path, name: str) -> None:
+    def test_xml_entities_are_rejected_without_expansion(self, tmp_path: Path, name: str) -> None:
         tens = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
         for entities in (f'<!ENTITY a0 "aaaaaaaaaa">{tens}', '<!ENTITY a11 SYSTEM "file:///etc/passwd">'):
             (tmp_path / name).write_text(f"<!DOCTYPE x [{entities}]><Xdmf Version='3.0'>&a11;</Xdmf>")

@@ -155,7 +155,7 @@ def test_line_search_does_not_change_its_arguments(problem: Problem) -> None:
     np.testing.assert_array_equal(direction.d.numpy(), before)
 
 
-def test_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -> None:
+def test_trust_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -> None:
     """Half of the norm of the full solution, less where the curvature is negative; a large radius has no effect."""
     K, r = dense(problem, 1e-2 * CRUSHED), compute_right_hand_side(problem)
     rest, solver = dense(problem, REST), build_rest_solver(problem)

@@ -44,7 +44,7 @@ def test_impossible_craniotomy_is_rejected_with_reason(cortex, place, reason):
         find_opening_at(cortex, np.array(place))
 
 
-def test_largest_distance_of_craniotomy_point_is_an_option(cortex):
+def test_largest_distance_from_surface_is_an_option(cortex):
     asked = np.array([0.0, 0.0, 0.12])
     with pytest.raises(InputError, match="50 mm is the most"):
         find_opening_at(cortex, 1.3 * asked, Placement(max_surface_distance=0.05))

@@ -48,7 +48,7 @@ def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accura
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
-def test_solver_steps_follow_the_table(more, one, few, many):
+def test_planned_solver_steps_agree_with_the_table(more, one, few, many):
     plan = planned(**more)
     assert [plan.list_steps(count) for count in (1, 2, MANY)] == [one, few, many]
     assert plan.list_steps(MANY, imposed=True) == (SolverStep.NEWTON,) and not plan.frames

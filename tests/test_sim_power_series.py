@@ -86,7 +86,7 @@ def _nodal(box, point, force, radius):
     return weights[:, :, None] * force[:, None, :]
 
 
-def test_series_of_combined_loads_agrees_with_single_load(box):
+def test_series_along_one_direction_agrees_with_single_load(box):
     fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="smoothed")
     nodes, direction = box.tumour_nodes, np.array([[0.5, -0.4, -0.7]])
     three = Pushed(np.repeat(POINT[:1], 3, axis=0), np.eye(3), np.repeat(RADIUS[:1], 3))

@@ -19,7 +19,7 @@ NO_CARD = pytest.mark.skipif(wp.is_cuda_available(), reason="there is a card her
 
 
 @pytest.mark.parametrize(("words", "names"), [("cpu", 1), ("cpu,cpu", 2), (" cpu , cpu,cpu", 3)])
-def test_device_list_names_each_device(words, names):
+def test_device_list_is_parsed_into_device_names(words, names):
     assert parse_device_names(words) == ("cpu",) * names
     assert parse_device_names("auto") == (find_device("auto", "float32").name,)
 

@@ -85,7 +85,7 @@ def test_zero_resection_steps_give_the_whole_body(operated: OperatedFem) -> None
     np.testing.assert_array_equal(operated.deform(lying([0])).displacement, plain.displacement)
 
 
-def test_resection_steps_are_separate_in_each_row(operated: OperatedFem) -> None:
+def test_load_cases_have_separate_resection_steps(operated: OperatedFem) -> None:
     done = [2, 0, 1, 0, 2]
     together = operated.deform(lying(done))
     for row, one in enumerate(done):
@@ -99,7 +99,7 @@ def test_resection_without_weight_causes_no_displacement(operated: OperatedFem) 
     assert not operated.deform(at_rest).displacement.any()
 
 
-def test_wall_of_resection_cavity_is_free(operated: OperatedFem) -> None:
+def test_forces_on_wall_of_resection_cavity_move_tissue(operated: OperatedFem) -> None:
     """Forces on the wall of the cavity act: it is no longer inside."""
     wall = np.setdiff1d(np.unique(operated.get_remains(2).anatomy.mesh.surface), np.unique(MESH.surface))
     force = np.zeros((1, len(MESH.nodes), 3))
@@ -206,7 +206,7 @@ class TestWhatComesLoose:
 
 
 class TestHardCases:
-    def test_resection_may_include_rim_and_held_vertices(self) -> None:
+    def test_resection_of_rim_and_held_vertices_is_solved(self) -> None:
         """A resection to the held floor through the opening's edge removes held, sliding and open vertices."""
         normal = np.where((MESH.nodes[:, :1] < 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [-1.0, 0.0, 0.0], 0.0)
         opened = MESH.nodes[:, 2] > 0.06 - 1e-9
@@ -270,7 +270,7 @@ class TestHardCases:
     MIDDLE_LAYER = within((0, 0, 1), (3, 3, 2))
 
     @pytest.mark.parametrize("done", [-1.0, 0.5])
-    def test_number_of_resection_steps_must_be_whole(self, done: float) -> None:
+    def test_negative_or_fractional_resection_step_is_rejected(self, done: float) -> None:
         with pytest.raises(InputError, match="integers >= 0"):
             Loads((Resected(np.array([done])),))
 

@@ -91,7 +91,7 @@ class TestMemory:
                 expected = share * np.exp(-time / tau) * at_once[stretched]
                 np.testing.assert_allclose(left[:, part], expected, atol=1e-6 * np.abs(at_once).max())
 
-    def test_resected_tissue_may_have_a_longer_series(self) -> None:
+    def test_prony_series_of_resected_tissue_changes_no_result(self) -> None:
         """A negligible share changes no result, one step forward and one back, also in a batch."""
         cut = np.isin(np.arange(len(MESH.tets)), STEPS.steps[0])
         body = base_held(replace(MESH, region=np.where(cut, 2, 1)))
@@ -106,8 +106,8 @@ class TestMemory:
             found.append(last.displacement)
         np.testing.assert_allclose(found[1], found[0], atol=1e-8 * np.abs(found[0]).max())
 
-    def test_run_without_resected_tissue_is_bit_identical(self) -> None:
-        """To a solver without the effect."""
+    def test_run_before_resection_is_bit_identical_to_plain_run(self) -> None:
+        """Compared with a solver without the effect `Resection`."""
         effects = (Elasticity(RELAXING), Held(), Gravity(direction=(0.0, 0.0, -1.0)), Inertia())
         plain, made = (
             Fem(BODY, effects, TIGHT, "cpu", element="p1"),

@@ -10,7 +10,7 @@ from sim.errors import InputError
 from sim.linalg.rest_solver import RestStiffnessSolver
 
 
-def test_linear_solution_is_same_without_inverse():
+def test_linear_solution_without_factorisation_agrees():
     """Terms of a series: by a factorisation, and by conjugate gradients where it would not pay."""
     problem, preconditioner = built("smoothed", 0.45, (2, 2, 3))
     free = problem.constraint.build_basis()

@@ -7,7 +7,7 @@ from sim.runtime.device import find_device
 from sim.terms.schur_stiffness import Exterior
 
 
-def test_energy_of_surroundings_is_potential_of_gradient() -> None:
+def test_exterior_gradient_is_derivative_of_its_energy() -> None:
     device, random = find_device("cpu", "float64"), np.random.default_rng(0)
     root, rows = random.normal(size=(4, 4)), np.array([1, 2, 5, 7])
     exterior = Exterior(rows, root @ root.T, 9, device)

@@ -25,7 +25,7 @@ def test_load_pairs_agree_with_second_order_of_series(tiny_box, law, element):
     check(tiny_box, Material(law, 3000.0, 0.45), element)
 
 
-def test_second_order_of_stiffening_tissue_agrees(tiny_box):
+def test_load_pairs_agree_for_a_stiffening_tissue(tiny_box):
     check(tiny_box, MATERIALS["minutes"].tissue, "p1")
 
 

@@ -33,7 +33,7 @@ def triangles_round(mesh: TetMesh, ends: np.ndarray) -> list[list[int]]:
     return [list(corners) for corners in mesh.surface.tolist() if set(ends.tolist()) <= set(corners)]
 
 
-def test_every_edge_has_one_node_in_its_middle() -> None:
+def test_every_edge_has_one_node_at_its_midpoint() -> None:
     space = discretise(THIN, "p2")
     edges = {pair for tet in THIN.tets.tolist() for pair in combinations(sorted(tet), 2)}
     assert sorted(edges) == sorted(map(tuple, space.edges.tolist()))
@@ -111,7 +111,7 @@ def test_added_mid_edge_node_slides_along_its_triangles() -> None:
     assert between_held and 0 < astray < many
 
 
-def test_normals_of_sliding_ball_prevent_flux() -> None:
+def test_sliding_normals_of_ball_are_parallel_to_flux_vectors() -> None:
     """Normals are parallel to the flux vector of their node, and as radial as its triangles allow."""
     surface = np.zeros(len(ROUND.nodes), bool)
     surface[ROUND.surface] = True
@@ -169,7 +169,7 @@ def test_start_without_mid_edge_nodes_is_accepted(fem: Fem) -> None:
     np.testing.assert_allclose(bare.displacement, found.displacement, atol=1e-9)
 
 
-def test_start_is_split_with_its_batch() -> None:
+def test_start_is_split_into_the_same_batches_as_loads() -> None:
     """Mid-edge nodes of every row are passed on: the solution as start needs no iteration."""
     fem = Fem(base_held(THIN), [Elasticity(), Held(), ToolForce()], TIGHT, "cpu", batch=2, element="p2")
     loads = push([0.05, 0.05, 0.1 / 3.0], np.outer([0.1, -0.2, 0.3, 0.2, -0.1], [0.3, 0.1, -1.0]), 0.02)

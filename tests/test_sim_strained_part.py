@@ -147,7 +147,7 @@ def test_updated_inverse_agrees_with_strained_stiffness() -> None:
         np.testing.assert_allclose(now, inverse[np.ix_(touched, touched)], atol=2e-5 * np.abs(inverse).max())
 
 
-def test_most_strained_nodes_are_selected() -> None:
+def test_update_selects_the_most_strained_nodes() -> None:
     """The number is limited, and no node with small strain is selected."""
     fem, descent, u, model = find_model(StrainLimits(min_strain=0.08, max_nodes=20, max_omitted=1.0))
     strain = fem.problem.device.allocate(fem.space.count, 2)

@@ -67,7 +67,7 @@ def test_rows_solved_alone_and_together_agree(hasty: Deformation) -> None:
         np.testing.assert_allclose(alone.displacement[0], hasty.displacement[row], atol=1e-8)
 
 
-def test_zero_load_steps_in_accuracy_disables_them() -> None:
+def test_accuracy_with_zero_steps_disables_load_steps() -> None:
     found = fem(replace(HASTY, steps=0)).deform(loads())
     assert found.outcome[4] is Outcome.BUDGET
     assert (found.iterations <= HASTY.outer).all()

@@ -63,7 +63,7 @@ def test_template_mesh_at_17k_nodes_meets_quality_bounds():
     assert np.percentile(distance, 95) < 1e-3
 
 
-def test_mesh_search_respects_limits_of_the_plan(subject):
+def test_mesh_search_stops_at_the_number_of_trials_of_the_plan(subject):
     meshing = Meshing(max_trials=1, max_deviation=0.0)
     with pytest.raises(InputError, match="3000 nodes are not possible for this anatomy"):
         make_anatomy(subject, MeshPlan(3000, meshing=meshing))
@@ -115,7 +115,7 @@ def test_craniotomy_is_wider_than_the_tumour(subject):
     assert sizes == pytest.approx([0.06, 0.08], abs=1e-3)
 
 
-def test_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
+def test_template_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
     mesh = anatomy.mesh
     outer = np.unique(mesh.surface)
     stem, skull = anatomy.fixed.all(axis=1), anatomy.slide_normal.any(axis=1)
@@ -135,7 +135,7 @@ def test_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
     ).mean() > 0.95
 
 
-def test_skull_normals_integrate_shape_gradients(anatomy):
+def test_skull_normals_agree_with_integrals_of_shape_gradients(anatomy):
     """Sum over the volume: linear shape functions have a constant gradient in each tetrahedron."""
     mesh, skull = anatomy.mesh, anatomy.slide_normal.any(axis=1)
     a, *others = np.moveaxis(mesh.nodes[mesh.tets], 1, 0)

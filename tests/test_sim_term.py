@@ -150,7 +150,7 @@ def test_definite_curvature_is_selected_for_each_column(term: Term, example: Exa
 
 
 @pytest.mark.parametrize("columns", [[0], [2, 0], [1, 2]])
-def test_selected_columns_agree_with_new_start(
+def test_term_with_selected_columns_agrees_with_new_term(
     term: Term, example: Example, device: Device, columns: list[int]
 ) -> None:
     index = np.array(columns)
@@ -210,7 +210,7 @@ def test_longest_step_never_raises_the_bound(term: Term, example: Example, devic
     assert (out.numpy() <= 1e-9).all()
 
 
-def test_linearisation_does_not_follow_the_state(term: Term, example: Example, device: Device) -> None:
+def test_curvature_is_unchanged_by_later_changes_of_state(term: Term, example: Example, device: Device) -> None:
     """The outer iteration changes u in place: the curvature remains that of the linearisation."""
     u, p = device.upload(example.u), noise(*example.u.shape)
     term.linearise(u, wp.zeros(3, dtype=wp.int32, device="cpu"))

@@ -84,7 +84,7 @@ def test_background_thread_waits_for_foreground_work() -> None:
     thread.join()
 
 
-def test_kernels_wait_for_the_foreground_before_launch(monkeypatch) -> None:
+def test_kernel_launch_waits_for_the_foreground(monkeypatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr("sim.runtime.device.wait_for_foreground", lambda: asked.append(1))
     monkeypatch.setattr("sim.runtime.device.wp.launch", lambda *_, **__: None)

@@ -157,7 +157,7 @@ class TestTwoTools:
         assert np.abs(both - first).max() > 0.2 * np.abs(both).max()
         assert np.abs(both - summed).max() < 1e-6 * np.abs(summed).max()
 
-    def test_frames_of_two_tools_start_from_the_last_frame(self):
+    def test_frames_of_two_tools_converge_from_previous_frame(self):
         """Neither the path of one push nor a patch around it is followed: the other solvers handle both."""
         fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu", live=True, element="p1")
         last = None

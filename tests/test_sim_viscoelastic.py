@@ -168,7 +168,7 @@ def test_time_step_of_a_day_reaches_long_term_stiffness(precision: str) -> None:
     assert left == pytest.approx(1.0 / modulus(np.inf), rel=0.2)
 
 
-def test_relaxing_runs_may_be_split_and_tissues_mixed() -> None:
+def test_second_solver_continues_relaxation_exactly() -> None:
     """Another solver continues as from the start; regions that do not relax have no memory."""
     halves = TetMesh(MESH.nodes, MESH.tets, np.arange(len(MESH.tets)) % 2)
     anatomy, force = base_held(halves), Nodal(top_forces(halves, np.array([[0.5, 0.0, 0.2], [0.0, 0.3, -0.2]])))
@@ -253,7 +253,7 @@ def test_relaxed_stable_law_agrees_with_its_elastic_limit(force: float, element:
     np.testing.assert_allclose(answer.displacement, still, atol=1e-5 * np.abs(still).max())
 
 
-def test_relaxed_tissue_converges_under_a_folding_push() -> None:
+def test_relaxing_tissue_converges_under_an_inverting_push() -> None:
     """The default law by its other name: it has the equilibria of its elastic limit, including inverted ones."""
     anatomy = base_held(box((5, 5, 3), 0.05))
     fem = Fem(

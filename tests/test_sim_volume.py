@@ -31,7 +31,7 @@ def header_with(path: Path, place: int, form: str, *values: float) -> Path:
 
 class TestVolumes:
     @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
-    def test_truncated_volume_takes_no_memory(self, tmp_path: Path, name: str) -> None:
+    def test_truncated_volume_is_rejected_before_allocation(self, tmp_path: Path, name: str) -> None:
         path = header_with(volume(tmp_path / name), 40, "<4h", 3, 700, 700, 700)
         with memory_below(2**24), pytest.raises(InputError, match=r"ends after 568 of 343,000,352 bytes"):
             read_volume(path)
