@@ -86,7 +86,7 @@ def test_contact_descent_agrees_with_newton() -> None:
 
 
 def test_contact_batch_with_one_slow_case_converges() -> None:
-    """Data that the slow case collects when it is the last one do not belong to the batch."""
+    """Curvature pairs of the last, slow case are not stored for the batch."""
     fem, far = solver(Accuracy(1e-6)), touching(DOWN, at(0.045, 0.04, HEIGHT - 3e-3))
     second = fem.deform(far, fem.deform(touching(DOWN, DOWN)))
     assert {len(value) for value in second.memory.values()} == {2}

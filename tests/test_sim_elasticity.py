@@ -48,7 +48,7 @@ def solve(
 @pytest.mark.parametrize("law", EVERY_LAW)
 @pytest.mark.parametrize("gradient", [SMALL, LARGE], ids=["small", "large"])
 def test_affine_boundary_motion_gives_affine_interior(law: str, kind: str, gradient: np.ndarray) -> None:
-    """An affine motion of the boundary extends to the interior, whatever the shapes of the elements."""
+    """An affine motion of the boundary extends to the interior, for all shapes of elements."""
     mesh, element = body(kind, (3, 3, 3), 0.2)
     affine = mesh.nodes @ gradient.T
     surface = surface_nodes(mesh)

@@ -134,7 +134,7 @@ class TestEveryDeformer:
         assert np.linalg.norm(answer.displacement, axis=2).max(axis=1).min() > 1e-4
 
     def test_deform_is_deterministic(self, deformer: Deformer, answer: Deformation) -> None:
-        """The same loads give the same bits, whatever was solved in between."""
+        """The same loads give the same bits after other loads were solved."""
         deformer.deform(loads(np.array([4, 2]), scale=-0.5), None)
         again = deformer.deform(loads())
         np.testing.assert_array_equal(answer.displacement, again.displacement)

@@ -232,7 +232,7 @@ def test_known_gradient_replaces_the_first_evaluation(device: Device, law: str) 
 
 
 def test_lbfgs_batch_is_independent_of_previous_batch(device: Device) -> None:
-    """A narrower workspace replaces a wider one: old values there are no scale of a residual."""
+    """A narrower workspace replaces a wider one: its old values must not scale a residual."""
     problem = read_problem(device, total=np.tile(50.0 * TOTAL[1], (8, 1)))
     solver, few = build_rest_solver(problem), TOTAL[[0, 1, 3]]
     lbfgs = Lbfgs(problem, solver)

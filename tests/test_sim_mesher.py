@@ -28,7 +28,7 @@ def rough_tumour(amount, width, seed=1):
 
 
 def test_rough_cortex_is_meshed(tmp_path, monkeypatch):
-    """A mesh fitted to it folds, so that nodes stay where that happens."""
+    """A mesh fitted to the rough cortex folds, so that the nodes of folds are not moved."""
     affine, places = grid(AFFINES["straight"])
     rough = np.linalg.norm((places - MIDDLE) / AXES, axis=-1) < 0.9 + roughness(places.shape[:-1], 0.15, 2.0, 1)
     labels = np.where(ball(places), 3, rough)

@@ -98,7 +98,7 @@ def test_single_precision_factor_solves_forces_of_any_size(columns: int) -> None
 
 
 def test_single_precision_factor_is_positive_definite() -> None:
-    """Where single precision holds no inverse: springs between neighbours, ten thousand million times as stiff here."""
+    """Condition number beyond single precision: springs between neighbours, every third one 1e10 times stiffer."""
     stiff = np.where(np.arange(299) % 3 == 0, 1e10, 1.0)
     diagonal = np.append(stiff, 0.0) + np.append(1.0, stiff)
     matrix = sp.csc_array(sp.diags_array([-stiff, diagonal, -stiff], offsets=[-1, 0, 1]))

@@ -79,7 +79,7 @@ def batch(problem: Problem) -> Found:
 
 
 def test_batch_cases_converge_after_different_steps(batch: Found) -> None:
-    """The tests below depend on it."""
+    """The tests below need different numbers of steps."""
     assert all(outcome is Outcome.CONVERGED for outcome in batch.outcome)
     assert len(set(batch.iterations)) >= 4
 

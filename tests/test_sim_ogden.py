@@ -51,7 +51,7 @@ def test_ogden_stress_at_equal_stretches_is_exact(of: Tissue, turn: np.ndarray, 
 @pytest.mark.parametrize("m", [-19.0, -4.0, 2.0, 8.0])
 @pytest.mark.parametrize("stretch", [0.5, 0.9, 1.1, 2.0])
 def test_incompressible_ogden_matches_closed_form(m: float, stretch: float) -> None:
-    """Uniaxial: sigma_1 - sigma_2 = sum c / m (s^m - s^(-m/2)), whatever K."""
+    """Uniaxial: sigma_1 - sigma_2 = sum c / m (s^m - s^(-m/2)), for any K."""
     of = Ogden(((1300.0, m), (200.0, 1.5)), 5e4)
     side = stretch**-0.5
     P = build_evaluator(of, "float64")(np.diag([stretch - 1.0, side - 1.0, side - 1.0])[None]).stress[0]

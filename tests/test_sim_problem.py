@@ -165,7 +165,7 @@ def test_potential_is_the_sum_of_its_terms(device: Device) -> None:
 
 
 def test_solve_integrates_its_tools_once(launches: list[str]) -> None:
-    """It begins, begins again for the reactions, and needs their moments."""
+    """The solution, the reactions and the moments use the same footprints."""
     fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce()], TIGHT, "cpu", element="p1")
     launches.clear()
     fem.deform(Loads((Pushed(np.array([[0.03, 0.03, 0.1]]), np.array([[0.0, 0.0, -0.1]]), np.array([0.02])),)))

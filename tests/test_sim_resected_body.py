@@ -100,7 +100,7 @@ def test_resection_without_weight_causes_no_displacement(operated: OperatedFem) 
 
 
 def test_forces_on_wall_of_resection_cavity_move_tissue(operated: OperatedFem) -> None:
-    """Forces on the wall of the cavity act: it is no longer inside."""
+    """The wall of the cavity is part of the surface."""
     wall = np.setdiff1d(np.unique(operated.get_remains(2).anatomy.mesh.surface), np.unique(MESH.surface))
     force = np.zeros((1, len(MESH.nodes), 3))
     force[0, wall, 2] = -0.01
@@ -198,7 +198,7 @@ class TestWhatComesLoose:
         assert [len(one.loose) for one in compute_remains(corner, Resection((TOP,)))] == [0, 0]
 
     def test_piece_that_only_slides_on_the_skull_is_removed(self) -> None:
-        """Nothing stops its sliding."""
+        """The skull prevents no tangential motion."""
         wall = np.where((MESH.nodes[:, :1] > 0.06 - 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
         sliding = hold(MESH, MESH.nodes[:, 2] < 1e-9, wall)
         _, left = compute_remains(sliding, Resection((self.SLICE,)))

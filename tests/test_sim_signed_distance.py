@@ -6,7 +6,7 @@ from sim.bodies.signed_distance import project_onto_level
 
 
 def test_projection_keeps_nodes_where_gradient_is_tiny():
-    """Its slope is round-off there."""
+    """The gradient of the flat field is round-off."""
     points = np.random.default_rng(0).normal(scale=0.01, size=(20, 3))
     moved = project_onto_level(lambda at: 2e-3 + 1e-6 * at[:, 0], points, np.zeros(20))
     assert np.abs(moved - points).max() < 1e-6

@@ -129,7 +129,7 @@ def test_definite_curvature_is_positive(term: Term, example: Example, device: De
 
 @pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean", "ogden"])
 def test_plain_curvature_of_crushed_tissue_is_indefinite(law: str, device: Device) -> None:
-    """Without it the test above could not fail."""
+    """Without indefinite curvature the test above could not fail."""
     example = EXAMPLES[law]
     term = example.build(device)
     term.begin(example.cases)

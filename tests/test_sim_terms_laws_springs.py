@@ -83,7 +83,7 @@ def test_rigid_motion_of_springs_has_no_energy():
 
 
 def test_bar_of_springs_stretches_within_model_error():
-    """Kuhn's tetrahedra have all long diagonals in one direction, which makes springs softer by a half here."""
+    """Kuhn's tetrahedra have all long diagonals in one direction, which makes springs softer by a half."""
     mesh = make_mesh((4, 4, 12), 0.06, distortion=0.2)
     anatomy = base_held(mesh)
     top = mesh.nodes[:, 2] > 0.06 - 1e-9
