@@ -1,4 +1,4 @@
-"""The pages for the browser: they build without a warning, hold what the code has, and fetch nothing from elsewhere."""
+"""HTML documentation: it builds without warnings, covers the public code, and loads nothing from other sites."""
 
 import importlib
 import json
@@ -75,14 +75,14 @@ def pages(site):
     return {path.relative_to(site).with_suffix("").as_posix(): Tags(path) for path in site.rglob("*.html")}
 
 
-def test_every_source_is_a_page_and_every_example_too(pages):
+def test_every_source_and_example_has_a_page(pages):
     wanted = {path.relative_to(HOUSE / "docs").with_suffix("").as_posix() for path in DOCS}
     wanted |= {f"generated/examples/{path.stem}" for path in (HOUSE / "examples").glob("*.py")}
     assert len(wanted) > 20 and wanted <= set(pages)
     assert not {"generated/examples/gone", "generated/sim/gone"} & set(pages)
 
 
-def test_every_example_has_an_image_of_its_own(site):
+def test_every_example_has_its_own_image(site):
     shown = (site / "generated/examples/index.html").read_text()
     names = {path.stem for path in (HOUSE / "examples").glob("*.py")}
     images = {path.stem: path.read_bytes() for path in (HOUSE / "docs/examples").iterdir()}
@@ -91,13 +91,13 @@ def test_every_example_has_an_image_of_its_own(site):
     assert set(re.findall(r"sphx_glr_(\w+)_thumb\.webp", shown)) == names
 
 
-def test_who_wants_to_contribute_finds_how(site, pages):
+def test_developer_page_links_the_contributing_guide(site, pages):
     assert "generated/contributing.html" in pages["develop"].links
     assert "Structure" in (site / "generated/contributing.html").read_text()
 
 
-def test_no_page_loads_anything_from_elsewhere(site, pages):
-    """No script, style, font or picture: the pages are read where there is no network."""
+def test_pages_load_nothing_from_other_sites(site, pages):
+    """No script, style, font or image: the pages are read without a network."""
     outside = {name: [it for it in page.loaded if "//" in it] for name, page in pages.items()}
     assert not {name: found for name, found in outside.items() if found}
     assert any(page.loaded for page in pages.values())
@@ -105,7 +105,7 @@ def test_no_page_loads_anything_from_elsewhere(site, pages):
     assert styles and not [text for text in styles if re.search(r"(url\(|@import )['\"]?(https?:)?//", text)]
 
 
-def test_every_link_inside_the_pages_arrives(site, pages):
+def test_every_internal_link_has_a_target(site, pages):
     checked = 0
     for name, page in pages.items():
         for link in page.links:
@@ -120,7 +120,7 @@ def test_every_link_inside_the_pages_arrives(site, pages):
     assert checked > 100
 
 
-def test_every_command_and_public_name_is_in_the_reference(site, pages, monkeypatch):
+def test_reference_contains_every_command_and_public_name(site, pages, monkeypatch):
     monkeypatch.syspath_prepend(HOUSE / "docs/extensions")
     page_of = importlib.import_module("public_names").page_of
     for name in COMMANDS:
@@ -138,17 +138,17 @@ def test_every_command_and_public_name_is_in_the_reference(site, pages, monkeypa
     assert len({page.lower() for page in pages}) == len(pages)  # files of other case are one on macOS and Windows
 
 
-def test_formulas_are_drawn_by_the_browser_itself(site, pages):
+def test_formulas_are_mathml_without_mathjax(site, pages):
     assert "math" in pages["concepts/physics"].names
     assert "MathJax" not in (site / "concepts/physics.html").read_text()
 
 
-def test_files_are_described_array_by_array(site):
+def test_formats_page_describes_every_array(site):
     text = re.sub(r"<[^>]+>", "", (site / "reference/formats.html").read_text())
     assert not [name for name in (*DATASET, *EPISODE) if name not in text]
 
 
-def test_the_code_on_the_page_of_formats_reads_the_files(tmp_path, monkeypatch, box, pretender):
+def test_code_on_formats_page_reads_the_files(tmp_path, monkeypatch, box, pretender):
     data, episode = re.findall(r"```python\n(.*?)```", FORMATS, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     simulate(Path("patient.h5"), pretender, draw("palpation", box, 6, 0), {"preset": "palpation"})
@@ -163,7 +163,7 @@ def test_the_code_on_the_page_of_formats_reads_the_files(tmp_path, monkeypatch, 
     assert len(read) == 4 and set(read) <= set(EPISODE)
 
 
-def test_the_page_of_formats_lists_what_a_model_holds():
+def test_formats_page_lists_the_contents_of_a_model():
     with np.load(to_model_path(get_template_path())) as archive:
         header = json.loads(str(archive["header"]))
     rows = re.findall(r"^\| (`\w+`) \| .*$", FORMATS.partition("\n## Model")[2].partition("\n## ")[0], re.M)
@@ -175,7 +175,7 @@ def test_the_page_of_formats_lists_what_a_model_holds():
     assert set(re.findall(r"`(\w+)`", stated)) == set(header["models"]["series-gp"]["envelope"])
 
 
-def test_each_scene_has_a_picture_and_its_own_words():
+def test_each_scene_has_an_image_and_a_heading():
     text = (HOUSE / "docs/scenes.md").read_text()
     assert re.findall(r"^## (\w+)\n\n!\[[^]]*\]\(scenes/(\w+)\.webp\)$", text, re.M) == [
         (name, name) for name in SCENES
@@ -185,8 +185,8 @@ def test_each_scene_has_a_picture_and_its_own_words():
     assert len(pictures) == len(SCENES) and sum(path.stat().st_size for path in pictures) < 400_000
 
 
-def test_the_motions_of_the_scenes_are_those_that_were_measured():
-    """And are measured again when a scene gets other effects."""
+def test_scene_displacements_agree_with_their_measurement():
+    """They are measured again when the effects of a scene change."""
     text, measured = ((HOUSE / "docs" / name).read_text() for name in ("scenes.md", "scenes/measured.json"))
     known = json.loads(measured)
     assert f"`{known['command']}` computes them" in text
@@ -208,13 +208,13 @@ def test_the_motions_of_the_scenes_are_those_that_were_measured():
         ("Push at 0.3 N.", "Push at 0.3 N", ""),
     ],
 )
-def test_what_an_example_begins_with_is_its_title(words, title, rest, monkeypatch):
+def test_start_of_example_docstring_becomes_its_title(words, title, rest, monkeypatch):
     monkeypatch.syspath_prepend(HOUSE / "docs/extensions")
     made = importlib.import_module("example_scripts").gallery_script(f'"""{words}"""\nx = 1\n')
     assert made == f'r"""\n{title}\n{"=" * len(title)}\n\n{rest}\n"""\nx = 1\n'
 
 
-def test_a_page_with_a_link_that_leads_nowhere_is_refused(tmp_path):
+def test_page_with_a_broken_link_fails_to_build(tmp_path):
     """Warnings are errors: here of one page, with the settings of all."""
     shutil.copytree(HOUSE / "docs/extensions", tmp_path / "extensions")
     settings = (HOUSE / "docs/conf.py").read_text()

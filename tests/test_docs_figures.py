@@ -1,4 +1,4 @@
-"""Measured figures of README and the user pages: each equals its record, and stands on one page.
+"""Measured figures of README and the user pages: each equals its record, and occurs on one page.
 
 Records are `benchmarks/records/*.json` and `benchmarks/cards.json`; tests/data/figures.toml says which figure is whose.
 """
@@ -87,11 +87,11 @@ def figures():
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_page_shows_the_figures_of_the_records(page, figures):
+def test_page_figures_agree_with_their_records(page, figures):
     assert not [(place, text) for place, text, digits in figures[page] if not agrees(text, look_up(place), digits)]
 
 
-def test_figure_with_another_digit_is_found(figures):
+def test_changed_digit_in_a_figure_is_detected(figures):
     """In the text, or in the record by a unit of the last place that the text shows."""
     for place, text, digits in chain.from_iterable(figures.values()):
         value = look_up(place)
@@ -104,7 +104,7 @@ def test_figure_with_another_digit_is_found(figures):
             assert not agrees(text, value + 10.0**-shown, digits), place
 
 
-def test_figure_stands_on_one_page(figures):
+def test_figure_occurs_on_one_page(figures):
     """README repeats some of docs/accuracy.md."""
     count = Counter(place for page, found in figures.items() if page != "README.md" for place, *_ in found)
     assert not [place for place, number in count.items() if number > 1]
@@ -127,7 +127,7 @@ def test_record_states_its_origin(figures):
     assert listed == set(RECORDS)
 
 
-def test_the_chart_of_families_is_as_new_as_the_models_that_ship():
+def test_chart_of_families_was_drawn_with_shipped_models():
     """Draw docs/report.png again with new models, and write their hash below the table."""
     digest = hashlib.sha256(to_model_path(get_template_path()).read_bytes()).hexdigest()[:12]
     assert digest in (HOUSE / "docs/notes/families.md").read_text()

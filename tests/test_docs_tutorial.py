@@ -1,4 +1,4 @@
-"""The page docs/tutorial.md: its Python and commands run, on the template that ships instead of a trained patient."""
+"""The page docs/tutorial.md: its Python and commands run, with the shipped template instead of a trained patient."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Every script in examples/ runs as a user runs it, in a folder of its own, and says what it is for."""
+"""Every script in examples/ runs like a user's, in an empty folder, and states its purpose."""
 
 import ast
 import contextlib
@@ -20,7 +20,7 @@ PARTS = {"nearest.py", "sucker.py", "veins.py", "yeoh.py"}
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
-def test_an_example_runs(script, tmp_path):
+def test_example_runs_without_warnings(script, tmp_path):
     alone = {"CUDA_VISIBLE_DEVICES": "", "DISPLAY": ""}
     done = subprocess.run(
         [sys.executable, "-W", "error", script],
@@ -33,7 +33,7 @@ def test_an_example_runs(script, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_the_notebook_prints_what_it_shows():
+def test_notebook_output_agrees_with_its_stored_output():
     notebook = json.loads((EXAMPLES / "first_steps.ipynb").read_text())
     assert notebook["nbformat"] == 4 and notebook["nbformat_minor"] == 5 and len(notebook["cells"]) <= 12
     assert len({cell["id"] for cell in notebook["cells"]}) == len(notebook["cells"])
@@ -49,12 +49,12 @@ def test_the_notebook_prints_what_it_shows():
     assert names["png"].startswith(b"\x89PNG") and names["frame"].shown.std() > 20.0
 
 
-def test_the_list_of_parts_names_examples():
+def test_list_of_parts_names_existing_examples():
     assert PARTS.issubset(script.name for script in SCRIPTS)
 
 
 @pytest.mark.parametrize("script", [path for path in SCRIPTS if path.name not in PARTS], ids=lambda path: path.stem)
-def test_an_example_is_short_and_asserts_a_number(script):
+def test_example_is_short_and_asserts_a_number(script):
     tree = ast.parse(script.read_text())
     title, blank, *rest = (ast.get_docstring(tree) or "").splitlines()
     assert title and not blank and 1 <= len(rest) <= 4
@@ -79,14 +79,14 @@ PYTHONS = {"util", "mrmlScene", "items", "suffix", "is_file"}
 """Modules of Slicer, and what is Python's own."""
 
 
-def test_the_example_for_slicer_calls_what_slicer_has():
+def test_slicer_example_calls_only_known_slicer_functions():
     tree = ast.parse(ELSEWHERE.read_text())
     compile(tree, ELSEWHERE.name, "exec")
     used = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     assert used == set().union(PYTHONS, *SLICER.values())
 
 
-def test_the_example_for_slicer_ends_in_a_sentence_elsewhere(tmp_path):
+def test_slicer_example_outside_slicer_ends_with_message(tmp_path):
     done = subprocess.run([sys.executable, ELSEWHERE], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and "Run it in the Python console of 3D Slicer" in done.stderr
     assert "Traceback" not in done.stderr

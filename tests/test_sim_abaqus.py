@@ -39,7 +39,7 @@ ASSEMBLY = f"*PART, NAME=P\n{NODE}\n{TET}\n*END PART\n*ASSEMBLY, NAME=A\n*INSTAN
     f"*PART, NAME=P\n{NODE}\n{SETS}\n*END PART\n*ASSEMBLY, NAME=A\n*INSTANCE, NAME=I, PART=P\n*END INSTANCE\n*NODE\n"
     "1, 9., 9., 9.\n*ELSET, ELSET=_PICK, INTERNAL\n3, 12\n*END ASSEMBLY",
 ])  # fmt: skip
-def test_abaqus_blocks_of_any_order_make_one_mesh(tmp_path: Path, text: str) -> None:
+def test_abaqus_blocks_in_any_order_give_the_same_mesh(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.inp").write_text(f"*HEADING\n{text}\n")
     mesh = read_mesh(tmp_path / "a.inp").mesh
     np.testing.assert_array_equal(mesh.nodes, MESH.nodes)
@@ -63,13 +63,13 @@ def test_abaqus_blocks_of_any_order_make_one_mesh(tmp_path: Path, text: str) -> 
     (f"{ASSEMBLY}*END INSTANCE\n*INSTANCE, NAME=J, PART=P", "moved apart, or several of one part: every node"),
     ("*NODE\n1, 0, 0, x", "it is damaged, or of another kind"),
 ])  # fmt: skip
-def test_abaqus_that_is_not_read_states_the_reason(tmp_path: Path, text: str, reason: str) -> None:
+def test_unsupported_abaqus_input_is_rejected_with_reason(tmp_path: Path, text: str, reason: str) -> None:
     (tmp_path / "a.inp").write_text(text)
     with pytest.raises(InputError, match=reason):
         read_mesh(tmp_path / "a.inp")
 
 
 @pytest.mark.parametrize(("line", "moved"), [("0.1, 0, -2.", (0.1, 0, -2)), (", 3,", (0, 3, 0)), ("", (0, 0, 0))])
-def test_abaqus_instance_is_translated(tmp_path: Path, line: str, moved: tuple[float, ...]) -> None:
+def test_translation_of_abaqus_instance_moves_nodes(tmp_path: Path, line: str, moved: tuple[float, ...]) -> None:
     (tmp_path / "a.inp").write_text(f"{ASSEMBLY}{line}\n*END INSTANCE\n*END ASSEMBLY\n")
     np.testing.assert_allclose(read_mesh(tmp_path / "a.inp").mesh.nodes, MESH.nodes + moved, atol=1e-15)

@@ -1,4 +1,4 @@
-"""What the accuracy presets promise, on the scene that ships."""
+"""Accuracy presets: error against the converged displacement on the example scene."""
 
 import numpy as np
 import pytest
@@ -25,14 +25,14 @@ def press():
 
 
 @pytest.mark.parametrize("name", PROMISED)
-def test_a_preset_keeps_its_promise(press, name):
+def test_accuracy_preset_meets_its_error_bound(press, name):
     anatomy, effects, loads, converged = press
     accuracy, bound = PROMISED[name]
     answer = Fem(anatomy, effects, accuracy, "cpu", element="p1").deform(loads).displacement
     assert np.linalg.norm(answer - converged, axis=2).max() <= bound
 
 
-def test_warm_starts_keep_the_live_promise(press):
+def test_warm_starts_meet_error_bound_of_live_preset(press):
     anatomy, effects, loads, converged = press
     fem, last = Fem(anatomy, effects, LIVE, "cpu", element="p1"), None
     for row in range(len(loads)):

@@ -1,4 +1,4 @@
-"""Algebraic multigrid against dense algebra and under refinement, and which preconditioner is chosen when."""
+"""Algebraic multigrid against dense algebra and under refinement, and the selection of the preconditioner."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ LEVELS = Preconditioning(max_factorised=0, max_smoothed_factorised=0, max_coarse
 
 @pytest.mark.parametrize("poisson", [0.3, 0.49])
 @pytest.mark.parametrize("kind", ["p1", "p2", "tetra10", "smoothed"])
-def test_symmetric_positive_and_close(kind: str, poisson: float) -> None:
+def test_amg_is_symmetric_positive_and_spectrally_equivalent(kind: str, poisson: float) -> None:
     problem, preconditioner = built(kind, poisson, (3, 3, 4), settings=LEVELS)
     K, M = matrices(problem, preconditioner)
     assert np.abs(M - M.T).max() < 1e-6 * np.abs(M).max()  # the coarsest factor is kept in single precision
@@ -28,7 +28,7 @@ def test_symmetric_positive_and_close(kind: str, poisson: float) -> None:
     assert spread(K, M) < (12.0 if poisson == 0.3 else 150.0)
 
 
-def test_refining_costs_few_iterations() -> None:
+def test_amg_iterations_grow_little_under_refinement() -> None:
     """Eight times as many unknowns and one level more; block Jacobi would take twice the iterations."""
     count = []
     for cells in (4, 8):
@@ -43,7 +43,7 @@ def test_refining_costs_few_iterations() -> None:
     assert count[1] <= count[0] + 8
 
 
-def test_the_same_mesh_gives_the_same_cycle() -> None:
+def test_amg_cycle_is_deterministic() -> None:
     first, second = (matrices(*built("p1", 0.45, (3, 3, 4), settings=LEVELS))[1] for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
@@ -58,14 +58,14 @@ def test_the_same_mesh_gives_the_same_cycle() -> None:
         ("smoothed", 10_000, "sparse factor"),
     ],
 )
-def test_the_choice_goes_by_size_and_element(kind: str, largest: int, name: str) -> None:
+def test_preconditioner_is_selected_by_size_and_element(kind: str, largest: int, name: str) -> None:
     settings = Preconditioning(max_factorised=largest, max_coarsest_nodes=5)
     problem, preconditioner = built(kind, 0.45, (5, 5, 5), settings=settings)
     assert name_of(preconditioner) == name
     assert name_of(BlockJacobi(problem.device)) == "block Jacobi"
 
 
-def test_rigid_motions_strain_nothing() -> None:
+def test_rigid_motions_lie_in_kernel_of_rest_stiffness() -> None:
     anatomy = base_held(box((2, 2, 3), distortion=0.2))
     space, device = discretise(anatomy.mesh, "p1"), find_device("cpu", "float64")
     problem = compile_problem((Elasticity(Material("linear", 3000.0, 0.3)), Held()), anatomy, device, space)

@@ -1,4 +1,4 @@
-"""A tumour's necrosis: a region of its own stiffness, inside of a tumour that is followed whole."""
+"""Necrosis of a tumour: a region with its own stiffness inside the tumour."""
 
 from dataclasses import replace
 
@@ -73,7 +73,7 @@ def files(tmp_path_factory):
 class TestLabels:
     """Of one's own, of a convention, and of a tumour in another file."""
 
-    def test_of_every_source_they_are_the_same(self, files):
+    def test_necrosis_mask_is_equal_from_every_label_source(self, files):
         found = [
             read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)})),
             read_head_masks(Sources(files / "own.nii", (1,), (3, 6), parts={"necrosis": (6,)})),
@@ -87,13 +87,13 @@ class TestLabels:
                 np.testing.assert_array_equal(one, other)
         assert (found[0].parts["necrosis"] & ~found[0].tumour).sum() == 0 < found[0].parts["necrosis"].sum()
 
-    def test_they_are_no_brain_and_must_be_there(self, files):
+    def test_necrosis_label_must_exist_and_differ_from_brain(self, files):
         with pytest.raises(InputError, match="label 1 is named by --brain and by --necrosis"):
             read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (1,)}))
         with pytest.raises(InputError, match="has no label 9"):
             read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (9,)}))
 
-    def test_the_mesh_has_their_volume_in_a_tumour_that_is_the_same(self, files, tmp_path):
+    def test_necrosis_region_has_mask_volume_and_keeps_tumour(self, files, tmp_path):
         masks = read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)}))
         subject = build_masked_subject(masks, regions=("necrosis",))
         (part,) = subject.parts
@@ -110,8 +110,8 @@ class TestLabels:
                 np.testing.assert_array_equal(getattr(one, name), getattr(whole, name))
 
 
-def test_its_stiffness_is_its_own_or_the_tumours(small_box, hollow):
-    """Without a law of its own it has the tumour's; softer than that, the tumour yields more."""
+def test_necrosis_without_own_law_uses_tumour_law(small_box, hollow):
+    """Necrosis softer than the tumour increases the tumour's strain."""
     np.testing.assert_array_equal(hollow.tumour_nodes, small_box.tumour_nodes)
     whole = pushed(small_box, Elasticity(BRAIN, {TUMOUR_LABEL: STIFF}))
     same = pushed(hollow, Elasticity(BRAIN, {TUMOUR_LABEL: STIFF}))
@@ -127,13 +127,13 @@ def test_its_stiffness_is_its_own_or_the_tumours(small_box, hollow):
     assert 1.02 * strain(whole) < strain(brain) < strain(soft)
 
 
-def test_a_law_of_a_region_that_is_not_there_is_refused(small_box):
+def test_law_for_missing_region_is_rejected(small_box):
     with pytest.raises(InputError, match=r"a law is given for region 5 \(necrosis\), but the mesh has the regions"):
         Fem(small_box, build_push_effects(small_box, Elasticity(BRAIN, {NECROSIS_LABEL: SOFT})))
 
 
-def test_what_is_left_of_a_tumour_keeps_its_law(small_box):
-    """Also where all of it but its necrosis is cut."""
+def test_resected_tumour_remainder_keeps_its_law(small_box):
+    """Includes a resection of the whole tumour except its necrosis."""
     mesh = small_box.mesh
     right = mesh.nodes[mesh.tets].mean(axis=1)[:, 0] > 0.0
     halved = replace(mesh, region=np.where(small_box.in_tumour & right, NECROSIS_LABEL, mesh.region))
@@ -151,5 +151,5 @@ def test_what_is_left_of_a_tumour_keeps_its_law(small_box):
     assert np.abs(after - pushed(left, BRAIN)).max() > 2e-6
 
 
-def test_debulking_takes_it_with_the_tumour(hollow, small_box):
+def test_debulking_removes_necrosis_with_the_tumour(hollow, small_box):
     assert Debulking((0.1, 0.2)).build_resection(hollow) == Debulking((0.1, 0.2)).build_resection(small_box)

@@ -1,4 +1,4 @@
-"""What callers get wrong is a sentence that names it: arrays, vertices, starts, and what a solver is made with."""
+"""Invalid arguments give an error that names them: arrays, vertices, starts and options of the solver."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -63,7 +63,7 @@ CAUSES: dict[type, dict[str, np.ndarray]] = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_arrays_of_every_cause_are_refused_by_name(wrong: str) -> None:
+def test_invalid_arrays_of_each_load_are_rejected_by_name(wrong: str) -> None:
     value, _ = WRONG[wrong]
     for kind, arrays in CAUSES.items():
         assert len(Loads((kind(**arrays),))) == 1
@@ -73,7 +73,7 @@ def test_arrays_of_every_cause_are_refused_by_name(wrong: str) -> None:
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_arguments_of_push_and_posture_are_refused_by_name(wrong: str) -> None:
+def test_invalid_push_and_posture_are_rejected_by_name(wrong: str) -> None:
     value, reason = WRONG[wrong]
     for name in ("point", "force", "footprint"):
         with pytest.raises(InputError, match=rf"Pushed\.{name} .*({reason}|shape)"):
@@ -100,7 +100,7 @@ def test_arguments_of_push_and_posture_are_refused_by_name(wrong: str) -> None:
         (lambda: Loads((Resected(np.array([1e300])),)), r"Resected\.done .* beyond"),
     ],
 )
-def test_rows_and_radii(build: Callable[[], Loads], sentence: str) -> None:
+def test_wrong_row_counts_and_radii_are_rejected(build: Callable[[], Loads], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         build()
 
@@ -131,7 +131,7 @@ VERTICES = [
 
 
 @pytest.mark.parametrize(("at", "sentence"), VERTICES)
-def test_vertices_that_are_none(fem: Fem, cut: Any, at: Any, sentence: str) -> None:
+def test_invalid_vertices_are_rejected(fem: Fem, cut: Any, at: Any, sentence: str) -> None:
     for body in (fem, cut):
         with pytest.raises(InputError, match=sentence):
             body.deform(PUSH, at=at)
@@ -143,13 +143,13 @@ def test_vertices_that_are_none(fem: Fem, cut: Any, at: Any, sentence: str) -> N
 
 
 @pytest.mark.parametrize("loads", [None, [PUSH], "push"])
-def test_what_is_no_load_is_refused(fem: Fem, cut: Any, loads: Any) -> None:
+def test_deform_rejects_values_that_are_not_loads(fem: Fem, cut: Any, loads: Any) -> None:
     for body in (fem, cut):
         with pytest.raises(InputError, match=r"loads is .*: give Loads, such as push\(...\) makes"):
             body.deform(loads)
 
 
-def test_lists_of_vertices_will_do(fem: Fem, cut: Any) -> None:
+def test_vertices_may_be_lists_tuples_or_small_integers(fem: Fem, cut: Any) -> None:
     for body in (fem, cut):
         whole = body.deform(PUSH)
         some_lists: list[Any] = [[5, 2], (5, 2), np.array([5, 2], np.uint8), [7, 7]]
@@ -167,7 +167,7 @@ def test_lists_of_vertices_will_do(fem: Fem, cut: Any) -> None:
 
 
 @pytest.mark.parametrize("batch", [0, -1, 1.5, True, "2", np.nan])
-def test_batches_of_none(batch: Any) -> None:
+def test_invalid_batch_size_is_rejected(batch: Any) -> None:
     with pytest.raises(InputError, match=r"batch is .*: give a whole number from 1 up"):
         Fem(BODY, EFFECTS, LIVE, "cpu", batch=batch, element="p1")
 
@@ -183,7 +183,7 @@ def test_batches_of_none(batch: Any) -> None:
         ({"effects": Elasticity()}, "effects is Elasticity.*: give a tuple of effects"),
     ],
 )
-def test_a_solver_of_nonsense(made: dict[str, Any], sentence: str) -> None:
+def test_invalid_solver_arguments_are_rejected(made: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Fem(**{"anatomy": BODY, "effects": EFFECTS, "accuracy": LIVE, "device": "cpu", **made})
 
@@ -199,7 +199,7 @@ def test_a_solver_of_nonsense(made: dict[str, Any], sentence: str) -> None:
         ({"precision": ["float32"]}, "no precision is called"),
     ],
 )
-def test_an_accuracy_of_nonsense(budget: dict[str, Any], sentence: str) -> None:
+def test_invalid_accuracy_arguments_are_rejected(budget: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Accuracy(**budget)
     assert Accuracy(**{"tolerance": np.float32(1e-3), "outer": np.int32(4)}).outer == 4
@@ -213,7 +213,7 @@ def warmed(answer: Deformation, **warm: Any) -> Deformation:
     return replace(answer, warm={**answer.warm, **warm})
 
 
-def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
+def test_invalid_starts_are_rejected(fem: Fem, cut: Any) -> None:
     for body in (fem, cut):
         good = body.deform(PUSH)
         own = np.zeros((1, 64, 3))
@@ -241,7 +241,7 @@ def test_starts_that_are_none(fem: Fem, cut: Any) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_was_learnt_and_is_not_finite_is_forgotten(fem: Fem, value: float) -> None:
+def test_non_finite_warm_start_data_are_ignored(fem: Fem, value: float) -> None:
     first = fem.deform(PUSH)
     start = fem.deform(PUSH.scale(1.1), first)
     assert start.warm["known"][0] > 0
@@ -252,7 +252,7 @@ def test_what_was_learnt_and_is_not_finite_is_forgotten(fem: Fem, value: float) 
         np.testing.assert_array_equal(found.displacement, other.displacement)
 
 
-def test_mid_edge_nodes_of_another_body() -> None:
+def test_start_with_wrong_mid_edge_nodes_is_rejected() -> None:
     body = Fem(BODY, EFFECTS, LIVE, "cpu", element="p2")
     answer = body.deform(PUSH)
     wrong = spoilt(answer, **{MID_EDGE_KEY: answer.memory[MID_EDGE_KEY][:, :, :2]})
@@ -260,13 +260,13 @@ def test_mid_edge_nodes_of_another_body() -> None:
         body.deform(PUSH, wrong)
 
 
-def test_no_load_at_all_from_a_start_is_no_answer_at_all() -> None:
+def test_empty_load_batch_with_start_gives_empty_result() -> None:
     body = Fem(BODY, (Elasticity(), Held(), ToolForce(), Inertia()), LIVE, "cpu", element="p1")
     none = PUSH.select(np.arange(0))
     assert len(body.deform(none, guess(np.zeros((0, 64, 3))))) == 0
 
 
-def test_an_accuracy_that_a_type_cannot_reach_is_refused() -> None:
+def test_accuracy_beyond_float_precision_is_rejected() -> None:
     with pytest.raises(InputError, match="float32 reaches 2e-05"):
         Accuracy(tolerance=1e-6, precision="float32")
     with pytest.raises(InputError, match="no precision is called"):

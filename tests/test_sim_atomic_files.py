@@ -1,4 +1,4 @@
-"""Files that are whole or absent: no left-overs of killed runs, and full disks are said."""
+"""Files that are complete or absent: no partial files of killed runs, and full disks are reported."""
 
 import os
 import platform
@@ -21,7 +21,7 @@ class TestWriting:
     LEAVING += "with write_atomically(sys.argv[1], '.txt') as p:\n"
     LEAVING += " p.write_text('half'); os.kill(os.getpid(), 9)"
 
-    def test_what_a_killed_run_left_is_swept_by_the_next(self, tmp_path: Path) -> None:
+    def test_partial_file_of_killed_run_is_removed_by_next_run(self, tmp_path: Path) -> None:
         path = tmp_path / "a.txt"
         house = Path(__file__).parents[1]
         done = subprocess.run([sys.executable, "-c", self.LEAVING, str(path)], cwd=house, check=False)
@@ -47,11 +47,11 @@ class TestWriting:
         assert sorted(tmp_path.iterdir()) == sorted([path, living, other])
 
     @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no such file system")
-    def test_read_only_folder_is_reported_before_work(self) -> None:
+    def test_output_to_proc_folder_is_rejected_before_work(self) -> None:
         with pytest.raises(InputError, match=r"cannot be written there \(No such file or directory\)"):
             check_output("/proc/a.txt", ".txt")
 
-    def test_a_stream_that_cannot_be_written_is_reported_at_the_end(self, tmp_path: Path) -> None:
+    def test_write_error_of_stream_is_reported_at_the_end(self, tmp_path: Path) -> None:
         with files_below(100_000):
             with (
                 pytest.raises(InputError, match="File too large"),
@@ -64,13 +64,13 @@ class TestWriting:
             check_disk_space(tmp_path / "a.h5", 1, 50_000)
         assert not list(tmp_path.iterdir())
 
-    def test_a_library_that_fails_says_nothing(self, tmp_path: Path) -> None:
+    def test_library_write_error_hides_internal_message(self, tmp_path: Path) -> None:
         with pytest.raises(InputError) as caught, write_atomically(tmp_path / "a.h5", ".h5"):
             raise OSError("Unable to synchronously create file (errno = 2, flags = 13)")
         assert "flags" not in str(caught.value)
 
 
-def test_output_to_a_folder_or_through_a_file_is_refused(tmp_path: Path) -> None:
+def test_output_path_at_folder_or_below_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "folder.vtu").mkdir()
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
@@ -80,7 +80,7 @@ def test_output_to_a_folder_or_through_a_file_is_refused(tmp_path: Path) -> None
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes anywhere")
-def test_output_to_a_closed_folder_is_refused(tmp_path: Path) -> None:
+def test_output_to_read_only_folder_is_rejected(tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o500)
     with pytest.raises(InputError, match="cannot be written"):

@@ -1,4 +1,4 @@
-"""Nonlinear elimination near the opening: fewer looks at the whole body, each column by itself."""
+"""Nonlinear elimination near the opening: fewer residuals of the whole body, independent columns."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ LAW = "stable-neo-hookean"
 """Method that takes a cycle's correction."""
 
 
-def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
+def test_elimination_needs_fewer_global_steps_on_brain() -> None:
     anatomy = read_anatomy(get_template_path())
     effects = (Elasticity(), Held(), Slide(), ToolForce())
     fem, loads = Fem(anatomy, effects, TRAIN, "cpu", element="p1"), draw("spatula", anatomy, 3, 1)
@@ -37,7 +37,7 @@ def test_on_a_brain_broad_pushes_take_few_looks_at_the_whole() -> None:
     np.testing.assert_allclose(found.u.numpy(), expected, atol=1e-3 * np.abs(expected).max())
 
 
-def test_columns_go_each_by_itself() -> None:
+def test_elimination_columns_are_independent() -> None:
     problem, space = begun(LAW)
     elimination = descent_of(build_batch_elimination, problem, space, LAW)
     together = elimination.descend(problem.device.allocate(problem.rows, len(TOTAL)), np.full(len(TOTAL), 1e-5), 100)
@@ -48,7 +48,7 @@ def test_columns_go_each_by_itself() -> None:
         np.testing.assert_allclose(alone.u.numpy()[:, 0], together.u.numpy()[:, row], atol=1e-10)
 
 
-def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
+def test_elimination_out_of_budget_keeps_last_finite_state() -> None:
     problem, space = begun(LAW)
     elimination = descent_of(build_batch_elimination, problem, space, LAW)
     start = problem.device.allocate(problem.rows, len(TOTAL)).numpy()
@@ -62,7 +62,7 @@ def test_the_budget_leaves_the_last_finite_state_and_says_so() -> None:
     np.testing.assert_array_equal(found.left, good)
 
 
-def test_rounding_of_what_follows_leaves_no_plane() -> None:
+def test_rounding_in_elimination_violates_no_constraint() -> None:
     problem, space = begun(LAW)
     elimination, random = descent_of(build_batch_elimination, problem, space, LAW), np.random.default_rng(0)
 
@@ -77,7 +77,7 @@ def test_rounding_of_what_follows_leaves_no_plane() -> None:
 
 
 @LAWS_AND_ELEMENTS
-def test_it_ends_where_the_whole_does(law: str, element: str) -> None:
+def test_elimination_agrees_with_equilibrium_of_whole_body(law: str, element: str) -> None:
     problem, space = begun(law, element)
     descent, expected = descent_of(build_batch_elimination, problem, space, law), equilibria(problem)
     problem.begin(Cases(loads_of(TOTAL), np.zeros(len(TOTAL))))

@@ -23,7 +23,7 @@ def lattice(levels):
 
 
 @pytest.mark.parametrize("levels", [0, 1, 2, 3])
-def test_tetrahedra_fit_and_have_good_angles(levels):
+def test_lattice_tetrahedra_fit_and_have_good_angles(levels):
     made = lattice(levels)
     assert compute_signed_volumes(made.nodes, made.tets).min() > 0.0
     angles = compute_dihedral_angles(made.nodes, made.tets)
@@ -41,14 +41,14 @@ def test_tetrahedra_fit_and_have_good_angles(levels):
     assert set(np.unique(compute_row_keys(edges), return_counts=True)[1]) == {2}
 
 
-def test_cells_follow_the_sizing():
+def test_lattice_cell_size_follows_sizing_field():
     made = lattice(3)
     longest = np.linalg.norm(made.nodes[made.tets] - made.nodes[np.roll(made.tets, 1, axis=1)], axis=2).max(axis=1)
     away = np.abs(np.linalg.norm(made.nodes[made.tets].mean(axis=1) - MIDDLE, axis=1) - 0.02)
     assert longest[away < 0.002].max() < 0.25 * 1.01 * longest[away > 0.05].max()
 
 
-def test_short_edges_join_centres_with_corners():
+def test_short_lattice_edges_join_centres_with_corners():
     made = lattice(0)
     ends = made.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]]
     length = np.linalg.norm(np.diff(made.nodes[ends], axis=2)[:, :, 0], axis=2)

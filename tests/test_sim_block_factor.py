@@ -14,8 +14,8 @@ ON_A_CARD = pytest.param(
 
 
 @pytest.mark.parametrize("name", ["cpu", ON_A_CARD])
-def test_factor_and_solution_are_those_of_the_matrix(name: str) -> None:
-    """Only `size` rows count, and of a matrix that is not positive that is said."""
+def test_block_factor_and_solution_agree_with_numpy(name: str) -> None:
+    """Only the first `size` rows count, and a matrix that is not positive definite is reported."""
     device, size, count = Device(name, "float64"), 37, 3
     functions = build_functions(device)
     factor, solve = functions.factor, functions.solve

@@ -1,4 +1,4 @@
-"""Matrices taken apart in blocks against dense algebra, on the host: torch multiplies there as it does on a card."""
+"""Block inverse and block elimination against dense algebra, on the host: torch multiplies as on a GPU."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ ACROSS = RANDOM.normal(size=(COUNT, BORDER))
 
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
-def test_what_is_inverted_in_place_is_the_inverse(block: int) -> None:
+def test_in_place_block_inverse_agrees_with_dense_inverse(block: int) -> None:
     rows = block_inverse.to_half_rows(sp.csc_array(MATRIX), block_inverse.compute_block_cuts(COUNT, block), "cpu")
     assert len(rows) == -(-COUNT // block)
     block_inverse.invert(rows)
@@ -27,7 +27,7 @@ def test_what_is_inverted_in_place_is_the_inverse(block: int) -> None:
 
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
-def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int) -> None:
+def test_block_elimination_agrees_with_dense_schur_complement(block: int) -> None:
     solution, taken = block_inverse.eliminate_unknowns(sp.csc_array(MATRIX), sp.csc_array(ACROSS), "cpu", block)
     expected = np.linalg.solve(MATRIX, ACROSS)
     assert solution.dtype == np.float32
@@ -35,11 +35,11 @@ def test_what_is_eliminated_is_the_solution_and_what_it_takes(block: int) -> Non
     np.testing.assert_allclose(taken, ACROSS.T @ expected, atol=1e-12)
 
 
-def test_what_is_not_positive_definite_is_refused() -> None:
+def test_block_elimination_rejects_indefinite_matrix() -> None:
     matrix = sp.csc_array(MATRIX - 1e3 * np.eye(COUNT))
     with pytest.raises(RuntimeError, match="positive"):
         block_inverse.eliminate_unknowns(matrix, sp.csc_array(ACROSS), "cpu")
 
 
-def test_a_device_is_asked_how_fast_it_multiplies() -> None:
+def test_measured_multiplication_rate_is_positive() -> None:
     assert block_inverse.measure_rate_of_work("cpu", trial=8) > 0.0

@@ -11,8 +11,8 @@ from sim.runtime.device import Precision, find_device
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-5), ("float64", 1e-13)])
 @pytest.mark.parametrize("size", [(3, 3), (3, 6), (6, 3), (6, 6)])
 @pytest.mark.parametrize("width", [1, 3, 8, 19])
-def test_adds_the_product(size: tuple[int, int], width: int, precision: Precision, tolerance: float) -> None:
-    """Of any number of columns; the third row of blocks is empty, the last one full to its end."""
+def test_block_product_matches_scipy(size: tuple[int, int], width: int, precision: Precision, tolerance: float) -> None:
+    """Any number of columns; the third block row is empty, the last one is full."""
     random, device = np.random.default_rng(0), find_device("cpu", precision)
     there = random.random((7, 5)) < 0.4
     there[2], there[6] = False, True

@@ -1,4 +1,4 @@
-"""What the threads of a block do together, against NumPy's; on the CPU a block is one thread."""
+"""Collective operations of a block's threads against NumPy; on the CPU a block is one thread."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A skull that the brain is bonded to: it holds, nothing passes it, and it tells how near it comes to tearing."""
+"""Bonded skull: it holds its nodes, prevents penetration and reports its traction as a share of the strength."""
 
 import numpy as np
 import pytest
@@ -31,8 +31,8 @@ def answered(anatomy, effect, total, element, device="cpu"):
 
 @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
 @pytest.mark.parametrize("total", [PULL, PRESS])
-def test_its_share_is_the_mean_traction_over_the_strength(cube, element, total):
-    """Force over area: what is pulled off the top, the base bears; it bears pressure without end."""
+def test_bond_share_is_mean_traction_over_strength(cube, element, total):
+    """Force over area: the base bears the pull on the top; pressure has no limit."""
     answer = answered(cube, Bonded(300.0, 200.0), total, element)
     traction = np.abs(total) / SIDE**2
     pull = traction[2] / 300.0 if total[2] > 0.0 else 0.0
@@ -40,20 +40,20 @@ def test_its_share_is_the_mean_traction_over_the_strength(cube, element, total):
     assert answer.select(np.array([0])).bond[0] == answer.bond[0]
 
 
-def test_it_holds_its_nodes(cube):
+def test_bonded_skull_fixes_its_nodes_like_held_nodes(cube):
     held = hold(cube.mesh, cube.slide_normal.any(axis=1))
     bonded, fast = (answered(one, Bonded(), PULL, "smoothed") for one in (cube, held))
     np.testing.assert_allclose(bonded.displacement, fast.displacement, atol=1e-12)
     assert not bonded.displacement[0, cube.slide_normal.any(axis=1)].any() and bonded.leaked[0] == 0.0
 
 
-def test_what_is_not_bonded_says_nothing(cube):
+def test_unbonded_body_has_nan_bond_share(cube):
     mesh, base = cube.mesh, cube.slide_normal.any(axis=1)
     loose = hold(mesh, base & (mesh.nodes[:, 0] < SIDE / 2), cube.slide_normal)
     assert np.isnan(answered(loose, Slide(), PULL, "p1").bond).all()
 
 
-def test_skulls_that_contradict_each_other_are_refused(cube):
+def test_contradicting_skull_models_are_rejected(cube):
     for other in (Slide(), SkullContact()):
         with pytest.raises(InputError, match=f"Bonded and {type(other).__name__} are alternative contact models"):
             Fem(cube, (Elasticity(TISSUE), Held(), Bonded(), other, NodalForce()), device="cpu")

@@ -1,4 +1,4 @@
-"""One frame on the device: what is left when it cannot be taken."""
+"""One frame on the device: the state after an interrupted start."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ def fem() -> Fem:
     return follower()
 
 
-def test_a_start_that_cannot_be_taken_leaves_no_state_behind(fem, monkeypatch):
+def test_interrupted_frame_start_leaves_no_state(fem, monkeypatch):
     first, middle, last = ride(fem, 3)
     expected, here = fem.deform(pushed(2.1e-3), last), fem.deform(pushed(1.4e-3), middle)
     take = CapturedFrame.take

@@ -28,8 +28,8 @@ def fem_and_elimination() -> tuple[Fem, ClampedElimination]:
     return fem, ClampedElimination(fem.problem, fem.strategy.preconditioner, EFFECTS, fem.space)
 
 
-def test_finds_the_equilibrium() -> None:
-    """Under a force that presses a box in by a twentieth of its height."""
+def test_clamped_elimination_finds_equilibrium() -> None:
+    """Under a force that compresses a box by a twentieth of its height."""
     fem, elimination = fem_and_elimination()
     load = pressed(0.6)
     answer = fem.deform(load)
@@ -43,7 +43,7 @@ def test_finds_the_equilibrium() -> None:
     assert fem.problem.residual(found.u)[1][0] <= 1.01e-8 * fem.problem.residual(found.u)[2][0]
 
 
-def test_what_it_does_not_bring_home_is_left_nearer_to_it() -> None:
+def test_clamped_elimination_out_of_budget_lowers_residual() -> None:
     fem, elimination = fem_and_elimination()
     fem.problem.begin(Cases(pressed(0.6), np.zeros(1)))
     start = fem.problem.device.allocate(fem.problem.rows, 1)
@@ -53,7 +53,7 @@ def test_what_it_does_not_bring_home_is_left_nearer_to_it() -> None:
     assert after < 0.5 * before
 
 
-def test_what_is_hardly_strained_is_left_to_others() -> None:
+def test_clamped_elimination_skips_small_strain() -> None:
     fem, elimination = fem_and_elimination()
     fem.problem.begin(Cases(pressed(1e-3), np.zeros(1)))
     found = elimination.descend(fem.problem.device.allocate(fem.problem.rows, 1), np.array([1e-8]), 60)
@@ -62,7 +62,7 @@ def test_what_is_hardly_strained_is_left_to_others() -> None:
 
 
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_the_assembled_curvature_is_the_one_that_multiplies(law: str) -> None:
+def test_assembled_curvature_agrees_with_curvature_product(law: str) -> None:
     fem = Fem(BODY, (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
     problem, random = fem.problem, np.random.default_rng(0)
     u, p = (problem.device.upload(scale * random.normal(size=(problem.rows, 1))) for scale in (3e-4, 1.0))
@@ -75,7 +75,7 @@ def test_the_assembled_curvature_is_the_one_that_multiplies(law: str) -> None:
 
 @pytest.mark.parametrize("law", ["neo-hookean", "ogden"])
 @pytest.mark.parametrize(("down", "aside"), [(2.0, 1.0), (2.0, 6.0)])
-def test_a_law_that_forbids_inversion_is_taken_as_far_as_it_goes(law: str, down: float, aside: float) -> None:
+def test_clamped_elimination_solves_laws_without_inversion(law: str, down: float, aside: float) -> None:
     body = base_held(box((3, 3, 3), 0.1))
     load = push(np.array([0.05, 0.05, 0.1]), np.array([aside, 0.0, -down]), 0.02)
     effects = (Elasticity(tissue(law)), Held(), ToolForce())

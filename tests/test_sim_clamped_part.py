@@ -1,4 +1,4 @@
-"""A part of the mesh, settled between what holds its rim."""
+"""Equilibrium of a part of the mesh with a fixed rim."""
 
 import numpy as np
 from oracle import tissue
@@ -12,7 +12,7 @@ from sim.local_solvers.clamped_part import ClampedPart
 from sim.minimisers.residual import compute_constant_gradients
 
 
-def test_a_part_is_settled_between_what_holds_its_rim() -> None:
+def test_clamped_part_reaches_equilibrium_with_fixed_rim() -> None:
     fem, _ = fem_and_elimination()
     problem, device = fem.problem, fem.problem.device
     problem.begin(Cases(pressed(0.6), np.zeros(1)))
@@ -29,7 +29,7 @@ def test_a_part_is_settled_between_what_holds_its_rim() -> None:
     assert np.linalg.norm(free[inside]) <= 1.01e-9 < np.linalg.norm(free)
 
 
-def test_a_part_whose_forces_are_not_finite_stays_as_it_is() -> None:
+def test_clamped_part_with_non_finite_forces_is_unchanged() -> None:
     fem = Fem(BODY, (Elasticity(tissue("neo-hookean")), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
     problem = fem.problem
     problem.begin(Cases(pressed(0.6), np.zeros(1)))

@@ -5,14 +5,14 @@ import numpy as np
 from sim.geometry.closest_point import find_closest_points
 
 
-def test_of_triangles_without_area_edges_are_closest():
+def test_closest_point_of_degenerate_triangle_lies_on_its_edge():
     flat = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[5.0, 0.0, 0.0]] * 3])
     found = find_closest_points(np.array([[0.5, 1.0, 0.0], [5.0, 2.0, 0.0]]), flat)
     assert np.allclose(found.point, [[0.5, 0.0, 0.0], [5.0, 0.0, 0.0]])
 
 
-def test_large_and_small_triangles_near_and_far():
-    """Triangles of very different sizes, from which those that may be the closest are chosen; the others are not."""
+def test_closest_points_of_mixed_triangles_match_brute_force():
+    """Triangles of very different sizes, from which candidates for the closest are selected."""
     random = np.random.default_rng(1)
     size = 10.0 ** random.uniform(-3.0, 0.7, (80, 1, 1))
     corners = random.normal(size=(80, 1, 3)) + size * random.normal(size=(80, 3, 3))

@@ -1,4 +1,4 @@
-"""Curvature pairs, of one column and of many: against BFGS."""
+"""Curvature pairs of one column and of many against BFGS."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def learnt_pairs(count: int) -> tuple[CurvaturePairs, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, PAIRS, PAIRS + 3])
-def test_pairs_are_those_of_bfgs(count: int) -> None:
+def test_curvature_pairs_agree_with_bfgs(count: int) -> None:
     pairs, begun, expected = learnt_pairs(count)
     force = np.random.default_rng(6).normal(size=len(begun))
     np.testing.assert_allclose(
@@ -38,8 +38,8 @@ def test_pairs_are_those_of_bfgs(count: int) -> None:
     )
 
 
-def test_each_column_learns_and_forgets_by_itself() -> None:
-    """Against BFGS: one column is always there, one learns late, one has more than fit, one has forgotten."""
+def test_columns_of_curvature_pairs_are_independent() -> None:
+    """Against BFGS: one column is always active, one starts late, one has too many pairs, one has dropped its pairs."""
     rng, size = np.random.default_rng(5), 30
     stiffness, change = (matrix @ matrix.T for matrix in rng.normal(size=(2, size, size)))
     begun = np.linalg.inv(stiffness + size * np.eye(size))

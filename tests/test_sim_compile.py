@@ -1,4 +1,4 @@
-"""Only what a scene asks for is imported, compiled, launched and kept: seen by a fresh interpreter for each scene."""
+"""Imports, kernels, launches and memory of each scene are only those of its effects, in a fresh interpreter."""
 
 import json
 import os
@@ -147,31 +147,31 @@ def get_law_name(name: str) -> str:
     return "prony" if tissue.prony else tissue.law
 
 
-def test_every_effect_and_law_has_its_line():
+def test_modules_are_listed_for_every_effect_and_law():
     assert set(OF_EFFECT) == {kind.__name__ for kind in BuiltIn.__args__}
     assert set(OF_LAW) == {*LAWS, "ogden", "prony"}
 
 
 @pytest.mark.parametrize("scene", {(*effects_of(name), get_law_name(name)): name for name in SCENES}.values())
-def test_a_scene_costs_its_effects_and_nothing_else(witnessed, scene):
+def test_scene_loads_only_modules_of_its_effects(witnessed, scene):
     check(witnessed(scene), effects_of(scene), get_law_name(scene))
 
 
 @pytest.mark.parametrize(
     "more", ["Inertia", "Pulsation", "NodalForce", "ToolDisplacement", "ToolContact", "Retraction", "Inertia+Gravity"]
 )
-def test_one_more_effect_costs_itself_alone(witnessed, more):
+def test_added_effect_loads_only_its_own_modules(witnessed, more):
     check(witnessed("press", more), [*effects_of("press"), *more.split("+")], get_law_name("press"))
 
 
 @pytest.mark.parametrize("law", sorted(set(OF_LAW) - {"stable-neo-hookean"}))
-def test_a_scene_of_one_law_knows_no_other(witnessed, law):
-    """A linear scene compiles no Ogden kernel: it does not even read what it is made of."""
+def test_scene_with_one_law_compiles_no_other_law(witnessed, law):
+    """A linear scene compiles no Ogden kernel and does not read its source."""
     check(witnessed("press", "", law), effects_of("press"), law)
 
 
 @pytest.mark.parametrize("element", ["p2", "smoothed"])
-def test_elements_need_no_term_of_their_own(witnessed, element):
+def test_element_choice_loads_no_additional_terms(witnessed, element):
     found = witnessed("press", "", "", element)
     check(found, effects_of("press"), get_law_name("press"))
     grids = {"sim.linalg.multigrid", "sim.linalg.block_sparse"}
@@ -179,7 +179,7 @@ def test_elements_need_no_term_of_their_own(witnessed, element):
 
 
 def test_frame_kernels_are_precompiled(witnessed):
-    """The ear hears: what is launched is what was compiled, and a scene that lies still steers nothing."""
+    """Launched kernels are a subset of the compiled ones, and a scene without tools compiles no footprint."""
     press, sinking = witnessed("press"), witnessed("brain_shift")
     assert press["launched"] <= press["compiled"] and len(press["launched"]) > 10
     assert not {name for name in sinking["compiled"] if "footprint" in name or name.endswith("dead_force:spread")}

@@ -1,4 +1,4 @@
-"""Columns of the compliance: those of the preconditioner, in any order."""
+"""Columns of the compliance against the preconditioner, in any order."""
 
 from typing import cast
 
@@ -9,7 +9,7 @@ from sim.linalg.compliance import Columns, Compliance
 from sim.linalg.pcg import Preconditioner
 
 
-def test_columns_are_what_the_preconditioner_does() -> None:
+def test_compliance_columns_agree_with_preconditioner() -> None:
     fem, descent = parts()
     soft, rng = descent.compliance, np.random.default_rng(1)
     nodes = soft.nodes
@@ -28,7 +28,7 @@ def test_columns_are_what_the_preconditioner_does() -> None:
     np.testing.assert_allclose(soft.compute_motion(force), expected[soft.rows], atol=1e-6 * size)
 
 
-def test_columns_are_bit_identical_in_any_order() -> None:
+def test_compliance_columns_are_bit_identical_in_any_order() -> None:
     fem, descent = parts()
     nodes, preconditioner = descent.barrier.touchable, cast(Preconditioner, Rough(fem.strategy.preconditioner, 0.0))
     assert len(nodes) > 3 * Columns().block

@@ -1,4 +1,4 @@
-"""Laws of a researcher's own: held to what every law must fulfil, and solved as built-in ones."""
+"""Tissue laws of users: checked against the requirements of a law, and solved like built-in ones."""
 
 from dataclasses import replace
 from typing import Any
@@ -23,25 +23,25 @@ YEOHS = Ogden(((1500.0, 2.0), (500.0, 2.0)), 1e4)
 
 class TestLaw:
     @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
-    def test_a_users_law_solves_as_the_built_in_one_that_it_equals(self, element):
+    def test_user_law_agrees_with_equal_built_in_law(self, element):
         """Yeoh without c2 is Ogden's law with m = 2, in as many terms as other tests compile it with."""
         own = answer(Elasticity(YEOH.Yeoh(500.0, 0.0, 1e4)), element=element)
         known = answer(Elasticity(YEOHS), element=element)
         assert np.abs(known).max() > 2e-3
         assert np.abs(own - known).max() < 1e-6 * np.abs(known).max()
 
-    def test_it_stiffens_as_it_says(self):
+    def test_user_law_stiffens_with_its_second_constant(self):
         soft, stiff = (answer(Elasticity(YEOH.Yeoh(500.0, c2, 1e4))) for c2 in (0.0, 5e3))
         ratio = np.abs(stiff).max(axis=(1, 2)) / np.abs(soft).max(axis=(1, 2))
         assert ratio[0] < 0.95 < 0.99 < ratio[1] < 1.0  # the second load is a quarter of the first
 
-    def test_regions_mix_it_with_built_in_laws(self):
+    def test_user_law_mixes_with_built_in_law_by_region(self):
         own, known = YEOH.Yeoh(500.0, 0.0, 1e4), YEOHS
         other = Material("neo-hookean", 6000.0, 0.4)
         mixed = [answer(Elasticity(law, {1: other}), body=TWO, element="smoothed") for law in (own, known)]
         assert np.abs(mixed[0] - mixed[1]).max() < 1e-6 * np.abs(mixed[1]).max()
 
-    def test_it_relaxes_when_it_says_so(self):
+    def test_user_law_with_prony_series_relaxes(self):
         class Relaxing(YEOH.Yeoh):
             law = "relaxing yeoh"
             prony = ((0.5, 1.0),)
@@ -53,11 +53,11 @@ class TestLaw:
         assert np.abs(later.displacement).max() > 1.2 * np.abs(at_once.displacement).max()
 
     @pytest.mark.parametrize("law", EVERY_LAW)
-    def test_every_built_in_law_passes_the_check_that_users_run(self, law):
+    def test_built_in_law_passes_check_for_user_laws(self, law):
         found = check_tissue(tissue(law), small_strain=law == "linear")
         assert len(found) > 12 and all(finding.kept for finding in found)
 
-    def test_the_example_passes_it_and_small_strain_is_not_for_all(self):
+    def test_example_law_passes_check_and_linear_law_fails(self):
         assert all(finding.kept for finding in check_tissue(YEOH.SOFT))
         with pytest.raises(InputError, match=r"the law linear does not hold: stress turns with the tissue: relative"):
             check_tissue(tissue("linear"))
@@ -70,7 +70,7 @@ class TestLaw:
             ({"needs_positive_volume": False}, "relative error (nan|inf)"),
         ],
     )
-    def test_a_broken_law_is_refused_with_what_is_broken(self, broken, words):
+    def test_broken_law_is_rejected_and_violated_property_named(self, broken, words):
         own_stress, own_change = YEOH.stress, YEOH.stress_change
 
         @wp.func
@@ -91,7 +91,7 @@ class TestLaw:
         with pytest.raises(InputError, match=words):
             check_tissue(Broken(500.0, 1500.0, 1e4))
 
-    def test_wrong_constants_and_wrong_counts_are_sentences(self):
+    def test_wrong_law_constants_are_rejected_with_reason(self):
         class Wrong(YEOH.Yeoh):
             def coefficients_at(self, mu, lam):
                 return mu, self.c2, lam
@@ -109,11 +109,11 @@ class TestLaw:
         with pytest.raises(InputError, match=r"Lamé constants -2.0"):
             check_tissue(YEOH.Yeoh(-1.0, 0.0, 1e4))
 
-    def test_what_is_no_tissue_is_a_sentence(self):
+    def test_value_that_is_not_a_tissue_law_is_rejected(self):
         with pytest.raises(InputError, match=r"str is no tissue: it has no law, functions.*Give a Material, an Ogden"):
             Elasticity("jelly")  # pyright: ignore[reportArgumentType]
 
-    def test_two_laws_of_one_name_are_a_sentence(self):
+    def test_two_laws_with_the_same_name_are_rejected(self):
         class Other(YEOH.Yeoh):
             functions = Law("yeoh", YEOH.energy, YEOH.stress, YEOH.stress_change)
 

@@ -61,26 +61,26 @@ def solve(
 
 @pytest.mark.parametrize("footprint", [False, True])
 class TestProjection:
-    def test_is_idempotent(self, device: Device, footprint: bool) -> None:
+    def test_projection_is_idempotent(self, device: Device, footprint: bool) -> None:
         of, v = constraint(device, footprint), RNG.normal(size=(3 * COUNT, 3))
         once = projected(of, device, v)
         np.testing.assert_allclose(projected(of, device, once), once, atol=1e-12)
 
-    def test_is_symmetric_and_shortens(self, device: Device, footprint: bool) -> None:
+    def test_projection_is_symmetric_and_reduces_norm(self, device: Device, footprint: bool) -> None:
         of = constraint(device, footprint)
         v, w = RNG.normal(size=(2, 3 * COUNT, 3))
         Pv, Pw = projected(of, device, v), projected(of, device, w)
         np.testing.assert_allclose((w * Pv).sum(axis=0), (Pw * v).sum(axis=0), atol=1e-10)
         assert (np.linalg.norm(Pv, axis=0) < np.linalg.norm(v, axis=0)).all()
 
-    def test_removes_what_is_forbidden(self, device: Device, footprint: bool) -> None:
+    def test_projection_removes_constrained_components(self, device: Device, footprint: bool) -> None:
         of = constraint(device, footprint)
         held, normal = of.fixed, of.normal
         v = projected(of, device, RNG.normal(size=(3 * COUNT, 3))).reshape(COUNT, 3, 3)
         assert not v[held].any()
         np.testing.assert_allclose(np.einsum("ni,nic->nc", normal, v), 0.0, atol=1e-12)
 
-    def test_closing_the_gap_meets_the_constraints(self, device: Device, footprint: bool) -> None:
+    def test_closed_gap_meets_the_constraints(self, device: Device, footprint: bool) -> None:
         of = constraint(device, footprint)
         u = RNG.normal(size=(3 * COUNT, 3))
         gap, size = of.close_gap(device.upload(u))
@@ -90,7 +90,7 @@ class TestProjection:
         # The least such motion: nothing in it is free.
         np.testing.assert_allclose(projected(of, device, gap.numpy()), 0.0, atol=1e-11)
 
-    def test_keeping_columns_keeps_values_weights_and_targets(self, device: Device, footprint: bool) -> None:
+    def test_selected_columns_keep_values_weights_and_targets(self, device: Device, footprint: bool) -> None:
         of, u = constraint(device, footprint), RNG.normal(size=(3 * COUNT, 3))
         gap = of.close_gap(device.upload(u))[0].numpy()
         free = projected(of, device, u)
@@ -99,7 +99,7 @@ class TestProjection:
         np.testing.assert_array_equal(projected(of, device, u[:, [2, 0]]), free[:, [2, 0]])
 
 
-def test_basis_spans_what_the_projection_leaves(device: Device) -> None:
+def test_constraint_basis_spans_range_of_projection(device: Device) -> None:
     of = constraint(device, False, columns=1)
     basis = of.build_basis().toarray()
     np.testing.assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-12)
@@ -107,7 +107,7 @@ def test_basis_spans_what_the_projection_leaves(device: Device) -> None:
     np.testing.assert_allclose(basis @ (basis.T @ v), projected(of, device, v), atol=1e-12)
 
 
-def test_sliding_nodes_do_not_leave_their_plane() -> None:
+def test_sliding_nodes_stay_in_their_plane() -> None:
     tilted = np.array([0.6, 0.0, 0.8])
     anatomy = hold(MESH, BASE, np.where(TOP[:, None], tilted, 0.0))
     force = np.zeros((1, COUNT, 3))
@@ -119,15 +119,15 @@ def test_sliding_nodes_do_not_leave_their_plane() -> None:
     assert np.linalg.norm(u[TOP], axis=1).min() > 1e-4  # tangentially free
 
 
-def test_without_the_effect_normals_are_ignored() -> None:
+def test_slide_normals_without_slide_effect_are_ignored() -> None:
     anatomy = hold(MESH, BASE, np.where(TOP[:, None], [0.0, 0.0, 1.0], 0.0))
     force = np.zeros((1, COUNT, 3))
     force[0, TOP, 2] = -0.05
     assert solve(anatomy, [Held(), NodalForce()], Nodal(force)).displacement[0, TOP, 2].max() < -1e-4
 
 
-def test_components_are_prescribed_one_by_one_and_row_by_row() -> None:
-    """One mask, three cases of other values; entries that are not held are ignored."""
+def test_components_are_prescribed_separately_in_each_case() -> None:
+    """One mask, three load cases with other values; entries that are not held are ignored."""
     held = np.repeat(BASE[:, None], 3, axis=1)
     held[TOP, 2] = True
     corner = int(np.flatnonzero(TOP)[0])
@@ -143,8 +143,8 @@ def test_components_are_prescribed_one_by_one_and_row_by_row() -> None:
 
 
 @pytest.mark.parametrize("law", ["linear", "stable-neo-hookean"])
-def test_a_node_that_slides_and_is_partly_held_obeys_both(law: str) -> None:
-    """A prescribed component drags a sliding node along its plane: the normal motion is zero all the same."""
+def test_sliding_and_partly_held_node_obeys_both_constraints(law: str) -> None:
+    """A prescribed component moves a sliding node along its plane; the normal motion is zero."""
     normal = np.array([0.6, 0.0, 0.8])
     held = np.repeat(BASE[:, None], 3, axis=1)
     held[TOP, 0] = True
@@ -176,7 +176,7 @@ def compile_clamped_part() -> Anatomy:
 
 
 @pytest.mark.parametrize("body", [clamped, compile_clamped_part])
-def test_a_tool_moves_the_mean_of_its_footprint(body) -> None:
+def test_tool_displacement_is_mean_of_its_footprint(body) -> None:
     found = solve(body(), [Held(), Slide(), ToolDisplacement()], Displaced(POINT, MOTION, RADIUS))
     weight = compute_footprint_weights(MESH.nodes, MESH.surface, POINT, RADIUS).toarray()
     mean = np.einsum("bv,bvi->bi", weight, found.displacement)
@@ -185,8 +185,8 @@ def test_a_tool_moves_the_mean_of_its_footprint(body) -> None:
 
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("body", [clamped, compile_clamped_part])
-def test_pushing_with_the_reaction_is_the_same(body, element: str) -> None:
-    """The two kinds of tool are dual: a displacement gives a force that gives the displacement."""
+def test_push_with_reaction_reproduces_displacement(body, element: str) -> None:
+    """Both kinds of tool are dual: the force of a displacement gives this displacement."""
     effects, accuracy = [Held(), Slide(), ToolDisplacement()], Accuracy(tolerance=1e-10, limit_strain=False)
     moved = solve(body(), effects, Displaced(POINT, MOTION, RADIUS), accuracy=accuracy, element=element)
     assert moved.reaction.shape == (3, 1, 6)
@@ -199,7 +199,7 @@ def test_pushing_with_the_reaction_is_the_same(body, element: str) -> None:
     np.testing.assert_allclose(pushed.reaction, moved.reaction, atol=1e-9)
 
 
-def test_reaction_carries_the_moment_about_the_tool_point() -> None:
+def test_reaction_includes_moment_about_tool_point() -> None:
     force = np.array([[0.1, 0.2, -0.3]])
     found = solve(clamped(), [Held(), ToolForce()], Pushed(POINT[:1], force, RADIUS[:1]))
     weight = compute_footprint_weights(MESH.nodes, MESH.surface, POINT[:1], RADIUS[:1]).toarray()[0]
@@ -207,13 +207,13 @@ def test_reaction_carries_the_moment_about_the_tool_point() -> None:
     np.testing.assert_allclose(found.reaction[0, 0], [*force[0], *moment], atol=1e-15)
 
 
-def test_a_footprint_that_is_held_cannot_be_moved() -> None:
+def test_displacement_of_held_footprint_is_rejected() -> None:
     fem = Fem(hold(MESH, BASE | TOP), [SOFT, Held(), ToolDisplacement()], TIGHT, "cpu", element="p1")
     with pytest.raises(InputError, match="fixed"):
         fem.deform(Loads((Displaced(POINT[:1], MOTION[:1], RADIUS[:1]),)))
 
 
-def test_sliding_footprint_cannot_leave_its_plane() -> None:
+def test_displacement_normal_to_sliding_plane_is_rejected() -> None:
     anatomy = hold(MESH, BASE, np.where(TOP[:, None], [0.0, 0.0, 1.0], 0.0))
     fem = Fem(anatomy, [SOFT, Held(), Slide(), ToolDisplacement()], TIGHT, "cpu", element="p1")
     with pytest.raises(InputError, match="fixed"):
@@ -228,13 +228,13 @@ def test_sliding_footprint_cannot_leave_its_plane() -> None:
         (np.isin(np.arange(COUNT), np.flatnonzero(BASE & (MESH.nodes[:, 1] < 1e-9))), "1 of 6"),
     ],
 )
-def test_a_body_that_can_move_rigidly_is_refused(held: np.ndarray, sentence: str) -> None:
+def test_body_with_free_rigid_motion_is_rejected(held: np.ndarray, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Fem(hold(MESH, held), [SOFT, Held(), NodalForce()], TIGHT, "cpu", element="p1")
 
 
-def test_walls_alone_hold_a_body() -> None:
-    """Three faces that slide leave no rigid motion; two leave one."""
+def test_three_sliding_walls_prevent_rigid_motion() -> None:
+    """Three sliding faces leave no rigid motion; two leave one."""
     faces = np.where(MESH.nodes < 1e-9, 1.0, 0.0)
     for used, free in (([0, 1, 2], 0), ([0, 2], 1), ([2], 3)):
         normal = np.zeros((COUNT, 3))
@@ -252,7 +252,7 @@ def test_walls_alone_hold_a_body() -> None:
         assert np.abs(np.einsum("vi,vi->v", found.displacement[0], normal)).max() < 1e-15
 
 
-def test_six_components_are_enough_to_hold_a_body() -> None:
+def test_six_held_components_prevent_rigid_motion() -> None:
     """Statically determinate: forces in balance deform it, and the six reactions vanish."""
     a, b, c = (int(np.argmin(np.linalg.norm(MESH.nodes - p, axis=1))) for p in ([0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]))
     held = np.zeros((COUNT, 3), bool)

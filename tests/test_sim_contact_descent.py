@@ -1,4 +1,4 @@
-"""What touches and what gives, solved apart: each part against the same by other means."""
+"""Contact descent with separate steps for contact and tissue: each part against another method."""
 
 from functools import cache
 
@@ -62,8 +62,8 @@ class Rough:
         out.assign(out.numpy() * (1.0 + self._share * self._random.uniform(-1.0, 1.0, out.shape)))
 
 
-def test_an_answer_alone_is_that_in_a_batch() -> None:
-    """Columns that take other ways, and end after other numbers of steps, do not feel each other."""
+def test_contact_case_alone_agrees_with_case_in_batch() -> None:
+    """Columns with other paths and other numbers of steps are independent."""
     fem, shallow = solver(Accuracy(1e-8)), at(0.02, 0.02, HEIGHT + RADIUS - 2e-4)
     poses = (ASIDE, shallow, DOWN, at(0.04, 0.012, HEIGHT - 5e-3))
     batch = fem.deform(touching(*poses))
@@ -75,8 +75,8 @@ def test_an_answer_alone_is_that_in_a_batch() -> None:
         np.testing.assert_allclose(alone.reaction[0], batch.reaction[row], rtol=1e-6, atol=1e-9)
 
 
-def test_contact_solved_apart_is_what_newton_finds() -> None:
-    """Of deep poses too, where the model of the tissue misleads."""
+def test_contact_descent_agrees_with_newton() -> None:
+    """Includes deep poses, where the model of the tissue is inaccurate."""
     effects = [Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), ToolContact((Ball(RADIUS),))]
     poses = touching(DOWN, at(0.031, 0.028, HEIGHT - 6e-3), at(0.012, 0.045, HEIGHT - 5e-3))
     newton = Fem(BODY, effects, Accuracy(1e-7), "cpu", element="p1", avoid=(SolverStep.CONTACT,)).deform(poses)
@@ -85,8 +85,8 @@ def test_contact_solved_apart_is_what_newton_finds() -> None:
     np.testing.assert_allclose(found.displacement, newton.displacement, atol=1e-8)
 
 
-def test_a_batch_of_which_one_case_is_slow_goes_on() -> None:
-    """What that one case learns, when it alone is left, is not the batch's."""
+def test_contact_batch_with_one_slow_case_converges() -> None:
+    """Curvature pairs of the last, slow case are not stored for the batch."""
     fem, far = solver(Accuracy(1e-6)), touching(DOWN, at(0.045, 0.04, HEIGHT - 3e-3))
     second = fem.deform(far, fem.deform(touching(DOWN, DOWN)))
     assert {len(value) for value in second.memory.values()} == {2}
@@ -95,13 +95,13 @@ def test_a_batch_of_which_one_case_is_slow_goes_on() -> None:
     np.testing.assert_allclose(third.displacement, second.displacement, atol=1e-5)
 
 
-def test_no_poses_no_answers() -> None:
+def test_contact_without_poses_gives_empty_result() -> None:
     fem = solver(Accuracy(1e-6))
     none = fem.deform(touching(DOWN).select(np.zeros(0, int)))
     assert none.displacement.shape == (0, len(BODY.mesh.nodes), 3)
 
 
-def test_what_was_asked_before_changes_no_bit() -> None:
+def test_contact_result_is_independent_of_earlier_solves() -> None:
     fem = solver(TRAIN)
     begun = fem.deform(touching(DOWN))
     first = fem.deform(touching(ASIDE), begun)

@@ -1,4 +1,4 @@
-"""Forces on the few nodes that a tool touches: against their own equation."""
+"""Contact forces on the nodes near a tool: against their own equation."""
 
 from dataclasses import replace
 from functools import partial
@@ -15,8 +15,8 @@ from sim.local_solvers.contact_forces import ContactCompliance, ForceLimits, all
 
 
 @pytest.mark.parametrize(("drag", "rough"), [(0.0, 0.0), (0.5, 0.0), (0.0, 1e-3)])
-def test_forces_are_those_of_tools_where_nodes_go_under_them(drag: float, rough: float) -> None:
-    """f = c'(w) + d (w - v) where that is not zero, w = w1 - C (f - f1): of each column by itself, in a few steps.
+def test_contact_forces_satisfy_their_equation(drag: float, rough: float) -> None:
+    """f = c'(w) + d (w - v) where that is not zero, w = w1 - C (f - f1): for each column separately, in a few steps.
 
     A preconditioner in half precision rounds each of C's columns by itself.
     """

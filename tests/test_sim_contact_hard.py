@@ -1,4 +1,4 @@
-"""Contact that breaks solvers: tools that jump, turn, squeeze and stab. Each answer is finite, honest and outside."""
+"""Hard contact: tools that jump, rotate, squeeze and stab. Each result is finite and outside, with a true outcome."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -109,8 +109,8 @@ def lattice(anatomy: Anatomy, found: Deformation, row: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_hard_contact_ends_as_it_says(name: str) -> None:
-    """Where it converged the surface is outside of every tool but for what the barrier yields; else it is said."""
+def test_hard_contact_ends_with_expected_outcome(name: str) -> None:
+    """A converged surface is outside of every tool up to the barrier's tolerance; else the outcome reports it."""
     hard, start = HARD[name], None
     fem = solver(hard)
     for poses in hard.frames:
@@ -127,8 +127,8 @@ def test_hard_contact_ends_as_it_says(name: str) -> None:
     assert start.outcome[0] in hard.ends
 
 
-def test_cases_of_a_batch_touch_or_do_not_each_for_itself() -> None:
-    """Some come, some go, some stay away: as each does alone."""
+def test_contact_cases_of_a_batch_are_independent() -> None:
+    """Some approach, some retreat, some stay away: each agrees with its own solution."""
     ways = (
         (at(0.03, 0.03, HEIGHT + 0.01), at(0.03, 0.03, HEIGHT - 3e-3)),
         (at(0.03, 0.03, HEIGHT - 2e-3), at(0.03, 0.03, HEIGHT + 2e-3)),
@@ -146,8 +146,8 @@ def test_cases_of_a_batch_touch_or_do_not_each_for_itself() -> None:
     assert together.displacement[[0, 2]].any(axis=(1, 2)).all()
 
 
-def test_an_answer_that_fell_short_says_where_the_tool_is() -> None:
-    """It is in equilibrium there, and the next frame goes on from there."""
+def test_incomplete_contact_reports_its_tool_pose() -> None:
+    """The result is in equilibrium at this pose, and the next frame continues from it."""
     fem = solver(Hard((), accuracy=Accuracy(1e-6, outer=6, steps=0)))
     short = fem.deform(touching(at(0.03, 0.03, HEIGHT - 9e-3)))
     assert short.outcome == (Outcome.BUDGET,)
@@ -161,8 +161,8 @@ def test_an_answer_that_fell_short_says_where_the_tool_is() -> None:
     assert following.outcome[0].good
 
 
-def test_pushes_and_touches_act_together() -> None:
-    """A push far from the tool adds its own force: what the base bears is the sum."""
+def test_forces_of_push_and_contact_add_up() -> None:
+    """A push far from the tool adds its own force: the base bears the sum."""
     fem = solver(Hard(()), ToolForce())
     pushed = Pushed(np.array([[0.045, 0.03, HEIGHT]]), np.array([[0.0, 0.0, -0.1]]), np.array([6e-3]))
     pose = at(0.018, 0.03, HEIGHT - 3e-3)
@@ -177,12 +177,12 @@ def test_pushes_and_touches_act_together() -> None:
     assert only.reaction[0, 0, 2] < both.reaction[0, 1, 2] < 0.0
 
 
-def test_without_touching_loads_no_tool_is_there() -> None:
+def test_tool_without_touching_load_has_no_effect() -> None:
     fem = solver(Hard(()))
     assert not fem.deform(Loads((), np.zeros(2))).displacement.any()
 
 
-def test_a_retractor_laid_and_lifted_leaves_nothing() -> None:
+def test_lifted_retractor_leaves_no_displacement() -> None:
     fem = Fem(
         BLOCK, [Elasticity(SOFT), Held(), Retraction(Spatula(0.012, 0.02, 1.5e-3))], Accuracy(1e-6), "cpu", element="p1"
     )
@@ -239,6 +239,6 @@ def skewed() -> np.ndarray:
         (lambda: Spatula(0.01, 1e-3, 1e-3), "no room for round edges"),
     ],
 )
-def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: str) -> None:
+def test_invalid_contact_arguments_are_rejected(build: Callable[[], object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         build()

@@ -1,4 +1,4 @@
-"""What rigid tools are known to do to elastic bodies: Hertz, the flat punch, and what moves with the observer."""
+"""Contact of rigid tools against the literature (Hertz, flat punch) and under rotation of the observer."""
 
 import warnings
 from dataclasses import replace
@@ -73,7 +73,7 @@ def force_on(anatomy: Anatomy, tool: Tool, depth: float, gap: float) -> float:
     return -4.0 * float(found.reaction[0, 0, 2])
 
 
-def test_a_ball_presses_as_hertz_has_it() -> None:
+def test_ball_force_agrees_with_hertz() -> None:
     """F = 4/3 E* sqrt(R) d^(3/2): Johnson 1985, "Contact Mechanics", equation 4.23. Within 5 %, from above, nearing."""
     radius, depth = 10.0 * SMALL, 0.1 * SMALL
     exact = 4.0 / 3.0 * PLANE_MODULUS * np.sqrt(radius) * depth**1.5
@@ -85,7 +85,7 @@ def test_a_ball_presses_as_hertz_has_it() -> None:
     assert off[1] < 0.6 * off[0]
 
 
-def test_a_flat_punch_presses_as_king_has_it() -> None:
+def test_flat_punch_force_agrees_with_king() -> None:
     """F = 1.012 (2 / sqrt(pi)) E* w d of a square: King 1987, Int. J. Solids Struct. 23:1657-1664. Within 5 %, falling.
 
     Its pressure is singular at the edges, which need cells that are small beside them.
@@ -122,8 +122,8 @@ TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5]).as_matrix()
 BESIDE, AWAY = at(0.018, 0.03, HEIGHT - 3e-3), at(0.042, 0.032, HEIGHT - 2e-3, turn=TILT)
 
 
-def test_body_and_tools_moved_together_bear_the_same() -> None:
-    """Displacements, forces and moments turn with the observer."""
+def test_rotation_of_body_and_tools_rotates_the_result() -> None:
+    """Displacements, forces and moments rotate with the observer."""
     loads = touching(BESIDE, AWAY)
     found = body((BALL, BLADE)).deform(loads)
     T = at(*SHIFT, turn=TURN)
@@ -145,8 +145,8 @@ def test_rotation_about_symmetry_axis_has_no_effect() -> None:
         assert np.abs(one.reaction[0, 0, 3:]).max() < 0.1 * HEIGHT * np.linalg.norm(one.reaction[0, 0, :3])
 
 
-def test_a_ball_feels_no_moment_about_its_middle() -> None:
-    """Without friction every force goes through it: about the origin the moment is that of the force at the middle."""
+def test_ball_has_no_moment_about_its_centre() -> None:
+    """Without friction every force passes through the centre: the moment about the origin is that of this force."""
     pose = at(0.031, 0.028, HEIGHT - 3e-3, turn=TILT)
     force, moment = np.split(body((BALL,)).deform(touching(pose)).reaction[0, 0], 2)
     middle = BALL.radius * pose[:3, 2]
@@ -154,8 +154,8 @@ def test_a_ball_feels_no_moment_about_its_middle() -> None:
     assert np.linalg.norm(np.cross(middle, force)) > 1e-3 * BALL.radius * np.linalg.norm(force)
 
 
-def test_where_the_tool_is_how_stiff_tissue_is_does_not_matter() -> None:
-    """Twice as stiff it moves as far, and bears twice as much."""
+def test_displacement_by_contact_is_independent_of_stiffness() -> None:
+    """Twice the stiffness gives the same displacement and twice the force."""
     stiff = Fem(
         BLOCK,
         [Elasticity(replace(SOFT, young=2.0 * SOFT.young)), Held(), ToolContact((BALL,))],
@@ -168,8 +168,8 @@ def test_where_the_tool_is_how_stiff_tissue_is_does_not_matter() -> None:
     np.testing.assert_allclose(stiff.reaction, 2.0 * found.reaction, atol=1e-6 * np.abs(stiff.reaction).max())
 
 
-def test_no_force_on_tissue_pulls() -> None:
-    """Every node that a blade moves is pushed away from it: what of it touches looks down or aside, never up."""
+def test_contact_forces_never_pull_on_tissue() -> None:
+    """The force on every node near a blade points away from it: down or sideways, never up."""
     fem = body((BLADE,))
     found = fem.deform(touching(BESIDE))
     term = fem.problem.barriers[0]
@@ -184,8 +184,8 @@ def test_no_force_on_tissue_pulls() -> None:
     assert force[:, 2].max() <= 0.0
 
 
-def test_tools_far_from_each_other_add_up() -> None:
-    """In small motions of a linear body: forces and displacements of both are those of each."""
+def test_effects_of_distant_tools_add_up() -> None:
+    """Small motions of a linear body: forces and displacements of both tools are the sum of each."""
     rock = Fem(BLOCK, [Elasticity(ROCK), Held(), ToolContact((BALL, BLADE), 2e-5)], TIGHT, "cpu", element="p1")
     off = at(0.0, 0.0, 10.0 * HEIGHT)
     left, right = at(0.01, 0.03, HEIGHT - 1e-4), at(0.05, 0.03, HEIGHT - 1e-4)
@@ -198,8 +198,8 @@ def test_tools_far_from_each_other_add_up() -> None:
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_a_tool_that_touches_nothing_moves_nothing(precision: str) -> None:
-    """From rest, and lifted again from where it pressed: exactly zero."""
+def test_tool_without_contact_causes_no_displacement(precision: str) -> None:
+    """From rest, and lifted after contact: exactly zero."""
     accuracy = Accuracy(tolerance=1e-4, precision=precision)  # pyright: ignore[reportArgumentType]
     fem = Fem(BLOCK, [Elasticity(SOFT), Held(), ToolContact((BALL,))], accuracy, "cpu", element="p1")
     clear = touching(at(0.03, 0.03, HEIGHT + 1.01e-4))
@@ -212,7 +212,7 @@ def test_a_tool_that_touches_nothing_moves_nothing(precision: str) -> None:
     assert not lifted.reaction.any()
 
 
-def test_a_retractor_is_a_tool_that_was_laid_on_and_moved() -> None:
+def test_retractor_agrees_with_contact_tool_after_same_motion() -> None:
     laid, drawn = at(0.03, 0.03, HEIGHT + 1e-3), np.array([2e-3, 0.0, -4e-3])
     retractor = Fem(BLOCK, [Elasticity(SOFT), Held(), Retraction(BLADE)], TIGHT, "cpu", element="p1")
     held = retractor.deform(Loads((Retracted(laid[None], drawn[None]),)))
@@ -233,8 +233,8 @@ def frames(fem: Fem, poses: list[np.ndarray], start: Deformation | None = None) 
     return found
 
 
-def test_answers_come_from_their_loads_and_start_alone() -> None:
-    """Clients that take turns at one solver get the bits that each would get alone; again gives the same again."""
+def test_contact_result_depends_only_on_loads_and_start() -> None:
+    """Clients that alternate at one solver get the same bits as alone; a repetition gives the same bits."""
     fem = body((BALL,))
     ways = [[at(x, 0.03, HEIGHT - depth) for depth in (1e-3, 2e-3, 3e-3)] for x in (0.02, 0.04)]
     alone = [frames(fem, way) for way in ways]
@@ -246,8 +246,8 @@ def test_answers_come_from_their_loads_and_start_alone() -> None:
             np.testing.assert_array_equal(one.reaction, alone[client][turn].reaction)
 
 
-def test_a_stored_answer_goes_on_as_the_answer_itself(tmp_path: Path) -> None:
-    """Displacement, time and memory are all that the next frame is given."""
+def test_stored_result_is_an_equivalent_start(tmp_path: Path) -> None:
+    """Displacement, time and memory are sufficient for the next frame."""
     fem, way = body((BALL,)), [at(x, 0.03, HEIGHT - 2e-3) for x in (0.02, 0.024, 0.028, 0.032)]
     straight = frames(fem, way)
     np.savez(tmp_path / "frame.npz", displacement=straight[1].displacement, **straight[1].memory)  # pyright: ignore[reportArgumentType]
@@ -261,8 +261,8 @@ def test_a_stored_answer_goes_on_as_the_answer_itself(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames(fem, way[2:], warm)[-1].displacement, straight[-1].displacement)
 
 
-def test_many_small_steps_and_one_long_one_end_alike() -> None:
-    """A ball pressed straight down has one answer, however it got there."""
+def test_many_small_contact_steps_agree_with_one_large_step() -> None:
+    """A ball pressed straight down has one solution, independent of the path."""
     fem = body((BALL,))
     once = fem.deform(touching(at(0.03, 0.03, HEIGHT - 4e-3)))
     little = frames(fem, [at(0.03, 0.03, HEIGHT - depth) for depth in np.linspace(2e-4, 4e-3, 12)])[-1]

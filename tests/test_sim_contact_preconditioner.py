@@ -1,4 +1,4 @@
-"""The preconditioner that knows what a tool touches."""
+"""The preconditioner with the curvature of contact."""
 
 from dataclasses import replace
 
@@ -17,8 +17,8 @@ from sim.material import Material
 from sim.tools import Ball
 
 
-def test_what_is_touched_is_known_to_the_preconditioner() -> None:
-    """It is the inverse of the rest stiffness and the barrier's curvature: that times it is what it was given."""
+def test_contact_preconditioner_inverts_barrier_curvature() -> None:
+    """Inverse of the rest stiffness plus the barrier's curvature: their product is the identity."""
     fem, descent = parts()
     problem, preconditioner = fem.problem, fem.strategy.preconditioner
     problem.begin(Cases(touching(DOWN), np.zeros(1)))
@@ -40,7 +40,7 @@ def test_what_is_touched_is_known_to_the_preconditioner() -> None:
 
 
 def test_contact_preconditioner_includes_skull() -> None:
-    """The answer is the same, in fewer linear iterations."""
+    """Same solution in fewer linear iterations."""
     mesh, down = box((12, 12, 6), SIDE), at(0.031, 0.028, HEIGHT - 5e-3)
     wall = np.where((mesh.nodes[:, :1] > SIDE - 1e-9) & (mesh.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
     effects = [Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), SkullContact(), ToolContact((Ball(RADIUS),))]

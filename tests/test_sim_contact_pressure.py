@@ -1,4 +1,4 @@
-"""How hard tools press: a plate evenly, by force over area; a blade the most under its lower end."""
+"""Contact pressure: uniform under a plate, force over area; largest under the lower end of a blade."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ def at(*place: float, tip: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_a_plate_presses_evenly_by_force_over_area(element: str) -> None:
-    """Tissue that does not widen: E times how far it is squeezed, at every vertex that the plate's edge is far from."""
+def test_plate_pressure_is_uniform_force_over_area(element: str) -> None:
+    """Tissue with Poisson's ratio zero: Young's modulus times the strain, at every vertex far from the plate's edge."""
     plate = Spatula(0.1, 0.1, 5e-3)
     effects = (Elasticity(Material("linear", 3000.0, 0.0)), Held(), ToolContact((plate,)))
     fem = Fem(BLOCK, effects, Accuracy(tolerance=1e-9), "cpu", element=element)
@@ -43,7 +43,7 @@ def test_a_plate_presses_evenly_by_force_over_area(element: str) -> None:
     assert not found[:, ~TOP & (BLOCK.mesh.nodes[:, 2] < HEIGHT - 0.011)].any()
 
 
-def test_a_blade_presses_hardest_under_its_lower_end() -> None:
+def test_blade_pressure_is_largest_at_its_lower_end() -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), Retraction(Spatula(0.015, 0.03, 2e-3))), Accuracy(), "cpu", element="p1")
     laid, moved = at(0.03, 0.03, HEIGHT + 5e-3, tip=12.0), np.array([[0.0, 0.0, -8e-3]])
     loads = Loads((Retracted(laid[None], moved),))
@@ -55,13 +55,13 @@ def test_a_blade_presses_hardest_under_its_lower_end() -> None:
     assert ends[0] > 3.0 * ends[1] and 200.0 < ends[0] < 5000.0
 
 
-def test_where_nothing_touches_it_presses_nowhere() -> None:
+def test_pressure_without_contact_is_zero() -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu", element="p1")
     loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
     assert not compute_pressure(fem, loads, fem.deform(loads)).any()
 
 
-def test_it_is_of_the_whole_answer_to_its_loads() -> None:
+def test_pressure_requires_full_result_and_its_loads() -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), ToolContact((Ball(5e-3),))), Accuracy(), "cpu", element="p1")
     loads = Loads((Touching(at(0.03, 0.03, HEIGHT + 1e-3)[None, None]),))
     answer, none = fem.deform(loads), np.zeros(0, int)
@@ -76,7 +76,7 @@ def test_it_is_of_the_whole_answer_to_its_loads() -> None:
     ("effect", "element", "sentence"),
     [(NodalForce(), "p1", "nothing touches this body: add ToolContact"), (ToolContact((Ball(5e-3),)), "p2", "with p1")],
 )
-def test_what_has_no_pressure_is_a_sentence(effect: Effect, element: str, sentence: str) -> None:
+def test_pressure_without_contact_effect_is_rejected(effect: Effect, element: str, sentence: str) -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), effect), Accuracy(), "cpu", element=element)
     loads = Loads((), np.zeros(1))
     with pytest.raises(InputError, match=sentence):

@@ -1,4 +1,4 @@
-"""Steps of single columns in arrays that stay, against the descent that makes each anew."""
+"""Contact steps of single columns in preallocated arrays, against the descent that allocates them."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -78,10 +78,10 @@ def counted(monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> list[obj
     ],
     ids=["usual", "models made anew", "dragged", "as at rest", "misled", "sharp", "relaxing"],
 )
-def test_replayed_steps_are_those_of_the_descent(
+def test_replayed_contact_steps_agree_with_descent(
     limits: ContactLimits, least: float, radius: float, many: int, material: Material, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As many of them, to the same places, whatever becomes of models, and of steps that go too far."""
+    """Same number of steps and same result, also with rejected models and steps that are too long."""
     fem = solver(material, radius)
     found = fem.strategy.contact
     assert found is not None

@@ -1,4 +1,4 @@
-"""Labels of widely used programs: known by their numbers, and compared with the anatomy."""
+"""Labels of widely used programs: recognised by their numbers, and compared with the anatomy."""
 
 import re
 from contextlib import nullcontext
@@ -27,7 +27,7 @@ class TestConventions:
         return nifti(folder / "seg.nii", labels.astype(np.uint8), affine)
 
     @pytest.mark.parametrize("enhancing", [3, 4])
-    def test_brats(self, tmp_path, enhancing):
+    def test_brats_labels_give_tumour_necrosis_and_oedema(self, tmp_path, enhancing):
         path = self.brats(tmp_path, enhancing)
         masks = read_head_masks(Sources(path, convention="brats", mask=tmp_path / "t1.nii"))
         assert build_masked_subject(masks).tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
@@ -37,7 +37,7 @@ class TestConventions:
         with pytest.raises(InputError, match="labels of brats do not mark the brain"):
             read_head_masks(Sources(path, convention="brats"))
 
-    def test_a_cavity_is_no_tumour(self, tmp_path):
+    def test_cavity_label_is_not_part_of_tumour(self, tmp_path):
         affine, places = grid()
         labels = head(places, brain=0)
         labels[10:14, 10:14, 10:14] = 4
@@ -111,7 +111,7 @@ class TestConventions:
         return mgz(folder / name, labels.astype(np.int32), affine)
 
     @pytest.mark.parametrize("name", ["freesurfer", "synthseg"])
-    def test_freesurfer(self, tmp_path, name):
+    def test_freesurfer_labels_give_brain_and_ventricles(self, tmp_path, name):
         path = self.aseg(tmp_path)
         masks = read_head_masks(Sources(path, convention=name, tumour_in=tmp_path / "tumour.nii"))
         subject = build_masked_subject(masks)
@@ -119,12 +119,12 @@ class TestConventions:
         low, high = 1e3 * subject.cortex.min(axis=0), 1e3 * subject.cortex.max(axis=0)
         np.testing.assert_allclose([low, high], MIDDLE + np.outer([-1, 1], [46.0, 55.0, 42.0]), atol=EDGE)
 
-    def test_left_on_the_right_is_refused(self, tmp_path):
+    def test_mirrored_freesurfer_labels_are_rejected(self, tmp_path):
         path = self.aseg(tmp_path, mirrored=True)
         with pytest.raises(InputError, match=r"left half lie \d+ mm to the right of .* Its affine is mirrored, or"):
             read_head_masks(Sources(path, convention="freesurfer", tumour_in=tmp_path / "tumour.nii"))
 
-    def test_labels_of_another_program_are_refused(self, tmp_path):
+    def test_labels_of_another_program_are_rejected(self, tmp_path):
         aseg, brats, tumour = self.aseg(tmp_path), self.brats(tmp_path, 4), tmp_path / "tumour.nii"
         for sources, reason in (
             (
@@ -141,7 +141,7 @@ class TestConventions:
             with pytest.raises(InputError, match=re.escape(reason)):
                 read_head_masks(sources)
 
-    def test_fsl_with_a_tumour_of_a_number_of_ones_own(self, tmp_path):
+    def test_fsl_labels_accept_own_tumour_number(self, tmp_path):
         affine, places = grid()
         labels = head(places, brain=2, tumour=9)
         labels[(labels == 2) & (places[..., 2] > MIDDLE[2])] = 3

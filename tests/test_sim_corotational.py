@@ -7,7 +7,7 @@ from test_sim_law import gradients
 from sim.terms.laws.conformance import build_evaluator
 
 
-def test_corotational_rotation_is_proper_and_nearest() -> None:
+def test_corotational_law_uses_the_nearest_proper_rotation() -> None:
     """With lambda = 0, F - P / (2 mu) is the rotation that the law used."""
     evaluate = build_evaluator(tissue("corotational", poisson=0.0), "float64")
     F = np.eye(3) + gradients("corotational")

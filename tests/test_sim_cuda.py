@@ -1,4 +1,4 @@
-"""CUDA and CPU give the same answers, whatever preconditioner each uses."""
+"""Results on CUDA against the CPU, with the preconditioner of each."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def pushes():
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_a_batch_of_pushes(box, law, element, precision):
+def test_cuda_agrees_with_cpu_for_batch_of_pushes(box, law, element, precision):
     accuracy = replace(Accuracy(1e-8) if precision == "float64" else TRAIN, limit_strain=False)
     effects = (Elasticity(tissue(law)), Held(), ToolForce())
     on_cpu = Fem(box, effects, accuracy, "cpu", element=element).deform(pushes())
@@ -58,7 +58,7 @@ def test_a_batch_of_pushes(box, law, element, precision):
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_a_moved_footprint_and_its_reaction(box, element):
+def test_cuda_reaction_of_moved_footprint_agrees_with_cpu(box, element):
     loads = Loads((Displaced(np.zeros((1, 3)), np.array([[1e-3, 0.0, -4e-3]]), np.array([7e-3])),))
     effects = (Elasticity(), Held(), Slide(), ToolDisplacement())
     on_cpu, on_cuda = (
@@ -69,8 +69,8 @@ def test_a_moved_footprint_and_its_reaction(box, element):
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_a_batch_of_postures(box, element, precision):
-    """Levels between those of the box's nodes, and a tool beside them; the scan's posture among them."""
+def test_cuda_agrees_with_cpu_for_batch_of_postures(box, element, precision):
+    """Fluid levels between nodes of the box, with a tool; includes the posture of the scan."""
     accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
     down, top = np.array([0.3, 0.0, -1.0]), float(box.mesh.nodes[:, 2].max())
     drained = build_posture(down, top - np.linspace(0.001, 0.04, 7))
@@ -90,7 +90,7 @@ def test_a_batch_of_postures(box, element, precision):
 @pytest.mark.parametrize(
     ("law", "moving"), [("ogden", ()), ("ogden", (Inertia(damping=2.0),)), ("stable-neo-hookean", ())]
 )
-def test_steps_in_time(box, law, moving, element, precision):
+def test_cuda_time_steps_agree_with_cpu(box, law, moving, element, precision):
     """Tissue that relaxes and swells, with and without mass; steps of two lengths in one batch."""
     accuracy = Accuracy(1e-8) if precision == "float64" else TRAIN
     made_of = replace(tissue(law), prony=((0.4, 0.5), (0.3, 5.0)))
@@ -111,8 +111,8 @@ def test_steps_in_time(box, law, moving, element, precision):
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_a_batch_of_moved_tools(box, element, precision):
-    """A ball and a blade in each case, in the air, touching and deep; then on from there."""
+def test_cuda_agrees_with_cpu_for_batch_of_moved_tools(box, element, precision):
+    """A ball and a blade in each case, without contact, in contact and deep; then a second step from there."""
     accuracy = Accuracy(1e-7) if precision == "float64" else TRAIN
     tools = (Ball(5e-3), Spatula(8e-3, 14e-3, 1.5e-3))
     effects = (Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), ToolContact(tools))
@@ -136,8 +136,8 @@ def test_a_batch_of_moved_tools(box, element, precision):
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_a_tool_moved_alone_frame_after_frame(box, element, precision):
-    """It comes down, slides, and leaves again: what touches and what gives are solved apart."""
+def test_cuda_contact_frames_agree_with_cpu(box, element, precision):
+    """One tool moves down, slides and lifts: contact descent with separate steps."""
     accuracy = Accuracy(1e-7) if precision == "float64" else TRAIN
     effects = (Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), ToolContact((Ball(5e-3),)))
     way = np.array([[0.0, 0.0, -1e-3], [1e-3, 0.0, -2e-3], [3e-3, 1e-3, -2e-3], [3e-3, 1e-3, 2e-3]])
@@ -159,8 +159,8 @@ def test_a_tool_moved_alone_frame_after_frame(box, element, precision):
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_a_skull_that_lets_go(box, element, precision):
-    """The box's lower side rests on bone, its weight turned over in half of the cases."""
+def test_cuda_skull_contact_agrees_with_cpu(box, element, precision):
+    """The box's lower side rests on bone, its weight reversed in half of the cases."""
     accuracy = Accuracy(1e-7) if precision == "float64" else TRAIN
     height = box.mesh.nodes[:, 2]
     low = height < height.min() + 1e-9
@@ -176,7 +176,7 @@ def test_a_skull_that_lets_go(box, element, precision):
     assert drop.min() > -1e-4 and drop[3].max() > 2e-4
 
 
-def test_block_jacobi_reaches_what_the_inverse_reaches(box):
+def test_cuda_block_jacobi_agrees_with_inverse(box):
     fem = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8), "cuda", element="p1")
     reference = fem.deform(pushes()).displacement
     plain = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8, inner=4000), "cuda", element="p1")
@@ -185,8 +185,8 @@ def test_block_jacobi_reaches_what_the_inverse_reaches(box):
     np.testing.assert_allclose(plain.deform(pushes()).displacement, reference, atol=1e-6 * np.abs(reference).max())
 
 
-def test_local_part_is_solved_alone_with_same_result():
-    """More columns than one room has, so that rooms change."""
+def test_cuda_local_solution_agrees_with_whole_body():
+    """More columns than one buffer holds, so that buffers change."""
     anatomy = read_anatomy(get_template_path())
     effects, loads = (Elasticity(), Held(), Slide(), ToolForce()), draw("mixed", anatomy, 150, 3)
     fem = Fem(anatomy, effects, replace(TRAIN, limit_strain=False), "cuda", element="p1")
@@ -200,8 +200,8 @@ def test_local_part_is_solved_alone_with_same_result():
     assert (np.abs(found.displacement - plain.displacement) <= BOUND["float32"] * largest).all()
 
 
-def test_frames_stay_on_the_card(box):
-    """As on the CPU, and an older frame leads where it led before: what it knew has been brought away in time."""
+def test_cuda_frame_sequence_agrees_with_cpu(box):
+    """An older frame as start gives its former result: its data were copied from the device in time."""
     effects = (Elasticity(), Held(), ToolForce())
     loads = [push(np.array([x, 0.0, 0.0]), np.array([0.0, 0.05, -0.4]), 7e-3) for x in np.linspace(-4e-3, 4e-3, 8)]
     fem, host = Fem(box, effects, LIVE, "cuda", element="p1"), Fem(box, effects, LIVE, "cpu", element="p1")

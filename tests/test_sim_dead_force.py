@@ -88,7 +88,7 @@ def far_error(space: str, element: str, cells: int) -> float:
     ("element", "cells", "fall", "bound"),
     [("p1", (6, 12), 2.0, 0.04), ("smoothed", (6, 12), 4.0, 0.03), ("p2", (4, 8), 5.0, 0.01)],
 )
-def test_the_far_field_is_the_point_loads(
+def test_far_field_agrees_with_point_load_solution(
     space: str, element: str, cells: tuple[int, int], fall: float, bound: float
 ) -> None:
     coarse, fine = (far_error(space, element, n) for n in cells)
@@ -97,7 +97,7 @@ def test_the_far_field_is_the_point_loads(
 
 
 @pytest.mark.parametrize("field", [kelvin, half_space])
-def test_the_formulas_are_in_balance(field: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+def test_point_load_solutions_are_in_equilibrium(field: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
     """The traction on a sphere (or half of one) round the force sums to it, and the half space's surface is free."""
 
     def stress(at: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A bond that tears lets go where it bears too much, and holds where it does not."""
+"""Debonding: overloaded bonds release, others hold."""
 
 import numpy as np
 import pytest
@@ -70,8 +70,8 @@ def sample_draw_scenario(slab):
 
 
 @pytest.mark.parametrize("load", [lambda slab: lifted(slab, 0.05), sample_draw_scenario])
-def test_without_strength_the_skull_only_presses(slab, load):
-    """Signorini's conditions: nothing passes, nothing is pulled, and what is off bears nothing."""
+def test_skull_without_bond_strength_bears_only_pressure(slab, load):
+    """Signorini's conditions: no penetration, no tension, and released nodes bear nothing."""
     loads = load(slab)
     found = solve_with_debonding(slab, effects(1e-6), loads, REFERENCE, "cpu", "p1")
     assert found.converged and found.deformation.bond[0] == 0.0 and len(found.sliding) and len(found.free)
@@ -82,7 +82,7 @@ def test_without_strength_the_skull_only_presses(slab, load):
     assert found.deformation.displacement[0, found.free, 2].min() > -1e-7 and found.rounds < 20
 
 
-def test_a_bond_that_holds_is_solved_once(slab):
+def test_bond_below_its_strength_is_solved_once(slab):
     loads = lifted(slab, 0.05)
     found = solve_with_debonding(slab, effects(1e5), loads, REFERENCE, "cpu")
     whole = Fem(slab, effects(1e5), REFERENCE, "cpu").deform(loads)
@@ -90,7 +90,7 @@ def test_a_bond_that_holds_is_solved_once(slab):
     np.testing.assert_array_equal(found.deformation.displacement, whole.displacement)
 
 
-def test_what_cannot_tear_is_refused(slab):
+def test_debonding_without_bond_or_with_two_loads_is_rejected(slab):
     loads = lifted(slab, 0.05)
     with pytest.raises(InputError, match="2 loads debond separately: give one at a time"):
         solve_with_debonding(slab, effects(1e3), loads.select([0, 0]), device="cpu")

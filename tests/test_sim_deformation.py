@@ -1,4 +1,4 @@
-"""What is warm in an answer only makes the next one faster: dropped everywhere, the answers are the same."""
+"""Warm data of a result only speed up the next solution: without them the results are the same."""
 
 from dataclasses import replace
 
@@ -55,7 +55,7 @@ def cases() -> dict[str, tuple[Fem, list[Loads]]]:
 
 
 @pytest.mark.parametrize("kind", ["p1", "smoothed", "p2", "patch", "contact", "relaxing", "inertia"])
-def test_dropped_everywhere_the_answers_are_the_same(kind):
+def test_results_without_warm_data_are_the_same(kind):
     fem, loads = cases()[kind]
     kept, dropped = (ride(fem, loads, drops) for drops in (False, True))
     assert all(answer.outcome[0].good for answer in (*kept, *dropped))
@@ -68,7 +68,7 @@ def test_dropped_everywhere_the_answers_are_the_same(kind):
             np.testing.assert_allclose(other.memory[name], value, atol=1e-4 * max(np.abs(value).max(), 1e-12))
 
 
-def test_memory_and_warmth_travel_with_their_rows():
+def test_memory_and_warm_data_follow_selected_rows():
     fem, loads = cases()["p1"]
     first, second = ride(fem, loads[:2], drops=False)
     both = join_deformations([second, second])

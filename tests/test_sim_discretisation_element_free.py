@@ -46,7 +46,7 @@ def relative_error(found: Deformation, exact: Deformation, nodes: np.ndarray) ->
 
 
 def test_gradients_are_exact_for_linear_fields() -> None:
-    """So rigid motions strain nothing, and constant stress is in equilibrium with tractions on linear triangles."""
+    """Rigid motions cause no strain, and constant stress is in equilibrium with tractions on linear triangles."""
     elements = cells(TWO)
     slope = np.einsum("tqai,taj->tqij", elements.gradient, TWO.nodes[elements.table])
     np.testing.assert_allclose(slope, np.broadcast_to(np.eye(3), slope.shape), atol=1e-12)
@@ -60,7 +60,7 @@ def test_gradients_are_exact_for_linear_fields() -> None:
     np.testing.assert_allclose(total, linear, atol=1e-15)
 
 
-def test_supports_are_wide_and_cross_no_interface() -> None:
+def test_element_free_supports_cross_no_interface() -> None:
     elements = cells(TWO)
     assert elements.size is not None and np.median(elements.size) >= 12 and elements.size.max() <= 40
     used = np.arange(elements.table.shape[1]) < elements.size[:, None]
@@ -69,7 +69,7 @@ def test_supports_are_wide_and_cross_no_interface() -> None:
         assert np.isin(elements.table[mine][used[mine]], TWO.find_nodes(label)).all()
 
 
-def test_shape_functions_interpolate_at_nodes() -> None:
+def test_element_free_shapes_interpolate_at_nodes() -> None:
     nodes = np.random.default_rng(0).uniform(size=(20, 14, 3))
     for a in range(14):
         shape = compute_shapes(nodes[:, a], nodes, np.ones((20, 14), bool))
@@ -85,7 +85,7 @@ def test_patch_test_with_large_strain_is_exact(law: str) -> None:
     np.testing.assert_allclose(found.deform(loads).displacement[0], value, atol=1e-8)
 
 
-def test_refinement_converges_to_quadratic_elements() -> None:
+def test_element_free_refinement_converges_to_quadratic_elements() -> None:
     exact = deflection("p2", 5, 0.45)
     off = [abs(deflection(ELEMENT, width, 0.45) / exact - 1.0) for width in (2, 3, 6)]
     assert off[0] > off[1] > off[2] and off[2] < 0.02
@@ -106,18 +106,18 @@ def test_stiff_inclusion_agrees_with_quadratic_elements() -> None:
 
 
 @pytest.mark.parametrize("poisson", [0.49, 0.499])
-def test_nearly_incompressible_tissue_is_finite(poisson: float) -> None:
+def test_nearly_incompressible_tissue_has_finite_result(poisson: float) -> None:
     found = solve(BLOCK, [0.02, 0.0, -0.01], replace(SOFT, poisson=poisson))
     assert found.outcome[0].good and np.isfinite(found.displacement).all()
 
 
-def test_overload_is_reported() -> None:
+def test_overload_of_element_free_body_is_reported() -> None:
     """Pressed to a third of the height."""
     found = solve(BLOCK, [0.0, 0.0, -0.07], SOFT)
     assert np.isfinite(found.displacement).all() and not found.outcome[0].good
 
 
-def test_slivers_keep_gradients_bounded() -> None:
+def test_slivers_keep_element_free_gradients_bounded() -> None:
     """A node near the opposite face of one of its tetrahedra, which keeps a thousandth of its height."""
     mesh = box((6, 6, 6), 0.1)
     tet = mesh.tets[np.flatnonzero(INSIDE[mesh.tets].any(axis=1))[0]]

@@ -1,4 +1,4 @@
-"""Falx and tentorium as walls: no edge of the mesh passes the sheet, and what lies beyond moves less."""
+"""Falx and tentorium as walls: no edge of the mesh crosses the sheet, and tissue beyond it moves less."""
 
 import json
 from contextlib import redirect_stdout
@@ -51,8 +51,8 @@ def said(labels):
 
 
 @pytest.mark.parametrize("edge", [0.5e-3, 2e-3])
-def test_each_edge_that_meets_the_sheet_has_an_end_that_is_held(box, edge):
-    """Of voxels finer and coarser than the mesh is; the sheet stands at x = 1 mm above z = -20 mm, and is oblique."""
+def test_edge_across_septum_has_a_held_end(box, edge):
+    """Voxels finer and coarser than the mesh; the sheet stands at x = 1 mm above z = -20 mm, and is oblique."""
     nodes, tets = box.mesh.nodes, box.mesh.tets
     steps = np.arange(-40e-3, 40e-3, edge)
     y, z = np.meshgrid(steps, steps[steps > -20e-3], indexing="ij")
@@ -70,8 +70,8 @@ def test_each_edge_that_meets_the_sheet_has_an_end_that_is_held(box, edge):
     assert not find_fixed_vertices(box.mesh, Septum("falx", sheet + [1.0, 0.0, 0.0], edge)).any()
 
 
-def test_a_drawn_falx_hangs_from_the_convexity_in_the_midline():
-    """Of an ellipsoid's points: upright in the middle, as deep as asked, above half of the height, without gaps."""
+def test_synthetic_falx_lies_in_midline_with_requested_depth():
+    """In an ellipsoid: upright in the midline, at the requested depth, above half of the height, without gaps."""
     directions = np.random.default_rng(1).normal(size=(4000, 3))
     radii, middle = np.array([70e-3, 90e-3, 65e-3]), np.array([3e-3, -20e-3, 10e-3])
     cortex = middle + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -88,8 +88,8 @@ def test_a_drawn_falx_hangs_from_the_convexity_in_the_midline():
             synthesise_falx(cortex, depth)
 
 
-def test_beyond_it_the_brain_moves_less(said, labels, subject):
-    """The far hemisphere; the tumour goes on moving. Without a falx in the labels nothing but the stem is held."""
+def test_brain_beyond_falx_moves_less(said, labels, subject):
+    """The other hemisphere; the tumour still moves. Without a falx in the labels only the stem is held."""
     walls = read_anatomy(labels.with_name("a.vtu"))
     mesh = walls.mesh
     plain = add_boundary_conditions(mesh, subject.site, PLAN.craniotomy, PLAN.placement)
@@ -106,14 +106,14 @@ def test_beyond_it_the_brain_moves_less(said, labels, subject):
     assert less < 0.6 * free and 0.5 * tumour < kept < tumour
 
 
-def test_an_opening_over_it_is_free(said, labels, subject):
+def test_craniotomy_over_falx_is_free(said, labels, subject):
     mesh = read_anatomy(labels.with_name("a.vtu")).mesh
     over = replace(subject, site=1e-3 * (MIDDLE + [0.0, 0.0, 42.0]))
     anatomy = add_boundary_conditions(mesh, over.site, PLAN.craniotomy, PLAN.placement, septa=subject.septa)
     assert anatomy.craniotomy.sum() > 6 and not anatomy.fixed[anatomy.craniotomy].any()
 
 
-def test_it_counts_as_brain(labels, subject, tmp_path, capsys):
+def test_falx_and_tentorium_labels_count_as_brain(labels, subject, tmp_path, capsys):
     assert subject.notes == () and [septum.name for septum in subject.septa] == ["falx"]
     with pytest.raises(InputError, match="label 3 is named by --tumour and by --tentorium"):
         read_head_masks(Sources(labels, (1,), (3,), parts={"tentorium": (3,)}))

@@ -1,4 +1,4 @@
-"""Every law on every element against what is known exactly: affine motions, stretch and shear, balance of forces."""
+"""Every law on every element against exact solutions: affine motions, stretch and shear, balance of forces."""
 
 from dataclasses import replace
 
@@ -47,8 +47,8 @@ def solve(
 @pytest.mark.parametrize("kind", EVERY_BODY)
 @pytest.mark.parametrize("law", EVERY_LAW)
 @pytest.mark.parametrize("gradient", [SMALL, LARGE], ids=["small", "large"])
-def test_patch(law: str, kind: str, gradient: np.ndarray) -> None:
-    """An affine motion of the boundary is the answer inside, whatever the shapes of the elements."""
+def test_affine_boundary_motion_gives_affine_interior(law: str, kind: str, gradient: np.ndarray) -> None:
+    """An affine motion of the boundary extends to the interior, for all shapes of elements."""
     mesh, element = body(kind, (3, 3, 3), 0.2)
     affine = mesh.nodes @ gradient.T
     surface = surface_nodes(mesh)
@@ -83,7 +83,7 @@ def shear_stress(material: Tissue, shear: float) -> float:
 @pytest.mark.parametrize("kind", EVERY_BODY)
 @pytest.mark.parametrize("law", EVERY_LAW)
 @pytest.mark.parametrize("shear", [1e-6, 0.5])
-def test_simple_shear(law: str, kind: str, shear: float) -> None:
+def test_simple_shear_stress_agrees_with_formula(law: str, kind: str, shear: float) -> None:
     mesh, element = body(kind, (2, 2, 2), 0.15)
     material = tissue(law)
     P = mean_stress(mesh, element, material, shear * np.outer([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
@@ -123,7 +123,7 @@ STRETCHED = {law: tissue(law) for law in ("neo-hookean", "stable-neo-hookean", "
     [(name, kind) for name in STRETCHED for kind in EVERY_BODY if kind == "p1" or name != "minutes"],
 )
 @pytest.mark.parametrize("axial", [0.6, 1.5])
-def test_uniaxial_stretch_of_a_cube(name: str, kind: str, axial: float) -> None:
+def test_uniaxial_stretch_of_cube_agrees_with_formula(name: str, kind: str, axial: float) -> None:
     (mesh, element), material = body(kind, (1, 1, 1)), STRETCHED[name]
     held = sleeve(mesh)
     top = mesh.nodes[:, 2] > 0.1 - 1e-9
@@ -143,7 +143,7 @@ def test_uniaxial_stretch_of_a_cube(name: str, kind: str, axial: float) -> None:
 
 @pytest.mark.parametrize("kind", OWN_NODES)
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_uniaxial_tension_at_small_strain_is_youngs_modulus(law: str, kind: str) -> None:
+def test_small_uniaxial_tension_agrees_with_youngs_modulus(law: str, kind: str) -> None:
     mesh, element = body(kind, (2, 2, 2))
     young, poisson, strain = 3000.0, 0.4, 1e-6
     force = np.zeros((1, len(mesh.nodes), 3))
@@ -159,7 +159,7 @@ def test_uniaxial_tension_at_small_strain_is_youngs_modulus(law: str, kind: str)
 
 @pytest.mark.parametrize("kind", OWN_NODES)
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_reactions_balance_the_load(law: str, kind: str) -> None:
+def test_reaction_forces_balance_the_load(law: str, kind: str) -> None:
     (mesh, element), material = body(kind, (2, 2, 3), 0.15), tissue(law)
     total = np.array([0.05, 0.02, -0.1])
     u = solve(base_held(mesh), material, Nodal(top_forces(mesh, total)), element)
@@ -169,7 +169,7 @@ def test_reactions_balance_the_load(law: str, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", EVERY_BODY)
 @pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean", "ogden"])
-def test_turning_the_world_turns_the_answer(law: str, kind: str) -> None:
+def test_rotation_of_the_problem_rotates_the_result(law: str, kind: str) -> None:
     (mesh, element), material = body(kind, (2, 2, 3), 0.15), tissue(law)
     Q, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
     Q *= np.linalg.det(Q)
@@ -189,7 +189,7 @@ def test_turning_the_world_turns_the_answer(law: str, kind: str) -> None:
     ids=["two laws", "two numbers of terms"],
 )
 @pytest.mark.parametrize("kind", OWN_NODES)
-def test_regions_of_different_laws_share_one_body(kind: str, laws: dict[int, Tissue]) -> None:
+def test_regions_with_different_laws_are_in_equilibrium(kind: str, laws: dict[int, Tissue]) -> None:
     """Equilibrium of an upper half on another lower half, each by its own formula."""
     mesh, element = body(kind, (2, 2, 4), 0.1)
     upper = mesh.nodes[mesh.tets].mean(axis=1)[:, 2] > 0.05

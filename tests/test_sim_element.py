@@ -54,15 +54,15 @@ def forces(problem: Problem, u: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("law", EVERY_LAW)
 class TestEveryLawAndElement:
-    def test_energy_and_forces_are_those_of_the_definition(self, law: str, element: str) -> None:
-        """Against averages over edges and nodes, and shape functions, that are found without the package."""
+    def test_element_energy_and_forces_match_their_definition(self, law: str, element: str) -> None:
+        """Against averages over edges and nodes, and shape functions, computed without the package."""
         built, mesh, u = problem(law, element), BODY[element], swell(BODY[element], 0)
         assert energy(built, u) == pytest.approx(elastic_energy(mesh, laws(law), u, element), rel=1e-12)
         expected = internal_forces(mesh, laws(law), u, element)
         np.testing.assert_allclose(forces(built, u), expected, atol=1e-12 * np.abs(expected).max())
 
-    def test_a_rigid_motion_costs_nothing(self, law: str, element: str) -> None:
-        """The elements' own forces have no resultant and no moment; turning the deformed body turns them."""
+    def test_rigid_motion_has_no_elastic_energy(self, law: str, element: str) -> None:
+        """The elements' forces have no resultant and no moment; rotating the deformed body rotates them."""
         built, mesh, u = problem(law, element), BODY[element], swell(BODY[element], 1)
         f, x = forces(built, u), mesh.nodes + u
         assert np.abs(f.sum(axis=0)).max() < 1e-12 * np.abs(f).sum()
@@ -76,7 +76,7 @@ class TestEveryLawAndElement:
         assert energy(built, turned) == pytest.approx(energy(built, u), rel=1e-10)
         np.testing.assert_allclose(forces(built, turned), f @ Q.T, atol=1e-9 * np.abs(f).max())
 
-    def test_single_precision(self, law: str, element: str) -> None:
+    def test_single_precision_forces_agree_with_double(self, law: str, element: str) -> None:
         """Forces at large strain, and at small strain, where nothing may cancel."""
         double, single = problem(law, element), problem(law, element, "float32")
         for size in (1.0, 1e-4):
@@ -84,7 +84,7 @@ class TestEveryLawAndElement:
             exact = forces(double, u.astype(np.float32))
             assert np.linalg.norm(forces(single, u) - exact) < 1e-5 * np.linalg.norm(exact)
 
-    def test_equilibria_in_single_precision(self, law: str, element: str) -> None:
+    def test_single_precision_equilibria_agree_with_double(self, law: str, element: str) -> None:
         mesh = BODY[element]
         loads = Loads((Nodal(top_forces(mesh, np.array([[0.02, 0.0, -0.1], [0.1, -0.05, 0.1]]))),))
         effects = Elasticity(regions=laws(law)), Held(), NodalForce()

@@ -1,4 +1,4 @@
-"""Manufactured solutions: what elements make of a smooth field, its body force and its values on the surface.
+"""Manufactured solutions: error of elements for a smooth field with its body force and its values on the surface.
 
 Roache 2002, "Code verification by the method of manufactured solutions", J. Fluids Eng. 124:4-10.
 """
@@ -78,7 +78,7 @@ LEAST_SLOPE = {"p1": 1.85, "p2": 2.85, "smoothed": 1.85}
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
 @pytest.mark.parametrize("element", LEAST_SLOPE)
-def test_the_error_falls_as_the_elements_promise(element: str, law: str) -> None:
+def test_error_decreases_with_expected_order_of_elements(element: str, law: str) -> None:
     """At nu 0.4; stretches from 0.84 to 1.15."""
     cells = np.array([2, 3, 5] if element == "p2" else [3, 5, 8])
     errors = np.array([error(tissue(law, 3000.0, 0.4), element, n) for n in cells])
@@ -88,8 +88,8 @@ def test_the_error_falls_as_the_elements_promise(element: str, law: str) -> None
     assert errors[-1] < 0.02
 
 
-def test_the_manufactured_force_is_in_balance_with_the_stress() -> None:
-    """Integrals over the box, by another rule: body force + traction on its six faces = 0; and it is no small one."""
+def test_manufactured_force_is_in_equilibrium_with_stress() -> None:
+    """Integrals over the box by another rule: body force + traction on its faces = 0, and the force is not small."""
     material = tissue("neo-hookean", 3000.0, 0.4)
     node, share = np.polynomial.legendre.leggauss(12)
     at, share = SIDE * (1.0 + node) / 2.0, SIDE * share / 2.0

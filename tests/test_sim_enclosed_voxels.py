@@ -1,4 +1,4 @@
-"""Voxels that a surface encloses."""
+"""Voxels enclosed by a surface."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from sim.bodies.enclosed_voxels import fill_enclosed
 from sim.errors import InputError
 
 
-def test_what_a_surface_encloses_is_counted_to_a_voxel():
+def test_enclosed_voxels_match_volume_of_closed_surface():
     points, triangles = egg()
     mask, affine = fill_enclosed(points, triangles, 2e-3)
     middles = np.argwhere(np.ones_like(mask)) @ affine[:3, :3].T + affine[:3, 3]

@@ -1,11 +1,11 @@
-"""A field beyond where it is known."""
+"""Extension of a field beyond its known domain."""
 
 import numpy as np
 
 from sim.fields.extension import extend_field
 
 
-def test_what_is_filled_in_is_no_larger_than_what_is_known():
+def test_extended_field_never_exceeds_known_values():
     known = np.zeros((24, 24, 24), bool)
     known[10:14, 10:14, 10:14] = True
     field = np.where(known, np.float32(2e-3), np.float32(0.0)) * np.ones((3, 1, 1, 1), np.float32)

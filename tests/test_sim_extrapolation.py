@@ -1,4 +1,4 @@
-"""A frame starts where the last two lead: exact on a straight way, and no farther than the load goes on it."""
+"""Start of a frame by extrapolation of the last two: exact on a straight path, limited by the change of the load."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -42,7 +42,7 @@ def share_of(now: Loads, last: Loads, before: Loads) -> float:
     return compute_shares(build_row(now), build_row(last), build_row(before))[0]
 
 
-def test_as_far_as_the_load_goes_on_its_way():
+def test_extrapolation_share_follows_the_load():
     before, last = pushed(0.0), pushed(1e-3)
     assert share_of(pushed(2e-3), last, before) == pytest.approx(1.0)
     assert share_of(pushed(1.5e-3), last, before) == pytest.approx(0.5)
@@ -54,7 +54,7 @@ def test_as_far_as_the_load_goes_on_its_way():
     assert share_of(pushed(0.0, 1.2), pushed(0.0, 1.1), pushed(0.0)) == pytest.approx(1.0)
 
 
-def test_a_tool_that_stood_still_or_was_lifted_tells_no_way():
+def test_still_or_lifted_tool_gives_no_extrapolation():
     assert share_of(pushed(1e-3), pushed(0.0), pushed(0.0)) == 0.0
     for lifted in range(3):
         loads = [pushed(2e-3), pushed(1e-3), pushed(0.0)]
@@ -62,7 +62,7 @@ def test_a_tool_that_stood_still_or_was_lifted_tells_no_way():
         assert share_of(*loads) == 0.0
 
 
-def test_extrapolation_follows_line_per_load():
+def test_extrapolation_is_linear_for_each_load():
     last, before = np.random.default_rng(0).normal(size=(2, 12, 2))
     pushes = np.stack([np.concatenate([build_row(pushed(x)) for x in (1e-3, 0.0)]).reshape(2, 7)] * 2)
     warm = {PUSHES_KEY: pushes, BEFORE_KEY: before.T}
@@ -73,7 +73,7 @@ def test_extrapolation_follows_line_per_load():
     assert extrapolate_start(loads, last, warm | {BEFORE_KEY: before.T[:, :9]}) is last  # another element's
 
 
-def test_moving_tool_frames_converge_in_fewer_steps(body):
+def test_extrapolation_reduces_steps_of_moving_tool_frames(body):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     exact = Fem(body, EFFECTS, replace(LIVE, tolerance=1e-4), "cpu", element="p1")
     steps, last, plain = np.zeros(2, int), None, None
@@ -87,7 +87,7 @@ def test_moving_tool_frames_converge_in_fewer_steps(body):
     assert steps[0] < 0.9 * steps[1]
 
 
-def test_a_start_that_would_turn_inside_out_is_not_moved_on(body):
+def test_extrapolation_to_inverted_elements_is_discarded(body):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     first = fem.deform(pushed(0.0))
     last = fem.deform(pushed(1e-3), first)
@@ -96,7 +96,7 @@ def test_a_start_that_would_turn_inside_out_is_not_moved_on(body):
     assert answer.outcome[0].name == "CONVERGED" and answer.inverted[0] == 0
 
 
-def test_a_foreign_start_tells_no_way(body):
+def test_guessed_start_gives_no_extrapolation(body):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     first = fem.deform(pushed(0.0))
     assert BEFORE_KEY not in first.warm
@@ -106,7 +106,7 @@ def test_a_foreign_start_tells_no_way(body):
 
 
 @pytest.mark.parametrize("spoilt", [PUSHES_KEY, "s", "known", "head"])
-def test_a_history_that_does_not_fit_is_none(body, spoilt):
+def test_inconsistent_history_of_pushes_is_ignored(body, spoilt):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     last = fem.deform(pushed(1e-3), fem.deform(pushed(0.0)))
     lacking = {name: value for name, value in last.warm.items() if name != spoilt}

@@ -40,7 +40,7 @@ def solve_fem(body, nodes, tissues):
     return 1e6 * moved.displacement.reshape(len(body.acting), 3, -1, 3)
 
 
-def test_integrals_of_rigid_and_uniform_fields() -> None:
+def test_boundary_integrals_satisfy_somiglianas_identity() -> None:
     """Somigliana's identity holds for linear displacements inside, at vertices, and 1 mm below the surface."""
     mesh, rng = box((3, 3, 3)), np.random.default_rng(0)
     corners = mesh.nodes[mesh.surface]
@@ -59,7 +59,7 @@ def test_integrals_of_rigid_and_uniform_fields() -> None:
     np.testing.assert_allclose(inside, -np.eye(3), atol=1e-5)
 
 
-def test_integrals_over_a_small_triangle_are_kelvins_solution() -> None:
+def test_integrals_over_small_triangle_agree_with_kelvin() -> None:
     """Displacements as in Kelvin's formula; tractions by Hooke's law from differences of these displacements."""
     mu, lam = BRAIN.lame
     place, corners = np.array([0.03, -0.05, 0.02]), 1e-6 * np.array([[0.0, 0, 0], [3, 1, 0], [1, 2, 3]])
@@ -76,7 +76,7 @@ def test_integrals_over_a_small_triangle_are_kelvins_solution() -> None:
     np.testing.assert_allclose(pulled, stress @ area_normal, rtol=1e-3, atol=1e-4 * np.abs(pulled).max())
 
 
-def test_bar_under_uniform_pull_stretches_uniformly() -> None:
+def test_bar_under_uniform_traction_stretches_uniformly() -> None:
     """Patch test: strain 1 / E [Pa] under unit traction if lateral contraction vanishes, away from the ends."""
     tissue = Material("linear", 3000.0, 0.0)
     body = build_block((4, 4, 12), tissues=(tissue,), inner=False)
@@ -115,7 +115,7 @@ def test_response_is_nearly_reciprocal() -> None:
     assert 0.0 < np.linalg.norm(difference[apart]) < 0.05 * np.linalg.norm(between[apart])
 
 
-def test_nearly_incompressible_pieces_at_the_surface_are_finite() -> None:
+def test_response_of_nearly_incompressible_pieces_is_finite() -> None:
     """A tumour in two pieces, one of which reaches the free surface."""
     body = build_block(tissues=(Material("linear", 3000.0, 0.4995), Material("linear", 9000.0, 0.4995)))
     mesh = body.anatomy.mesh
@@ -128,7 +128,7 @@ def test_nearly_incompressible_pieces_at_the_surface_are_finite() -> None:
     assert (work > 0.0).all() and work.max() < 2.0 * work.min()
 
 
-def test_rejected_bodies() -> None:
+def test_boundary_elements_reject_unsupported_bodies() -> None:
     body = build_block()
     mesh = body.anatomy.mesh
     middle = np.linalg.norm(mesh.nodes - 0.05, axis=1) < 1e-9

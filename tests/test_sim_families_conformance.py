@@ -1,4 +1,4 @@
-"""Every family of deformation models meets the same contract: loads, constraints, outcome, cost, refusals."""
+"""Every family of deformation models meets the same contract: loads, constraints, outcome, cost, rejected input."""
 
 from dataclasses import replace
 
@@ -53,11 +53,11 @@ def family(request, body):
     return request.param, build_family(request.param, body, build_push_effects(body, SOFT), "cpu")
 
 
-def test_every_family_is_measured_here():
+def test_error_bounds_are_listed_for_every_family():
     assert sorted(ERRORS) == sorted(FAMILIES)
 
 
-def test_a_family_keeps_the_contract_of_deformers(family, body):
+def test_family_meets_contract_of_deformers(family, body):
     model = family[1]
     result = model.deform(pushes(2))
     assert isinstance(model, Deformer)
@@ -73,19 +73,19 @@ def test_a_family_keeps_the_contract_of_deformers(family, body):
     assert result.stretch[0, 0] < 1.0 < result.stretch[1, 0]
 
 
-def test_no_force_moves_nothing(family):
+def test_zero_force_causes_no_displacement(family):
     result = family[1].deform(pushes(force=0.0))
     assert np.abs(result.displacement).max() < 1e-12
 
 
-def test_fixed_vertices_stay(family, body):
+def test_fixed_vertices_hardly_move(family, body):
     result = family[1].deform(pushes())
     fixed = body.fixed.all(axis=1)
     moved = np.linalg.norm(result.displacement[0], axis=1)
     assert moved[fixed].max() <= (0.15 if ERRORS[family[0]] is None else 1e-6) * moved.max()
 
 
-def test_a_family_moves_tissue_as_far_as_stated(family, exact):
+def test_family_meets_its_error_bound(family, exact):
     name, model = family
     field, truth = model.deform(pushes(2)).displacement, exact.displacement
     error = np.linalg.norm(field - truth, axis=2).max() / np.linalg.norm(truth, axis=2).max()
@@ -95,7 +95,7 @@ def test_a_family_moves_tissue_as_far_as_stated(family, exact):
         assert error < ERRORS[name]
 
 
-def test_small_loads_add_up(family):
+def test_small_displacements_are_proportional_to_load(family):
     one, two = (family[1].deform(pushes(force=size)).displacement for size in (1e-4, 2e-4))
     assert np.abs(two - 2.0 * one).max() < 0.01 * np.abs(two).max()
 
@@ -117,7 +117,7 @@ def build_hard_case(case, body):
 
 @pytest.mark.parametrize("case", ["nu 0.499", "slivers", "overload", "stiff tumour", "edge of the opening"])
 @pytest.mark.parametrize("name", sorted(FAMILIES))
-def test_hard_cases_end_in_an_honest_outcome(name, case, body):
+def test_hard_case_has_finite_result_and_correct_outcome(name, case, body):
     body, tissue, loads = build_hard_case(case, body)
     result = build_family(name, body, build_push_effects(body, tissue), "cpu").deform(loads)
     assert np.isfinite(result.displacement).all()
@@ -128,7 +128,7 @@ def test_hard_cases_end_in_an_honest_outcome(name, case, body):
 
 
 @pytest.mark.parametrize("name", sorted(set(FAMILIES) - set(ELEMENTS_BY_FAMILY)))
-def test_other_effects_and_loads_are_rejected(name, body):
+def test_unsupported_effects_and_loads_are_rejected(name, body):
     with pytest.raises(InputError, match=r"does not compute Gravity.*finite elements"):
         build_family(name, body, (*build_push_effects(body, SOFT), Gravity()), "cpu")
     relaxing = replace(SOFT, prony=((0.5, 1.0),))
@@ -142,7 +142,7 @@ def test_other_effects_and_loads_are_rejected(name, body):
         model.deform(pushes(), at=np.array([10**6]))
 
 
-def test_a_body_with_removed_tissue_still_moves(family, body):
+def test_body_with_removed_tissue_deforms(family, body):
     """Vertices without tetrahedra, several tools, prescribed motion, and no load at all."""
     name, model = family
     lowest = np.argsort(body.mesh.nodes[body.mesh.tets, 2].mean(axis=1))
@@ -161,12 +161,12 @@ def test_a_body_with_removed_tissue_still_moves(family, body):
             model.deform(Loads((Prescribed(np.zeros((1, len(body.mesh.nodes), 3))),)))
 
 
-def test_an_unknown_family_is_rejected(body):
+def test_unknown_family_is_rejected(body):
     with pytest.raises(InputError, match="no family of models is called 'springs': choose one of kelvinlets"):
         build_family("springs", body, build_push_effects(body, SOFT))
 
 
-def test_a_partly_fixed_or_closed_body_is_rejected():
+def test_partly_fixed_or_closed_body_is_rejected():
     mesh = make_mesh((3, 3, 2), 0.06)
     low = mesh.nodes[:, 2] < 1e-9
     side = (mesh.nodes[:, 0] < 1e-9)[:, None] & [True, False, False]

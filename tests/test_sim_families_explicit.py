@@ -1,4 +1,4 @@
-"""Explicit dynamics ends at the equilibrium that the implicit solver finds; the condensed table at its linear limit."""
+"""Explicit dynamics ends at the equilibrium of the implicit solver; the condensed table is its linear limit."""
 
 import numpy as np
 from conftest import make_box
@@ -20,7 +20,7 @@ def push(force):
     return Loads((Pushed(np.zeros((count, 3)), np.array(force), np.full(count, 9e-3)),))
 
 
-def test_explicit_steps_end_at_the_equilibrium():
+def test_explicit_dynamics_ends_at_equilibrium():
     loads = push([[0.02, 0.0, -0.1], [0.0, 0.0, 0.05]])
     exact = Fem(BODY, EFFECTS, REFERENCE, "cpu", element="smoothed").deform(loads)
     found = build_family("explicit", BODY, EFFECTS, "cpu").deform(loads)
@@ -28,14 +28,14 @@ def test_explicit_steps_end_at_the_equilibrium():
     assert np.abs(found.displacement - exact.displacement).max() < 0.005 * np.abs(exact.displacement).max()
 
 
-def test_the_condensed_table_is_the_limit_of_small_loads():
+def test_condensed_table_is_limit_of_small_loads():
     loads = push([[1e-4, 2e-5, -3e-4]])
     exact = Fem(BODY, EFFECTS, REFERENCE, "cpu", element="smoothed").deform(loads).displacement
     found = build_family("condensed", BODY, EFFECTS, "cpu").deform(loads).displacement
     assert np.abs(found - exact).max() < 1e-3 * np.abs(exact).max()
 
 
-def test_the_condensed_table_is_symmetric():
+def test_condensed_table_is_symmetric():
     """Maxwell's reciprocity: the response at b to a force at a is that at a to the same force at b."""
     from sim.families.condensed import compute_response
     from sim.families.linear_body import build_body
@@ -45,7 +45,7 @@ def test_the_condensed_table_is_symmetric():
     np.testing.assert_allclose(table, table.transpose(2, 3, 0, 1), atol=1e-9 * table.max())
 
 
-def test_forces_at_vertices_equal_the_footprint_they_spread():
+def test_nodal_force_displaces_its_own_vertex_most():
     from sim.effects import NodalForce
 
     force = np.zeros((1, len(BODY.mesh.nodes), 3))

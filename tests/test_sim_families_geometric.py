@@ -19,7 +19,7 @@ def body():
     return build_body("here", anatomy, build_push_effects(anatomy, TISSUE))
 
 
-def test_a_kelvinlet_far_from_fixed_tissue_is_kelvins_solution():
+def test_kelvinlet_far_from_fixed_tissue_agrees_with_kelvin():
     """Without fixed vertices at its side, at ten radii: u = ((3 - 4 nu) I + r r^T / r^2) f / (16 pi mu (1 - nu) r)."""
     anatomy = make_box((20, 20, 10), 0.1, opening=0.9)
     body = build_body("here", anatomy, build_push_effects(anatomy, TISSUE))
@@ -32,7 +32,7 @@ def test_a_kelvinlet_far_from_fixed_tissue_is_kelvins_solution():
     assert np.abs(found - np.diag(np.diag(found))).max() < 0.01 * found.max()
 
 
-def test_kelvinlets_stay_where_they_are_pinned(body):
+def test_kelvinlets_hardly_move_fixed_vertices(body):
     fixed = np.flatnonzero(body.fixed)
     moved = np.abs(compute_kelvinlet_response(body, fixed)).max(axis=(0, 1, 3))
     assert moved.max() < 0.05 * np.abs(compute_kelvinlet_response(body, body.acting)).max()
@@ -41,7 +41,7 @@ def test_kelvinlets_stay_where_they_are_pinned(body):
 @pytest.mark.parametrize(
     ("respond", "tolerance"), [(compute_thin_plate_response, 1e-6), (compute_lattice_response, 0.2)]
 )
-def test_the_surface_moves_as_a_half_space(body, respond, tolerance):
+def test_surface_displacement_agrees_with_half_space(body, respond, tolerance):
     """Boussinesq: u_z = (1 - nu) / (2 pi mu r); Cerruti along the force: 1 / (2 pi mu r) (Johnson 1985)."""
     points = body.anatomy.mesh.nodes[body.acting]
     middle, other = (int(np.linalg.norm(points - at, axis=1).argmin()) for at in ([0, 0, 0], [12e-3, 0, 0]))
@@ -53,8 +53,8 @@ def test_the_surface_moves_as_a_half_space(body, respond, tolerance):
     assert found[2, 0] == pytest.approx(0.2 / (4.0 * np.pi * MU * r), rel=max(0.1, 2 * tolerance))
 
 
-def test_a_thin_plate_continues_the_motion_of_the_surface(body):
-    """Between loaded and fixed vertices the motion decreases."""
+def test_thin_plate_displacement_decreases_with_depth(body):
+    """Between loaded and fixed vertices."""
     points = body.anatomy.mesh.nodes
     column = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < 1e-9)
     column = column[np.argsort(-points[column, 2])]

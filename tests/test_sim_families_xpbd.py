@@ -1,4 +1,4 @@
-"""Position-based dynamics approaches the equilibrium of its springs as its steps become many and short."""
+"""Position-based dynamics converges to the equilibrium of its springs with many short steps."""
 
 from dataclasses import replace
 from functools import partial

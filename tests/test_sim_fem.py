@@ -1,4 +1,4 @@
-"""One conformance suite that every deformer passes, and what finite elements promise besides."""
+"""Conformance suite for every deformer, and further properties of finite elements."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -113,11 +113,11 @@ class TestEveryDeformer:
     def error(self, name: str) -> float:
         return DEFORMERS[name].error
 
-    def test_is_a_deformer_of_its_anatomy(self, deformer: Deformer) -> None:
+    def test_model_is_a_deformer_of_its_anatomy(self, deformer: Deformer) -> None:
         assert isinstance(deformer, Deformer)
         assert deformer.anatomy is ANATOMY
 
-    def test_one_row_for_each_load(self, deformer: Deformer) -> None:
+    def test_deformation_has_one_row_for_each_load(self, deformer: Deformer) -> None:
         for count in (0, 1, 2, 5):
             found = deformer.deform(loads(np.arange(count)))
             assert len(found) == len(found.outcome) == count
@@ -126,15 +126,15 @@ class TestEveryDeformer:
             assert found.reaction.ndim == 3
             assert found.reaction.shape[::2] == (count, 6)
 
-    def test_answers_are_finite_and_say_how_they_came_about(self, answer: Deformation) -> None:
+    def test_deformation_is_finite_and_has_a_good_outcome(self, answer: Deformation) -> None:
         assert np.isfinite(answer.displacement).all()
         assert np.isfinite(answer.reaction).all()
         assert all(isinstance(outcome, Outcome) and outcome.good for outcome in answer.outcome)
         assert all(len(outcome.value.split()) >= 5 for outcome in answer.outcome)
         assert np.linalg.norm(answer.displacement, axis=2).max(axis=1).min() > 1e-4
 
-    def test_is_pure(self, deformer: Deformer, answer: Deformation) -> None:
-        """The same question gives the same bits, whatever was asked in between."""
+    def test_deform_is_deterministic(self, deformer: Deformer, answer: Deformation) -> None:
+        """The same loads give the same bits after other loads were solved."""
         deformer.deform(loads(np.array([4, 2]), scale=-0.5), None)
         again = deformer.deform(loads())
         np.testing.assert_array_equal(answer.displacement, again.displacement)
@@ -144,15 +144,15 @@ class TestEveryDeformer:
         warm = [deformer.deform(loads(scale=1.1), answer).displacement for _ in range(2)]
         np.testing.assert_array_equal(*warm)
 
-    def test_does_not_touch_what_it_is_given(self, deformer: Deformer, answer: Deformation) -> None:
+    def test_deform_does_not_change_its_arguments(self, deformer: Deformer, answer: Deformation) -> None:
         given, start = loads(scale=0.9), answer
         copies = [cause.force.copy() for cause in given.causes if isinstance(cause, Pushed)], start.displacement.copy()
         deformer.deform(given, start)
         np.testing.assert_array_equal([c.force for c in given.causes if isinstance(c, Pushed)], copies[0])
         np.testing.assert_array_equal(start.displacement, copies[1])
 
-    def test_rows_do_not_depend_on_each_other(self, deformer: Deformer, answer: Deformation, error: float) -> None:
-        """In any order, and however the batch is split."""
+    def test_deformation_rows_are_independent(self, deformer: Deformer, answer: Deformation, error: float) -> None:
+        """In any order, and for any partition of the batch."""
         whole, scale = answer.displacement, np.abs(answer.displacement).max()
         order = np.array([3, 0, 4, 1, 2])
         np.testing.assert_allclose(deformer.deform(loads(order)).displacement, whole[order], atol=error * scale)
@@ -160,7 +160,7 @@ class TestEveryDeformer:
             alone = deformer.deform(loads(np.array([row]))).displacement[0]
             np.testing.assert_allclose(alone, whole[row], atol=error * scale)
 
-    def test_at_picks_rows(self, deformer: Deformer, answer: Deformation) -> None:
+    def test_deform_returns_only_selected_vertices(self, deformer: Deformer, answer: Deformation) -> None:
         picked = answer.nodes[[5, 2, 11]]
         some = deformer.deform(loads(), at=picked)
         np.testing.assert_array_equal(some.nodes, picked)
@@ -169,7 +169,7 @@ class TestEveryDeformer:
         with pytest.raises(InputError, match=f"vertex {COUNT}"):
             deformer.deform(loads(), at=np.array([COUNT]))
 
-    def test_no_load_no_motion(self, deformer: Deformer, answer: Deformation) -> None:
+    def test_zero_load_causes_no_displacement(self, deformer: Deformer, answer: Deformation) -> None:
         """Exactly: from rest, from a warm start, alone and among others."""
         still = push(POINT, np.zeros((5, 3)), 0.02)
         assert not deformer.deform(still).displacement.any()
@@ -179,45 +179,45 @@ class TestEveryDeformer:
         assert not found[[1, 3]].any()
         assert found[[0, 2, 4]].any(axis=(1, 2)).all()
 
-    def test_time_is_carried(self, deformer: Deformer) -> None:
+    def test_deformation_has_times_of_its_loads(self, deformer: Deformer) -> None:
         given = loads(time=2.5)
         np.testing.assert_array_equal(deformer.deform(given).time, given.times)
 
-    def test_costs_are_reported(self, deformer: Deformer) -> None:
+    def test_deformation_reports_its_cost(self, deformer: Deformer) -> None:
         cost = deformer.deform(loads()).cost
         assert cost.total > 0.0
         assert min(cost.seconds.values()) >= 0.0
         assert cost.total == pytest.approx(sum(cost.seconds.values()))
 
-    def test_a_warm_start_changes_the_way_only(self, deformer: Deformer, answer: Deformation, error: float) -> None:
+    def test_warm_start_only_reduces_iterations(self, deformer: Deformer, answer: Deformation, error: float) -> None:
         warm = deformer.deform(loads(), deformer.deform(loads(scale=0.95)))
         assert (warm.iterations <= answer.iterations).all()
         scale = np.abs(answer.displacement).max()
         np.testing.assert_allclose(warm.displacement, answer.displacement, atol=error * scale)
 
-    def test_the_answer_itself_is_the_best_start(self, deformer: Deformer, answer: Deformation) -> None:
+    def test_start_at_solution_needs_no_iterations(self, deformer: Deformer, answer: Deformation) -> None:
         again = deformer.deform(loads(), answer)
         np.testing.assert_array_equal(again.iterations, 0)
 
-    def test_a_harder_push_moves_more(self, deformer: Deformer, answer: Deformation) -> None:
+    def test_larger_push_causes_larger_displacement(self, deformer: Deformer, answer: Deformation) -> None:
         each = [*(deformer.deform(loads(scale=scale)) for scale in (0.3, 0.6)), answer]
         assert (np.diff([np.abs(found.displacement).max(axis=(1, 2)) for found in each], axis=0) > 0.0).all()
 
-    def test_loads_of_another_kind_are_refused(self, deformer: Deformer) -> None:
+    def test_loads_of_another_kind_are_rejected(self, deformer: Deformer) -> None:
         with pytest.raises(InputError, match="Displaced"):
             deformer.deform(Loads((Displaced(POINT, FORCE, np.full(5, 0.02)),)))
 
-    def test_loads_off_the_body_are_refused(self, deformer: Deformer) -> None:
+    def test_loads_outside_the_body_are_rejected(self, deformer: Deformer) -> None:
         with pytest.raises(InputError, match="does not touch"):
             deformer.deform(push([0.0, 0.0, 1.0], [0.0, 0.0, -0.1], 0.01))
 
-    def test_a_start_with_other_rows_is_refused(self, deformer: Deformer, answer: Deformation) -> None:
+    def test_start_with_other_number_of_rows_is_rejected(self, deformer: Deformer, answer: Deformation) -> None:
         with pytest.raises(InputError, match=r"start has displacements of shape \(5, "):
             deformer.deform(loads(np.arange(2)), answer)
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 64])
-def test_batches_split_as_asked_give_the_same(size: int) -> None:
+def test_batch_size_does_not_change_the_result(size: int) -> None:
     whole = built("fem float64").deform(loads(time=1.0))
     split = Fem(ANATOMY, EFFECTS, REFERENCE, "cpu", batch=size, element="p1").deform(loads(time=1.0))
     np.testing.assert_allclose(split.displacement, whole.displacement, atol=1e-9)
@@ -227,8 +227,8 @@ def test_batches_split_as_asked_give_the_same(size: int) -> None:
     assert split.outcome == whole.outcome
 
 
-def test_several_causes_act_together() -> None:
-    """A push beside nodal forces is the sum of both as nodal forces."""
+def test_loads_of_several_kinds_add_up() -> None:
+    """A push with nodal forces is the sum of both as nodal forces."""
     both = Fem(ANATOMY, [*EFFECTS, NodalForce()], REFERENCE, "cpu", element="p1")
     top = top_forces(MESH, FORCE / 3.0)
     found = both.deform(Loads((*loads().causes, Nodal(top)))).displacement
@@ -240,8 +240,8 @@ def test_several_causes_act_together() -> None:
     np.testing.assert_allclose(found, alone.displacement, atol=1e-8)
 
 
-def test_a_tool_displacement_is_never_drowned_in_a_batch() -> None:
-    """Columns of very different size, in single precision: each reaches its own."""
+def test_tiny_and_large_tool_displacements_are_both_exact() -> None:
+    """Columns of very different size, in single precision: each reaches its own value."""
     body = Fem(ANATOMY, [Elasticity(), Held(), ToolDisplacement()], TRAIN, "cpu", element="p1")
     motion = np.array([[0.0, 0.0, -1e-6], [0.0, 0.0, -1e-2], [1e-4, 0.0, 0.0]])
     found = body.deform(Loads((Displaced(POINT[:3], motion, np.full(3, 0.03)),)))
@@ -258,7 +258,7 @@ def stubborn() -> tuple[Anatomy, Loads]:
     return hold(MESH, ANATOMY.fixed.all(axis=1) | top), Loads((Prescribed(value[None]),))
 
 
-def test_load_steps_rescue_what_newton_fails_on() -> None:
+def test_load_steps_solve_case_where_newton_fails() -> None:
     anatomy, asked = stubborn()
     effects = Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held()
     patient = Fem(anatomy, effects, Accuracy(1e-8, limit_strain=False), "cpu", element="p1").deform(asked)
@@ -272,7 +272,7 @@ def test_load_steps_rescue_what_newton_fails_on() -> None:
     np.testing.assert_allclose(hasty.displacement, patient.displacement, atol=1e-6)
 
 
-def test_a_rescue_leaves_the_other_rows_alone() -> None:
+def test_load_steps_of_one_row_leave_other_rows_unchanged() -> None:
     anatomy, asked = stubborn()
     effects = Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held()
     value = asked.get(Prescribed)
@@ -288,8 +288,8 @@ def test_a_rescue_leaves_the_other_rows_alone() -> None:
 
 
 @pytest.mark.parametrize("law", ["neo-hookean", "stable-neo-hookean"])
-def test_a_hopeless_case_returns_its_last_accepted_state(law: str) -> None:
-    """Two steps for a load of 50 N: not converged, said so, finite, and farther than rest; the others are not hurt."""
+def test_unsolvable_case_returns_its_last_accepted_state(law: str) -> None:
+    """Two steps for a load of 50 N: reported as not converged, finite, beyond rest; the other rows are not affected."""
     body = Fem(
         ANATOMY,
         [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()],
@@ -312,7 +312,7 @@ def test_a_hopeless_case_returns_its_last_accepted_state(law: str) -> None:
 
 
 def test_too_large_load_stops_at_reachable_share() -> None:
-    """The top is pressed through the base: under the share that was reached an independent residual vanishes."""
+    """The top is pressed through the base: under the share that is reached an independent residual vanishes."""
     mesh = box((2, 2, 2), 0.1)
     top = mesh.nodes[:, 2] > 0.1 - 1e-9
     value = np.where(top[:, None], [0.0, 0.0, -0.11], 0.0)
@@ -329,13 +329,13 @@ def test_too_large_load_stops_at_reachable_share() -> None:
     assert found.residual[0] > 0.05  # of the motion is missing
 
 
-def test_drafts_do_not_pay_for_load_steps() -> None:
+def test_draft_accuracy_takes_no_load_steps() -> None:
     found = Fem(ANATOMY, EFFECTS, DRAFT, "cpu", element="p1").deform(loads(scale=10.0))
     assert max(found.iterations) == DRAFT.outer
     assert not all(outcome.good for outcome in found.outcome)
 
 
-def test_numbers_that_overflow_are_an_outcome_not_an_answer() -> None:
+def test_overflow_is_reported_and_result_is_finite() -> None:
     body = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TRAIN, "cpu", element="p1")
     found = body.deform(Loads((Nodal(top_forces(MESH, np.array([[0.0, 0.0, -1e30], [0.0, 0.0, -0.1]]))),)))
     assert found.outcome == (Outcome.NOT_FINITE, Outcome.CONVERGED)
@@ -343,7 +343,7 @@ def test_numbers_that_overflow_are_an_outcome_not_an_answer() -> None:
 
 
 @pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean"])
-def test_brutal_loads_converge(law: str) -> None:
+def test_solver_converges_under_extreme_loads(law: str) -> None:
     """10 N on a 10 cm box of 3 kPa: strains of several hundred per cent."""
     effects = [Elasticity(Material(law, 3000.0, 0.45)), Held(), NodalForce()]
     force = top_forces(MESH, np.array([[3.0, 2.0, -9.0], [0.0, 0.0, 10.0], [10.0, 0.0, 0.0]]))
@@ -357,13 +357,13 @@ def test_brutal_loads_converge(law: str) -> None:
 
 
 @pytest.mark.parametrize("poisson", [0.0, 0.49, 0.499, -0.4])
-def test_poissons_ratios(poisson: float) -> None:
+def test_solver_converges_for_each_poissons_ratio(poisson: float) -> None:
     effects = [Elasticity(Material("neo-hookean", 3000.0, poisson)), Held(), ToolForce()]
     body = Fem(ANATOMY, effects, REFERENCE, "cpu", element="p1")
     assert all(outcome.good for outcome in body.deform(loads()).outcome)
 
 
-def test_a_thousandfold_contrast() -> None:
+def test_solver_converges_for_thousandfold_stiffness_contrast() -> None:
     inner = np.linalg.norm(MESH.nodes[MESH.tets].mean(axis=1) - 0.05, axis=1) < 0.03
     mesh = TetMesh(MESH.nodes, MESH.tets, inner.astype(int))
     for young in (3.0, 3e6):
@@ -372,8 +372,8 @@ def test_a_thousandfold_contrast() -> None:
         assert all(outcome.good for outcome in body.deform(loads()).outcome)
 
 
-def test_presets_hold_their_promise() -> None:
-    """Coarser presets differ from the reference by what their tolerance lets expect, in rising order."""
+def test_accuracy_presets_meet_their_tolerance() -> None:
+    """Coarser presets differ from the reference as expected by their tolerance, in rising order."""
     exact = built("fem float64").deform(loads()).displacement
     errors = []
     for accuracy in (TRAIN, LIVE, DRAFT):
@@ -384,12 +384,12 @@ def test_presets_hold_their_promise() -> None:
     assert errors[2] < 5e-2
 
 
-def test_deformations_never_hold_what_is_not_finite() -> None:
+def test_deformation_rejects_non_finite_displacements() -> None:
     good = built("fem float64").deform(loads())
     with pytest.raises(AssertionError, match="non-finite"):
         replace(good, displacement=np.full_like(good.displacement, np.nan))
 
 
-def test_an_unknown_device_is_refused() -> None:
+def test_unknown_device_is_rejected() -> None:
     with pytest.raises(InputError, match="no device 'abacus'"):
         Fem(ANATOMY, EFFECTS, device="abacus", element="p1")

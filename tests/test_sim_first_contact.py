@@ -1,4 +1,4 @@
-"""A ball that comes down on a surface: it touches, it does not sink in, and known cases are met."""
+"""First contact of a ball moving towards a surface: contact without penetration, and known cases."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def sampled_tip(points, through, inward, radius):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_ball_touches_and_does_not_sink_in(seed):
+def test_resting_ball_touches_surface_without_penetration(seed):
     nodes, triangles = landscape(seed)
     random = np.random.default_rng(seed)
     points = samples(nodes, triangles, 40)
@@ -57,7 +57,7 @@ def test_the_ball_touches_and_does_not_sink_in(seed):
         assert -1e-12 < (sampled_tip(points, through, inward, radius) - tip) @ inward < 1e-4
 
 
-def test_a_plane_stops_the_tip_where_they_meet():
+def test_ball_tip_rests_on_plane():
     through = np.array([0.015, 0.015, 0.2])
     assert find_resting_tip(CORNERS, ONE, through, DOWN, RADIUS) == pytest.approx([0.015, 0.015, 0.0], abs=1e-15)
     assert find_resting_tip(CORNERS, ONE[:, ::-1], through, DOWN, RADIUS)[2] == pytest.approx(0.0, abs=1e-15)
@@ -67,7 +67,7 @@ def test_a_plane_stops_the_tip_where_they_meet():
     assert tip[2] == pytest.approx(3e-3 - 3e-3 * 0.8, abs=1e-15)
 
 
-def test_an_edge_and_a_vertex_stop_it_beside_the_face():
+def test_ball_rests_on_edge_or_vertex_outside_the_face():
     beside = 4e-3
     down = RADIUS - np.sqrt(RADIUS**2 - beside**2)
     for through in ([0.02, -beside, 0.1], [-beside, 0.02, 0.1], [-0.6 * beside, -0.8 * beside, 0.1]):
@@ -81,7 +81,7 @@ def test_an_edge_and_a_vertex_stop_it_beside_the_face():
     assert tip[2] == pytest.approx(0.01 + RADIUS * (slope - 1.0), abs=1e-15)
 
 
-def test_on_a_sphere_it_stops_where_two_balls_touch():
+def test_ball_on_sphere_rests_at_analytic_height():
     size, beside = 0.03, 0.012
     theta, phi = np.meshgrid(np.linspace(0.0, np.pi, 181), np.linspace(0.0, 2.0 * np.pi, 361)[:-1], indexing="ij")
     nodes = size * np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
@@ -94,7 +94,7 @@ def test_on_a_sphere_it_stops_where_two_balls_touch():
     assert tip[2] == pytest.approx(np.sqrt((size + RADIUS) ** 2 - beside**2) - RADIUS, abs=size * 1e-4)
 
 
-def test_into_a_hole_that_is_too_narrow_it_does_not_fall():
+def test_ball_rests_on_hole_narrower_than_itself():
     wall = np.array(
         [
             [-0.05, -0.05, 0.0],
@@ -109,7 +109,7 @@ def test_into_a_hole_that_is_too_narrow_it_does_not_fall():
     assert tip[2] == pytest.approx(-(RADIUS - np.sqrt(RADIUS**2 - 5e-3**2)), abs=1e-15)
 
 
-def test_triangles_without_area_are_edges_or_points():
+def test_degenerate_triangles_act_as_edges_or_points():
     flat = np.array([[-0.05, 0.0, 0.0], [0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])
     line = np.array([0.01, 3e-3, 0.1])
     down = RADIUS - np.sqrt(RADIUS**2 - 3e-3**2)
@@ -117,13 +117,13 @@ def test_triangles_without_area_are_edges_or_points():
     assert find_resting_tip(np.zeros((3, 3)), ONE, np.array([0.0, 3e-3, 0.1]), DOWN, RADIUS)[2] == pytest.approx(-down)
 
 
-def test_a_ball_that_passes_by_is_reported():
+def test_ball_that_misses_the_surface_is_reported():
     with pytest.raises(InputError, match="misses the surface"):
         find_resting_tip(CORNERS, ONE, np.array([0.02, -0.008, 0.1]), DOWN, RADIUS)
 
 
-def test_many_balls_rest_where_each_would_alone():
-    """Surfaces, lines and radii of their own, of which one ball passes its surface by."""
+def test_several_balls_rest_at_positions_of_single_balls():
+    """Separate surfaces, lines and radii; one ball misses its surface."""
     nodes, triangles = landscape(4)
     random = np.random.default_rng(4)
     surfaces = nodes + random.normal(scale=1e-3, size=(9, *nodes.shape))

@@ -35,20 +35,20 @@ def weights(nodes: np.ndarray, triangles: np.ndarray, point: np.ndarray = POINT,
 
 
 @pytest.mark.parametrize("radius", [0.0005, 0.005, RADIUS, 0.02, 0.5])
-def test_the_whole_force_arrives(radius: float) -> None:
+def test_footprint_weights_sum_to_one(radius: float) -> None:
     weight = weights(*sheet(200), radius=radius)
     assert weight.sum() == pytest.approx(1.0, abs=1e-14)
     assert weight.min() >= 0.0
 
 
 @pytest.mark.parametrize("count", [0, 30, 300, 3000])
-def test_the_centroid_is_the_tool_point_on_any_mesh(count: int) -> None:
-    """Linear functions are integrated exactly by linear elements: no moment about the tool's point."""
+def test_footprint_centroid_is_tool_point_on_any_mesh(count: int) -> None:
+    """Linear functions are integrated exactly by linear elements: no moment about the tool point."""
     nodes, triangles = sheet(count)
     np.testing.assert_allclose(weights(nodes, triangles) @ nodes, POINT, atol=2e-3 * RADIUS)
 
 
-def test_the_second_moment_is_that_of_the_traction() -> None:
+def test_footprint_second_moment_agrees_with_traction() -> None:
     """Integral of w x^2 over integral of w is r^2 / 5 for w = sqrt(1 - s^2); interpolation on fine meshes adds h^2."""
     nodes, triangles = sheet(20000)
     second = weights(nodes, triangles) @ (nodes - POINT)[:, 0] ** 2
@@ -64,19 +64,19 @@ def test_the_second_moment_is_that_of_the_traction() -> None:
     ],
     ids=["linear", "quadratic", "sine"],
 )
-def test_two_meshes_of_one_surface_agree(function: Callable[[np.ndarray], np.ndarray], bound: float) -> None:
+def test_footprints_on_meshes_of_a_surface_agree(function: Callable[[np.ndarray], np.ndarray], bound: float) -> None:
     answers = [float(weights(*mesh) @ function(mesh[0])) for mesh in (sheet(1500, 1), sheet(2500, 2))]
     assert abs(answers[0] - answers[1]) < bound
 
 
-def test_a_small_tool_on_large_triangles() -> None:
-    """0.5 mm on triangles of 10 mm: three corners share the force as the point's barycentric coordinates."""
+def test_small_footprint_weights_are_barycentric() -> None:
+    """0.5 mm on triangles of 10 mm: three corners share the force by the point's barycentric coordinates."""
     nodes = 0.01 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]])
     weight = weights(nodes, np.array([[0, 1, 2], [1, 3, 2]]), np.array([0.003, 0.002, 0.0]), 0.0005)
     np.testing.assert_allclose(weight, [0.5, 0.3, 0.2, 0.0], atol=2e-3)
 
 
-def test_last_press_is_kept_for_same_place_and_radius() -> None:
+def test_last_footprint_is_reused_for_same_point_and_radius() -> None:
     nodes, triangles = sheet(300)
     skin = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
     for point, radius in ((POINT, RADIUS), (POINT, 0.5 * RADIUS), (-POINT, 0.5 * RADIUS), (POINT, RADIUS)):
@@ -84,8 +84,8 @@ def test_last_press_is_kept_for_same_place_and_radius() -> None:
         np.testing.assert_allclose(found, weights(nodes, triangles, point, radius), atol=1e-15)
 
 
-def test_the_edge_of_the_surface_cuts_the_footprint() -> None:
-    """Half of the disc lies outside: the force stays, and moves inwards by the half disc's centroid."""
+def test_surface_boundary_cuts_the_footprint() -> None:
+    """Half of the disc lies outside: the force is kept and moves inwards by the half disc's centroid."""
     nodes, triangles = sheet(6000)
     at = np.array([0.03, 0.0, 0.0])
     inward = at[0] - (weights(nodes, triangles, at) @ nodes)[0]
@@ -93,14 +93,14 @@ def test_the_edge_of_the_surface_cuts_the_footprint() -> None:
     assert inward == pytest.approx(3.0 / 8.0 * RADIUS, rel=0.01)
 
 
-def test_a_point_beside_the_surface_is_moved_to_it() -> None:
+def test_tool_point_above_surface_gives_same_weights() -> None:
     nodes, triangles = sheet(300)
     above = POINT + [0.0, 0.0, 0.9 * RADIUS]
     np.testing.assert_allclose(weights(nodes, triangles, above), weights(nodes, triangles), atol=1e-15)
 
 
 @pytest.mark.parametrize("offset", [[0.0, 0.0, 1.1 * RADIUS], [0.1, 0.0, 0.0], [10.0, 0.0, 0.0]])
-def test_a_point_off_the_surface_is_refused(offset: list[float]) -> None:
+def test_tool_point_off_the_surface_is_rejected(offset: list[float]) -> None:
     nodes, triangles = sheet(300)
     points = np.stack([POINT, POINT + offset])
     with pytest.raises(InputError, match=r"load 1 .*does not touch the surface"):
@@ -109,12 +109,12 @@ def test_a_point_off_the_surface_is_refused(offset: list[float]) -> None:
 
 @pytest.mark.parametrize("radius", [1e-12, 1e-300])
 def test_too_small_footprint_is_rejected(radius: float) -> None:
-    """It would be cut into more pieces than there are whole numbers."""
+    """Its number of pieces would exceed the integer range."""
     with pytest.raises(InputError, match="too small for the triangles of this surface: give a radius of at least"):
         weights(*sheet(30), radius=radius)
 
 
-def test_the_smallest_footprint_that_is_taken_is_integrated() -> None:
+def test_smallest_accepted_footprint_is_integrated() -> None:
     nodes, triangles = sheet(0)
     weight = weights(nodes, triangles, radius=2e-7)
     np.testing.assert_allclose(weight @ nodes, POINT, atol=1e-9)
@@ -131,7 +131,7 @@ def test_only_nodes_near_the_tool_are_loaded() -> None:
     assert (weight[distance < 0.8 * RADIUS] > 0.0).all()
 
 
-def test_rows_do_not_depend_on_each_other() -> None:
+def test_footprint_rows_are_independent() -> None:
     mesh = box((3, 3, 3), 0.06)
     points = np.array([[0.03, 0.03, 0.06], [0.0, 0.02, 0.03], [0.06, 0.06, 0.06]])
     radii = np.array([0.01, 0.02, 0.015])
@@ -150,8 +150,8 @@ def quadratic_sheet(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.vstack([nodes, nodes[edges].mean(axis=1)]), np.hstack([triangles, middles])
 
 
-def test_quadratic_triangles_against_a_sum_over_the_disc() -> None:
-    """Rings of points, each found in its triangle and shared by the six shape functions there."""
+def test_quadratic_footprint_agrees_with_sum_over_disc() -> None:
+    """Rings of points, each located in its triangle and distributed by the six shape functions."""
     nodes, triangles = quadratic_sheet(60)
     share = (np.arange(200) + 0.5) / 200.0
     angle = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
@@ -172,7 +172,7 @@ def test_quadratic_triangles_against_a_sum_over_the_disc() -> None:
 
 @pytest.mark.parametrize("count", [0, 30, 300])
 def test_quadratic_footprint_preserves_moments(count: int) -> None:
-    """Quadratic functions are integrated exactly on any mesh: linear triangles have the first two alone."""
+    """Quadratic functions are integrated exactly on any mesh: linear triangles preserve the first two moments only."""
     nodes, triangles = quadratic_sheet(count)
     weight = weights(nodes, triangles)
     assert weight.sum() == pytest.approx(1.0, abs=1e-14)
@@ -181,14 +181,14 @@ def test_quadratic_footprint_preserves_moments(count: int) -> None:
     np.testing.assert_allclose(np.einsum("v,vi,vj->ij", weight, arm, arm), np.eye(2) / 5.0, atol=2e-3)
 
 
-def test_no_rows() -> None:
+def test_footprint_weights_without_loads_are_empty() -> None:
     nodes, triangles = sheet(30)
     assert compute_footprint_weights(nodes, triangles, np.zeros((0, 3)), np.zeros(0)).shape == (0, len(nodes))
 
 
 @pytest.mark.parametrize("aspect", [1.0, 1e-3, 1e-6, 1e-10])
-def test_nearest_point_against_a_search(aspect: float) -> None:
-    """Triangles of every shape, needles too: no sampled point of any is nearer."""
+def test_nearest_point_agrees_with_sampled_search(aspect: float) -> None:
+    """Triangles of every shape, including needles: no sampled point is nearer."""
     rng = np.random.default_rng(5)
     corners = rng.normal(size=(20, 3, 3))
     corners[:, 2] = (corners[:, 0] + corners[:, 1]) / 2.0 + aspect * (corners[:, 2] - corners[:, 0])
@@ -202,8 +202,8 @@ def test_nearest_point_against_a_search(aspect: float) -> None:
         assert np.linalg.norm(samples - found, axis=1).min() < 0.15  # and it lies on one of them
 
 
-def test_the_nearest_point_is_found_in_any_chunk() -> None:
-    """Many more triangles than one thread searches; every point stands above its own."""
+def test_nearest_point_is_found_in_every_chunk() -> None:
+    """Many more triangles than one thread searches; every point lies above its own triangle."""
     nodes, triangles = sheet(400)
     assert len(triangles) > 8 * CHUNK
     above = nodes[triangles].mean(axis=1) + [0.0, 0.0, 1e-3]
@@ -214,8 +214,8 @@ def test_the_nearest_point_is_found_in_any_chunk() -> None:
     assert np.isinf(skin.find_nearest(above, np.full(len(above), 0.9e-3))[1]).all()
 
 
-def test_finer_pieces_find_nearly_the_same_weights() -> None:
-    """And a tool that some pieces are too coarse for is refused."""
+def test_finer_subdivision_changes_footprint_weights_little() -> None:
+    """A tool too small for the allowed subdivisions is rejected."""
     nodes, triangles = sheet(60)
     device, point, radius = find_device("cpu", "float64"), np.zeros((1, 3)), np.array([5e-3])
     coarse, fine = (
@@ -230,13 +230,13 @@ def test_finer_pieces_find_nearly_the_same_weights() -> None:
 
 
 @pytest.mark.parametrize("mesh", [sheet(300), quadratic_sheet(60)], ids=["linear", "quadratic"])
-def test_the_centre_is_where_the_force_acts(mesh: tuple[np.ndarray, np.ndarray]) -> None:
+def test_footprint_centre_is_weighted_mean_of_nodes(mesh: tuple[np.ndarray, np.ndarray]) -> None:
     points, radii = np.array([POINT, [0.03, 0.0, 0.0]]), np.array([RADIUS, 0.007])
     pressed = ContactSurface(*mesh, find_device("cpu", "float64")).press(points, radii)
     np.testing.assert_allclose(pressed.compute_centres(), pressed.to_matrix(len(mesh[0])) @ mesh[0], atol=1e-16)
 
 
-def test_arrays_that_change_in_place_are_pressed_anew() -> None:
+def test_footprint_follows_arrays_changed_in_place() -> None:
     nodes, triangles = sheet(300)
     skin, points, radii = (
         ContactSurface(nodes, triangles, find_device("cpu", "float64")),
@@ -252,7 +252,7 @@ def test_arrays_that_change_in_place_are_pressed_anew() -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
 @pytest.mark.parametrize("mesh", [sheet(3000), quadratic_sheet(300)], ids=["linear", "quadratic"])
-def test_a_graphics_card_gives_the_same_weights(mesh: tuple[np.ndarray, np.ndarray]) -> None:
+def test_cuda_footprint_weights_agree_with_cpu(mesh: tuple[np.ndarray, np.ndarray]) -> None:
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-0.03, 0.03, (200, 2)), rng.uniform(-3e-4, 3e-4, 200)])
     radii = rng.uniform(5e-4, 0.016, 200)

@@ -1,4 +1,4 @@
-"""Frames that stay on the device: the same answers wherever a start stands, and nothing lost that somebody may read."""
+"""Frames that stay on the device: equal results for starts on device and host, and no loss of readable data."""
 
 from dataclasses import replace
 
@@ -55,7 +55,7 @@ def same(one: Deformation, other: Deformation) -> bool:
     return one.outcome == other.outcome and all(np.array_equal(*pair) for pair in pairs)
 
 
-def test_frames_are_those_of_the_ladder(fem):
+def test_frame_sequence_agrees_with_standard_solver(fem):
     plain = Fem(BODY, EFFECTS, LIVE, "cpu", element="p1")
     for own, other in zip(ride(fem)[1:], ride(plain)[1:], strict=True):
         assert isinstance(own.warm, Kept) and own.outcome == other.outcome == (Outcome.CONVERGED,)
@@ -67,14 +67,14 @@ def test_frames_are_those_of_the_ladder(fem):
         assert own.warm["known"].shape == (1,)
 
 
-def test_a_start_is_the_same_on_the_device_and_on_the_host(fem):
+def test_start_on_device_and_on_host_give_same_result(fem):
     last = ride(fem)[-1]
     here = fem.deform(pushed(5e-3), last)
     brought = fem.deform(pushed(5e-3), replace(last, warm={**last.warm}))
     assert same(here, brought)
 
 
-def test_an_older_frame_leads_where_it_led_before(fem):
+def test_older_frame_as_start_gives_its_former_result(fem):
     answers = ride(fem)
     again = fem.deform(pushed(7e-4 * 3), answers[2])
     assert same(again, answers[3])
@@ -82,7 +82,7 @@ def test_an_older_frame_leads_where_it_led_before(fem):
     assert same(fem.deform(pushed(7e-4 * 4), again), answers[4])
 
 
-def test_only_what_is_kept_leaves_the_device(fem, monkeypatch):
+def test_only_kept_frames_are_copied_from_the_device(fem, monkeypatch):
     read = []
     monkeypatch.setattr(frame_sequence, "to_rows_first", lambda array: read.append(array) or array.numpy().copy())
     last = ride(fem, 3)[-1]
@@ -97,14 +97,14 @@ def test_only_what_is_kept_leaves_the_device(fem, monkeypatch):
     assert len(read) == len(HISTORY_KEYS)
 
 
-def test_a_batch_between_frames_changes_nothing(fem):
+def test_batch_between_frames_does_not_change_the_result(fem):
     answers = ride(fem)
     other = ride(fem, 5)[-1]
     fem.deform(stack([pushed(x) for x in (0.0, 4e-3, 8e-3)]))
     assert same(fem.deform(pushed(7e-4 * 5), other), answers[-1])
 
 
-def test_what_does_not_go_well_is_the_ladders(fem):
+def test_frame_that_fails_is_solved_by_standard_solver(fem):
     last = ride(fem)[-1]
     with pytest.raises(InputError, match="does not touch the surface"):
         fem.deform(pushed(0.5), last)
@@ -116,7 +116,7 @@ def test_what_does_not_go_well_is_the_ladders(fem):
     assert same(fem.deform(pushed(4e-3), last), fem.deform(pushed(4e-3), replace(last)))
 
 
-def test_a_start_that_is_not_fit_is_the_ladders(fem):
+def test_unsuitable_start_is_solved_by_standard_solver(fem):
     rng, good = np.random.default_rng(0), ride(fem, 2)[-1]
     torn = fem.deform(pushed(1e-3), guess(good.displacement + rng.normal(0.0, 0.1, good.displacement.shape)))
     assert torn.outcome == (Outcome.CONVERGED_ANEW,)
@@ -126,18 +126,18 @@ def test_a_start_that_is_not_fit_is_the_ladders(fem):
     assert isinstance(fem.deform(pushed(1e-3), guess(good.displacement)).warm, Kept)
 
 
-def test_a_start_may_name_its_vertices_in_any_order(fem):
+def test_start_may_list_its_vertices_in_any_order(fem):
     last = ride(fem)[-1]
     turned = last.restrict(last.nodes[::-1].copy())
     assert same(fem.deform(pushed(5e-3), last), fem.deform(pushed(5e-3), turned))
 
 
-def test_an_answer_cannot_be_changed_behind_the_device(fem):
+def test_displacement_of_kept_frame_is_read_only(fem):
     with pytest.raises(ValueError, match="read-only"):
         ride(fem)[-1].displacement[0, 0] = 1.0
 
 
-def test_vertices_are_picked_from_the_same_answer(fem):
+def test_frame_at_selected_vertices_agrees_with_whole_frame(fem):
     last, some = ride(fem)[-1], np.array([40, 3, 7])
     picked = fem.deform(pushed(5e-3), last, at=some)
     np.testing.assert_array_equal(picked.displacement, fem.deform(pushed(5e-3), last).displacement[:, some])

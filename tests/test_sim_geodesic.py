@@ -1,4 +1,4 @@
-"""Distances along surfaces against those known in closed form."""
+"""Distances along surfaces against closed forms."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from sim.geometry.geodesic import compute_geodesic_distances
 from sim.geometry.tetmesh import find_single_faces
 
 
-def test_on_a_sphere_they_are_arcs():
+def test_geodesic_distances_on_sphere_are_arcs():
     radius = 0.06
     lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
     body = cut(build_whole(lattice), lambda points: np.linalg.norm(points, axis=1) - radius)
@@ -24,7 +24,7 @@ def test_on_a_sphere_they_are_arcs():
     assert np.isinf(np.delete(found, outer)).all()
 
 
-def test_they_go_round_a_gap():
+def test_geodesic_distances_lead_round_a_gap():
     # A horseshoe in the plane: from one tip to the other the way leads round the slit.
     x, y = np.meshgrid(np.arange(11.0), np.arange(11.0), indexing="ij")
     nodes = np.stack([x.ravel(), y.ravel(), np.zeros(121)], axis=1) * 0.001

@@ -1,4 +1,4 @@
-"""Weight that changes with posture and fluid: what is cut, what it weighs, and how a column stands under it."""
+"""Gravity with changing posture and fluid level: cut elements, their weight, and a column under its weight."""
 
 import math
 from collections.abc import Callable
@@ -48,7 +48,7 @@ def mean_height_under(height: np.ndarray) -> np.ndarray:
     return (np.where(height < 0.0, height**4, 0.0) / others.prod(axis=2)).sum(axis=1) / 4.0
 
 
-def test_what_lies_under_a_plane_is_the_divided_differences() -> None:
+def test_volume_below_plane_agrees_with_differences() -> None:
     """Shares, and the means of corner coordinates over them, which are slopes of the mean of min(h, 0)."""
     height = np.random.default_rng(1).normal(size=(400, 4))
     height = height[(height < 0.0).any(axis=1) & (height > 0.0).any(axis=1)]
@@ -63,8 +63,8 @@ def test_what_lies_under_a_plane_is_the_divided_differences() -> None:
 
 @pytest.mark.parametrize("level", [0.0, 1e-300, 0.02, 0.0371, 0.05, 0.0999, 0.1, 0.3])
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_forces_do_the_work_of_the_weight(element: str, level: float) -> None:
-    """Under every motion down that the elements hold exactly: uniform, linear in x and z, quadratic if they are."""
+def test_work_of_gravity_forces_agrees_with_weight(element: str, level: float) -> None:
+    """For every motion that the elements represent exactly: uniform, linear in x and z, quadratic where possible."""
     mesh = box((3, 3, 3), HEIGHT, distortion=0.2)
     force, nodes = build_nodal_forces(mesh, element, build_posture(3.0 * DOWN, level))
     wet, area = min(level, HEIGHT), HEIGHT**2
@@ -77,23 +77,23 @@ def test_forces_do_the_work_of_the_weight(element: str, level: float) -> None:
     assert not force[..., :2].any()
 
 
-def test_curved_elements_weigh_what_they_hold() -> None:
+def test_weight_of_curved_elements_agrees_with_volume() -> None:
     mesh = quadratic(box((2, 2, 2), HEIGHT), curved=0.05)
     force, nodes = build_nodal_forces(mesh, "p2", build_posture(DOWN, -1.0))
     assert force[0, :, 2].sum() == pytest.approx(-FLUID * HEIGHT**3, rel=1e-12)
     assert force[0, :, 2] @ nodes[:, 2] == pytest.approx(-FLUID * HEIGHT**4 / 2.0, rel=1e-4)
 
 
-def test_a_turned_head_weighs_aside() -> None:
-    """Under fluid both times: what floats pulls along the new direction, and no longer along the old one."""
+def test_gravity_force_changes_with_rotation_of_head() -> None:
+    """Immersed in both postures: the force acts along the new direction minus the old one."""
     way = np.array([0.6, 0.0, -0.8])
     force, _ = build_nodal_forces(box((2, 2, 2), HEIGHT), "p1", build_posture(1e-20 * way, 1.0))
     np.testing.assert_allclose(force[0].sum(axis=0), (DRY - FLUID) * HEIGHT**3 * (way - DOWN), rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_forces_follow_the_level_without_a_jump(element: str) -> None:
-    """Each of 81 steps of the level shifts as much force as the fluid between weighs, through the mesh's own planes."""
+def test_gravity_forces_are_continuous_in_fluid_level(element: str) -> None:
+    """Each of 81 steps of the level changes the force by the weight of the fluid between, across planes of the mesh."""
     mesh, levels = box((2, 2, 2), HEIGHT, distortion=0.2), np.linspace(0.0, HEIGHT, 82)
     force, _ = build_nodal_forces(mesh, element, build_posture(DOWN, levels))
     step = np.diff(force[:, :, 2], axis=0)
@@ -131,23 +131,23 @@ def errors_of_column(element: str, cells: int, level: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("level", [0.0, 0.025, 0.05])
-def test_quadratic_elements_hold_the_column_exactly(level: float) -> None:
-    """Its sinking is quadratic in z on either side of a level that lies between elements."""
+def test_column_of_quadratic_elements_is_exact_under_gravity(level: float) -> None:
+    """Its displacement is quadratic in z on either side of a level that lies between elements."""
     assert errors_of_column("p2", 1, level).max() < 1e-9
 
 
 @pytest.mark.parametrize("level", [0.0, 0.042])
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_a_column_of_linear_elements_converges(element: str, level: float) -> None:
-    """At second order in the mean square, a level within elements notwithstanding."""
+def test_column_of_linear_elements_converges_under_gravity(element: str, level: float) -> None:
+    """At second order in the mean square, also with a level within elements."""
     errors = [np.sqrt((errors_of_column(element, cells, level) ** 2).mean()) for cells in (2, 4, 8)]
     assert errors[-1] < 0.002
     assert np.log2(errors[-2] / errors[-1]) > 1.7
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_the_posture_of_the_scan_moves_nothing(precision: str) -> None:
-    """From rest and from elsewhere; a level above everything is as good as that of a full skull."""
+def test_posture_of_the_scan_causes_no_displacement(precision: str) -> None:
+    """From rest and from another posture; a level above the body is equal to that of a full skull."""
     accuracy = Accuracy(tolerance=1e-4, precision=precision)  # pyright: ignore[reportArgumentType]
     scan = Gravity(direction=(0.0, -3.0, -4.0), csf_level=0.043)
     for effect, level in ((scan, scan.csf_level), (Gravity(direction=scan.direction), 0.2)):
@@ -161,7 +161,7 @@ def test_the_posture_of_the_scan_moves_nothing(precision: str) -> None:
         assert not again.displacement.any()
 
 
-def test_a_share_of_the_load_is_a_share_of_the_change() -> None:
+def test_scaled_posture_scales_the_gravity_forces() -> None:
     turned = build_posture([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0]], [0.04, 0.06])
     mesh = box((2, 2, 2))
     whole, _ = build_nodal_forces(mesh, "p1", turned)
@@ -169,8 +169,8 @@ def test_a_share_of_the_load_is_a_share_of_the_change() -> None:
     np.testing.assert_allclose(part, np.array([0.25, -2.0])[:, None, None] * whole, rtol=1e-14)
 
 
-def test_a_tool_in_a_drained_head_and_batches() -> None:
-    """Postures and pushes add up in small motions, and a batch answers as its cases do one by one."""
+def test_postures_and_pushes_add_up_in_batches() -> None:
+    """In small motions; a batch agrees with its cases solved separately."""
     fem = Fem(base_held(box((2, 2, 2))), [Elasticity(ROCK), Held(), ToolForce(), UPRIGHT], TIGHT, "cpu", element="p1")
     drained = build_posture(DOWN, [0.0, 0.03, 0.07])
     pushed = push(
@@ -202,12 +202,12 @@ def test_a_tool_in_a_drained_head_and_batches() -> None:
         ),
     ],
 )
-def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: str) -> None:
+def test_invalid_gravity_arguments_are_rejected(build: Callable[[], object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         build()
 
 
-def test_a_posture_without_gravity_is_refused() -> None:
+def test_posture_without_gravity_effect_is_rejected() -> None:
     fem = Fem(base_held(box((1, 1, 1))), [Elasticity(), Held()], TIGHT, "cpu", element="p1")
     with pytest.raises(InputError, match="loads hold Posture, which no effect uses: add the effect Gravity"):
         fem.deform(build_posture(DOWN, 0.0))

@@ -1,4 +1,4 @@
-"""A displacement on a grid, both ways: exact in the body, whole at its surface, fading round it, nowhere folded."""
+"""Displacement on a grid, forward and inverse: exact in the body, continuous, fading outside, without folds."""
 
 import numpy as np
 import pytest
@@ -34,15 +34,15 @@ def errors(box, moved, fields):
     return np.linalg.norm(off, axis=-1)
 
 
-def test_both_fields_lead_each_vertex_where_it_goes(box, moved, fields):
-    """Sampling alone is off by 0.15 mm, and by 0.1 mm below the surface."""
+def test_both_fields_map_vertices_to_their_positions(box, moved, fields):
+    """Sampling alone has an error of 0.15 mm, and 0.1 mm below the surface."""
     error = errors(box, moved, fields)
     assert np.median(error) < 6e-6 and error.max() < 0.1e-3
     inner = box.mesh.nodes[:, 2] < -12e-3
     assert np.quantile(error, 0.98) < 0.04e-3 and error[:, inner].max() < 0.05e-3
 
 
-def test_faint_motion_is_cut_and_grid_may_omit_it(box, moved, fields):
+def test_faint_motion_is_set_to_zero_and_shrinks_the_grid(box, moved, fields):
     rest = warp_fields(box, 1e-3 * moved, 1e-3)
     faint = compute_faint_threshold(moved)
     assert compute_faint_threshold(1e-3 * moved) == pytest.approx(2.5e-6 * np.linalg.norm(moved, axis=1).max())
@@ -56,7 +56,7 @@ def test_faint_motion_is_cut_and_grid_may_omit_it(box, moved, fields):
     assert half.shape[0] < fields.grid.shape[0]
 
 
-def test_fields_do_not_fold_and_jacobians_match(fields):
+def test_fields_have_no_folds_and_bounded_jacobians(fields):
     assert not fields.folds and min(fields.least) > 0.5
     for field, least in ((fields.forward, fields.least[0]), (fields.backward, fields.least[1])):
         gradient = np.stack(np.gradient(field.astype(float), fields.grid.spacing, axis=(1, 2, 3)), axis=-1)
@@ -64,8 +64,8 @@ def test_fields_do_not_fold_and_jacobians_match(fields):
         assert between.min() > least > 0.0
 
 
-def test_no_tear_at_skull_or_opening_and_zero_at_the_edge(box, fields):
-    """From node to node the field changes by no more than the tissue itself is strained."""
+def test_field_is_continuous_and_zero_at_the_grid_edge(box, fields):
+    """From node to node the field changes by no more than the strain of the tissue."""
     for field in (fields.forward, fields.backward):
         steps = max(np.abs(np.diff(field, axis=axis)).max() for axis in (1, 2, 3))
         assert steps < 0.9 * fields.grid.spacing
@@ -75,20 +75,20 @@ def test_no_tear_at_skull_or_opening_and_zero_at_the_edge(box, fields):
     assert np.abs(fields.grid.read(fields.forward, below)).max() < 1e-9  # a skull that holds is left where it is
 
 
-def test_just_outside_the_field_goes_on_as_inside(box, moved, fields):
+def test_field_is_smooth_across_the_surface_of_the_body(box, moved, fields):
     top = np.array([[2e-3, 1e-3, 0.0], [-5e-3, 4e-3, 0.0], [8e-3, -3e-3, 0.0]])
     below, at, above = (fields.grid.read(fields.forward, top + [0, 0, z]) for z in (-5e-4, 0.0, 5e-4))
     assert np.abs((above - at) - (at - below)).max() < 2e-5 < np.abs(at - below).max()
 
 
-def test_outside_the_two_fields_are_each_others_inverse(box, fields):
+def test_fields_outside_body_are_inverse_to_each_other(box, fields):
     around = np.array([[x, y, z] for x in (-8e-3, 0.0, 7e-3) for y in (-4e-3, 5e-3) for z in (3e-3, 6e-3)])
     back = around + fields.grid.read(fields.backward, around)
     assert np.abs(back + fields.grid.read(fields.forward, back) - around).max() < 0.05e-3
 
 
-def test_a_body_that_is_turned_inside_out_is_unfolded_too():
-    """Moves from there alone end in a minimum that still folds."""
+def test_inverted_region_is_unfolded():
+    """Local moves alone end in a minimum that still folds."""
     x, y, z = np.indices((14, 14, 14)) - 6.5
     core = np.exp(-(x**2 + y**2 + z**2) / 6.0)
     field = np.stack([-4e-3 * x * core, 0.0 * y, 0.0 * z]).astype(np.float32)
@@ -97,7 +97,7 @@ def test_a_body_that_is_turned_inside_out_is_unfolded_too():
     assert unfold(field, inside, ~inside, 1e-3) == compute_jacobians(field, 1e-3).min() > 0.0
 
 
-def test_folds_are_undone_outside_a_body_first():
+def test_unfolding_changes_field_outside_the_body_first():
     rng = np.random.default_rng(1)
     field = np.zeros((3, 20, 20, 20), np.float32)
     field[:, 8:12, 8:12, 8:12] = rng.uniform(-1.5e-3, 1.5e-3, (3, 4, 4, 4))
@@ -116,14 +116,14 @@ def test_folds_are_undone_outside_a_body_first():
     assert np.linalg.norm(round_body - field, axis=0)[10].max() < 0.9 * moved[10].max()
 
 
-def test_a_fold_at_any_corner_of_a_cell_is_found():
+def test_fold_at_any_corner_of_a_cell_is_found():
     for corner in np.ndindex(2, 2, 2):
         field = np.zeros((3, 2, 2, 2), np.float32)
         field[(slice(None), *corner)] = 0.7e-3 * (1 - 2 * np.array(corner))  # past the middle of its neighbours
         assert compute_jacobians(field, 1e-3).min() < 0.0 < compute_jacobians(0.3 * field, 1e-3).min()
 
 
-def test_tissue_that_was_cut_away_is_known_to_be_gone(box, moved):
+def test_resected_tissue_is_marked_in_the_grid(box, moved):
     cut = np.flatnonzero(box.mesh.region == 2)
     found = warp_fields(box, moved, 2e-3, box.remove_elements(cut))
     middle = box.mesh.nodes[box.mesh.tets[cut]].mean(axis=(0, 1))

@@ -14,7 +14,7 @@ def moved(box):
     return bump(box.mesh.nodes)
 
 
-def test_nodes_in_tetrahedra_have_what_the_vertices_say(box, moved):
+def test_grid_nodes_in_tetrahedra_interpolate_the_vertices(box, moved):
     grid = build_grid_around(box.mesh.nodes, 1.7e-3, 4e-3)
     field, inside = interpolate_in_tetrahedra(grid, box.mesh.nodes, box.mesh.tets, moved)
     points = grid.compute_points(np.arange(inside.size))
@@ -27,7 +27,7 @@ def test_nodes_in_tetrahedra_have_what_the_vertices_say(box, moved):
 
 
 def test_every_grid_node_on_a_shared_face_is_inside():
-    """A lattice whose nodes are the grid's: none falls between two tetrahedra."""
+    """A lattice with the grid's nodes: none is missed between two tetrahedra."""
     nodes = 1e-3 * np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4], [4, 4, 4]], float)
     tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
     grid = build_grid_around(nodes, 1e-3, 0.0)

@@ -9,7 +9,7 @@ from sim.linalg.half_symv import add_product, list_tiles
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
-def test_half_of_a_symmetric_matrix_is_enough_to_multiply():
+def test_half_symmetric_product_agrees_with_full_matrix():
     size = 64 * 13  # no multiple of a tile
     random = np.random.default_rng(0)
     matrix, x = random.normal(size=(size, size)).astype(np.float16), random.normal(size=size).astype(np.float32)

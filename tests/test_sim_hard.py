@@ -1,4 +1,4 @@
-"""Cases that break solvers. Each says what goes wrong elsewhere, and how it must end here.
+"""Cases that break solvers, each with its usual failure and its required outcome.
 
 Whatever is marked converged has its residual computed again from the published formulas, without the package.
 """
@@ -208,7 +208,7 @@ CATALOGUE = {
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_it_ends_as_it_must(name: str) -> None:
+def test_hard_case_ends_with_required_outcome(name: str) -> None:
     case = CATALOGUE[name]
     found = case.solve()
     outcome, u = found.outcome[0], found.displacement[0]
@@ -228,8 +228,8 @@ def test_it_ends_as_it_must(name: str) -> None:
 
 @pytest.mark.parametrize("law", ["stable-neo-hookean", "corotational"])
 @pytest.mark.parametrize("name", LOST)
-def test_a_lost_body_comes_back_to_rest(law: str, name: str) -> None:
-    """No load to speak of: what is left of the start is nothing."""
+def test_unloaded_body_returns_to_rest_from_bad_start(law: str, name: str) -> None:
+    """With a negligible load, no displacement of the start remains."""
     found = Hard("", BLOCK, soft(law), 1e-9 * pressed(), LOST[name]).solve()
     assert found.outcome[0].good
     assert np.abs(found.displacement).max() <= 1e-6 * HEIGHT
@@ -238,8 +238,8 @@ def test_a_lost_body_comes_back_to_rest(law: str, name: str) -> None:
 
 @pytest.mark.parametrize("law", ["stable-neo-hookean", "corotational"])
 @pytest.mark.parametrize("name", LOST)
-def test_newton_itself_brings_a_lost_body_back(law: str, name: str) -> None:
-    """No restart, no load: the iteration finds its way out of elements that lie inside out."""
+def test_newton_returns_inverted_body_to_rest(law: str, name: str) -> None:
+    """Without a restart or load, the iteration leaves the inverted elements of its start."""
     effects = [Elasticity(soft(law)[0]), Held(), NodalForce()]
     problem = compile_problem(effects, base_held(BLOCK), find_device("cpu", "float64"))
     problem.begin(Cases(Loads((Nodal(0.0 * pressed()[None]),)), np.zeros(1)))
@@ -249,15 +249,15 @@ def test_newton_itself_brings_a_lost_body_back(law: str, name: str) -> None:
     assert np.abs(found.u).max() <= 1e-6 * HEIGHT
 
 
-def test_no_load_is_exactly_no_motion() -> None:
+def test_zero_load_gives_zero_displacement_from_any_start() -> None:
     for start in (None, *LOST.values(), *COLLAPSED.values()):
         found = Hard("", BLOCK, soft("stable-neo-hookean"), 0.0 * pressed(), start).solve()
         assert not found.displacement.any()
         assert found.outcome[0].good
 
 
-def test_an_overload_says_how_far_it_got() -> None:
-    """A hundred times too much, and next to no time for it."""
+def test_overload_reports_its_reached_share() -> None:
+    """A hundred times too much, with a small budget."""
     case = Hard("", BLOCK, soft("neo-hookean"), 100.0 * pressed(), accuracy=Accuracy(TOLERANCE, outer=6, steps=6))
     found = case.solve()
     assert found.outcome[0] in STOPPED
@@ -269,12 +269,12 @@ def test_an_overload_says_how_far_it_got() -> None:
 
 
 @pytest.mark.parametrize("mesh", [TINY, HUGE], ids=["0.1 mm", "100 m"])
-def test_a_doubtful_size_names_the_option(mesh: TetMesh) -> None:
+def test_doubtful_mesh_size_warning_names_the_unit_option(mesh: TetMesh) -> None:
     with pytest.warns(MeshWarning, match="with unit m"):
         TetMesh(mesh.nodes, mesh.tets, mesh.region)
 
 
-def test_slivers_are_as_thin_as_they_say() -> None:
+def test_sliver_mesh_has_tiny_dihedral_angles() -> None:
     assert 0.01 < compute_dihedral_angles(SLIVERS.nodes, SLIVERS.tets).min() < 0.15
 
 
@@ -343,7 +343,7 @@ def _too_many(batch: int) -> None:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_it_is_refused_in_a_sentence(name: str) -> None:
+def test_unsuitable_case_is_rejected_with_reason(name: str) -> None:
     build, reason = REFUSED[name]
     with pytest.raises(InputError, match=reason) as refusal:
         build()

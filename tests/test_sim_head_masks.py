@@ -1,4 +1,4 @@
-"""One head in files of every format, by every convention, on one grid or several: the same brain, or a sentence."""
+"""One head in files of every format and convention, on one grid or several: the same brain, or an error message."""
 
 import gzip
 import re
@@ -97,7 +97,7 @@ WRITERS = {
 
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_head_is_the_same_in_every_format(tmp_path, name, axes):
+def test_head_mesh_is_independent_of_the_file_format(tmp_path, name, axes):
     affine, places = grid(AXES[axes])
     path = WRITERS[name](tmp_path / name, head(places), affine)
     named = ("Whole brain",), ("tumour",)
@@ -133,14 +133,14 @@ def test_a_head_is_the_same_in_every_format(tmp_path, name, axes):
         ({"more": "byte skip: 16\n"}, "skips bytes"),
     ],
 )
-def test_an_nrrd_file_that_does_not_say_all_is_refused(tmp_path, change, reason):
+def test_incomplete_nrrd_header_is_rejected(tmp_path, change, reason):
     affine, places = grid()
     with pytest.raises(InputError, match=reason):
         read_volume(nrrd(tmp_path / "a.nrrd", head(places), affine, **change))
 
 
 @pytest.mark.parametrize("coding", ["gzip", "raw"])
-def test_a_damaged_nrrd_file_is_a_sentence(tmp_path, coding):
+def test_damaged_nrrd_file_is_rejected(tmp_path, coding):
     affine, places = grid(count=12, edge=6.0)
     whole = nrrd(tmp_path / "a.nrrd", head(places), affine, coding=coding, more=segments(("A", 0, 1))).read_bytes()
     path = tmp_path / "b.nrrd"
@@ -161,7 +161,7 @@ def test_a_damaged_nrrd_file_is_a_sentence(tmp_path, coding):
         read_volume(path)
 
 
-def test_a_freesurfer_volume_without_orientation_is_refused(tmp_path):
+def test_freesurfer_volume_without_orientation_is_rejected(tmp_path):
     affine, places = grid()
     path = mgz(tmp_path / "a.mgz", head(places), affine)
     raw = bytearray(gzip.decompress(path.read_bytes()))
@@ -175,7 +175,7 @@ def test_a_freesurfer_volume_without_orientation_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "layers"), [("Segmentation", 1), ("SegmentationOverlapping", 2)])
-def test_what_slicer_wrote_is_read_as_others_read_it(name, layers):
+def test_slicer_segmentation_agrees_with_reference_reader(name, layers):
     slicerio = pytest.importorskip("slicerio")
     import nrrd as reference
 
@@ -197,7 +197,7 @@ def test_what_slicer_wrote_is_read_as_others_read_it(name, layers):
             read_volume(path, Voxels(max_edge=0.011))
 
 
-def test_segments_are_called_by_their_names(tmp_path):
+def test_segments_are_selected_by_their_names(tmp_path):
     affine, places = grid()
     path = seg_nrrd(tmp_path / "a.seg.nrrd", head(places), affine)
     with pytest.raises(InputError, match=r"has no label Tumor. Choose from Whole brain, Tumour\."):
@@ -208,7 +208,7 @@ def test_segments_are_called_by_their_names(tmp_path):
         build_volume_subject(path, ("Whole brain", "tumour"), ("Tumour",))
 
 
-def test_segments_of_one_name_need_numbers(tmp_path):
+def test_segments_with_equal_names_require_numbers(tmp_path):
     affine, places = grid()
     named = segments(("Brain", 0, 1), ("Tumou\u0301r", 0, 4), ("Tumo\u00far", 0, 3))
     labels = head(places)
@@ -229,7 +229,7 @@ class TestSeveralFiles:
         nifti(tmp_path / "tumour.nii.gz", (head(places) == 3).astype(np.int16), affine)
         return tmp_path
 
-    def test_a_mask_on_another_grid_widens_the_labels(self, files):
+    def test_mask_on_another_grid_extends_the_labels(self, files):
         sources = Sources(files / "tumour.nii.gz", tumour=(1,), mask=files / "brain.nii.gz")
         subject = build_masked_subject(read_head_masks(sources))
         assert subject.notes == ()
@@ -237,7 +237,7 @@ class TestSeveralFiles:
         low, high = 1e3 * subject.cortex.min(axis=0), 1e3 * subject.cortex.max(axis=0)
         np.testing.assert_allclose([low, high], MIDDLE + np.outer([-1, 1], [46.0, 55.0, 42.0]), atol=3.5)
 
-    def test_a_tumour_in_another_file(self, files):
+    def test_tumour_is_read_from_another_file(self, files):
         affine, places = grid(AXES["oblique"])
         nrrd(files / "brain.nrrd", head(places, tumour=1), affine)
         sources = Sources(files / "brain.nrrd", brain=(1,), tumour_in=files / "tumour.nii.gz")
@@ -252,7 +252,7 @@ class TestSeveralFiles:
             (None, "With x and y negated it would lie in the brain: one of the two states LPS as RAS"),
         ],
     )
-    def test_volumes_apart_are_refused_with_both_boxes(self, files, moved, reason):
+    def test_disjoint_volumes_are_rejected_with_both_boxes(self, files, moved, reason):
         image = nibabel.load(files / "tumour.nii.gz")
         affine = LPS @ image.affine if moved is None else image.affine.copy()
         affine[:3, 3] += 0.0 if moved is None else moved
@@ -261,21 +261,21 @@ class TestSeveralFiles:
             read_head_masks(Sources(files / "elsewhere.nii", tumour=(1,), mask=files / "brain.nii.gz"))
         assert str(caught.value).count("(RAS)") == 2
 
-    def test_one_grid_with_x_and_y_negated_is_refused(self, tmp_path):
+    def test_grid_with_x_and_y_negated_is_rejected(self, tmp_path):
         affine, places = grid(middle=np.zeros(3))
         brain = nifti(tmp_path / "brain.nii", (head(places + MIDDLE) > 0).astype(np.uint8), affine)
         tumour = nifti(tmp_path / "tumour.nii", (head(places + MIDDLE) == 3).astype(np.uint8), LPS @ affine)
         with pytest.raises(InputError, match=r"has the grid of .*, but with x and y negated"):
             read_head_masks(Sources(tumour, tumour=(1,), mask=brain))
 
-    def test_a_tumour_that_a_mask_lacks_is_noted(self, tmp_path):
+    def test_tumour_outside_the_mask_is_noted(self, tmp_path):
         affine, places = grid()
         brain = nifti(tmp_path / "brain.nii", (head(places, tumour=0) > 0).astype(np.uint8), affine)
         tumour = nifti(tmp_path / "tumour.nii", (head(places) == 3).astype(np.uint8), affine)
         (note,) = read_head_masks(Sources(tumour, tumour=(1,), mask=brain)).notes
         assert re.fullmatch(r"7(\.\d)? ml of what is labelled lie outside of the mask: see that .*", note)
 
-    def test_what_says_nothing_or_too_much_is_refused(self, files):
+    def test_missing_or_contradicting_sources_are_rejected(self, files):
         tumour, brain = files / "tumour.nii.gz", files / "brain.nii.gz"
         nifti(files / "none.nii", np.zeros((5, 5, 5), np.uint8), np.eye(4))
         for sources, reason in (
@@ -290,7 +290,7 @@ class TestSeveralFiles:
 
 
 def test_oedema_and_ventricles_become_regions(tmp_path):
-    """Of labels of one's own, and by their names where a convention knows them; as large as their labels."""
+    """Own labels, and names of a convention; with the volumes of their labels."""
     affine, places = grid()
     labels = head(places)
     rim = np.linalg.norm(places - TUMOUR, axis=-1)

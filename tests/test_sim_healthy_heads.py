@@ -1,4 +1,4 @@
-"""Healthy heads beside the template in which `sulcus anatomy` draws a tumour: a mask's, and fsaverage's inner skull."""
+"""Healthy heads in which `sulcus anatomy` places a tumour: a mask's, and fsaverage's inner skull."""
 
 import importlib
 import json
@@ -70,7 +70,7 @@ def test_fsaverage_has_its_inner_skull_and_size(skull, tmp_path, capsys):
     assert abs(summary["tumour_volume_error_percent"]) < 2.0
 
 
-def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys):
+def test_wrong_file_at_path_of_skull_is_rejected(skull, tmp_path, capsys):
     skull.write_bytes(b"another's file")
     code, text, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
     assert code == 2 and not text and not (tmp_path / "fs.vtu").exists()
@@ -79,7 +79,7 @@ def test_another_file_in_the_skulls_place_is_refused(skull, tmp_path, capsys):
     )
 
 
-def test_a_skull_with_a_hole_or_none_is_refused(skull, tmp_path, capsys, monkeypatch):
+def test_missing_or_open_skull_surface_is_rejected(skull, tmp_path, capsys, monkeypatch):
     points, triangles = egg()
     write_skull(skull, points, triangles[1:])
     code, _, error = run(capsys, "--head", "fsaverage", "--out", tmp_path / "fs.vtu")
@@ -109,7 +109,7 @@ def masked(tmp_path):
     return tmp_path
 
 
-def test_tumour_is_drawn_in_mask_with_t1(masked, capsys):
+def test_mask_with_t1_receives_a_synthetic_tumour(masked, capsys):
     words = ("--mask", masked / "brain.nii.gz", "--t1", masked / "t1.nii.gz", "--nodes", 2000, "--radius", 10, "--json")
     code, text, noted = run(capsys, *words, "--out", masked / "own.vtu")
     own = json.loads(text)
@@ -154,7 +154,7 @@ def test_tumour_is_drawn_in_mask_with_t1(masked, capsys):
         (("--labels", "brain.nii.gz", "--brain", "1", "--tumour", "2", "--head", "template"), "leave it out with"),
     ],
 )
-def test_bad_heads_are_a_sentence_and_nothing_is_written(masked, capsys, monkeypatch, words, reason):
+def test_invalid_head_is_rejected_and_nothing_is_written(masked, capsys, monkeypatch, words, reason):
     monkeypatch.chdir(masked)
     image = nibabel.load("brain.nii.gz")
     for name, kept in (("zero", 0), ("tiny", 4)):

@@ -1,4 +1,4 @@
-"""Motion in time: periods, decay, order, energy that never grows, and a past that travels with the answers."""
+"""Inertia: periods, decay, order, energy that never increases, and state carried with the results."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -55,7 +55,7 @@ def rod(cells: int) -> Anatomy:
 
 
 @pytest.mark.parametrize(("element", "cells"), [("p1", 8), ("smoothed", 8), ("p2", 3)])
-def test_a_rod_swings_with_its_analytic_period(element: str, cells: int) -> None:
+def test_rod_oscillates_with_its_analytic_period(element: str, cells: int) -> None:
     """T = 4 L sqrt(rho / E) without contraction across; its end passes through zero after T/4 and 3/4 T."""
     period, anatomy = 4.0 * LENGTH * np.sqrt(DENSITY / YOUNG), rod(cells)
     effects = [Elasticity(Material("linear", YOUNG, 0.0)), Held(), Inertia(DENSITY)]
@@ -84,7 +84,7 @@ def mode(problem: Problem, mass: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 @pytest.mark.parametrize("damping", [0.0, 7.0])
-def test_a_mode_decays_as_the_scheme_has_it(damping: float) -> None:
+def test_mode_decays_as_backward_euler_predicts(damping: float) -> None:
     """Backward Euler of q'' + c q' + w^2 q = 0, for steps of very different lengths in one batch."""
     effects = [Elasticity(Material("linear", YOUNG, 0.3)), Held(), Inertia(DENSITY, damping)]
     fem = Fem(BLOCK, effects, TIGHT, "cpu", batch=2, element="p1")
@@ -99,8 +99,8 @@ def test_a_mode_decays_as_the_scheme_has_it(damping: float) -> None:
         np.testing.assert_allclose(answer.displacement, q[:, None, None] * motion, rtol=1e-6, atol=1e-12)
 
 
-def test_damping_is_the_exponential_of_a_free_flight() -> None:
-    """Fast against any stiffness, velocity decays with exp(-c t), at first order in the step."""
+def test_damped_free_flight_decays_exponentially() -> None:
+    """Fast compared with any stiffness, velocity decays with exp(-c t), at first order in the step."""
     soft = Elasticity(Material("linear", 0.1, 0.0))
     fem = Fem(BLOCK, [soft, Held(), Inertia(DENSITY, 5.0)], replace(TIGHT, limit_strain=False), "cpu", element="p1")
     errors = []
@@ -123,7 +123,7 @@ def plucked(poisson: float = 0.45) -> tuple[Fem, Deformation]:
     return Fem(BLOCK, [*effects, Inertia(DENSITY)], TIGHT, "cpu", element="p1"), guess(aside.displacement)
 
 
-def test_first_order_in_the_step() -> None:
+def test_inertia_is_first_order_in_the_time_step() -> None:
     fem, start = plucked()
     one, two, four = (after(fem, start, count, 0.04 / count).displacement for count in (8, 16, 32))
     ratio = np.linalg.norm(one - two) / np.linalg.norm(two - four)
@@ -132,7 +132,7 @@ def test_first_order_in_the_step() -> None:
 
 @pytest.mark.parametrize("poisson", [0.45, 0.49])
 @pytest.mark.parametrize("step", [1e-4, 1e-2, 1.0])
-def test_energy_never_grows_under_loads_that_stay(step: float, poisson: float) -> None:
+def test_energy_never_increases_under_constant_load(step: float, poisson: float) -> None:
     fem, answer = plucked(poisson)
     force = top_forces(BLOCK.mesh, np.array([-0.3, 0.2, 0.1]))
     effects = [Elasticity(Material("neo-hookean", YOUNG, poisson)), Held(), NodalForce()]
@@ -155,7 +155,7 @@ def test_energy_never_grows_under_loads_that_stay(step: float, poisson: float) -
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_one_long_step_is_statics(element: str) -> None:
+def test_one_long_time_step_agrees_with_static_solution(element: str) -> None:
     effects = [Elasticity(Material("neo-hookean", YOUNG, 0.45)), Held(), NodalForce()]
     pull = Nodal(top_forces(BLOCK.mesh, np.array([0.5, 0.0, 0.3])))
     still = Fem(BLOCK, effects, TIGHT, "cpu", element=element).deform(Loads((pull,)))
@@ -164,8 +164,8 @@ def test_one_long_step_is_statics(element: str) -> None:
     assert np.abs(moving.memory["inertia"]).max() < 1e-5
 
 
-def test_runs_are_pure_and_may_be_cut_or_interleaved() -> None:
-    """Nothing stays in a solver: another one goes on as if it had been there from the start, mid-edge nodes too."""
+def test_second_solver_continues_time_steps_of_first_exactly() -> None:
+    """A solver keeps no state: another one continues as from the start, including mid-edge nodes."""
     effects = [Elasticity(), Held(), NodalForce(), Inertia(DENSITY, 1.0)]
     mesh = box((1, 1, 1), LENGTH)
     anatomy, force = base_held(mesh), top_forces(mesh, np.array([0.4, 0.0, 0.2]))
@@ -181,8 +181,8 @@ def test_runs_are_pure_and_may_be_cut_or_interleaved() -> None:
     assert straight.memory["inertia"].shape == (1, first.space.count, 3)
 
 
-def test_where_no_time_passes_a_body_stays_as_it_is() -> None:
-    """In the first frame of a scene, and in a frame that is asked for twice: the next one knows no difference."""
+def test_zero_time_step_leaves_body_unchanged() -> None:
+    """In the first frame of a scene, and in a repeated frame: the next frame is the same."""
     fem = Fem(BLOCK, [Elasticity(), Held(), NodalForce(), Inertia(DENSITY)], TIGHT, "cpu", element="p2")
     force = top_forces(BLOCK.mesh, np.array([0.4, 0.0, 0.2]))
     first = fem.deform(Loads((Nodal(force),), np.zeros(1)))
@@ -197,15 +197,15 @@ def test_where_no_time_passes_a_body_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_masses_are_positive_and_whole(element: str) -> None:
+def test_lumped_masses_are_positive_and_sum_to_total(element: str) -> None:
     mesh = box((2, 2, 3), LENGTH, distortion=0.2)
     mass = compute_lumped_mass(DENSITY, discretise(mesh, element))
     assert mass.min() > 0.0
     assert mass.sum() == pytest.approx(DENSITY * mesh.volumes.sum(), rel=1e-13)
 
 
-def test_curved_elements_weigh_what_they_hold() -> None:
-    """Their inner middles are moved: the outside, and so the whole, is a straight box."""
+def test_mass_of_curved_elements_is_density_times_volume() -> None:
+    """Their inner mid-edge nodes are moved: the boundary, and so the volume, is that of a box."""
     mesh: TetMesh = quadratic(box((2, 2, 2), LENGTH), curved=0.05)
     assert compute_lumped_mass(DENSITY, discretise(mesh)).sum() == pytest.approx(DENSITY * LENGTH**3, rel=1e-12)
 
@@ -234,13 +234,13 @@ def strange() -> Deformation:
         (asked(strange(), 1.0), r"memory of inertia has shape \(1, 5, 3\), not \(1, 27, 3\)"),
     ],
 )
-def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: str) -> None:
+def test_invalid_inertia_arguments_are_rejected(build: Callable[[], object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         build()
 
 
-def test_the_preconditioner_knows_the_mass() -> None:
-    """At a short step its inverse is nearly exact: a step from rest takes hardly any turns."""
+def test_preconditioner_includes_the_mass() -> None:
+    """At a short step its inverse is nearly exact: a step from rest takes few iterations."""
     fem = Fem(BLOCK, [Elasticity(), Held(), NodalForce(), Inertia()], TIGHT, "cpu", element="p1")
     force = top_forces(BLOCK.mesh, np.array([0.1, 0.0, 0.0]))
     assert after(fem, None, 1, 2.0**-13, force).iterations[0] <= 4
@@ -248,13 +248,13 @@ def test_the_preconditioner_knows_the_mass() -> None:
     assert fem.problem.paced and not compile_problem([Elasticity(), Held()], BLOCK, device).paced
 
 
-def test_no_cases_have_no_answers() -> None:
+def test_empty_batch_with_inertia_gives_empty_result() -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu", element="p1")
     assert fem.deform(at()).displacement.shape == (0, len(BLOCK.mesh.nodes), 3)
 
 
-def test_where_no_time_passes_tools_stay_where_they_are() -> None:
-    """A tool that came through a body that cannot move would be inside it, and push as nothing does."""
+def test_zero_time_step_does_not_move_tools() -> None:
+    """A tool that moved through a body at rest would be inside it without contact force."""
     ball = Ball(0.02)
     fem = Fem(BLOCK, (Elasticity(), Held(), Inertia(), ToolContact((ball,))), Accuracy(), "cpu", element="p1")
 
@@ -276,7 +276,7 @@ def test_where_no_time_passes_tools_stay_where_they_are() -> None:
     np.testing.assert_array_equal(moved.memory["tool contact"][0, 0, :3, 3], [0.04, 0.06, 0.080])
 
 
-def test_a_step_in_time_is_not_held_against_an_equilibrium() -> None:
+def test_residual_of_time_steps_is_rejected() -> None:
     fem = Fem(BLOCK, (Elasticity(), Held(), Inertia()), TIGHT, "cpu", element="p1")
     answer = fem.deform(at(0.1))
     with pytest.raises(InputError, match="solutions under Inertia are time steps"):

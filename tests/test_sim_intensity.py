@@ -1,4 +1,4 @@
-"""Grey values beside a mesh: written, read, cropped and sampled in the mesh's frame."""
+"""Intensities of an image with a mesh: written, read, cropped and sampled in the mesh's frame."""
 
 import nibabel
 import numpy as np
@@ -22,7 +22,7 @@ def places(index):
     return np.asarray(index) @ AFFINE[:3, :3].T + AFFINE[:3, 3]
 
 
-def test_sampling_is_trilinear_in_metres_and_zero_outside():
+def test_intensity_sampling_is_trilinear_and_zero_outside():
     index = np.array([[3.25, 7.5, 11.75], [20.0, 30.0, 10.0], [38.9, 48.9, 28.9]])
     np.testing.assert_allclose(ramp().interpolate(places(index)), index @ [2.0, 1.0, 3.0] / 255.0, rtol=1e-6)
     assert ramp().interpolate(places([[-5.0, 0.0, 0.0]]))[0] == 0.0
@@ -34,7 +34,7 @@ def brain():
     return TetMesh(places(mesh.nodes * [23.0, 33.0, 20.0] + [8.0, 8.0, 5.0]), mesh.tets[:, [0, 2, 1, 3]], mesh.region)
 
 
-def test_the_crop_keeps_the_place_and_fits_the_brain(tmp_path):
+def test_cropped_intensity_round_trip_keeps_values_and_affine(tmp_path):
     points = places([[18.0, 22.0, 14.0], [22.0, 28.0, 16.0]])
     crop = ramp().crop(points, brain())
     assert crop.values.dtype == np.uint8 and np.prod(crop.values.shape) < 40 * 50 * 30
@@ -53,8 +53,8 @@ def test_the_crop_keeps_the_place_and_fits_the_brain(tmp_path):
     assert sorted(tmp_path.iterdir()) == [path]
 
 
-def test_the_crop_reaches_15_mm_beyond_the_box_round_the_points():
-    """Voxels of 1 mm: one point has 15 to each side, the two of a trilinear value, and no more; less at the border."""
+def test_intensity_crop_reaches_15_mm_beyond_the_points():
+    """Voxels of 1 mm: one point has 15 to each side, and the two of a trilinear value; fewer at the border."""
     cube = Intensity(np.ones((60, 60, 60), np.float32), np.diag([1e-3, 1e-3, 1e-3, 1.0]))
     crop = cube.crop(np.array([[0.0302, 0.0302, 0.0502]]), box((2, 2, 2), 0.059))
     assert crop.values.shape == (32, 32, 25)
@@ -67,7 +67,7 @@ def waves():
     return 100.0 + 30.0 * np.sin(np.indices((40, 50, 30)).sum(axis=0) / 3.0) + noise
 
 
-def test_windows_know_neither_a_scanners_scale_nor_its_zero():
+def test_intensity_window_ignores_scale_and_offset():
     grey = waves()
     usual = Intensity(grey, AFFINE).apply_window(brain())
     inside = np.s_[8:32, 8:42, 5:26]
@@ -78,7 +78,7 @@ def test_windows_know_neither_a_scanners_scale_nor_its_zero():
     np.testing.assert_allclose(Intensity(coarse, AFFINE).apply_window(brain()), usual, atol=0.02)
 
 
-def test_voxels_that_are_no_tissue_leave_the_others_as_they_are():
+def test_non_finite_voxels_do_not_change_the_window():
     grey = waves()
     usual = Intensity(grey, AFFINE).apply_window(brain())
     wrong = np.random.default_rng(1).random(grey.shape) < 0.01
@@ -89,7 +89,7 @@ def test_voxels_that_are_no_tissue_leave_the_others_as_they_are():
     assert (Intensity(np.full(grey.shape, -7.0), AFFINE).apply_window(brain()) == np.float32(Window().flat_grey)).all()
 
 
-def test_a_volume_elsewhere_or_without_numbers_is_refused(tmp_path):
+def test_intensity_without_cover_or_finite_values_is_rejected(tmp_path):
     with pytest.raises(InputError, match="does not cover"):
         ramp().crop(places([[400.0, 0.0, 0.0]]), brain())
     with pytest.raises(InputError, match="no finite values in the brain"):

@@ -6,8 +6,8 @@ from sim.fields.grid import Grid
 from sim.fields.inversion import invert_field
 
 
-def test_a_twist_that_no_fixed_point_inverts_is_inverted():
-    """d = -u(y + d) alone moves away where tissue is turned, or sheared, by that much."""
+def test_twist_beyond_fixed_point_iteration_is_inverted():
+    """The iteration d = -u(y + d) alone diverges where the rotation or shear is this large."""
     grid = Grid(np.full(3, -20e-3), 1e-3, (41, 41, 41))
     x, y, _ = np.indices(grid.shape) * 1e-3 - 20e-3
     turn = 1.3 * np.exp(-(np.hypot(x, y) ** 2) / 7e-3**2)

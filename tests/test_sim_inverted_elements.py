@@ -1,4 +1,4 @@
-"""Tetrahedra that are inside out: counted, and followed."""
+"""Inverted tetrahedra: counted, and tracked."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from sim.runtime.device import find_device
 
 
 def test_inverted_elements_from_rest_are_counted() -> None:
-    """A brutal push: an equilibrium of the law, but no tissue's."""
+    """An extreme push: an equilibrium of the law, but not of tissue."""
     load, free = loads(np.array([[0.0, 0.0, -20.0]])), fem(replace(ACCURACY, limit_strain=False))
     found = free.deform(load)
     warm = free.deform(load, found)
@@ -30,8 +30,8 @@ def test_inverted_elements_from_rest_are_counted() -> None:
 
 
 @pytest.mark.parametrize(("law", "followed"), [("neo-hookean", True), ("stable-neo-hookean", False)])
-def test_inverted_single_tetrahedra_are_tracked(law: str, followed: bool) -> None:
-    """A deep press inverts some averages, from any start, if the law is infinite only after that."""
+def test_inverted_tetrahedra_of_smoothed_elements_are_tracked(law: str, followed: bool) -> None:
+    """A deep push inverts some tetrahedra of the averages, from any start, if the law allows it."""
     effects = (Elasticity(tissue(law)), *openings.EFFECTS)
     deep = 8.0 * np.array([[0.2, 0.1, -1.0]])
     solver = Fem(openings.body()[0], effects, Accuracy(tolerance=1e-6, limit_strain=False), "cpu", element="smoothed")
@@ -45,8 +45,8 @@ def test_inverted_single_tetrahedra_are_tracked(law: str, followed: bool) -> Non
 
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_tetrahedra_inside_out_are_counted(element: str, precision: str) -> None:
-    """None at rest, nor in a turned or crushed body; one whose corner is pushed through; all of a mirrored body."""
+def test_inverted_tetrahedra_are_counted(element: str, precision: str) -> None:
+    """None at rest, rotated or crushed; one with a corner pushed through; all of a mirrored body."""
     space = discretise(MESH, element)
     device = find_device("cpu", precision)  # pyright: ignore[reportArgumentType]
     turn = MESH.nodes @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

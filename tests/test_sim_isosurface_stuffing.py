@@ -1,4 +1,4 @@
-"""Bodies carved from a lattice: angles, volumes, conformity, and what stays where it is."""
+"""Bodies cut from a lattice: angles, volumes, conformity, and nodes that keep their position."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def carved():
     return body, cut(body, core, pinned=body.surface)
 
 
-def test_angles_of_one_surface_keep_the_bound_of_the_paper(carved):
+def test_dihedral_angles_meet_bound_of_isosurface_stuffing(carved):
     assert compute_dihedral_angles(carved[0].nodes, carved[0].tets).min() > 10.7
 
 
@@ -55,7 +55,7 @@ def test_no_tetrahedron_crosses_the_interface(carved):
     assert values[~both.inside].min() > -1e-8
 
 
-def test_pinned_nodes_stay():
+def test_pinned_nodes_keep_their_position():
     lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
     body = cut(build_whole(lattice), ball)
     body = body.select(body.inside)
@@ -68,13 +68,13 @@ def test_pinned_nodes_stay():
     assert not np.array_equal(both.nodes[: len(body.nodes)], body.nodes)
 
 
-def test_nothing_is_snapped_where_no_share_of_an_edge_is():
+def test_zero_snap_distance_leaves_lattice_nodes_in_place():
     lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
     body = cut(build_whole(lattice), ball, settings=IsosurfaceStuffingOptions(snap_shortest=0.0))
     np.testing.assert_array_equal(body.nodes[: len(lattice.nodes)], lattice.nodes)
 
 
-def test_the_same_input_gives_the_same_mesh(carved):
+def test_isosurface_stuffing_is_deterministic(carved):
     body, both = carved
     again = cut(body, core, pinned=body.surface)
     np.testing.assert_array_equal(again.nodes, both.nodes)

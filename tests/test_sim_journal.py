@@ -1,4 +1,4 @@
-"""The journal of a run: whose records it takes up."""
+"""The journal of a run: the records that it resumes."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from sim.runtime.journal import RECORD_HEADER, DamageWarning, open_journal, run_
 
 
 def test_damaged_journal_header_discards_records(tmp_path):
-    """Their own run still finds them: only its beginning is lost."""
+    """The original run still finds them: only the header is lost."""
     path, batch = tmp_path / "data.h5.partial", ("answers", 0)
     with open_journal(path, {"seed": "0"}) as journal:
         journal.add(batch, b"what was solved")
@@ -35,7 +35,7 @@ class Row:
 ROWS = [Row(number, 0.5 * number) for number in range(3)]
 
 
-def test_rows_of_a_run_are_read_but_for_one_that_a_kill_tore(tmp_path):
+def test_journal_rows_are_read_except_truncated_ones(tmp_path):
     path = tmp_path / "trial.rows"
     with open_journal(path, {"seed": "0"}) as journal:
         for row in ROWS:
@@ -53,7 +53,7 @@ def test_rows_of_a_run_are_read_but_for_one_that_a_kill_tore(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"sulcus rows 1 a table\n", b"# this trial\nsize,asked\n", b"\xff\xfe", b"", b"[" * 10**5]
 )
-def test_files_of_earlier_versions_and_of_others_are_rejected(tmp_path, content):
+def test_files_that_are_not_journals_are_rejected(tmp_path, content):
     path = tmp_path / "trial.rows"
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"is not an unfinished run.*delete it"), open_journal(path, {}):

@@ -43,7 +43,7 @@ def test_unwritable_cache_is_replaced_with_one_warning(homeless, monkeypatch, na
 
 
 @pytest.mark.parametrize("taken", ["link", "open", "file"])
-def test_name_taken_by_others_is_not_used(homeless, tmp_path, taken):
+def test_unsafe_cache_path_is_not_used(homeless, tmp_path, taken):
     if taken == "link":
         homeless.symlink_to(tmp_path / "theirs")
     elif taken == "open":
@@ -58,13 +58,13 @@ def test_name_taken_by_others_is_not_used(homeless, tmp_path, taken):
     assert stat.S_IMODE(os.stat(chosen).st_mode) == 0o700
 
 
-def test_no_writable_folder_is_an_input_error(homeless, monkeypatch):
+def test_missing_writable_cache_folder_is_rejected(homeless, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", "/proc")
     with pytest.raises(InputError, match="Set WARP_CACHE_PATH"):
         ensure_writable_cache()
 
 
-def test_command_runs_with_an_unwritable_home(homeless, tmp_path):
+def test_command_runs_with_unwritable_home_folder(homeless, tmp_path):
     command = [sys.executable, "-m", "scenes.cli", "scenes", "--device", "cpu"]
     done = subprocess.run(command, env=os.environ | {"TMPDIR": str(tmp_path)}, capture_output=True, text=True)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr

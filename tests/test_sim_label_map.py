@@ -13,7 +13,7 @@ from sim.errors import InputError
 
 
 @pytest.mark.parametrize("form", ["set_sform", "set_qform"])
-def test_axes_of_a_file_with_a_place_are_ignored_with_a_note(tmp_path, form):
+def test_given_axes_of_oriented_file_are_ignored_with_note(tmp_path, form):
     image = nibabel.Nifti1Image(np.ones((4, 4, 4), np.int16), None)
     getattr(image, form)(np.eye(4), 1)
     nibabel.save(image, tmp_path / "l.nii")

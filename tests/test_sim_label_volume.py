@@ -1,4 +1,4 @@
-"""Label volumes of many kinds become meshes in their own frame, or are refused in a sentence."""
+"""Label volumes of many kinds become meshes in their own frame, or are rejected with a message."""
 
 import json
 
@@ -88,15 +88,15 @@ def test_every_affine_gives_the_same_brain(tmp_path, kind):
     assert mesh.nodes[anatomy.fixed.all(axis=1), 2].max() < MIDDLE[2] - 0.03
 
 
-def test_the_skull_is_not_opened_from_below(tmp_path):
+def test_craniotomy_is_never_below_the_tumour(tmp_path):
     low = MIDDLE - [0.0, 0.0, 0.024]
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], lambda points: ball(points, low))
     subject = build_volume_subject(path, (1, 2), (3, 4))
     assert subject.site[2] >= low[2]
 
 
-def test_the_skull_is_opened_over_cortex_that_can_be_reached(tmp_path):
-    """A fissure as deep as the brain is half high runs beside the tumour: its wall is nearest, and out of reach."""
+def test_craniotomy_lies_over_reachable_cortex(tmp_path):
+    """A fissure of half the brain's height lies at the tumour: its wall is nearest, and out of reach."""
     affine, places = grid(AFFINES["straight"])
     middle = MIDDLE + [0.012, 0.0, 0.012]
     fissure = (np.abs(places[..., 0] - MIDDLE[0] + 0.001) < 0.0025) & (places[..., 2] > MIDDLE[2])
@@ -117,14 +117,14 @@ def test_the_skull_is_opened_over_cortex_that_can_be_reached(tmp_path):
         ((), (3,), "at least one label"),
     ],
 )
-def test_labels_that_cannot_be_used(tmp_path, brain, tumour, reason):
+def test_invalid_label_selection_is_rejected(tmp_path, brain, tumour, reason):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["thick slices"])
     with pytest.raises(InputError, match=reason):
         build_volume_subject(path, brain, tumour)
 
 
 def test_unknown_labels_are_named_and_tumour_kept(tmp_path):
-    """Oedema that nobody named, 5, is the brain's upper half; in the lower one is a small piece of the tumour."""
+    """Unnamed oedema, 5, is the brain's upper half; in the lower one is a small piece of the tumour."""
     affine, places = grid(AFFINES["thick slices"])
     labels = np.where(ellipsoid(places), np.where(places[..., 2] > MIDDLE[2], 5, 1), 0)
     labels[ball(places) | ball(places, MIDDLE - [0.018, 0.0, 0.014], 0.006)] = 3
@@ -137,7 +137,7 @@ def test_unknown_labels_are_named_and_tumour_kept(tmp_path):
     assert found.notes[0] == "neither brain nor tumour: what is labelled 2" and "of holes" in found.notes[1]
 
 
-def test_volumes_that_cannot_be_used(tmp_path):
+def test_invalid_label_volumes_are_rejected_with_reason(tmp_path):
     affine, places = grid(AFFINES["thick slices"])
     labels = ellipsoid(places).astype(np.int16)
     with_tumour = np.where(ball(places), 3, labels)
@@ -166,7 +166,7 @@ def test_volumes_that_cannot_be_used(tmp_path):
     refused("few.nii.gz", few, "has 1 voxels")
 
 
-def test_files_that_are_no_volumes(tmp_path):
+def test_files_that_are_not_volumes_are_rejected_by_name(tmp_path):
     (tmp_path / "folder.nii").mkdir()
     (tmp_path / "text.nii").write_text("not a volume" * 99)
     (tmp_path / "text.nii.gz").write_text("not compressed")
@@ -190,7 +190,7 @@ def test_files_that_are_no_volumes(tmp_path):
 
 
 @pytest.mark.parametrize(("apart", "said"), [(0.5, False), (30.0, True)])
-def test_forms_that_disagree_are_said_and_the_sform_is_taken(tmp_path, apart, said):
+def test_contradicting_forms_are_noted_and_sform_is_used(tmp_path, apart, said):
     affine, places = grid(AFFINES["oblique and negative"])
     labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
     image = nibabel.Nifti1Image(labels, affine)
@@ -204,7 +204,7 @@ def test_forms_that_disagree_are_said_and_the_sform_is_taken(tmp_path, apart, sa
     assert np.linalg.norm(subject.interface.mean(axis=0) - TUMOUR) < 1e-3
 
 
-def test_a_qform_without_rotation_does_not_spoil_a_good_sform(tmp_path):
+def test_invalid_qform_does_not_affect_valid_sform(tmp_path):
     affine, places = grid(AFFINES["straight"])
     image = nibabel.Nifti1Image(np.where(ball(places), 3, ellipsoid(places)).astype(np.int16), affine)
     image.set_qform(affine, 1)
@@ -213,7 +213,7 @@ def test_a_qform_without_rotation_does_not_spoil_a_good_sform(tmp_path):
     assert build_volume_subject(tmp_path / "l.nii", (1,), (3,)).notes == ()
 
 
-def test_a_brain_that_the_volume_cuts_is_said_to_be_cut(tmp_path):
+def test_brain_cut_by_the_volume_border_is_noted(tmp_path):
     affine, places = grid(AFFINES["straight"])
     labels = np.where(ball(places), 3, ellipsoid(places))
     whole = build_volume_subject(save(tmp_path / "whole.nii", labels, affine), (1,), (3,))
@@ -224,7 +224,7 @@ def test_a_brain_that_the_volume_cuts_is_said_to_be_cut(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "per_millimetre"), [("meter", 1e-3), ("micron", 1e3), ("unknown", 1.0)])
-def test_a_file_in_other_units_holds_the_same_brain(tmp_path, unit, per_millimetre):
+def test_brain_is_independent_of_length_unit_of_the_file(tmp_path, unit, per_millimetre):
     affine, places = grid(AFFINES["thick slices"])
     labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
     image = nibabel.Nifti1Image(labels, np.diag([*[per_millimetre] * 3, 1.0]) @ affine)
@@ -239,8 +239,8 @@ def test_a_file_in_other_units_holds_the_same_brain(tmp_path, unit, per_millimet
     np.testing.assert_allclose(there.brain(points), here.brain(points), atol=1e-7)
 
 
-def test_intensities_are_read_where_their_own_affine_says(tmp_path):
-    """One bright voxel on a grid that is turned and finer along one axis than the labels'."""
+def test_intensities_are_read_by_their_own_affine(tmp_path):
+    """One bright voxel on a grid that is rotated and finer along one axis than the labels'."""
     path, labels, _ = labelled(tmp_path / "labels.nii", AFFINES["thick slices"])
     affine, places = grid(AFFINES["oblique and negative"])
     grey = np.full(places.shape[:3], 20.0, np.float32)

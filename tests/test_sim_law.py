@@ -1,4 +1,4 @@
-"""Every tissue law: its formulas are each other's derivatives, meet Hooke's law, and do not cancel."""
+"""Every tissue law: its formulas are derivatives of each other, agree with Hooke's law, and avoid cancellation."""
 
 import numpy as np
 import pytest
@@ -43,19 +43,19 @@ def relative(error: np.ndarray, exact: np.ndarray) -> np.ndarray:
     return np.linalg.norm(error, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
 
 
-def test_large_strains_include_inverted_elements(name: str) -> None:
+def test_sampled_strains_invert_elements_if_law_permits(name: str) -> None:
     J = np.linalg.det(np.eye(3) + gradients(name))
     assert J.max() > 2.0
     assert (J.min() < -0.2) == (name not in POSITIVE)
 
 
-def test_energy_is_the_published_formula(name: str, double: Evaluator) -> None:
+def test_energy_agrees_with_published_formula(name: str, double: Evaluator) -> None:
     H = gradients(name)
     expected = energy_density(name, np.eye(3) + H, *tissue(name).coefficients)
     np.testing.assert_allclose(double(H).energy, expected, rtol=1e-11, atol=1e-9)
 
 
-def test_stress_is_the_published_formula(name: str, double: Evaluator) -> None:
+def test_stress_agrees_with_published_formula(name: str, double: Evaluator) -> None:
     H = gradients(name)
     expected = piola(name, np.eye(3) + H, *tissue(name).coefficients)
     assert relative(double(H).stress - expected, expected).max() < 1e-11
@@ -80,7 +80,7 @@ def test_stress_change_is_the_gradient_of_the_stress(name: str, double: Evaluato
     assert relative(numeric - exact, exact).max() < 1e-6
 
 
-def test_curvature_is_symmetric(name: str, double: Evaluator) -> None:
+def test_law_curvature_is_symmetric(name: str, double: Evaluator) -> None:
     H = gradients(name)
     D, E = np.random.default_rng(6).normal(size=(2, *H.shape))
     one = np.einsum("nij,nij->n", double(H, D).change, E)
@@ -89,9 +89,7 @@ def test_curvature_is_symmetric(name: str, double: Evaluator) -> None:
 
 
 @pytest.mark.parametrize(("young", "poisson"), [(3000.0, 0.45), (1.0e4, 0.0), (500.0, 0.4945), (3000.0, -0.3)])
-def test_small_strain_is_hookes_law_with_young_and_poisson(
-    name: str, double: Evaluator, young: float, poisson: float
-) -> None:
+def test_small_strain_stress_agrees_with_hookes_law(name: str, double: Evaluator, young: float, poisson: float) -> None:
     """Uniaxial stress of 1e-6 E stretches by 1e-6 and contracts by nu 1e-6; a shear strain gives E / (2 (1 + nu))."""
     stretch = 1e-6 * np.diag([1.0, -poisson, -poisson])
     shear = 1e-6 * (np.eye(3)[[1]].T @ np.eye(3)[[0]] + np.eye(3)[[0]].T @ np.eye(3)[[1]])
@@ -100,7 +98,7 @@ def test_small_strain_is_hookes_law_with_young_and_poisson(
     np.testing.assert_allclose(stress[1], shear * young / (1.0 + poisson), atol=1e-10 * young)
 
 
-def test_rotations_cost_nothing_and_turn_the_stress(name: str, double: Evaluator) -> None:
+def test_rotation_keeps_energy_and_rotates_stress(name: str, double: Evaluator) -> None:
     if name == "linear":
         pytest.skip("small strain is not invariant, and says so")
     H = gradients(name)
@@ -112,19 +110,19 @@ def test_rotations_cost_nothing_and_turn_the_stress(name: str, double: Evaluator
     assert np.abs(double(Q - np.eye(3)).stress).max() < 1e-9 * MU
 
 
-def test_linear_law_sees_rotations(double: Evaluator, name: str) -> None:
+def test_linear_law_has_energy_under_rotation(double: Evaluator, name: str) -> None:
     if name == "linear":
         assert double(rotations(3) - np.eye(3)).energy.min() > 0.01 * MU
 
 
-def test_isotropic(name: str, double: Evaluator) -> None:
+def test_tissue_law_is_isotropic(name: str, double: Evaluator) -> None:
     H = gradients(name)
     Q = rotations(len(H))
     turned = double(Q @ H @ Q.transpose(0, 2, 1))
     np.testing.assert_allclose(turned.energy, double(H).energy, rtol=1e-10)
 
 
-def test_rest_is_exactly_free_of_stress(name: str, double: Evaluator, single: Evaluator) -> None:
+def test_stress_and_energy_at_rest_are_exactly_zero(name: str, double: Evaluator, single: Evaluator) -> None:
     for evaluate in (double, single):
         at_rest = evaluate(np.zeros((1, 3, 3)))
         assert not at_rest.stress.any()
@@ -132,7 +130,7 @@ def test_rest_is_exactly_free_of_stress(name: str, double: Evaluator, single: Ev
 
 
 @pytest.mark.parametrize("size", [1e-5, 1e-4, 1e-3])
-def test_single_precision_does_not_cancel_at_small_strain(
+def test_single_precision_stress_is_accurate_at_small_strain(
     name: str, single: Evaluator, double: Evaluator, size: float
 ) -> None:
     H = np.random.default_rng(7).normal(0.0, size, (200, 3, 3)).astype(np.float32).astype(np.float64)
@@ -141,7 +139,7 @@ def test_single_precision_does_not_cancel_at_small_strain(
     np.testing.assert_allclose(single(H).energy, exact.energy, rtol=1e-5)
 
 
-def test_single_precision_at_large_strain(name: str, single: Evaluator, double: Evaluator) -> None:
+def test_single_precision_stress_is_accurate_at_large_strain(name: str, single: Evaluator, double: Evaluator) -> None:
     H = gradients(name, spread=0.3).astype(np.float32).astype(np.float64)
     D = np.random.default_rng(8).normal(size=H.shape)
     exact = double(H, D)
@@ -150,7 +148,7 @@ def test_single_precision_at_large_strain(name: str, single: Evaluator, double: 
 
 
 @pytest.mark.parametrize("law", POSITIVE)
-def test_laws_with_a_logarithm_are_infinite_where_inverted(law: str) -> None:
+def test_energy_of_logarithmic_laws_is_infinite_if_inverted(law: str) -> None:
     evaluate = build_evaluator(tissue(law), "float64")
     assert np.isposinf(evaluate(np.diag([-2.0, 0.0, 0.0])[None]).energy).all()
     assert np.isposinf(evaluate(np.diag([-1.0, 0.0, 0.0])[None]).energy).all()

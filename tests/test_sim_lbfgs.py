@@ -1,4 +1,4 @@
-"""L-BFGS on many columns: the algorithm of the book, column by column, and what the host does between its turns."""
+"""L-BFGS on many columns: the textbook algorithm for each column, and the host's work between iterations."""
 
 import numpy as np
 import pytest
@@ -75,8 +75,8 @@ def book(problem: Problem, steps: int) -> np.ndarray:
     return u
 
 
-def test_the_steps_are_those_of_the_book(device: Device) -> None:
-    """More steps than pairs: the oldest leave in turn."""
+def test_lbfgs_steps_agree_with_textbook_algorithm(device: Device) -> None:
+    """More steps than pairs: the oldest are dropped first."""
     mild = TOTAL[1:2]
     for steps in (1, 2, 5, PAIRS + 3):
         found = descended(read_problem(device, total=mild), np.zeros((ROWS, 1)), 1e-300, steps + 1)
@@ -86,7 +86,7 @@ def test_the_steps_are_those_of_the_book(device: Device) -> None:
 
 
 @pytest.mark.parametrize("law", ["linear", "corotational", "neo-hookean", "stable-neo-hookean", "ogden"])
-def test_it_ends_where_newton_does(device: Device, law: str) -> None:
+def test_lbfgs_agrees_with_newton(device: Device, law: str) -> None:
     problem = read_problem(device, law)
     found = descended(problem)
     assert (found.status == DONE).all()
@@ -100,14 +100,14 @@ def test_it_ends_where_newton_does(device: Device, law: str) -> None:
     np.testing.assert_allclose(found.residual[:-1], free[:-1] / scale[:-1], rtol=1e-4, atol=1e-15)
 
 
-def test_linear_law_converges_in_one_step_and_none(device: Device) -> None:
+def test_linear_law_converges_in_one_lbfgs_step(device: Device) -> None:
     found = descended(read_problem(device, "linear"))
     np.testing.assert_array_equal(found.steps, [1, 1, 1, 1, 1, 0])
     assert not found.u.numpy()[:, -1].any()
 
 
-def test_columns_are_steered_each_by_itself(device: Device) -> None:
-    """Others that end sooner or later change nothing."""
+def test_lbfgs_columns_are_independent(device: Device) -> None:
+    """Columns that end sooner or later do not change the others."""
     whole = descended(read_problem(device))
     for row in range(len(TOTAL)):
         alone = descended(read_problem(device, total=TOTAL[[row]]), np.zeros((ROWS, 1)))
@@ -115,7 +115,7 @@ def test_columns_are_steered_each_by_itself(device: Device) -> None:
         np.testing.assert_allclose(alone.u.numpy()[:, 0], whole.u.numpy()[:, row], atol=1e-12)
 
 
-def test_what_the_budget_leaves_is_the_last_accepted_state(device: Device) -> None:
+def test_lbfgs_out_of_budget_returns_last_accepted_state(device: Device) -> None:
     found = descended(read_problem(device), most=6)
     np.testing.assert_array_equal(found.left, np.flatnonzero(found.status != DONE))
     assert len(found.left) >= 2
@@ -124,7 +124,7 @@ def test_what_the_budget_leaves_is_the_last_accepted_state(device: Device) -> No
     assert (found.residual[found.left] > FINE).all()
 
 
-def test_a_start_that_is_not_finite_is_given_up(device: Device) -> None:
+def test_lbfgs_reports_non_finite_start(device: Device) -> None:
     start = np.zeros((ROWS, len(TOTAL)))
     start[FREE, 1] = 1e200
     found = descended(read_problem(device), start)
@@ -132,8 +132,8 @@ def test_a_start_that_is_not_finite_is_given_up(device: Device) -> None:
     assert (np.delete(found.status, 1) == DONE).all()
 
 
-def test_forces_that_overflow_are_no_equilibrium() -> None:
-    """In single precision, at held nodes first: what is free then looks like nothing beside them."""
+def test_overflowing_forces_are_not_an_equilibrium() -> None:
+    """In single precision, at held nodes first: free forces are negligible compared with them."""
     single, power = find_device("cpu", "float32"), np.arange(2, 34, 0.5)
     problem = read_problem(single, total=np.tile(TOTAL[1], (len(power), 1)))
     start = np.random.default_rng(0).normal(size=(ROWS, 1)) * FREE[:, None] * 10.0**power
@@ -145,8 +145,8 @@ def test_forces_that_overflow_are_no_equilibrium() -> None:
     assert not (found.status == DONE).any() and (found.status == NOT_FINITE).any()
 
 
-def test_steps_stay_inside_the_domain(device: Device) -> None:
-    """Pulled towards a wall, none passes it on the way, nor at the end."""
+def test_lbfgs_steps_stay_inside_the_domain(device: Device) -> None:
+    """Pulled towards a wall, no state crosses it, neither on the path nor at the end."""
     problem = read_problem(device, "neo-hookean")
     wall = Wall(device, MESH.nodes, 0.105, 4e-3, 1.0)
     walled = Problem((*problem.terms, wall), problem.constraint, device)
@@ -162,7 +162,7 @@ def test_steps_stay_inside_the_domain(device: Device) -> None:
     assert wall.distance(found.u.numpy())[:, 2].min() < 5e-3
 
 
-def test_any_preconditioner_serves(device: Device) -> None:
+def test_lbfgs_converges_with_any_preconditioner(device: Device) -> None:
     problem = read_problem(device)
     jacobi = Lbfgs(problem, BlockJacobi(device)).descend(
         device.allocate(ROWS, len(TOTAL)), np.full(len(TOTAL), 1e-6), 2000
@@ -172,14 +172,14 @@ def test_any_preconditioner_serves(device: Device) -> None:
     np.testing.assert_allclose(jacobi.u.numpy(), exact, atol=1e-3 * np.abs(exact).max())
 
 
-def test_single_precision_ends_at_its_floor() -> None:
+def test_lbfgs_converges_in_single_precision() -> None:
     single = find_device("cpu", "float32")
     found = descended(read_problem(single), tolerance=2e-5)
     assert (found.status == DONE).all()
 
 
-def test_what_was_learnt_shortens_the_next_descent(device: Device) -> None:
-    """The load grows by a tenth: the pairs of the last descent know the way."""
+def test_curvature_pairs_shorten_the_next_descent(device: Device) -> None:
+    """The load grows by a tenth: the pairs of the last descent remain valid."""
     few, rest = TOTAL[:3], device.allocate(ROWS, 3)
     problem = read_problem(device, total=few)
     solver, tolerance = build_rest_solver(problem), np.full(3, 1e-6)
@@ -192,7 +192,7 @@ def test_what_was_learnt_shortens_the_next_descent(device: Device) -> None:
     assert not descended(read_problem(device)).warm_start  # too many columns to have a next frame
 
 
-def test_a_column_ends_at_a_force_too(device: Device) -> None:
+def test_lbfgs_column_also_ends_at_force_tolerance(device: Device) -> None:
     problem = read_problem(device)
     force = np.array([0.0, 1e-3, 0.0, 1e-4, 0.0, 0.0])
     start, count = device.allocate(ROWS, len(TOTAL)), len(TOTAL)
@@ -202,7 +202,7 @@ def test_a_column_ends_at_a_force_too(device: Device) -> None:
     assert (free[[1, 3]] <= force[[1, 3]]).all()
 
 
-def test_stragglers_are_left_where_they_are(device: Device) -> None:
+def test_lbfgs_stops_when_few_columns_remain(device: Device) -> None:
     problem = read_problem(device)
     start, count = device.allocate(ROWS, len(TOTAL)), len(TOTAL)
     found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(count, FINE), 300, stragglers=0.4)
@@ -211,8 +211,8 @@ def test_stragglers_are_left_where_they_are(device: Device) -> None:
 
 
 @pytest.mark.parametrize("law", ["stable-neo-hookean", "neo-hookean"])
-def test_a_known_gradient_saves_the_first_look(device: Device, law: str) -> None:
-    """And no more: the same steps follow, the first of them within the domain."""
+def test_known_gradient_replaces_the_first_evaluation(device: Device, law: str) -> None:
+    """The following steps are the same, the first of them within the domain."""
     problem = read_problem(device, law)
     solver, start = build_rest_solver(problem), device.allocate(ROWS, len(TOTAL))
     tolerance = np.full(len(TOTAL), FINE)
@@ -231,8 +231,8 @@ def test_a_known_gradient_saves_the_first_look(device: Device, law: str) -> None
     assert len(looks) >= found.steps.max()
 
 
-def test_a_batch_forgets_the_one_before(device: Device) -> None:
-    """A narrower room stands where a wider one worked: what that left there is no scale of a residual."""
+def test_lbfgs_batch_is_independent_of_previous_batch(device: Device) -> None:
+    """A narrower workspace replaces a wider one: its old values must not scale a residual."""
     problem = read_problem(device, total=np.tile(50.0 * TOTAL[1], (8, 1)))
     solver, few = build_rest_solver(problem), TOTAL[[0, 1, 3]]
     lbfgs = Lbfgs(problem, solver)

@@ -1,4 +1,4 @@
-"""The kernels do for one column, whose rows they share, what they do for many."""
+"""Kernels for one column, whose rows threads share, against those for many columns."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def double(*shape: int) -> wp.array:
     return wp.zeros(shape, dtype=wp.float64, device="cpu")
 
 
-def test_a_step():
+def test_step_kernels_for_one_and_many_columns_agree():
     u, d, t, one, many = column(ROWS), column(ROWS), double(1), column(ROWS), column(ROWS)
     t.fill_(0.3)
     for spread, out in ((ONE, one), (MANY, many)):
@@ -35,7 +35,7 @@ def test_a_step():
     np.testing.assert_array_equal(one.numpy(), many.numpy())
 
 
-def test_a_gradient_is_finished():
+def test_gradient_kernels_for_one_and_many_columns_agree():
     held = DEVICE.upload(RNG.integers(0, 2, (NODES, 3)), wp.int8)
     normals = RNG.normal(size=(NODES, 3)) * RNG.integers(0, 2, (NODES, 1))
     normal = DEVICE.upload(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9), DEVICE.vector)
@@ -51,7 +51,7 @@ def test_a_gradient_is_finished():
 
 
 @pytest.mark.parametrize("count", [0, 3, PAIRS])
-def test_products_with_the_pairs_that_are_known(count):
+def test_pair_product_kernels_for_one_and_many_columns_agree(count):
     s, w, vectors = column(PAIRS, ROWS), column(PAIRS, ROWS), [column(ROWS) for _ in range(4)]
     known = wp.array([count], dtype=wp.int32, device="cpu")
     one, many = double(2 * PAIRS + PRODUCTS, 1), double(2 * PAIRS + PRODUCTS, 1)

@@ -1,4 +1,4 @@
-"""What the world does: loads that make no sense are refused, and how rows and magnitudes are taken."""
+"""Loads: invalid ones are rejected; selection of rows and scaling."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ POINT = np.array([[0.05, 0.05, 0.1], [0.04, 0.06, 0.1], [0.07, 0.05, 0.1], [0.05
 LOADS = push(POINT, FORCE, 0.02)
 
 
-def test_no_cause_or_one_twice_is_refused() -> None:
+def test_loads_without_or_with_repeated_causes_are_rejected() -> None:
     with pytest.raises(InputError, match="causes none"):
         Loads(())
     with pytest.raises(InputError, match="each kind but Pushed once"):
@@ -40,12 +40,12 @@ def test_no_cause_or_one_twice_is_refused() -> None:
         (lambda: Loads((), np.array(0.1)), r"Loads\.time has shape \(\)"),
     ],
 )
-def test_bad_numbers_are_refused(build: Callable[[], Loads], sentence: str) -> None:
+def test_invalid_numbers_in_loads_are_rejected(build: Callable[[], Loads], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         build()
 
 
-def test_a_whole_field_of_another_mesh_is_refused() -> None:
+def test_nodal_field_of_another_mesh_is_rejected() -> None:
     body = Fem(base_held(box((2, 2, 2))), [Elasticity(), Held(), NodalForce()], TRAIN, "cpu", element="p1")
     with pytest.raises(InputError, match=rf"Nodal.force has 8 vertices, but the mesh has {COUNT}"):
         body.deform(Loads((Nodal(np.zeros((1, 8, 3))),)))
@@ -53,7 +53,7 @@ def test_a_whole_field_of_another_mesh_is_refused() -> None:
         body.deform(Loads((Prescribed(np.zeros((1, 8, 3))),)))
 
 
-def test_time_alone_is_a_load() -> None:
+def test_loads_may_consist_of_times_only() -> None:
     later = Loads((), np.array([0.1, 0.2]))
     both = stack([later, later.select(np.array([1])).scale(0.5)])
     np.testing.assert_array_equal(both.times, [0.1, 0.2, 0.2])
@@ -61,7 +61,7 @@ def test_time_alone_is_a_load() -> None:
     np.testing.assert_array_equal(body.deform(both).displacement, 0.0)
 
 
-def test_scaling_and_rows() -> None:
+def test_loads_are_scaled_and_selected_by_row() -> None:
     half = LOADS.scale(0.5).get(Pushed)
     each = LOADS.scale(np.arange(5.0)).select(np.array([3])).get(Pushed)
     assert half is not None

@@ -1,4 +1,4 @@
-"""Side and lobe of a tumour, at published places in MNI space."""
+"""Side and lobe of a tumour, at published locations in MNI space."""
 
 from types import SimpleNamespace
 
@@ -18,7 +18,7 @@ PLACES = {  # MNI [mm]; not the reference points themselves
 
 
 @pytest.mark.parametrize("scale", [0.9, 1.0, 1.1])
-def test_known_places_have_their_lobe_in_small_and_large_heads(scale):
+def test_published_locations_have_their_lobe_at_any_scale(scale):
     box = np.array([[-72.0, -106.0, -71.0], [72.0, 73.0, 82.0]])
     for named, places in PLACES.items():
         for place in places:

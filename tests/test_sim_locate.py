@@ -1,4 +1,4 @@
-"""Points of one mesh read in another."""
+"""Interpolation at points of one mesh in another."""
 
 import numpy as np
 from boxes import box
@@ -6,7 +6,7 @@ from boxes import box
 from sim.geometry.locate import locate
 
 
-def test_a_linear_field_is_read_exactly_and_a_vertex_at_itself():
+def test_linear_field_is_interpolated_exactly():
     mesh = box((4, 3, 5), distortion=0.2)
     points = np.random.default_rng(0).uniform(0.0, 1.0, (200, 3)) * mesh.nodes.max(axis=0)
     slope = np.random.default_rng(1).normal(size=(2, 3, 3))
@@ -18,7 +18,7 @@ def test_a_linear_field_is_read_exactly_and_a_vertex_at_itself():
     assert np.allclose(at_home.read(field), field[:, :50], atol=1e-12)
 
 
-def test_what_lies_outside_is_read_nearby():
+def test_point_outside_the_mesh_takes_nearby_values():
     mesh = box((2, 2, 2), size=0.1)
     found = locate(mesh, np.array([[0.03, 0.04, 0.11]]))
     assert np.allclose(found.read(mesh.nodes[None]), [[[0.03, 0.04, 0.1]]], atol=0.01)

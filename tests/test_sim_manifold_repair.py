@@ -1,4 +1,4 @@
-"""Tetrahedra taken away until the surface is a manifold."""
+"""Removal of tetrahedra until the surface is a manifold."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from sim.bodies.manifold_repair import clean
 from sim.geometry.tetmesh import compute_row_keys, find_single_faces
 
 
-def test_bodies_that_touch_in_an_edge_or_a_node_are_parted():
+def test_bodies_that_share_only_an_edge_or_node_are_separated():
     lattice = build_graded_lattice(np.zeros(3), np.ones(3), 0.25, 0, np.zeros_like)
     middle = lattice.nodes[lattice.tets].mean(axis=1) - 0.5
     for together in ((middle[:, :2] > 0).all(axis=1) | (middle[:, :2] < 0).all(axis=1), (middle > 0).all(axis=1)):

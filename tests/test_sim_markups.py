@@ -9,7 +9,7 @@ from sim.errors import InputError
 
 
 @pytest.mark.parametrize("system", ["LPS", "RAS", None])
-def test_coordinates_use_stated_system_or_slicers(tmp_path, system):
+def test_markup_coordinates_use_given_or_default_system(tmp_path, system):
     found = read_markup(markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0], [1.0, 2.0, 3.0]], "Line", system))
     np.testing.assert_allclose(found.points, [[0.01, 0.02, 0.03], [0.001, 0.002, 0.003]])
 
@@ -19,7 +19,7 @@ OLD = '1,{},{},30,0,0,0,1,1,1,0,"F, 1",,'
 
 @pytest.mark.parametrize(("system", "sign"), [("LPS", -1), ("1", -1), ("RAS", 1), ("0", 1)])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_points_of_older_files_are_of_the_system_that_is_stated(tmp_path, system, sign, end):
+def test_fcsv_points_use_the_given_coordinate_system(tmp_path, system, sign, end):
     """Slicer 5 has a carriage return before the status: 2 is placed, 1 is not."""
     rows = (OLD.format(10 * sign, 20 * sign), OLD.format(sign, 2) + "\r,2,0", OLD.format(5, 6) + "\r,1,0")
     found = read_markup(fcsv(tmp_path / "p.fcsv", system, *rows, end=end))
@@ -38,12 +38,12 @@ def test_points_of_older_files_are_of_the_system_that_is_stated(tmp_path, system
         ("LPS", "", "has 0 placed points"),
     ],
 )
-def test_older_files_that_do_not_say_all_are_refused(tmp_path, system, row, reason):
+def test_incomplete_fcsv_files_are_rejected(tmp_path, system, row, reason):
     with pytest.raises(InputError, match=reason):
         read_markup(fcsv(tmp_path / "p.fcsv", system, row))
 
 
-def test_a_curve_is_smooth_through_its_points(tmp_path):
+def test_closed_curve_passes_smoothly_through_its_points(tmp_path):
     smooth = read_markup(markup(tmp_path / "c.mrk.json", curve(), "ClosedCurve")).fit_curve()
     np.testing.assert_allclose(1e3 * np.linalg.norm(smooth, axis=1), RADIUS, atol=0.15)
     np.testing.assert_allclose((1e3 * smooth[:, 1] / 30.0) ** 2 + (1e3 * smooth[:, 0] / 18.0) ** 2, 1.0, atol=0.04)
@@ -60,7 +60,7 @@ def test_a_curve_is_smooth_through_its_points(tmp_path):
         ({"controlPoints": 3}, "cannot be read as markups"),
     ],
 )
-def test_other_files_are_refused(tmp_path, more, reason):
+def test_unsupported_markups_are_rejected(tmp_path, more, reason):
     points = more.pop("points", [[1.0, 2.0, 3.0]])
     with pytest.raises(InputError, match=reason):
         read_markup(markup(tmp_path / "p.mrk.json", points, **more))

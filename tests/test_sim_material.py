@@ -1,4 +1,4 @@
-"""Tissue descriptions: what they mean at small strain, what is refused, and the named ones."""
+"""Tissue descriptions: constants at small strain, rejected values, and named tissues."""
 
 import numpy as np
 import pytest
@@ -16,20 +16,20 @@ from sim.material import (
 )
 
 
-def test_engineering_constants_come_back_from_lames() -> None:
+def test_lame_constants_agree_with_young_and_poisson() -> None:
     mu, lam = Material("linear", 3000.0, 0.45).lame
     assert mu * (3.0 * lam + 2.0 * mu) / (lam + mu) == pytest.approx(3000.0)
     assert lam / (2.0 * (lam + mu)) == pytest.approx(0.45)
 
 
-def test_ogdens_constants_at_small_strain() -> None:
-    """Twice the shear modulus is the sum of c, whatever the exponents."""
+def test_ogden_constants_give_small_strain_moduli() -> None:
+    """Twice the shear modulus is the sum of c, for any exponents."""
     mu, lam = Ogden(((1000.0, -19.0), (-200.0, 4.0), (600.0, 0.5)), 5e4).lame
     assert mu == pytest.approx(700.0)
     assert lam + 2.0 * mu / 3.0 == pytest.approx(5e4)
 
 
-def test_coefficients_of_a_law_have_one_length() -> None:
+def test_coefficients_of_tissues_are_padded_to_equal_length() -> None:
     tissues = Ogden(((1.0, 2.0),), 9.0), Ogden(((3.0, 4.0), (5.0, 6.0), (7.0, 8.0)), 10.0)
     rows = collect_coefficients(tissues)
     np.testing.assert_array_equal(rows, [[9, 1, 2, 0, 1, 0, 1], [10, 3, 4, 5, 6, 7, 8]])
@@ -54,7 +54,7 @@ def test_coefficients_of_a_law_have_one_length() -> None:
         (((1000.0, 2.0),), np.inf, "bulk modulus is inf"),
     ],
 )
-def test_ogdens_constants_that_no_tissue_has(terms: tuple, bulk: float, words: str) -> None:
+def test_invalid_ogden_constants_are_rejected(terms: tuple, bulk: float, words: str) -> None:
     with pytest.raises(InputError, match=words):
         Ogden(terms, bulk)
 
@@ -71,7 +71,7 @@ def test_ogdens_constants_that_no_tissue_has(terms: tuple, bulk: float, words: s
         ("linear", 3000.0, np.nan, "Poisson's ratio is nan"),
     ],
 )
-def test_engineering_constants_that_no_tissue_has(law: str, young: float, poisson: float, words: str) -> None:
+def test_invalid_engineering_constants_are_rejected(law: str, young: float, poisson: float, words: str) -> None:
     with pytest.raises(InputError, match=words):
         Material(law, young, poisson)
 
@@ -79,12 +79,12 @@ def test_engineering_constants_that_no_tissue_has(law: str, young: float, poisso
 @pytest.mark.parametrize(
     "tissue", [*(known.tissue for known in MATERIALS.values()), Ogden(((0.1, -19.0), (1e3 / 3.0, 2.5)), 7.0)]
 )
-def test_a_tissue_written_is_the_tissue_read(tissue: Tissue) -> None:
+def test_tissue_json_round_trip_is_exact(tissue: Tissue) -> None:
     assert read_tissue_json(to_tissue_json(tissue)) == tissue
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-def test_named_tissues_report_range_and_source(name: str) -> None:
+def test_named_tissues_have_time_scale_stiffness_and_source(name: str) -> None:
     known = MATERIALS[name]
     assert any(word in known.time_scale for word in ("second", "minutes", "hours", "no fluid leaves"))
     assert len(known.source) > 20
@@ -93,7 +93,7 @@ def test_named_tissues_report_range_and_source(name: str) -> None:
     assert 0.44 < lam / (2.0 * (lam + mu)) < 0.5
 
 
-def test_published_figures_in_the_convention_of_the_house() -> None:
+def test_named_tissues_use_published_shear_moduli() -> None:
     """Ogden's mu of 670 Pa before 2 mu / alpha^2 is a shear modulus."""
     minutes = MATERIALS["minutes"].tissue
     assert isinstance(minutes, Ogden)
@@ -109,7 +109,7 @@ SERIES = ((0.45, 0.5), (0.365, 50.0))
 @pytest.mark.parametrize(
     "tissue", [Material("neo-hookean", 3000.0, 0.45, SERIES), Ogden(((1684.0, -4.7),), 4e4, SERIES), *PLAIN]
 )
-def test_tissues_come_back_from_their_line(tissue: Tissue) -> None:
+def test_tissue_json_round_trip_keeps_prony_series(tissue: Tissue) -> None:
     line = to_tissue_json(tissue)
     assert read_tissue_json(line) == tissue
     assert ("prony" in line) == bool(tissue.prony)
@@ -127,7 +127,7 @@ def test_tissues_come_back_from_their_line(tissue: Tissue) -> None:
         ("neo-hookean", ((0.5, 1.0), (0.5, 2.0)), "g sum to 1: must be below 1"),
     ],
 )
-def test_series_that_no_tissue_has(law: str, series: tuple, words: str) -> None:
+def test_invalid_prony_series_are_rejected(law: str, series: tuple, words: str) -> None:
     with pytest.raises(InputError, match=words):
         Material(law, 3000.0, 0.45, series)
     if law == "neo-hookean":

@@ -1,4 +1,4 @@
-"""What memory is free, as Linux says it, and the sentence when a batch does not fit."""
+"""Free memory as Linux reports it, and the error message for a batch that does not fit."""
 
 import re
 from pathlib import Path
@@ -19,8 +19,8 @@ def group(folder: Path, most: str, used: int, cached: int) -> MemoryBudget:
     return MemoryBudget(group=folder)
 
 
-def test_a_control_group_bounds_what_is_free(tmp_path: Path) -> None:
-    """Less what it uses; files that are merely cached are given up."""
+def test_control_group_limits_free_memory(tmp_path: Path) -> None:
+    """Less its used memory; cached files are not counted as used."""
     plain = measure_host_bytes()
     assert measure_host_bytes(group(tmp_path, "50000000", 20_000_000, 3_000_000)) == 33_000_000
     assert measure_host_bytes(group(tmp_path, "max", 20_000_000, 0)) == pytest.approx(plain, rel=0.2)
@@ -28,7 +28,7 @@ def test_a_control_group_bounds_what_is_free(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("batch", "count"), [(64, 2_000), (512, 400)])
-def test_what_is_said_to_fit_does_and_one_more_does_not(batch: int, count: int, tmp_path: Path) -> None:
+def test_reported_batch_limit_is_the_largest_that_fits(batch: int, count: int, tmp_path: Path) -> None:
     budget = group(tmp_path, "100000000", 0, 0)
     device = find_device("cpu", "float64")
     with pytest.raises(InputError) as refusal:
@@ -46,7 +46,7 @@ def test_what_is_said_to_fit_does_and_one_more_does_not(batch: int, count: int, 
             check_fits(ROWS, fitting + 1, count, device, budget=budget)
 
 
-def test_a_mesh_of_which_not_one_load_fits_is_reported(tmp_path: Path) -> None:
+def test_mesh_without_room_for_one_load_is_rejected(tmp_path: Path) -> None:
     budget = group(tmp_path, "1000000", 0, 0)
     with pytest.raises(InputError, match="coarser mesh"):
         check_fits(ROWS, 1, 1, find_device("cpu", "float64"), budget=budget)
@@ -55,7 +55,7 @@ def test_a_mesh_of_which_not_one_load_fits_is_reported(tmp_path: Path) -> None:
 CARD = Device("cuda:0", "float32")
 
 
-def test_columns_on_a_card_stand_in_rooms_of_few_widths() -> None:
+def test_workspaces_on_gpu_have_few_widths() -> None:
     counts = (1, 4, 5, 64, 65, 96, 97, 16384, 16385)
     assert [find_workspace_width(CARD, count) for count in counts] == [1, 4, 64, 64, 96, 96, 128, 16384, 32768]
     assert [find_widest_workspace(CARD, count) for count in (-3, 0, *counts)] == [
@@ -65,8 +65,8 @@ def test_columns_on_a_card_stand_in_rooms_of_few_widths() -> None:
     assert find_workspace_width(processor, 65) == find_widest_workspace(processor, 65) == 65
 
 
-def test_a_batch_that_fits_a_card_fills_its_room() -> None:
-    """As many loads as are worth it, and at least one."""
+def test_batch_size_fills_the_gpu_workspace() -> None:
+    """Memory for many loads gives as many as are efficient, at least one."""
     column = estimate_column_bytes(ROWS, CARD)
     batches = [choose_batch_size(ROWS, CARD, free * column) for free in (0, 2, 9, 100, 200, 10**9)]
     assert batches == [1, 1, 4, 4, 96, MemoryBudget.max_cases_on_cuda]

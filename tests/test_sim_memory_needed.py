@@ -1,4 +1,4 @@
-"""Memory that a batch needs, and what does not fit on a card."""
+"""Memory that a batch needs, and the error when a GPU has less."""
 
 import re
 
@@ -50,5 +50,5 @@ def test_gpu_overflow_is_rejected_with_fitting_batch() -> None:
         compute_needed(SPACE, CARD, 50_000, 1, 1, free).check_fits()
 
 
-def test_the_processor_is_asked_batch_by_batch() -> None:
+def test_needed_memory_is_not_estimated_on_cpu() -> None:
     assert estimate_needed(base_held(SPACE.mesh), None, TRAIN, "cpu", None, 10**9) is None

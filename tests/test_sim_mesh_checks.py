@@ -1,4 +1,4 @@
-"""Cells of mesh files from elsewhere: one body without overlaps, with the regions that a mesher gave it."""
+"""Cells of mesh files of other programs: one body without overlaps, with the mesher's regions."""
 
 import re
 from pathlib import Path
@@ -80,7 +80,7 @@ def test_coincident_nodes_of_different_data_are_rejected(tmp_path: Path) -> None
         ),
     ],
 )  # fmt: skip
-def test_regions_of_a_mesher_are_taken_with_a_note(changes: dict, region: np.ndarray, note: str) -> None:
+def test_regions_of_a_mesher_are_used_with_a_note(changes: dict, region: np.ndarray, note: str) -> None:
     raw = meshio.Mesh(MESH.nodes, [("tetra", MESH.tets)], **changes)
     found, (said,) = collect_regions(raw, [0])
     np.testing.assert_array_equal(found, region)
@@ -91,7 +91,7 @@ def test_regions_of_a_mesher_are_taken_with_a_note(changes: dict, region: np.nda
     ("msh", "gmsh22", "gmsh:physical"), ("vtu", None, "MaterialIds"),
     ("mesh", None, "medit:ref"), ("med", None, "cell_tags"), ("avs", None, "avsucd:material"), ("xdmf", None, "tag"),
 ])  # fmt: skip
-def test_regions_of_formats_are_taken(tmp_path: Path, suffix: str, form: str | None, name: str) -> None:
+def test_regions_are_read_from_each_mesh_format(tmp_path: Path, suffix: str, form: str | None, name: str) -> None:
     data = {name: [HALF + 1]} | ({"gmsh:geometrical": [HALF + 1]} if "gmsh" in name else {})
     file = read_mesh(write(tmp_path / f"a.{suffix}", form, cell_data=data))
     np.testing.assert_array_equal(file.mesh.region, HALF + 1)
@@ -133,13 +133,13 @@ CUBE = [[0, 2, 8, 6, 18, 20, 26, 24]]
         ),
     ],
 )  # fmt: skip
-def test_cells_that_are_no_one_body_are_rejected(tmp_path: Path, changes: dict, sentence: str) -> None:
+def test_cells_that_are_not_one_body_are_rejected(tmp_path: Path, changes: dict, sentence: str) -> None:
     path = write(tmp_path / "bad.vtu", **changes)
     with pytest.raises(InputError, match=sentence):
         read_mesh(path)
 
 
-def test_vtu_packed_with_lz4_says_so(tmp_path: Path) -> None:
+def test_vtu_packed_with_lz4_is_rejected(tmp_path: Path) -> None:
     path = write(tmp_path / "a.vtu")
     path.write_bytes(path.read_bytes().replace(b"vtkZLibDataCompressor", b"vtkLZ4DataCompressor"))
     with pytest.raises(InputError, match="its arrays are packed by vtkLZ4DataCompressor"):
@@ -198,7 +198,7 @@ def test_gmsh_groups_of_some_volumes_only_are_rejected(tmp_path: Path) -> None:
          "CELL_TYPES 1\n1\nFIELD FieldData 1\nnames 1 2 string\ngrey\nwhite\n", "has an array of text"),
     ],
 )  # fmt: skip
-def test_mesh_of_an_unread_kind_states_the_remedy(tmp_path: Path, text: str, reason: str) -> None:
+def test_mesh_of_unsupported_kind_is_rejected_with_remedy(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / ("a.vtk" if "vtk" in text else "a.msh")
     path.write_text(text)
     with pytest.raises(InputError, match=reason):

@@ -1,4 +1,4 @@
-"""Mesh files that refer to other files, declare what they do not hold, or are of a format that is read for ever."""
+"""Mesh files that refer to other files, declare more data than they hold, or have a format whose reader never ends."""
 
 from pathlib import Path
 
@@ -16,14 +16,14 @@ BODY = base_held(box((2, 2, 2), 0.02))
 
 
 @pytest.mark.parametrize("name", ["a.mdpa", "a.tec", "a.dat", "a.node", "a.vol.gz", "a.stl", "a"])
-def test_formats_that_may_be_read_for_ever_are_refused(tmp_path: Path, name: str) -> None:
+def test_formats_with_endless_readers_are_rejected(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"Begin Nodes\n")
     with pytest.raises(InputError, match=r"no mesh is read from .*: give a tetrahedral mesh as \.vtu, \.vtk"):
         read_mesh(tmp_path / name)
 
 
 @pytest.mark.parametrize("word", ["*INCLUDE", " *Include"])
-def test_a_mesh_includes_no_other_file(tmp_path: Path, word: str) -> None:
+def test_mesh_that_includes_another_file_is_rejected(tmp_path: Path, word: str) -> None:
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(tmp_path / "b.inp")
     (tmp_path / "a.inp").write_text(f"*HEADING\n{word}, INPUT={tmp_path}/b.inp\n")
     with pytest.raises(InputError, match=r"it includes another file\. Merge both into one file"):
@@ -31,7 +31,7 @@ def test_a_mesh_includes_no_other_file(tmp_path: Path, word: str) -> None:
 
 
 @pytest.mark.parametrize("way", ["over", "absolute", "link", "binary", "missing"])
-def test_xdmf_refers_to_its_own_folder_alone(tmp_path: Path, way: str) -> None:
+def test_xdmf_reference_outside_its_folder_is_rejected(tmp_path: Path, way: str) -> None:
     path, away = tmp_path / "in/a.xdmf", tmp_path / "a.h5"
     path.parent.mkdir()
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
@@ -49,7 +49,7 @@ def test_xdmf_refers_to_its_own_folder_alone(tmp_path: Path, way: str) -> None:
 
 @pytest.mark.parametrize("way", ["external link", "soft link", "external", "virtual", "declared"])
 @pytest.mark.parametrize("name", ["a.xdmf", "a.hmf"])
-def test_hdf5_of_a_mesh_holds_its_arrays_itself(tmp_path: Path, name: str, way: str) -> None:
+def test_hdf5_mesh_with_external_arrays_is_rejected(tmp_path: Path, name: str, way: str) -> None:
     path = tmp_path / name
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
     assert read_mesh(path).mesh.digest == BODY.mesh.digest
@@ -79,7 +79,7 @@ def test_hdf5_of_a_mesh_holds_its_arrays_itself(tmp_path: Path, name: str, way: 
         read_mesh(path)
 
 
-def test_hdf5_is_as_large_as_its_own_file_allows(tmp_path: Path) -> None:
+def test_hdf5_mesh_larger_than_allowed_ratio_is_rejected(tmp_path: Path) -> None:
     path, few = tmp_path / "a.xdmf", MeshBytes(max_ratio=2, small=2**10)
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
     with h5py.File(path.with_suffix(".h5"), "r+") as file:

@@ -1,4 +1,4 @@
-"""Nodes moved and tetrahedra taken away for the sake of shape, without harm to what is represented."""
+"""Smoothing of nodes and removal of tetrahedra for better shapes, without change of the represented surface."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_surface_fit_reduces_distance_at_same_volume(body):
     np.testing.assert_array_equal(still, body.nodes)
 
 
-def test_nodes_whose_move_turns_a_tetrahedron_inside_out_stay(body):
+def test_nodes_that_would_invert_a_tetrahedron_are_not_moved(body):
     inner = np.setdiff1d(np.arange(len(body.nodes)), find_single_faces(body.tets))
     thrown, pushed = inner[0], np.setdiff1d(inner, body.tets[(body.tets == inner[0]).any(axis=1)])[0]
     moved = body.nodes.copy()
@@ -89,7 +89,7 @@ def test_smoothing_improves_angles_on_the_surface(body):
     assert compute_signed_volumes(moved, body.tets).min() > 0.0
 
 
-def test_taking_ears_leaves_a_manifold(body):
+def test_removed_boundary_tetrahedra_leave_a_manifold(body):
     rough = body.tets[np.linalg.norm(body.nodes[body.tets].mean(axis=1), axis=1) < 0.7 * RADIUS]
     rough = rough[clean(rough)]
     everywhere = np.ones(len(rough), bool)

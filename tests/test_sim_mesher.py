@@ -1,4 +1,4 @@
-"""Meshes of rough tumours and cortices: fitted, or rejected with what would do."""
+"""Meshes of rough tumours and cortices: fitted, or rejected with a remedy."""
 
 import re
 import warnings
@@ -27,8 +27,8 @@ def rough_tumour(amount, width, seed=1):
     return lambda points: ball(points, radius=RADIUS * (1.2 + roughness(points.shape[:-1], amount, width, seed)))
 
 
-def test_a_rough_cortex_is_meshed(tmp_path, monkeypatch):
-    """A mesh fitted to it folds, so that nodes stay where that happens."""
+def test_rough_cortex_is_meshed(tmp_path, monkeypatch):
+    """A mesh fitted to the rough cortex folds, so that the nodes of folds are not moved."""
     affine, places = grid(AFFINES["straight"])
     rough = np.linalg.norm((places - MIDDLE) / AXES, axis=-1) < 0.9 + roughness(places.shape[:-1], 0.15, 2.0, 1)
     labels = np.where(ball(places), 3, rough)
@@ -43,7 +43,7 @@ def test_a_rough_cortex_is_meshed(tmp_path, monkeypatch):
         make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(factors=())))
 
 
-def test_what_is_fitted_without_folds_is_left_as_it_is(tmp_path, monkeypatch):
+def test_fit_without_folds_is_not_corrected(tmp_path, monkeypatch):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"])
     monkeypatch.delattr(mesher, "prevent_folds")
     assert len(make_anatomy(build_volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)).mesh.nodes)
@@ -63,7 +63,7 @@ def test_mesh_without_tumour_detail_names_needed_nodes(tmp_path):
     assert missed(2000, 1.0) > 0.1 > abs(missed(enough, 0.1))
 
 
-def test_small_pieces_are_another_reason_than_intricate_surfaces(tmp_path):
+def test_too_small_tumour_pieces_are_reported(tmp_path):
     subject = build_volume_subject(with_plates(tmp_path / "l.nii", 12), (1,), (3,))
     with pytest.raises(
         InputError, match=r"12 of the tumour's 13 pieces, 1.\d ml in all, are too small for 2000 nodes: "
@@ -71,7 +71,7 @@ def test_small_pieces_are_another_reason_than_intricate_surfaces(tmp_path):
         make_anatomy(subject, MeshPlan(nodes=2000, meshing=mesher.Meshing(factors=())))
 
 
-def test_labels_as_rough_as_their_voxels_are_to_be_smoothed(tmp_path):
+def test_too_rough_labels_are_rejected_with_advice_to_smooth(tmp_path):
     path, _, _ = labelled(tmp_path / "l.nii", AFFINES["straight"], rough_tumour(1.5, 1.2))
     plan = MeshPlan(nodes=2000, meshing=mesher.Meshing(factors=(1.25,)))
     with pytest.raises(InputError, match="too intricate for 2000 nodes: smooth the labels"):

@@ -1,4 +1,4 @@
-"""Mesh files: several formats in, `.vtu` out, every refusal a sentence, nothing half-written."""
+"""Mesh files: several input formats, `.vtu` output, rejected files with messages, no partial files."""
 
 import warnings
 from pathlib import Path
@@ -33,7 +33,7 @@ def write(path: Path, file_format: str | None = None, **changes: object) -> Path
 
 
 @pytest.mark.parametrize("mesh", [MESH, CURVED], ids=["linear", "quadratic"])
-def test_round_trip_is_exact(tmp_path: Path, mesh: TetMesh) -> None:
+def test_mesh_round_trip_is_exact(tmp_path: Path, mesh: TetMesh) -> None:
     value = np.random.default_rng(0).normal(size=(len(mesh.nodes), 3))
     write_mesh(tmp_path / "a.vtu", mesh, {"displacement": value})
     file = read_mesh(tmp_path / "a.vtu")
@@ -56,7 +56,7 @@ def test_anatomy_round_trip_is_exact(tmp_path: Path, mesh: TetMesh) -> None:
 
 
 @pytest.mark.parametrize("form", ["vtu", "vtk", "gmsh", "gmsh22", "abaqus", "xdmf"])
-def test_quadratic_tetrahedra_are_taken_as_they_are(tmp_path: Path, form: str) -> None:
+def test_quadratic_tetrahedra_are_read_unchanged(tmp_path: Path, form: str) -> None:
     suffix = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp"}.get(form, form)
     file = read_mesh(write(tmp_path / f"a.{suffix}", form, points=CURVED.nodes, cells=[("tetra10", CURVED.table)]))
     np.testing.assert_allclose(file.mesh.nodes, CURVED.nodes, atol=1e-12)
@@ -65,7 +65,7 @@ def test_quadratic_tetrahedra_are_taken_as_they_are(tmp_path: Path, form: str) -
 
 
 @pytest.mark.parametrize("version", [2.2, 4.1])
-def test_gmsh_has_its_own_order_of_mid_edge_nodes(tmp_path: Path, version: float) -> None:
+def test_gmsh_order_of_mid_edge_nodes_is_converted(tmp_path: Path, version: float) -> None:
     """Gmsh's manual, "Node ordering": the last two are the middles of edges 2-3 and 1-3. Written without meshio."""
     corners = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
     ends = np.array([[0, 1], [1, 2], [2, 0], [3, 0], [2, 3], [1, 3]])
@@ -86,36 +86,36 @@ def test_gmsh_has_its_own_order_of_mid_edge_nodes(tmp_path: Path, version: float
     np.testing.assert_allclose(mesh.nodes[mesh.middles], mesh.nodes[mesh.tets[:, QUADRATIC_EDGES]].mean(axis=2))
 
 
-def test_a_mesh_is_not_an_anatomy(tmp_path: Path) -> None:
+def test_mesh_without_anatomy_data_is_rejected_as_anatomy(tmp_path: Path) -> None:
     write_mesh(tmp_path / "a.vtu", MESH, {"held": np.zeros((27, 3))})
     with pytest.raises(InputError, match="no point data `slide_normal`, `craniotomy`"):
         read_anatomy(tmp_path / "a.vtu")
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".mesh", ".inp", ".xdmf"])
-def test_formats(tmp_path: Path, suffix: str) -> None:
+def test_mesh_formats_give_the_same_mesh(tmp_path: Path, suffix: str) -> None:
     file = read_mesh(write(tmp_path / f"a{suffix}"))
     np.testing.assert_allclose(file.mesh.nodes, MESH.nodes, atol=1e-12)
     np.testing.assert_array_equal(file.mesh.tets, MESH.tets)
 
 
-def test_millimetres(tmp_path: Path) -> None:
+def test_mesh_in_millimetres_requires_the_unit(tmp_path: Path) -> None:
     path = write(tmp_path / "a.vtu", points=1e3 * MESH.nodes)
     np.testing.assert_allclose(read_mesh(path, "mm").mesh.nodes, MESH.nodes, rtol=1e-15)
     with pytest.warns(MeshWarning, match="with unit mm if it has millimetres"):
         read_mesh(path)
 
 
-def test_no_region_is_one_region(tmp_path: Path) -> None:
+def test_mesh_without_regions_has_one_region(tmp_path: Path) -> None:
     assert not read_mesh(write(tmp_path / "a.vtu", cell_data={})).mesh.region.any()
 
 
-def test_regions_written_as_whole_floats(tmp_path: Path) -> None:
+def test_regions_stored_as_whole_floats_are_read(tmp_path: Path) -> None:
     path = write(tmp_path / "a.vtu", cell_data={"region": [MESH.region.astype(float)]})
     np.testing.assert_array_equal(read_mesh(path).mesh.region, MESH.region)
 
 
-def test_negative_tetrahedra_are_turned_with_a_note(tmp_path: Path) -> None:
+def test_negative_tetrahedra_are_reoriented_with_a_note(tmp_path: Path) -> None:
     tets = MESH.tets.copy()
     tets[:5] = tets[:5][:, [1, 0, 2, 3]]
     file = read_mesh(write(tmp_path / "a.vtu", cells=[("tetra", tets)]))
@@ -123,8 +123,8 @@ def test_negative_tetrahedra_are_turned_with_a_note(tmp_path: Path) -> None:
     assert file.mesh.volumes.min() > 0.0
 
 
-def test_middles_follow_their_edges_when_corners_are_turned(tmp_path: Path) -> None:
-    """A mesh seen in a mirror, and one whose corners another program numbered the other way round."""
+def test_mid_edge_nodes_follow_reoriented_tetrahedra(tmp_path: Path) -> None:
+    """A mirrored mesh, and one whose corners another program numbered in opposite order."""
     mirrored = read_mesh(
         write(tmp_path / "a.vtu", points=CURVED.nodes * [-1.0, 1.0, 1.0], cells=[("tetra10", CURVED.table)])
     )
@@ -139,7 +139,7 @@ def _edges(mesh: TetMesh) -> list[tuple[np.ndarray, int]]:
 
 
 def test_other_cells_are_dropped_with_a_note(tmp_path: Path) -> None:
-    """Regions stay with their tetrahedra, wherever the other cells stand."""
+    """Regions stay with their tetrahedra, in any order of the cells."""
     cells = [("triangle", MESH.surface), ("tetra", MESH.tets[:20]), ("line", [[0, 1]]), ("tetra", MESH.tets[20:])]
     region = [np.full(len(MESH.surface), 9), MESH.region[:20], np.array([8]), MESH.region[20:]]
     file = read_mesh(write(tmp_path / "a.vtu", cells=cells, cell_data={"region": region}))
@@ -173,14 +173,14 @@ def test_other_cells_are_dropped_with_a_note(tmp_path: Path) -> None:
         ({"cells": [("tetra", MESH.tets[:, [0, 1, 2, 2]])]}, "zero or negative"),
     ],
 )
-def test_bad_files_are_refused_by_name(tmp_path: Path, changes: dict, sentence: str) -> None:
+def test_bad_mesh_files_are_rejected_by_name(tmp_path: Path, changes: dict, sentence: str) -> None:
     path = write(tmp_path / "bad.vtu", **changes)
     with pytest.raises(InputError, match=sentence) as caught:
         read_mesh(path)
     assert str(caught.value).startswith(str(path))
 
 
-def test_a_missing_file(tmp_path: Path) -> None:
+def test_missing_mesh_file_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_mesh(tmp_path / "none.vtu")
     with pytest.raises(InputError, match="no such file"):
@@ -201,7 +201,7 @@ def test_a_missing_file(tmp_path: Path) -> None:
         ("a.nii.gz", "hello"),
     ],
 )
-def test_a_file_that_is_no_mesh(tmp_path: Path, name: str, text: str, capsys: pytest.CaptureFixture) -> None:
+def test_file_without_mesh_is_rejected(tmp_path: Path, name: str, text: str, capsys: pytest.CaptureFixture) -> None:
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -209,30 +209,30 @@ def test_a_file_that_is_no_mesh(tmp_path: Path, name: str, text: str, capsys: py
     assert str(caught.value).startswith(str(path))
 
 
-def test_a_truncated_file(tmp_path: Path) -> None:
+def test_truncated_mesh_file_is_rejected(tmp_path: Path) -> None:
     path = write(tmp_path / "a.vtu")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(InputError, match="cannot be read as a mesh"):
         read_mesh(path)
 
 
-def test_an_unknown_unit(tmp_path: Path) -> None:
+def test_unknown_unit_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'inch': choose one of m, mm"):
         read_mesh(write(tmp_path / "a.vtu"), "inch")
 
 
-def test_output_must_be_vtu(tmp_path: Path) -> None:
+def test_mesh_output_without_vtu_suffix_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"written as \.vtu"):
         write_mesh(tmp_path / "a.vtk", MESH, {})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_output_makes_its_folder_and_leaves_no_partial(tmp_path: Path) -> None:
+def test_mesh_output_creates_folder_without_partial_file(tmp_path: Path) -> None:
     write_mesh(tmp_path / "new" / "deep" / "a.vtu", MESH, {})
     assert [path.name for path in (tmp_path / "new" / "deep").iterdir()] == ["a.vtu"]
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.vtu"
     write_mesh(path, MESH, {})
     before = path.read_bytes()
@@ -252,7 +252,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     ("3D Slicer. SPACE=LPS", [-1, -1, 1]), ("mm;SPACE = lps", [-1, -1, 1]), ("SPACE=RAS", 1), ("FE space=H1", 1),
 ])  # fmt: skip
 @pytest.mark.parametrize("form", ["vtk42", "vtk51"])
-def test_vtk_in_lps_is_turned_with_a_note(tmp_path: Path, form: str, title: str, signs: list[int] | int) -> None:
+def test_vtk_in_lps_is_converted_with_a_note(tmp_path: Path, form: str, title: str, signs: list[int] | int) -> None:
     force = np.random.default_rng(2).normal(size=(len(MESH.nodes), 3))
     path = write(tmp_path / "a.vtk", form, points=CURVED.nodes * signs, cells=[("tetra10", CURVED.table)],
                  point_data={"force": np.resize(force, CURVED.nodes.shape) * signs})  # fmt: skip

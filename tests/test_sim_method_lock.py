@@ -1,4 +1,4 @@
-"""Threads that share a deformer get the answers that one of them alone would get."""
+"""Results of threads that share a deformer equal those of a single thread."""
 
 import threading
 from collections.abc import Callable
@@ -52,8 +52,8 @@ def together_and_alone(work: Callable[[int], list[T]]) -> list[tuple[T, T]]:
 
 
 @pytest.mark.parametrize("accuracy", [LIVE, REFERENCE], ids=["float32", "float64"])
-def test_finite_elements_shared_by_threads_answer_bit_for_bit(accuracy: Accuracy) -> None:
-    """Cold and warm: what is learnt on the way travels in the answers, not in the solver."""
+def test_finite_elements_shared_by_threads_are_bit_identical(accuracy: Accuracy) -> None:
+    """Cold and warm: warm data are part of the results, not of the solver."""
     fem = Fem(BODY, EFFECTS, accuracy, "cpu", batch=2, element="p1")
 
     def work(thread: int) -> list[Deformation]:
@@ -65,7 +65,7 @@ def test_finite_elements_shared_by_threads_answer_bit_for_bit(accuracy: Accuracy
         same(one, other)
 
 
-def test_residuals_and_series_shared_by_threads() -> None:
+def test_residuals_and_series_shared_by_threads_are_identical() -> None:
     fem = Fem(BODY, EFFECTS, REFERENCE, "cpu", batch=2, element="p1")
     nodes = np.arange(40, 46)
     modes = np.eye(18).reshape(18, 6, 3)
@@ -80,7 +80,7 @@ def test_residuals_and_series_shared_by_threads() -> None:
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_body_that_is_cut_shared_by_threads() -> None:
+def test_resected_body_shared_by_threads_is_bit_identical() -> None:
     gone = np.flatnonzero((BODY.mesh.nodes[BODY.mesh.tets].mean(axis=1) > [0.0, 0.0, 0.075]).all(axis=1))[:9]
     fem = build_fem(BODY, (*EFFECTS, Resection((tuple(gone.tolist()),))), LIVE, "cpu")
 
@@ -93,8 +93,8 @@ def test_a_body_that_is_cut_shared_by_threads() -> None:
         same(one, other)
 
 
-def test_device_results_survive_later_solves() -> None:
-    """Frame after frame, each thread on its own way; what is warm is read after others have moved on."""
+def test_results_on_device_are_kept_after_later_solves() -> None:
+    """Frame after frame, each thread on its own path; warm data are read after others have moved on."""
     fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu", element="p1")
     fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True))
 

@@ -39,7 +39,7 @@ def applied(factor: Factor, r: np.ndarray, precision: Precision, live: np.ndarra
 
 
 @pytest.mark.parametrize("precision", EXACT)
-def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
+def test_factor_is_inverse_over_free_motions(precision: Precision) -> None:
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     L, r = motions.toarray(), np.random.default_rng(0).normal(size=(stiffness.shape[0], FEW + 2))
@@ -51,7 +51,7 @@ def test_it_is_the_inverse_over_the_free_motions(precision: Precision) -> None:
 
 
 @pytest.mark.parametrize("precision", EXACT)
-def test_compliance_rows_match_unit_forces(precision: Precision) -> None:
+def test_compliance_agrees_with_solutions_of_unit_forces(precision: Precision) -> None:
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     rows = np.random.default_rng(1).choice(stiffness.shape[0], 2 * STRIP + 7, replace=False)
@@ -65,8 +65,8 @@ def test_compliance_rows_match_unit_forces(precision: Precision) -> None:
 
 
 @pytest.mark.parametrize("columns", [FEW, FEW + 2])
-def test_it_is_symmetric_in_single_precision(columns: int) -> None:
-    """Conjugate gradients ask it of every preconditioner, to round-off."""
+def test_factor_is_symmetric_in_single_precision(columns: int) -> None:
+    """Conjugate gradients require it of every preconditioner, to round-off."""
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float32"))
     r = np.random.default_rng(1).normal(size=(stiffness.shape[0], columns))
@@ -75,7 +75,7 @@ def test_it_is_symmetric_in_single_precision(columns: int) -> None:
 
 
 @pytest.mark.parametrize("count", [2, FEW + 3])
-def test_only_live_columns_are_solved(count: int) -> None:
+def test_factor_solves_selected_columns(count: int) -> None:
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"), "float64")
     r = np.random.default_rng(2).normal(size=(stiffness.shape[0], count))
@@ -86,7 +86,7 @@ def test_only_live_columns_are_solved(count: int) -> None:
 
 
 @pytest.mark.parametrize("columns", [1, FEW + 1])
-def test_single_precision_solves_forces_of_any_size(columns: int) -> None:
+def test_single_precision_factor_solves_forces_of_any_size(columns: int) -> None:
     """In a double-precision solver; a column without forces stays zero. Rounding depends on the processor."""
     stiffness, motions = system(sliding())
     factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"))
@@ -97,8 +97,8 @@ def test_single_precision_solves_forces_of_any_size(columns: int) -> None:
     assert (np.linalg.norm(found - expected, axis=0) <= 1e-4 * np.linalg.norm(expected, axis=0)).all()
 
 
-def test_single_precision_stays_positive_definite() -> None:
-    """Where single precision holds no inverse: springs between neighbours, ten thousand million times as stiff here."""
+def test_single_precision_factor_is_positive_definite() -> None:
+    """Condition number beyond single precision: springs between neighbours, every third one 1e10 times stiffer."""
     stiff = np.where(np.arange(299) % 3 == 0, 1e10, 1.0)
     diagonal = np.append(stiff, 0.0) + np.append(1.0, stiff)
     matrix = sp.csc_array(sp.diags_array([-stiff, diagonal, -stiff], offsets=[-1, 0, 1]))
@@ -107,14 +107,14 @@ def test_single_precision_stays_positive_definite() -> None:
     assert np.linalg.eigvalsh(gram / np.abs(gram).max())[0] > -1e-7
 
 
-def test_pieces_that_do_not_touch_are_solved_together() -> None:
+def test_factor_solves_disconnected_blocks() -> None:
     matrix = sp.csc_array(sp.block_diag([np.array([[2.0, -1.0], [-1.0, 2.0]])] * 200))
     factor = Factor(matrix, sp.csc_array(sp.eye_array(400)), np.arange(400), find_device("cpu", "float64"), "float64")
     r = np.random.default_rng(3).normal(size=(400, 1))
     np.testing.assert_allclose(matrix @ applied(factor, r, "float64"), r, rtol=1e-12)
 
 
-def test_a_single_unknown_and_none() -> None:
+def test_factor_of_one_or_no_unknown_is_exact() -> None:
     one = Factor(sp.csc_array([[4.0]]), sp.csc_array([[1.0]]), np.zeros(1, int), find_device("cpu", "float64"))
     assert applied(one, np.array([[2.0, 6.0]]), "float64").tolist() == [[0.5, 1.5]]
     none = Factor(sp.csc_array(np.eye(3)), sp.csc_array((3, 0)), np.zeros(0, int), find_device("cpu", "float64"))
@@ -122,8 +122,8 @@ def test_a_single_unknown_and_none() -> None:
         assert not applied(none, np.ones((3, columns)), "float64").any()
 
 
-def test_what_is_not_held_cannot_be_factorised() -> None:
-    """Rigid motions have no stiffness; neither has a node of no element."""
+def test_singular_stiffness_is_rejected() -> None:
+    """Rigid motions have no stiffness; neither has a node without elements."""
     anatomy = base_held(box(CELLS, 0.1, distortion=0.15))
     stiffness, _ = system(anatomy)
     every = sp.csc_array(sp.eye_array(stiffness.shape[0]))

@@ -1,4 +1,4 @@
-"""Two levels against dense algebra: symmetric, positive definite, and close to the inverse on every mesh."""
+"""Two levels against dense algebra: symmetric, positive definite, spectrally close to the inverse on every mesh."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def spread(K: np.ndarray, M: np.ndarray) -> float:
 
 @pytest.mark.parametrize("poisson", [0.3, 0.49])
 @pytest.mark.parametrize("kind", ["p2", "tetra10", "smoothed"])
-def test_symmetric_positive_and_close(kind: str, poisson: float) -> None:
+def test_two_level_is_symmetric_positive_and_close(kind: str, poisson: float) -> None:
     problem, preconditioner = built(kind, poisson, (2, 2, 3))
     assert isinstance(preconditioner, TwoLevel)
     K, M = matrices(problem, preconditioner)
@@ -79,12 +79,12 @@ def test_symmetric_positive_and_close(kind: str, poisson: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ["p2", "smoothed"])
-def test_refining_changes_little(kind: str) -> None:
+def test_two_level_condition_grows_little_under_refinement(kind: str) -> None:
     coarse, fine = (spread(*matrices(*built(kind, 0.45, (n, n, n)))) for n in (2, 3))
     assert fine < 1.5 * coarse
 
 
-def test_an_average_resists_less_than_what_is_averaged() -> None:
+def test_smoothed_stiffness_is_at_most_linear_stiffness() -> None:
     """Linear tetrahedra are the coarse solver of smoothed ones: their stiffness is at least as large."""
     (smoothed, _), (linear, _) = (built(kind, 0.49, (2, 2, 3)) for kind in ("smoothed", "p1"))
     basis = linear.constraint.build_basis()
@@ -95,8 +95,8 @@ def test_an_average_resists_less_than_what_is_averaged() -> None:
 
 
 @pytest.mark.parametrize("kind", ["p2", "smoothed"])
-def test_columns_that_are_done_change_nothing(kind: str) -> None:
-    """The live ones of a batch get what they get alone; single precision gets nearly the same."""
+def test_converged_columns_do_not_change_live_ones(kind: str) -> None:
+    """Live columns of a batch equal separate ones; single precision nearly agrees."""
     answers = {}
     for precision in ("float64", "float32"):
         problem, preconditioner = built(kind, 0.45, (2, 2, 3), precision)
@@ -113,7 +113,7 @@ def test_columns_that_are_done_change_nothing(kind: str) -> None:
     np.testing.assert_allclose(*answers.values(), atol=1e-4 * np.abs(answers["float64"]).max())
 
 
-def test_device_out_of_memory_differs_from_free_body():
+def test_out_of_memory_and_free_body_have_separate_messages():
     full = RuntimeError("Failed to allocate 21322944 bytes on device 'cuda:0'")
     assert explain_no_factor(full, "cuda:0").startswith(
         "cuda:0 has too little free memory for this mesh: end what else runs"

@@ -1,4 +1,4 @@
-"""Places on the surface that are nearest to a tool's core."""
+"""Points on the surface that are nearest to a tool's core."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from sim.discretisation.nearest_points import PlacedBox
 
 
 @pytest.mark.parametrize("half", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.4], [0.3, 0.5, 1e-9], [0.2, 0.3, 0.4]])
-def test_the_place_nearest_to_a_core_is_nearest(half: list[float]) -> None:
+def test_nearest_point_to_tool_core_agrees_with_lattice(half: list[float]) -> None:
     """Against a fine lattice on random triangles, whether or not they cut the core."""
     rng = np.random.default_rng(1)
     corners = rng.normal(size=(150, 3, 3)) * rng.uniform(0.3, 1.0, (150, 1, 3))
@@ -25,8 +25,8 @@ def test_the_place_nearest_to_a_core_is_nearest(half: list[float]) -> None:
     np.testing.assert_allclose(np.linalg.norm(way[far > 1e-9], axis=1), 1.0)
 
 
-def test_what_came_through_a_blade_is_pushed_down_again() -> None:
-    """The farther above, the deeper inside; beside the blade the nearest edge counts."""
+def test_triangle_through_blade_has_negative_distance() -> None:
+    """The farther above, the deeper inside; outside the blade the nearest edge counts."""
     blade = PlacedBox(np.zeros(3), np.eye(3), np.array([4.0, 6.0, 0.0]))
     flat = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     tilted = flat + [[0.0, 0.0, 0.1], [0.0, 0.0, 0.7], [0.0, 0.0, -0.2]]

@@ -1,4 +1,4 @@
-"""Equilibria found by independent solvers (FElupe, torch-fem, scikit-fem, dolfinx, warp.fem) on a 10 cm box."""
+"""Equilibria of independent solvers (FElupe, torch-fem, scikit-fem, dolfinx, warp.fem) on a 10 cm box."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +54,7 @@ def reference(name: str, law: str) -> Reference:
     ("name", "law"),
     [("base", "neo-hookean"), ("incl", "neo-hookean"), ("snh", "stable-neo-hookean"), ("corot", "corotational")],
 )
-def test_matches_the_independent_solution(name: str, law: str) -> None:
+def test_equilibrium_agrees_with_independent_solver(name: str, law: str) -> None:
     case = reference(name, law)
     deformation = case.solve(REFERENCE)
     assert deformation.outcome[0].good
@@ -63,7 +63,7 @@ def test_matches_the_independent_solution(name: str, law: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "law"), [("snh", "stable-neo-hookean"), ("corot", "corotational")])
-def test_single_precision_matches_at_training_accuracy(name: str, law: str) -> None:
+def test_single_precision_agrees_with_independent_solver(name: str, law: str) -> None:
     case = reference(name, law)
     deformation = case.solve(TRAIN)
     assert deformation.outcome[0].good

@@ -1,4 +1,4 @@
-"""The outer iteration on a body with a spring that remembers and a wall: batches, criteria, hard cases."""
+"""The outer iteration on a body with a creeping spring and a wall: batches, criteria, hard cases."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -78,26 +78,26 @@ def batch(problem: Problem) -> Found:
     return solve(problem, cases_of())
 
 
-def test_the_cases_leave_at_different_steps(batch: Found) -> None:
-    """Otherwise the tests below prove nothing."""
+def test_batch_cases_converge_after_different_steps(batch: Found) -> None:
+    """The tests below need different numbers of steps."""
     assert all(outcome is Outcome.CONVERGED for outcome in batch.outcome)
     assert len(set(batch.iterations)) >= 4
 
 
-def test_a_batch_is_its_rows_one_by_one(problem: Problem, batch: Found) -> None:
+def test_newton_batch_agrees_with_separate_rows(problem: Problem, batch: Found) -> None:
     for row in range(len(TOTAL)):
         alone = solve(problem, select_rows(cases_of(), np.array([row])))
         np.testing.assert_allclose(alone.u[:, 0], batch.u[:, row], atol=1e-8 * max(np.abs(batch.u[:, row]).max(), 1e-3))
         assert alone.iterations[0] == batch.iterations[row]
 
 
-def test_rows_do_not_depend_on_their_order(problem: Problem, batch: Found) -> None:
+def test_newton_rows_are_independent_of_order(problem: Problem, batch: Found) -> None:
     order = np.array([5, 0, 6, 2, 1, 4, 3])
     shuffled = solve(problem, select_rows(cases_of(), order))
     np.testing.assert_allclose(shuffled.u, batch.u[:, order], atol=1e-10)
 
 
-def test_history_arrives_in_its_rows(problem: Problem, batch: Found, device: Device) -> None:
+def test_history_is_stored_by_load_case(problem: Problem, batch: Found, device: Device) -> None:
     cases = cases_of()
     problem.begin(cases)
     memory = problem.end(device.upload(batch.u))
@@ -106,8 +106,8 @@ def test_history_arrives_in_its_rows(problem: Problem, batch: Found, device: Dev
     np.testing.assert_allclose(memory["spring"], before + (1.0 - np.exp(-0.7)) * (u - before), atol=1e-14)
 
 
-def test_history_travels_through_the_deformer() -> None:
-    """Spring that creeps: with each call the body sinks further, as the same steps one by one in a batch of its own."""
+def test_deformer_passes_history_to_the_next_frame() -> None:
+    """Creeping spring: the displacement grows with each call, and equals that of separate steps in a batch."""
     fem = Fem(ANATOMY, [Elasticity(), Held(), NodalForce()], TIGHT, "cpu", batch=2, element="p1")
     terms = (*fem.problem.terms, Spring(fem.problem.device, ROWS, 40.0))
     fem.strategy = replace(fem.strategy, problem=Problem(terms, fem.problem.constraint, fem.problem.device))
@@ -132,8 +132,8 @@ def test_history_travels_through_the_deformer() -> None:
             np.testing.assert_allclose(alone[0], whole[row], atol=1e-10)
 
 
-def test_the_wall_is_never_crossed(problem: Problem, batch: Found, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not by the answers, and not on the way: every state that the gradient sees lies below it."""
+def test_newton_never_crosses_the_wall(problem: Problem, batch: Found, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither in the results nor on the path: every evaluated state lies below it."""
     wall = next(term for term in problem.terms if isinstance(term, Wall))
     assert wall.distance(batch.u).min() > 0.0
     assert wall.distance(batch.u)[:, 5].min() < 1.5e-3  # the strong pull is held by it
@@ -150,7 +150,7 @@ def test_the_wall_is_never_crossed(problem: Problem, batch: Found, monkeypatch: 
     assert min(seen) > 0.0
 
 
-def test_energy_decreases_with_every_step(problem: Problem, device: Device) -> None:
+def test_energy_decreases_with_every_newton_step(problem: Problem, device: Device) -> None:
     """Budgets of 1, 2, 3, ... steps give the path; the total potential falls along it."""
     cases, path = cases_of(), [np.zeros((ROWS, len(TOTAL)))]
     path += [solve(problem, cases, Accuracy(tolerance=1e-10, outer=outer)).u for outer in range(1, 12)]
@@ -163,8 +163,8 @@ def test_energy_decreases_with_every_step(problem: Problem, device: Device) -> N
 
 
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_converged_means_converged_by_an_independent_residual(law: str) -> None:
-    """The criterion of `Accuracy`, recomputed in NumPy from the answers alone, at several tolerances and precisions."""
+def test_converged_outcome_agrees_with_independent_residual(law: str) -> None:
+    """The criterion of `Accuracy`, recomputed in NumPy from the results, at several tolerances and precisions."""
     material = tissue(law)
     force = top_forces(MESH, TOTAL)
     precisions: list[tuple[Precision, float]] = [("float64", 1e-4), ("float64", 1e-9), ("float32", 1e-3)]
@@ -187,7 +187,7 @@ def test_converged_means_converged_by_an_independent_residual(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_single_precision_agrees_with_double(law: str) -> None:
+def test_single_precision_newton_agrees_with_double(law: str) -> None:
     """Within 1e-3 of the largest motion at a tolerance of 1e-4: a factor ten for the condition of the box."""
     effects = Elasticity(tissue(law)), Held(), NodalForce()
     loads = Loads((Nodal(top_forces(MESH, TOTAL[1:])),))
@@ -210,8 +210,8 @@ def compressed() -> tuple[Fem, Loads]:
     return fem, Loads((Prescribed(value[None]), Nodal(force[None])))
 
 
-def test_negative_curvature_is_met_and_left(device: Device) -> None:
-    """The column buckles sideways by millimetres under a load of nothing, to a stable state."""
+def test_newton_finds_stable_state_after_negative_curvature(device: Device) -> None:
+    """The column buckles sideways by millimetres under a negligible load, to a stable state."""
     fem, loads = compressed()
     found = fem.deform(loads)
     assert found.outcome[0].good
@@ -235,8 +235,8 @@ def test_negative_curvature_is_met_and_left(device: Device) -> None:
     assert least(found.displacement.reshape(-1, 1)) > 0.0
 
 
-def test_block_jacobi_reaches_the_same_answer(device: Device) -> None:
-    """What meshes too large to factorise use."""
+def test_newton_with_block_jacobi_gives_same_result(device: Device) -> None:
+    """The preconditioner for meshes that are too large to factorise."""
     effects = Elasticity(), Held(), NodalForce()
     problem = compile_problem(effects, ANATOMY, device)
     cases = cases_of()
@@ -270,8 +270,8 @@ class Scaled:
         return replace(found, d=problem.device.upload(self.times(taken) * found.d.numpy()))
 
 
-def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, batch: Found) -> None:
-    """Every other step is lost, the others take the curvature at rest: slower, but it arrives."""
+def test_failed_search_is_repeated_with_positive_curvature(problem: Problem, batch: Found) -> None:
+    """Every other step fails, the others take the curvature at rest: slower, but convergent."""
     rows = np.array([1, 2, 4])
     problem.begin(select_rows(cases_of(), rows))
     patient = Accuracy(tolerance=1e-7, outer=300)
@@ -282,7 +282,7 @@ def test_a_failed_search_is_repeated_with_positive_curvature(problem: Problem, b
     np.testing.assert_allclose(found.u, batch.u[:, rows], atol=1e-6 * np.abs(batch.u).max())
 
 
-def test_a_search_that_fails_twice_is_reported(problem: Problem) -> None:
+def test_search_that_fails_twice_is_reported_as_stalled(problem: Problem) -> None:
     problem.begin(cases_of())
     uphill = Scaled(problem, lambda taken: np.full(len(taken), -1.0))
     found = equilibrium_of(problem, uphill, np.zeros((ROWS, len(TOTAL))), TIGHT)
@@ -291,7 +291,7 @@ def test_a_search_that_fails_twice_is_reported(problem: Problem) -> None:
 
 
 @pytest.mark.parametrize(("tiny", "outcome"), [(12, Outcome.CONVERGED), (1000, Outcome.STALLED)])
-def test_steps_below_the_last_digit_end_stalled(problem: Problem, batch: Found, tiny: int, outcome: Outcome) -> None:
+def test_only_many_tiny_steps_end_as_stalled(problem: Problem, batch: Found, tiny: int, outcome: Outcome) -> None:
     """Newton resumes after a few of them, and does not spend its budget on them."""
     problem.begin(select_rows(cases_of(), np.array([4])))
     sizes = chain(repeat(1e-20, tiny), repeat(1.0))
@@ -301,7 +301,7 @@ def test_steps_below_the_last_digit_end_stalled(problem: Problem, batch: Found, 
     assert found.iterations[0] <= 30
 
 
-def test_a_spent_budget_is_reported(problem: Problem) -> None:
+def test_exhausted_budget_is_reported(problem: Problem) -> None:
     found = solve(problem, cases_of(), Accuracy(tolerance=1e-10, outer=1))
     assert found.outcome[-1] is Outcome.BUDGET
     assert found.iterations[-1] == 1
@@ -322,8 +322,8 @@ LOST = {
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("law", ["stable-neo-hookean", "corotational"])
 @pytest.mark.parametrize("name", LOST)
-def test_a_lost_body_comes_back_by_itself(name: str, law: str, precision: Precision) -> None:
-    """Without any load, to a millionth of its size. No force is left to measure a residual against: that is rest."""
+def test_unloaded_body_returns_to_rest_without_restart(name: str, law: str, precision: Precision) -> None:
+    """Without load, to a millionth of its size. No force is left to scale a residual: that is rest."""
     problem = compile_problem([Elasticity(tissue(law)), Held(), NodalForce()], ANATOMY, find_device("cpu", precision))
     start = np.where(FREE, LOST[name] - MESH.nodes, 0.0).reshape(-1, 1)
     accuracy = Accuracy(tolerance=1e-4, outer=100, precision=precision)
@@ -334,7 +334,7 @@ def test_a_lost_body_comes_back_by_itself(name: str, law: str, precision: Precis
 
 
 def test_round_off_is_reported_and_ends_the_iteration() -> None:
-    """A core ten thousand times stiffer in single precision: the residual stays above the tolerance; double goes on."""
+    """A core ten thousand times stiffer: the residual stays above the tolerance; double precision converges."""
     core = np.linalg.norm(MESH.nodes[MESH.tets].mean(axis=1) - [0.033, 0.033, 0.07], axis=1) < 0.03
     mesh = TetMesh(MESH.nodes, MESH.tets, core.astype(int))
     effects = Elasticity(tissue("stable-neo-hookean"), {1: tissue("stable-neo-hookean", 3e7)}), Held(), NodalForce()

@@ -1,4 +1,4 @@
-"""Newton-CG within its radius: what it promises as a descent."""
+"""Newton-CG within its trust radius: requirements of a descent."""
 
 import numpy as np
 from boxes import base_held, box, top_forces
@@ -49,7 +49,7 @@ def walk(problem: Problem, descent: Descent, steps: int) -> list[tuple[np.ndarra
     return path
 
 
-def test_directions_lead_downhill_and_promise_their_slope(device: Device) -> None:
+def test_newton_cg_directions_are_downhill_and_predict_slope(device: Device) -> None:
     problem = begun(read_problem(device))
     for _, g, found in walk(problem, descent_of(problem), 8):
         slope = (g * found.d.numpy()).sum(axis=0)
@@ -57,8 +57,8 @@ def test_directions_lead_downhill_and_promise_their_slope(device: Device) -> Non
         np.testing.assert_allclose(found.predicted, -slope, rtol=1e-9)
 
 
-def test_memory_leaves_with_its_columns(device: Device) -> None:
-    """Three steps together, then some columns go on: as if they had always been alone."""
+def test_newton_cg_forgets_memory_of_removed_columns(device: Device) -> None:
+    """Three steps together, then some columns continue as if they had always been separate."""
     rows = np.array([3, 0, 4])
     problem = begun(read_problem(device))
     whole = descent_of(problem)
@@ -84,7 +84,7 @@ def test_memory_leaves_with_its_columns(device: Device) -> None:
     )
 
 
-def test_a_gap_is_closed_by_the_first_whole_step(device: Device) -> None:
+def test_first_full_step_closes_the_constraint_gap(device: Device) -> None:
     top = MESH.nodes[:, 2] > 0.1 - 1e-9
     anatomy = type(ANATOMY)(MESH, ANATOMY.fixed | top[:, None], ANATOMY.slide_normal, ANATOMY.craniotomy)
     value = np.where(top[:, None], [1e-3, 0.0, -2e-3], 0.0)
@@ -97,8 +97,8 @@ def test_a_gap_is_closed_by_the_first_whole_step(device: Device) -> None:
     assert done.outcome[0].good
 
 
-def test_newtons_radius_follows_the_steps(device: Device) -> None:
-    """What follows a step that was cut to a tenth is at most twice that long, in the norm of the rest stiffness."""
+def test_trust_radius_follows_accepted_steps(device: Device) -> None:
+    """After a step cut to a tenth, the next is at most twice that long, in the norm of the rest stiffness."""
     problem = begun(read_problem(device))
     K = problem.rest_curvature()
 

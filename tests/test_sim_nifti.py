@@ -1,4 +1,4 @@
-"""NIfTI files as other programs leave them: packed otherwise than named, rounded, or without an orientation."""
+"""NIfTI files of other programs: unusual compression, rounding, or missing orientation."""
 
 import struct
 from contextlib import nullcontext
@@ -16,7 +16,7 @@ from sim.errors import InputError
 @pytest.mark.parametrize(
     ("signs", "swapped"), [((-1, 1, 1), True), ((-1, -1, 1), True), ((-1, 1, -1), True), ((1, -1, -1), False)]
 )
-def test_forms_that_swap_sides_say_left_and_right(tmp_path, signs, swapped):
+def test_forms_that_swap_sides_are_noted(tmp_path, signs, swapped):
     affine, places = grid(AFFINES["straight"])
     image = nibabel.Nifti1Image(np.where(ball(places), 3, ellipsoid(places)).astype(np.int16), affine)
     image.set_qform(np.diag([*signs, 1.0]) @ affine, 1)
@@ -27,7 +27,7 @@ def test_forms_that_swap_sides_say_left_and_right(tmp_path, signs, swapped):
     assert "sform is taken" in note.lower()
 
 
-def test_header_without_voxel_size_says_so_without_a_log(tmp_path, capfd):
+def test_header_without_voxel_size_is_rejected_without_a_log(tmp_path, capfd):
     affine, places = grid(AFFINES["straight"])
     image = nibabel.Nifti1Image(np.where(ball(places), 3, ellipsoid(places)).astype(np.int16), affine)
     image.set_qform(affine, 1)
@@ -55,7 +55,7 @@ def test_overlong_quaternion_is_rounded_or_reported(tmp_path, kind):
             np.testing.assert_allclose(read_labels(tmp_path / "l.nii").affine[:3, :3], 1e-3 * turn)
 
 
-def test_values_of_an_unread_type_are_reported(tmp_path):
+def test_unsupported_voxel_type_is_rejected(tmp_path):
     raw = bytearray(nibabel.Nifti1Image(np.ones((4, 4, 4), np.int16), np.eye(4)).to_bytes())
     struct.pack_into("<hh", raw, 70, 1536, 128)
     (tmp_path / "l.nii").write_bytes(raw)

@@ -1,4 +1,4 @@
-"""NRRD headers whose voxels lie in a file beside them (`.nhdr`)."""
+"""NRRD headers with voxels in a separate file (`.nhdr`)."""
 
 import nrrd as reference
 import numpy as np
@@ -10,8 +10,8 @@ from sim.errors import InputError
 
 
 @pytest.mark.parametrize("coding", ["gzip", "raw"])
-def test_voxels_beside_a_header(tmp_path, coding):
-    """As pynrrd writes them; cut off, of another size, or without the voxels it is a sentence of the header's file."""
+def test_separate_voxel_file_of_nrrd_header_is_read(tmp_path, coding):
+    """Written by pynrrd; truncated, of another size or missing, it is rejected with the header's path."""
     affine, places = grid(count=12, edge=6.0)
     whole = read_volume(nrrd(tmp_path / "a.nrrd", head(places), affine))
     values, header = reference.read(str(tmp_path / "a.nrrd"))

@@ -29,8 +29,8 @@ PRINCIPAL = {
 @pytest.mark.parametrize("of", [tissue("ogden"), MINUTES], ids=["two terms", "minutes"])
 @pytest.mark.parametrize("turn", [np.eye(3), TURN], ids=["on the axes", "turned"])
 @pytest.mark.parametrize("stretches", PRINCIPAL.values(), ids=PRINCIPAL)
-def test_equal_stretches_are_no_special_case(of: Tissue, turn: np.ndarray, stretches: list[float]) -> None:
-    """Against the published stress and its differences, which take no notice of what is equal; in both precisions."""
+def test_ogden_stress_at_equal_stretches_is_exact(of: Tissue, turn: np.ndarray, stretches: list[float]) -> None:
+    """Against the published stress and its differences, which need no special case; in both precisions."""
     F = np.repeat((turn @ np.diag(stretches) @ turn.T)[None], 40, axis=0)
     D = np.random.default_rng(9).normal(size=F.shape)
     double, single = (build_evaluator(of, precision)(F - np.eye(3), D) for precision in ("float64", "float32"))
@@ -51,7 +51,7 @@ def test_equal_stretches_are_no_special_case(of: Tissue, turn: np.ndarray, stret
 @pytest.mark.parametrize("m", [-19.0, -4.0, 2.0, 8.0])
 @pytest.mark.parametrize("stretch", [0.5, 0.9, 1.1, 2.0])
 def test_incompressible_ogden_matches_closed_form(m: float, stretch: float) -> None:
-    """Uniaxial: sigma_1 - sigma_2 = sum c / m (s^m - s^(-m/2)), whatever K."""
+    """Uniaxial: sigma_1 - sigma_2 = sum c / m (s^m - s^(-m/2)), for any K."""
     of = Ogden(((1300.0, m), (200.0, 1.5)), 5e4)
     side = stretch**-0.5
     P = build_evaluator(of, "float64")(np.diag([stretch - 1.0, side - 1.0, side - 1.0])[None]).stress[0]
@@ -60,7 +60,7 @@ def test_incompressible_ogden_matches_closed_form(m: float, stretch: float) -> N
     assert np.abs(P - np.diag(np.diag(P))).max() == 0.0
 
 
-def test_exponent_of_nineteen_in_single_precision() -> None:
+def test_large_ogden_exponent_is_accurate_in_single_precision() -> None:
     single, double = (build_evaluator(MINUTES, precision) for precision in ("float32", "float64"))
     for spread, bound in ((1e-5, 1e-5), (1e-3, 1e-5), (0.1, 1e-5), (0.3, 1e-4)):
         H = gradients("ogden", 200, spread).astype(np.float32).astype(np.float64)
@@ -69,8 +69,8 @@ def test_exponent_of_nineteen_in_single_precision() -> None:
         assert relative(single(H).stress - exact.stress, exact.stress).max() < bound
 
 
-def test_a_term_of_no_stiffness_adds_nothing() -> None:
-    """Shorter sums are filled up with them where regions share a kernel."""
+def test_ogden_term_without_stiffness_changes_no_stress() -> None:
+    """Shorter sums are padded with them where regions share a kernel."""
     H = gradients("ogden")
     D = np.random.default_rng(10).normal(size=H.shape)
     of = tissue("ogden")

@@ -1,4 +1,4 @@
-"""The open cortex: its frame, places on it, and the closest points of surfaces."""
+"""The open cortex: its frame, positions on it, and the closest points of surfaces."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ def template():
     return read_anatomy(get_template_path())
 
 
-def test_closest_points_are_those_of_trimesh(template):
+def test_closest_points_agree_with_trimesh(template):
     random = np.random.default_rng(0)
     triangles = template.tumour_surface
     nodes = template.mesh.nodes
@@ -37,7 +37,7 @@ def test_closest_points_are_those_of_trimesh(template):
     assert np.allclose(moved.point - shifts[:, 0, 0], found.point, atol=1e-12)
 
 
-def test_a_place_is_where_it_was_asked_for(template):
+def test_place_on_cortex_has_requested_offsets(template):
     cortex = open_cortex(template)
     assert np.allclose(cortex.place().point, cortex.origin, atol=1e-12)
     for right, up in ((5.0, 0.0), (0.0, -7.0), (-6.0, 6.0)):
@@ -51,7 +51,7 @@ def test_a_place_is_where_it_was_asked_for(template):
 
 
 @pytest.mark.parametrize("asked", [(60.0, 0.0), (0.0, -200.0)])
-def test_a_place_under_the_bone_is_refused(template, asked):
+def test_place_under_the_bone_is_rejected(template, asked):
     with pytest.raises(InputError, match="outside the open cortex: stay within"):
         open_cortex(template).place(*asked)
 
@@ -65,12 +65,12 @@ def test_a_place_under_the_bone_is_refused(template, asked):
         ({"right_mm": float("nan")}, "right_mm has a value that is not finite"),
     ],
 )
-def test_a_place_that_is_no_number_is_refused(template, asked, reason):
+def test_place_with_invalid_number_is_rejected(template, asked, reason):
     with pytest.raises(InputError, match=reason):
         open_cortex(template).place(**asked)
 
 
-def test_without_a_craniotomy_there_is_none(template):
+def test_body_without_craniotomy_has_no_open_cortex(template):
     closed = replace(template, craniotomy=np.zeros(len(template.mesh.nodes), bool))
     with pytest.raises(InputError, match="no open cortex"):
         open_cortex(closed)

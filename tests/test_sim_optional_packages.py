@@ -1,4 +1,4 @@
-"""Extras: a command that needs a package of one says which, in one line."""
+"""Extras: a command without a package that it needs names the extra in one line."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_command_without_its_extra_says_which(words, tmp_path):
+def test_command_without_its_extra_names_package_and_extra(words, tmp_path):
     package, extra = COMMANDS[words]
     begin = f"import sys; sys.modules[{package!r}] = None\n"
     script = f"{begin}from scenes.cli import main\nsys.exit(main({words.split()}))"

@@ -1,4 +1,4 @@
-"""Cycles between part and whole: what they leave to others, and what they do not take."""
+"""Cycles between part and whole: columns passed on, and rejected cycles."""
 
 from dataclasses import replace
 
@@ -50,8 +50,8 @@ def larger(force: wp.array, factor: float) -> wp.array:
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e12, 1e30])
-def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
-    """Forces so large that they overflow, or that what is free of them looks small beside the rest."""
+def test_diverging_cycle_is_rejected(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
+    """Forces that overflow, or residuals that look small compared with them."""
     anatomy, space = body()
     problem = compile_problem((Elasticity(tissue(LAW)), *EFFECTS), anatomy, find_device("cpu", "float32"), space)
     problem.begin(Cases(loads_of(TOTAL[:4]), np.zeros(4)))
@@ -62,7 +62,7 @@ def test_a_cycle_that_explodes_is_not_taken(monkeypatch: pytest.MonkeyPatch, fac
     np.testing.assert_allclose(found.residual, 1.0)
 
 
-def test_what_gets_no_nearer_is_left_to_others() -> None:
+def test_stagnating_cycle_is_passed_on_to_next_solver() -> None:
     problem, space = begun(LAW, total=TOTAL[:1])
     found = descent_of(build_batch_elimination, problem, space, LAW).descend(
         problem.device.allocate(problem.rows, 1), np.zeros(1), 100

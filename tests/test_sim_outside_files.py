@@ -1,4 +1,4 @@
-"""Files from outside: one sentence of ours whatever is wrong, and bounded memory."""
+"""Input files: a one-line message for every defect, and bounded memory."""
 
 import base64
 import lzma
@@ -71,24 +71,24 @@ def bomb(path: Path) -> Path:
 
 class TestMeshes:
     @pytest.mark.parametrize("name", ["a.msh", "a4.msh", "a.vtk", "a.meshb"])
-    def test_no_format_makes_a_library_fill_the_memory(self, tmp_path: Path, name: str) -> None:
+    def test_mesh_formats_cannot_exhaust_memory(self, tmp_path: Path, name: str) -> None:
         before = resource.getrlimit(resource.RLIMIT_AS)
         with pytest.raises(InputError, match=r"take more than 1\.07 GB"):
             read_mesh(bomb(tmp_path / name))
         assert resource.getrlimit(resource.RLIMIT_AS) == before
 
     @pytest.mark.parametrize("name", ["a.msh", "a.vtk", "a.xdmf", "a.inp"])
-    def test_good_meshes_of_those_formats_are_read(self, tmp_path: Path, name: str) -> None:
+    def test_valid_meshes_of_limited_formats_are_read(self, tmp_path: Path, name: str) -> None:
         meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(tmp_path / name)
         assert np.array_equal(read_mesh(tmp_path / name).mesh.tets, BODY.mesh.tets)
 
-    def test_raw_bytes_behind_the_xml_are_counted(self, tmp_path: Path) -> None:
+    def test_raw_appended_bytes_count_towards_memory_limit(self, tmp_path: Path) -> None:
         block = zlib.compress(bytes(2**27))
         path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<4Q", 1, 2**27, 0, len(block)) + block)
         with memory_below(2**27), pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
             read_mesh(path, limits=FEW)
 
-    def test_a_small_file_does_not_fill_the_memory(self, tmp_path: Path) -> None:
+    def test_small_compressed_mesh_cannot_exhaust_memory(self, tmp_path: Path) -> None:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
         assert read_mesh(tmp_path / "a.vtu", limits=FEW).mesh.digest == BODY.mesh.digest
         fattened(tmp_path / "a.vtu", 128)
@@ -96,7 +96,7 @@ class TestMeshes:
             read_mesh(tmp_path / "a.vtu", limits=FEW)
         assert MeshBytes().max_bytes > 2**31
 
-    def test_a_file_is_no_larger_than_the_limit(self, tmp_path: Path) -> None:
+    def test_mesh_file_above_size_limit_is_rejected(self, tmp_path: Path) -> None:
         for name in ("a.vtu", "a.inp"):
             (tmp_path / name).touch()
             os.truncate(tmp_path / name, 60 * 10**9)  # of which the disk holds nothing
@@ -105,7 +105,7 @@ class TestMeshes:
         assert MeshBytes().limit_bytes(10) == 2**30 and MeshBytes().limit_bytes(2**24) == 100 * 2**24
 
     @pytest.mark.parametrize("packing", ["zlib", "lzma"])
-    def test_a_bomb_is_refused_at_the_limit(self, tmp_path: Path, packing: str) -> None:
+    def test_decompression_bomb_is_rejected_at_the_limit(self, tmp_path: Path, packing: str) -> None:
         """128 megabytes in a few kilobytes, whether or not the header says so."""
         block = {"zlib": zlib.compress, "lzma": lzma.compress}[packing](bytes(2**27))
         for size in (2**27, 2**10):
@@ -114,7 +114,7 @@ class TestMeshes:
             with pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
                 read_mesh(path, limits=FEW)
 
-    def test_what_looks_raw_in_a_comment_hides_no_array(self, tmp_path: Path) -> None:
+    def test_raw_data_tag_in_comment_does_not_evade_the_limit(self, tmp_path: Path) -> None:
         write_mesh(tmp_path / "a.vtu", BODY.mesh, {})
         text = fattened(tmp_path / "a.vtu", 64).read_text().replace("</VTKFile>", "<!-- </AppendedData> --></VTKFile>")
         (tmp_path / "a.vtu").write_text(text.replace("<Unstr", '<!-- <AppendedData encoding="raw"> --><Unstr', 1))
@@ -122,15 +122,15 @@ class TestMeshes:
             read_mesh(tmp_path / "a.vtu", limits=FEW)
 
     @pytest.mark.parametrize("kind", ["Int64", "Float64"])
-    def test_a_header_counts_upwards(self, tmp_path: Path, kind: str) -> None:
-        """Blocks of -8 bytes would make meshio read one place for ever."""
+    def test_vtu_header_of_signed_integers_is_rejected(self, tmp_path: Path, kind: str) -> None:
+        """Blocks of -8 bytes would make meshio read the same position for ever."""
         path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<q", -8) * 4)
         path.write_bytes(path.read_bytes().replace(b"UInt64", kind.encode()).replace(b' compressor="vtkZLib', b' a="'))
         with pytest.raises(InputError, match=f"header_type is '{kind}'. Write it again with UInt64"):
             read_mesh(path)
 
     @pytest.mark.parametrize("name", ["a.vtu", "a.xdmf"])
-    def test_entities_fill_no_memory_and_read_no_file(self, tmp_path: Path, name: str) -> None:
+    def test_xml_entities_are_rejected_without_expansion(self, tmp_path: Path, name: str) -> None:
         tens = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
         for entities in (f'<!ENTITY a0 "aaaaaaaaaa">{tens}', '<!ENTITY a11 SYSTEM "file:///etc/passwd">'):
             (tmp_path / name).write_text(f"<!DOCTYPE x [{entities}]><Xdmf Version='3.0'>&a11;</Xdmf>")
@@ -138,7 +138,7 @@ class TestMeshes:
                 read_mesh(tmp_path / name)
 
     @pytest.mark.parametrize("path", [None, 3, b"a.vtu"])
-    def test_what_names_no_file_is_a_sentence(self, path: object) -> None:
+    def test_path_of_wrong_type_is_rejected(self, path: object) -> None:
         with pytest.raises(InputError, match="names no file: give its path as text"):
             read_anatomy(path)  # pyright: ignore[reportArgumentType]
 
@@ -153,10 +153,10 @@ class TestMeshes:
         ("a.vtk", "# vtk DataFile Version 3.0\n\nASCII\nDATASET A\x1b[2J\n", "Only VTK .* supported .not A [2J.*"),
         ("a.msh", "$MeshFormat\n5.0 0 8\n$EndMeshFormat", "Need mesh format in .* .got 5.0."),
     ])  # fmt: skip
-    def test_mesh_reader_reports_only_a_true_reason(
+    def test_mesh_reader_message_includes_reason_of_meshio(
         self, tmp_path: Path, capfd: pytest.CaptureFixture, name: str, text: str, reason: str | None
     ) -> None:
-        """meshio's own reason is passed on; other exceptions are those of a damaged file."""
+        """meshio's own reason is included; other exceptions mean a damaged file."""
         path = tmp_path / name
         path.write_text(text)
         said = f"meshio reports `{reason}`" if reason else "cannot be read as a mesh: it is damaged, or of another kind"
@@ -165,7 +165,7 @@ class TestMeshes:
             read_mesh(path)
         assert capfd.readouterr() == ("", "")
 
-    def test_an_anatomy_is_in_metres(self, tmp_path: Path) -> None:
+    def test_anatomy_in_millimetres_is_rejected(self, tmp_path: Path) -> None:
         mesh = TetMesh(BODY.mesh.nodes, BODY.mesh.tets, BODY.mesh.region)
         write_mesh(tmp_path / "m.vtu", mesh, self.fields())
         assert read_anatomy(tmp_path / "m.vtu").digest == BODY.digest
@@ -176,7 +176,7 @@ class TestMeshes:
             read_anatomy(tmp_path / "mm.vtu")
 
     @pytest.mark.parametrize("name", ["held", "slide_normal", "craniotomy"])
-    def test_marks_are_numbers(self, tmp_path: Path, name: str) -> None:
+    def test_anatomy_with_nan_fields_is_rejected(self, tmp_path: Path, name: str) -> None:
         field = self.fields()[name].astype(float)
         field[3] = np.nan
         write_mesh(tmp_path / "a.vtu", BODY.mesh, self.fields() | {name: field})
@@ -191,7 +191,7 @@ class TestMeshes:
             "craniotomy": BODY.craniotomy.astype(np.uint8),
         }
 
-    def test_damage_is_a_sentence_or_another_anatomy(self, tmp_path: Path) -> None:
+    def test_damaged_anatomy_is_rejected_or_still_valid(self, tmp_path: Path) -> None:
         write_anatomy(tmp_path / "a.vtu", BODY)
         whole = np.frombuffer((tmp_path / "a.vtu").read_bytes(), np.uint8)
         refused = 0
@@ -211,7 +211,7 @@ class TestMeshes:
 @pytest.mark.parametrize(
     "text", ["[]", "3", "null", "{}", "[" * 100_000, '{"law": []}', '{"law": "linear", "young": "a", "poisson": 0.3}']
 )
-def test_a_tissue_that_is_none_is_a_sentence(text: str) -> None:
+def test_invalid_tissue_json_is_rejected(text: str) -> None:
     assert read_tissue_json(to_tissue_json(BRAIN)) == BRAIN
     with pytest.raises(InputError) as caught:
         read_tissue_json(text)
@@ -230,13 +230,13 @@ def test_a_tissue_that_is_none_is_a_sentence(text: str) -> None:
         (SystemExit(1), "damaged"),
     ],
 )
-def test_whatever_a_library_raises_is_a_sentence(error: BaseException, reason: str) -> None:
+def test_exceptions_of_libraries_become_input_errors(error: BaseException, reason: str) -> None:
     sentence = rf"a\.x: cannot be read as a thing: .*{reason}.*\. Make one\."
     with pytest.raises(InputError, match=sentence) as caught, read_as("a.x", "a thing", "Make one."):
         raise error
     assert not re.search(r"4 GiB|depth|-3|99|encrypted|library", str(caught.value))
 
 
-def test_an_interruption_stays_one() -> None:
+def test_keyboard_interrupt_is_not_converted() -> None:
     with pytest.raises(KeyboardInterrupt), read_as("a.x", "a thing", "Make one."):
         raise KeyboardInterrupt

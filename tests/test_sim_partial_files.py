@@ -40,7 +40,7 @@ def test_leftovers_of_dead_processes_only_are_removed(tmp_path):
 DECADE = 10 * 365 * 86400.0
 
 
-def test_times_of_files_decide_nothing(tmp_path, monkeypatch):
+def test_leftovers_are_identified_without_file_times(tmp_path, monkeypatch):
     run = RunSettings("own", "0", 1, "cpu", {})
     monkeypatch.setattr("time.time", lambda: 0.0)  # a clock that was set back
     assert begin(tmp_path, run, PLAN) and not begin(tmp_path, run, PLAN) and read_run(tmp_path) == run

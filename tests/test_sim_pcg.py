@@ -64,7 +64,7 @@ def solve(problem: Problem, preconditioner: Preconditioner, r: np.ndarray, toler
     return solve_conjugate_gradients(problem, preconditioner, problem.device.upload(r), tolerance, most)
 
 
-def test_solves_to_the_tolerance_column_by_column(problem: Problem, preconditioner: Preconditioner) -> None:
+def test_pcg_solves_each_column_to_the_tolerance(problem: Problem, preconditioner: Preconditioner) -> None:
     K, r = dense(problem, 1e-2 * CRUSHED), compute_right_hand_side(problem)
     found = solve(problem, preconditioner, r, 1e-10 * np.linalg.norm(r, axis=0), 400)
     x = found.x.numpy()
@@ -75,7 +75,7 @@ def test_solves_to_the_tolerance_column_by_column(problem: Problem, precondition
     assert not found.truncated.any()
 
 
-def test_needs_no_more_iterations_than_unknowns(problem: Problem, preconditioner: Preconditioner) -> None:
+def test_pcg_needs_no_more_iterations_than_unknowns(problem: Problem, preconditioner: Preconditioner) -> None:
     """Directions are conjugate: exact arithmetic ends after n steps; steepest descent takes hundreds."""
     dense(problem, 1e-2 * CRUSHED)
     r = compute_right_hand_side(problem)
@@ -83,7 +83,7 @@ def test_needs_no_more_iterations_than_unknowns(problem: Problem, preconditioner
     assert found.iterations <= (1.2 * len(FREE) if isinstance(preconditioner, BlockJacobi) else 8)
 
 
-def test_the_factor_inverts_the_rest_stiffness(problem: Problem) -> None:
+def test_factor_inverts_the_rest_stiffness(problem: Problem) -> None:
     K, r = dense(problem, REST), compute_right_hand_side(problem)
     out = problem.device.allocate(*r.shape)
     build_rest_solver(problem).apply(problem.device.upload(r), np.ones(2, bool), out)
@@ -107,7 +107,7 @@ def test_negative_curvature_gives_a_descent_direction(problem: Problem, precondi
     assert ((curved > 0.0) | first).all()
 
 
-def test_a_budget_ends_the_iteration(problem: Problem) -> None:
+def test_pcg_ends_at_its_iteration_budget(problem: Problem) -> None:
     dense(problem, 1e-2 * CRUSHED)
     r = compute_right_hand_side(problem)
     found = solve(problem, BlockJacobi(problem.device), r, np.zeros(2), 5)
@@ -115,7 +115,7 @@ def test_a_budget_ends_the_iteration(problem: Problem) -> None:
     assert np.isfinite(found.x.numpy()).all()
 
 
-def test_nothing_to_solve_is_zero(problem: Problem, preconditioner: Preconditioner) -> None:
+def test_pcg_solution_for_zero_force_is_zero(problem: Problem, preconditioner: Preconditioner) -> None:
     dense(problem, REST)
     found = solve(problem, preconditioner, np.zeros((ROWS, 2)), np.zeros(2), 400)
     assert found.iterations == 0
@@ -131,7 +131,7 @@ def downhill(problem: Problem, sign: np.ndarray) -> tuple[wp.array, Direction]:
     return u, Direction(problem.device.upload(d), np.abs((g.numpy() * d).sum(axis=0)), 0)
 
 
-def test_search_accepts_where_the_energy_falls(problem: Problem) -> None:
+def test_line_search_lowers_the_energy(problem: Problem) -> None:
     u, direction = downhill(problem, np.ones(2))
     length = search(problem, u, direction)
     assert ((length > 0.0) & (length <= 1.0)).all()
@@ -140,14 +140,14 @@ def test_search_accepts_where_the_energy_falls(problem: Problem) -> None:
     assert (problem.energy(moved) < before).all()
 
 
-def test_search_returns_zero_uphill_and_only_there(problem: Problem) -> None:
+def test_line_search_returns_zero_only_for_uphill_direction(problem: Problem) -> None:
     u, direction = downhill(problem, np.array([1.0, -1.0]))
     length = search(problem, u, direction)
     assert length[0] > 0.0
     assert length[1] == 0.0
 
 
-def test_search_does_not_move_what_it_is_given(problem: Problem) -> None:
+def test_line_search_does_not_change_its_arguments(problem: Problem) -> None:
     u, direction = downhill(problem, np.ones(2))
     before = direction.d.numpy().copy()
     search(problem, u, direction)
@@ -155,8 +155,8 @@ def test_search_does_not_move_what_it_is_given(problem: Problem) -> None:
     np.testing.assert_array_equal(direction.d.numpy(), before)
 
 
-def test_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -> None:
-    """Half of what the whole solution takes, and less where the curvature is negative; a large one changes nothing."""
+def test_trust_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -> None:
+    """Half of the norm of the full solution, less where the curvature is negative; a large radius has no effect."""
     K, r = dense(problem, 1e-2 * CRUSHED), compute_right_hand_side(problem)
     rest, solver = dense(problem, REST), build_rest_solver(problem)
     tolerance = 1e-10 * np.linalg.norm(r, axis=0)
@@ -184,8 +184,8 @@ def test_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -> None
     assert (model[1] < model[0]).all()
 
 
-def test_search_lengthens_what_it_cut_too_much(problem: Problem) -> None:
-    """Along a direction far too long it comes near the minimum, not to a tenth of a tenth of the way."""
+def test_line_search_extends_a_step_that_was_cut_too_much(problem: Problem) -> None:
+    """Along a direction that is far too long it ends near the minimum."""
     u, direction = downhill(problem, np.ones(2))
     far = 37.0 / search(problem, u, direction)
     long = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.predicted, 0)
@@ -199,7 +199,7 @@ def test_search_lengthens_what_it_cut_too_much(problem: Problem) -> None:
     assert (np.abs(slope(length)) <= 0.5 * long.predicted).all()
 
 
-def test_negligible_step_is_rejected(problem: Problem) -> None:
+def test_line_search_rejects_negligible_step(problem: Problem) -> None:
     """Only a step of 1e-10 of the direction lowers the energy."""
     u, direction = downhill(problem, np.ones(2))
     length = search(problem, u, direction)

@@ -1,4 +1,4 @@
-"""Where the skull is opened, and what places are called."""
+"""Position of the craniotomy, and names of locations."""
 
 import numpy as np
 import pytest
@@ -39,19 +39,19 @@ def test_craniotomy_is_centred_on_reachable_cortex(cortex):
         ((np.nan, 0.0, 0.0), "finite"),
     ],
 )
-def test_an_opening_that_cannot_be_is_a_sentence(cortex, place, reason):
+def test_impossible_craniotomy_is_rejected_with_reason(cortex, place, reason):
     with pytest.raises(InputError, match=reason):
         find_opening_at(cortex, np.array(place))
 
 
-def test_how_far_off_a_point_may_lie_is_asked_for(cortex):
+def test_largest_distance_from_surface_is_an_option(cortex):
     asked = np.array([0.0, 0.0, 0.12])
     with pytest.raises(InputError, match="50 mm is the most"):
         find_opening_at(cortex, 1.3 * asked, Placement(max_surface_distance=0.05))
     assert find_opening_at(cortex, asked, Placement(max_surface_distance=0.06))[2] > 0.06
 
 
-def test_over_a_point_outside_nothing_is_opened(cortex):
+def test_craniotomy_over_point_outside_brain_is_rejected(cortex):
     with pytest.raises(InputError, match="lies 30 mm outside the brain"):
         find_opening_over(cortex, np.array([0.1, 0.0, 0.0]), -0.03)
     with pytest.raises(InputError, match="over the brainstem"):
@@ -69,11 +69,11 @@ def test_over_a_point_outside_nothing_is_opened(cortex):
         ((0.03, 0.0, 0.01), "right"),
     ],
 )
-def test_places_are_called_as_clinicians_call_them(place, words):
+def test_location_names_follow_clinical_usage(place, words):
     assert describe_side(np.array(place), LOW, HIGH) == words
 
 
-def test_too_few_nodes_are_refused_with_how_many_would_do():
+def test_too_few_nodes_are_rejected_with_sufficient_number():
     asked = []
 
     def would_do(count):

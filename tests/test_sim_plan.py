@@ -1,4 +1,4 @@
-"""Which solvers answer a load: the table says what is done, and what is done is what the table says."""
+"""Solvers that are selected for a load: the table, and the solvers that run."""
 
 from dataclasses import replace
 
@@ -48,13 +48,13 @@ def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accura
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
-def test_the_table(more, one, few, many):
+def test_planned_solver_steps_agree_with_the_table(more, one, few, many):
     plan = planned(**more)
     assert [plan.list_steps(count) for count in (1, 2, MANY)] == [one, few, many]
     assert plan.list_steps(MANY, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
 
 
-def test_contact_is_solved_apart_for_one_tool_kind_only():
+def test_contact_descent_requires_exactly_one_tool_effect():
     assert planned(**POSED).contact is SolverStep.CONTACT and planned().contact is None
     both = (*POSED["effects"], Retraction(Spatula(12e-3, 20e-3, 1e-3)))
     assert planned(**{**POSED, "effects": both}).contact is SolverStep.NEWTON
@@ -69,7 +69,7 @@ def test_contact_is_solved_apart_for_one_tool_kind_only():
         (SolverStep.NEWTON, {1: (SolverStep.STRAINED, *LAST), MANY: (SolverStep.NEAR, *LAST)}),
     ],
 )
-def test_what_is_avoided_is_not_tried(avoid, steps):
+def test_avoided_solver_step_is_not_planned(avoid, steps):
     plan = planned(live=True, element="smoothed", avoid=(avoid,))
     assert {count: plan.list_steps(count) for count in steps} == steps
     assert planned(**POSED, avoid=(SolverStep.CONTACT,)).contact is SolverStep.NEWTON
@@ -81,7 +81,7 @@ def test_what_is_avoided_is_not_tried(avoid, steps):
     ("count", "more"), [(1, {"live": True, "element": "smoothed"}), (MANY, {}), (1, {"element": "p2"})]
 )
 def test_evaluation_budget_bounds_work_before_newton(count, more, evaluations, monkeypatch):
-    """Counted at the element's kernels, of the whole body: a local solver's part is another problem."""
+    """Counted at the element's kernels of the whole body: the part of a local solver is another problem."""
     accuracy, looks = replace(TRAIN, evaluations=evaluations, outer=PLAN_LIMITS.min_outer_iterations, steps=0), []
     fem = Fem(BODY, PUSHED, accuracy, "cpu", **{"element": "p1", **more})
     whole = next(term for term in fem.problem.terms if isinstance(term, ElasticTerm))
@@ -108,7 +108,7 @@ def test_evaluation_budget_bounds_work_before_newton(count, more, evaluations, m
         replace(TRAIN, evaluations=-1)
 
 
-def test_quadratic_loads_go_one_by_one():
+def test_quadratic_elements_use_batches_of_one():
     assert planned(element="p2", batch=8).batch == 1 and planned(batch=8).batch == 8
 
 
@@ -116,8 +116,8 @@ def test_quadratic_loads_go_one_by_one():
     ("count", "more"),
     [(1, {"live": True, "element": "smoothed"}), (2, {"live": True}), (MANY, {}), (1, {"element": "p2"})],
 )
-def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
-    """Each step that is asked passes every load on, so that all are heard."""
+def test_solvers_run_in_the_order_of_the_plan(count, more, monkeypatch):
+    """Each solver passes every load on, so that all are recorded."""
     tried, left = [], [PLAN_LIMITS.max_evaluations]
     kinds = {
         BatchElimination: SolverStep.NEAR,
@@ -185,7 +185,7 @@ def test_what_is_tried_is_what_the_plan_says(count, more, monkeypatch):
     ],
     ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )
-def test_it_is_reported_in_sentences(more, said, unsaid):
+def test_plan_explanation_describes_the_solvers(more, said, unsaid):
     lines = planned(**more).explain()
     text = " ".join(lines)
     assert all(line[0].isupper() and line.endswith(".") and len(line.split()) < 32 for line in lines), lines

@@ -1,4 +1,4 @@
-"""The power series of an answer in the size of its load: held to equilibria that Newton finds."""
+"""Power series of a displacement in the size of its load, against equilibria of Newton's method."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def series(fem, loads, orders, nodes, sizes=1):
 
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
 @pytest.mark.parametrize("law", [law for law in LAWS if law != "linear"])
-def test_what_is_left_falls_with_the_fourth_power(box, law, element):
+def test_series_error_falls_with_fourth_power_of_load(box, law, element):
     fem = Fem(box, (Elasticity(Material(law, 3000.0, 0.45)), *EFFECTS), REFERENCE, "cpu", element=element)
     nodes = box.tumour_nodes
     terms = series(fem, pushes(1.0), 3, nodes)
@@ -50,7 +50,7 @@ def test_what_is_left_falls_with_the_fourth_power(box, law, element):
     assert (np.log2(left[0] / left[1]) > 3.7).all() and (np.log2(left[0] / left[1]) < 4.6).all()
 
 
-def test_a_linear_body_has_one_order_only(box):
+def test_linear_body_has_only_first_order_terms(box):
     fem = Fem(box, (Elasticity(Material("linear", 3000.0, 0.45)), *EFFECTS), REFERENCE, "cpu", element="p1")
     nodes = np.arange(len(box.mesh.nodes))
     first, second, third = series(fem, pushes(1.0), 3, nodes)
@@ -58,12 +58,12 @@ def test_a_linear_body_has_one_order_only(box):
     assert max(np.abs(second).max(), np.abs(third).max()) < 1e-6 * np.abs(first).max()
 
 
-def test_no_load_has_a_series_of_nothing(box):
+def test_series_of_zero_load_is_zero(box):
     fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
     assert not series(fem, pushes(0.0), 3, box.tumour_nodes).any()
 
 
-def test_several_loads_at_once_have_forms_in_their_sizes(box):
+def test_series_of_several_loads_has_fourth_order_error(box):
     fem = Fem(box, (Elasticity(Material("neo-hookean", 3000.0, 0.45)), *EFFECTS), REFERENCE, "cpu", element="p1")
     nodes = box.tumour_nodes
     point, radius = np.repeat(POINT[:1], 3, axis=0) + [[0, 0, 0], [0, 0, 0], [4e-3, 0, 0]], np.full(3, 7e-3)
@@ -86,7 +86,7 @@ def _nodal(box, point, force, radius):
     return weights[:, :, None] * force[:, None, :]
 
 
-def test_in_its_own_direction_a_form_is_the_series_of_one_load(box):
+def test_series_along_one_direction_agrees_with_single_load(box):
     fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="smoothed")
     nodes, direction = box.tumour_nodes, np.array([[0.5, -0.4, -0.7]])
     three = Pushed(np.repeat(POINT[:1], 3, axis=0), np.eye(3), np.repeat(RADIUS[:1], 3))
@@ -99,12 +99,12 @@ def test_in_its_own_direction_a_form_is_the_series_of_one_load(box):
 
 @pytest.mark.parametrize("sizes", [1, 2, 3])
 @pytest.mark.parametrize("order", [1, 2, 3])
-def test_directions_tell_every_form(sizes, order):
+def test_unit_directions_determine_every_product(sizes, order):
     values = compute_products(choose_unit_directions(sizes, order), order)
     assert values.shape[0] == values.shape[1] and np.linalg.cond(values) < 14.0
 
 
-def test_columns_are_mixed_alike_by_warp_and_by_numpy():
+def test_column_mixing_by_warp_agrees_with_numpy():
     device = find_device("cpu", "float64")
     random = np.random.default_rng(0)
     x, weight = device.upload(random.normal(size=(7, 12))), random.normal(size=(3, 5))
@@ -116,7 +116,7 @@ def test_columns_are_mixed_alike_by_warp_and_by_numpy():
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
-def test_cuda_finds_the_same_series(box):
+def test_cuda_series_agrees_with_cpu(box):
     force = Pushed(np.repeat(POINT, 3, axis=0), np.tile(np.eye(3), (2, 1)), np.repeat(RADIUS, 3))
     one, other = (
         series(Fem(box, (Elasticity(), *EFFECTS), REFERENCE, name, element="smoothed"), Loads((force,)), 3,
@@ -127,7 +127,7 @@ def test_cuda_finds_the_same_series(box):
         assert np.allclose(one[rows], other[rows], atol=1e-4 * np.abs(one[rows]).max())
 
 
-def test_what_is_read_and_how_many_at_a_time_do_not_matter(box):
+def test_series_is_independent_of_batch_size_and_reading(box):
     whole = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
     some = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1", batch=1)
     nodes, modes = box.tumour_nodes, np.random.default_rng(0).normal(size=(4, len(box.tumour_nodes), 3))
@@ -137,7 +137,7 @@ def test_what_is_read_and_how_many_at_a_time_do_not_matter(box):
         assert np.allclose(found, wanted, atol=1e-6 * np.abs(wanted).max(axis=(0, 2))[None, :, None])
 
 
-def test_what_has_no_series_is_refused(box):
+def test_unsupported_series_are_rejected(box):
     with pytest.raises(InputError, match="float64"):
         series(Fem(box, (Elasticity(), *EFFECTS), TRAIN, "cpu", element="p1"), pushes(1.0), 3, box.tumour_nodes)
     fem = Fem(box, (Elasticity(), *EFFECTS, ToolDisplacement()), REFERENCE, "cpu", element="p1")
@@ -149,7 +149,7 @@ def test_what_has_no_series_is_refused(box):
         series(fem, pushes(1.0), 3, box.tumour_nodes, 3)
 
 
-def test_what_does_not_fit_into_memory_is_refused(box, monkeypatch):
+def test_series_beyond_free_memory_is_rejected(box, monkeypatch):
     fem = Fem(box, (Elasticity(), *EFFECTS), REFERENCE, "cpu", element="p1")
     reading = fem.build_reading(box.tumour_nodes, np.ones((1, len(box.tumour_nodes), 3)))
     monkeypatch.setattr("sim.runtime.memory.measure_host_bytes", lambda budget: 2_000_000)

@@ -1,4 +1,4 @@
-"""What a problem is made of: only what is asked for, in as few launches for many loads as for one."""
+"""Composition of a problem: only required terms, and as few launches for many loads as for one."""
 
 import subprocess
 import sys
@@ -44,7 +44,7 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_sixty_four_loads_launch_as_many_kernels_as_a_few(launches: list[str], precision: Precision) -> None:
+def test_kernel_launches_are_independent_of_batch_size(launches: list[str], precision: Precision) -> None:
     """Identical loads take the same iterations, so that the whole solves can be compared launch by launch."""
     accuracy = Accuracy(tolerance=1e-4, precision=precision)
     fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], accuracy, "cpu", batch=64, element="p1")
@@ -62,8 +62,8 @@ def test_sixty_four_loads_launch_as_many_kernels_as_a_few(launches: list[str], p
     assert many == few
 
 
-def test_only_what_is_asked_for_is_imported() -> None:
-    """In a fresh interpreter: laws, terms and libraries that a scene does not name stay out of memory."""
+def test_only_modules_of_used_effects_are_imported() -> None:
+    """In a fresh interpreter: laws, terms and libraries that a scene does not name are not imported."""
     script = (
         "import sys; sys.path.insert(0, 'tests')\n"
         "import numpy as np\n"
@@ -100,7 +100,7 @@ def test_only_what_is_asked_for_is_imported() -> None:
     assert imported(", Gravity()") == sorted([*own, "dead_force", "gravity"])
 
 
-def test_an_effect_that_is_not_asked_for_is_not_launched(launches: list[str]) -> None:
+def test_kernels_of_absent_effects_are_not_launched(launches: list[str]) -> None:
     fem = Fem(ANATOMY, [Elasticity(), Held()], TIGHT, "cpu", element="p1")
     value = np.where(ANATOMY.fixed, 1e-3, 0.0)[None]
     fem.deform(Loads((Prescribed(value),)))
@@ -110,8 +110,8 @@ def test_an_effect_that_is_not_asked_for_is_not_launched(launches: list[str]) ->
     assert any("add_gradient" in name for name in launches)
 
 
-def test_a_cause_that_does_not_act_is_not_launched(launches: list[str]) -> None:
-    """Both effects are asked for, nodal forces alone act: no tool is integrated, and no force is subtracted twice."""
+def test_kernels_of_absent_loads_are_not_launched(launches: list[str]) -> None:
+    """Both effects are present, only nodal forces act: no tool is integrated, and no force is subtracted twice."""
     fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce(), NodalForce()], TIGHT, "cpu", element="p1")
     launches.clear()
     fem.problem.begin(Cases(Loads((Nodal(top_forces(MESH, np.array([[0.1, 0.0, 0.0]]))),)), np.zeros(1)))
@@ -134,12 +134,12 @@ def test_a_cause_that_does_not_act_is_not_launched(launches: list[str]) -> None:
         ([Elasticity(), NodalForce()], "can move rigidly"),
     ],
 )
-def test_effects_that_make_no_problem_are_refused(device: Device, effects: list, sentence: str) -> None:
+def test_invalid_combinations_of_effects_are_rejected(device: Device, effects: list, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         compile_problem(effects, ANATOMY, device)
 
 
-def test_the_potential_is_the_sum_of_its_terms(device: Device) -> None:
+def test_potential_is_the_sum_of_its_terms(device: Device) -> None:
     plain = compile_problem([Elasticity(), Held(), NodalForce()], ANATOMY, device)
     extra = Spring(device, ROWS, 0.5), Wall(device, MESH.nodes, 0.1005, 1.5e-3, 1e4)
     problem = Problem((*plain.terms, *extra), plain.constraint, device)
@@ -164,8 +164,8 @@ def test_the_potential_is_the_sum_of_its_terms(device: Device) -> None:
         assert parts[0][column] == pytest.approx((MESH.volumes * psi).sum(), rel=1e-10)
 
 
-def test_a_solve_integrates_its_tools_once(launches: list[str]) -> None:
-    """It begins, begins again for the reactions, and needs their moments."""
+def test_solve_integrates_its_tools_once(launches: list[str]) -> None:
+    """The solution, the reactions and the moments use the same footprints."""
     fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce()], TIGHT, "cpu", element="p1")
     launches.clear()
     fem.deform(Loads((Pushed(np.array([[0.03, 0.03, 0.1]]), np.array([[0.0, 0.0, -0.1]]), np.array([0.02])),)))

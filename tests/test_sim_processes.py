@@ -1,4 +1,4 @@
-"""Lists of devices, and a process on each: who answers what, how one is lost, and that none outlives its parent."""
+"""Lists of devices, and a process on each: tasks and results, lost processes, and their end with the parent."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ NO_CARD = pytest.mark.skipif(wp.is_cuda_available(), reason="there is a card her
 
 
 @pytest.mark.parametrize(("words", "names"), [("cpu", 1), ("cpu,cpu", 2), (" cpu , cpu,cpu", 3)])
-def test_a_list_names_devices_one_by_one(words, names):
+def test_device_list_is_parsed_into_device_names(words, names):
     assert parse_device_names(words) == ("cpu",) * names
     assert parse_device_names("auto") == (find_device("auto", "float32").name,)
 
@@ -36,18 +36,18 @@ def test_a_list_names_devices_one_by_one(words, names):
         pytest.param("cpu,cuda:0", "no device 'cuda:0' here, as no NVIDIA driver", marks=NO_CARD),
     ],
 )
-def test_what_is_no_list_of_devices_is_a_sentence(words, reason):
+def test_invalid_device_list_is_rejected(words, reason):
     with pytest.raises(InputError, match=reason):
         parse_device_names(words)
 
 
 @pytest.mark.parametrize("words", ["cpu,cpu", "all", "cuda:0,cuda:1"])
-def test_who_wants_one_device_refuses_several(words):
+def test_single_device_argument_rejects_several_devices(words):
     with pytest.raises(InputError, match=f"'{words}' names several devices, but only one is allowed here: choose"):
         find_device(words, "float32")
 
 
-def test_cards_are_listed_and_not_mixed_with_processors(monkeypatch):
+def test_gpus_are_listed_and_not_mixed_with_cpus(monkeypatch):
     class Card:
         def __init__(self, alias):
             self.alias = alias
@@ -72,7 +72,7 @@ def test_every_task_is_solved_once_and_processes_end():
     assert all(map(gone, numbers))
 
 
-def test_a_process_sees_its_own_card_alone(monkeypatch):
+def test_process_sees_only_its_own_gpu(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     with process_pool(["cpu", "cuda:0", "cuda:2"], named) as children:
         said = run_on_each(children, doing, ["environment"] * 3)
@@ -82,13 +82,13 @@ def test_a_process_sees_its_own_card_alone(monkeypatch):
         assert run_on_each(children, doing, ["environment"]) == [("cuda:0", "GPU-7")]
 
 
-def test_what_cannot_be_made_is_a_sentence():
+def test_error_during_construction_in_process_is_reported():
     with pytest.raises(InputError, match="nothing is made on cpu"), process_pool(["cpu", "cpu"], refusing):
         pass
 
 
-def test_what_goes_wrong_names_its_device():
-    """Errors of bad input stay what they are."""
+def test_error_in_process_names_its_device():
+    """Errors of bad input keep their type and message."""
     with process_pool(["cpu", "cuda:0"], named) as children:
         with pytest.raises(InputError, match=r"^this is refused\.\n"):
             run_on_each(children, doing, ["refuse", 1])
@@ -102,8 +102,8 @@ def test_what_goes_wrong_names_its_device():
         run_on_each(children, doing, [1, "fail"])
 
 
-def test_finished_results_precede_reported_death():
-    """One dies and the other has its answer while nobody looks; what was not begun then is not begun."""
+def test_results_are_returned_before_a_lost_process_is_reported():
+    """One process dies and the other has finished before the next read; tasks that were not started stay so."""
     given = []
     with process_pool(["cpu", "cpu"], named) as children, pytest.raises(LostError) as lost:
         for task, _ in map_unordered(children, doing, ["doze and die", 0, "nap", 9]):
@@ -113,7 +113,7 @@ def test_finished_results_precede_reported_death():
     assert "give --device one cpu less" in str(lost.value) and given == [0, "nap"]
 
 
-def test_none_outlives_a_parent_that_is_killed():
+def test_processes_end_when_their_parent_is_killed():
     """In the middle of a task that takes minutes."""
     code = (
         "from on_devices import doing, named\n"

@@ -1,4 +1,4 @@
-"""The README's Python example runs as it stands; what the pages name is there."""
+"""The README's Python example runs unchanged; files that the pages name exist."""
 
 import re
 
@@ -20,7 +20,7 @@ def example():
 
 
 @pytest.mark.parametrize("body", ["box", "template"])
-def test_the_example_runs_as_it_stands(body, box, tmp_path, monkeypatch, capsys):
+def test_readme_example_runs_unchanged(body, box, tmp_path, monkeypatch, capsys):
     anatomy = box if body == "box" else read_anatomy(get_template_path())
     write_anatomy(tmp_path / "patient.vtu", anatomy)
     monkeypatch.chdir(tmp_path)
@@ -33,12 +33,12 @@ def test_the_example_runs_as_it_stands(body, box, tmp_path, monkeypatch, capsys)
     assert "converged" in capsys.readouterr().out
 
 
-def test_the_readme_is_read_in_two_minutes():
+def test_readme_is_at_most_8_kib():
     assert len((HOUSE / "README.md").read_bytes()) <= 8192
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}-{page.stem}")
-def test_every_link_and_file_that_a_page_names_is_there(page):
+def test_links_and_files_of_a_page_exist(page):
     text = page.read_text()
     links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]+)\)", text)]
     missing = [link for link in links if link and not (page.parent / link).exists()]

@@ -1,4 +1,4 @@
-"""The barrier of the nodes that tools can touch: against the whole term."""
+"""The barrier on the nodes that tools can touch, against the whole term."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from sim.discretisation.term import Cases
 
 
 @pytest.mark.parametrize("definite", [False, True])
-def test_the_reduced_barrier_is_the_whole_one(definite: bool) -> None:
+def test_reduced_barrier_agrees_with_whole_term(definite: bool) -> None:
     """Its gradient, and its curvature against the term's own product."""
     fem, descent = parts()
     problem, term, nodes = fem.problem, descent.barrier, descent.barrier.touchable

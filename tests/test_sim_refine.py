@@ -1,4 +1,4 @@
-"""A finer mesh is the same body."""
+"""Refinement of a mesh without change of the body."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from sim.geometry.surface import compute_areas, compute_edge_lengths
 from sim.geometry.tetmesh import TetMesh, compute_row_keys
 
 
-def test_the_body_stays_and_every_edge_is_halved():
+def test_refinement_keeps_body_and_halves_every_edge():
     mesh = block((2, 2, 3), 0.1, distortion=0.2)
     mesh = TetMesh(mesh.nodes, mesh.tets, np.arange(len(mesh.tets)) % 3)
     fine = refine(hold(mesh, mesh.nodes[:, 2] < 1e-9)).mesh
@@ -31,7 +31,7 @@ def test_the_body_stays_and_every_edge_is_halved():
     assert np.unique(compute_row_keys(faces), return_counts=True)[1].max() == 2
 
 
-def test_what_holds_the_body_holds_it_still(box):
+def test_refinement_keeps_held_vertices_and_opening(box):
     fine = refine(box)
     assert fine.fixed[: len(box.mesh.nodes)].tolist() == box.fixed.tolist()
     # Of the finer surface, what lies inside the opening's triangles is open and the rest is held.
@@ -46,7 +46,7 @@ def test_what_holds_the_body_holds_it_still(box):
     assert near.max() < 8e-3
 
 
-def test_refinement_near_opening_halves_only_those_cells(box):
+def test_refinement_near_opening_divides_only_nearby_cells(box):
     fine = refine(box, near_opening=True)
     mesh, count = fine.mesh, len(box.mesh.nodes)
     np.testing.assert_array_equal(mesh.nodes[:count], box.mesh.nodes)
@@ -80,7 +80,7 @@ def test_fixed_or_sliding_surface_is_not_open(box):
     assert fine.craniotomy.any() and not fine.fixed[fine.craniotomy].any()
 
 
-def test_a_quadratic_mesh_is_refused():
+def test_refinement_of_quadratic_mesh_is_rejected():
     mesh = TetMesh(np.vstack([np.zeros(3), np.eye(3), _middles()]), [[0, 1, 2, 3]], [0], [[4, 5, 6, 7, 8, 9]])
     with pytest.raises(InputError, match="linear one"):
         refine(hold(mesh, np.ones(10, bool)))

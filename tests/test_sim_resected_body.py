@@ -1,4 +1,4 @@
-"""Tissue that is taken away: what is left answers as if it had always been so; what came loose goes and is reported."""
+"""Resected tissue: the remainder agrees with a body meshed without it; loose pieces are removed and reported."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ def operated() -> OperatedFem:
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_what_is_left_answers_as_the_body_meshed_without_it(element: str) -> None:
+def test_resected_body_agrees_with_mesh_of_the_remainder(element: str) -> None:
     made = solver(element=element)
     loads = Loads((*lying([2, 1]).causes, *push([0.005, 0.05, 0.06], [0.0, 0.02, -0.1], 0.012).select([0, 0]).causes))
     answer = made.deform(loads)
@@ -60,7 +60,7 @@ def test_what_is_left_answers_as_the_body_meshed_without_it(element: str) -> Non
         np.testing.assert_allclose(answer.reaction[row], alone.reaction[0], rtol=1e-9)
 
 
-def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
+def test_resection_removes_own_mid_edge_nodes() -> None:
     curved = quadratic(box((2, 2, 2), 0.04, distortion=0.1), curved=0.05)
     body, effects = base_held(curved), EFFECTS[:3]
     made = build_fem(body, (*effects, Resection((within((1, 1, 1), (2, 2, 2), curved),))), TIGHT, "cpu")
@@ -74,18 +74,18 @@ def test_a_mesh_with_middles_of_its_own_loses_them_too() -> None:
     )
 
 
-def test_without_a_cause_all_steps_are_done(operated: OperatedFem) -> None:
+def test_loads_without_resected_cause_apply_all_steps(operated: OperatedFem) -> None:
     silent = operated.deform(build_posture(DOWN, -1.0))
     said = operated.deform(lying([2]))
     np.testing.assert_array_equal(silent.displacement, said.displacement)
 
 
-def test_no_step_is_the_whole_body(operated: OperatedFem) -> None:
+def test_zero_resection_steps_give_the_whole_body(operated: OperatedFem) -> None:
     plain = Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(build_posture(DOWN, -1.0))
     np.testing.assert_array_equal(operated.deform(lying([0])).displacement, plain.displacement)
 
 
-def test_each_row_has_its_own_body(operated: OperatedFem) -> None:
+def test_load_cases_have_separate_resection_steps(operated: OperatedFem) -> None:
     done = [2, 0, 1, 0, 2]
     together = operated.deform(lying(done))
     for row, one in enumerate(done):
@@ -94,13 +94,13 @@ def test_each_row_has_its_own_body(operated: OperatedFem) -> None:
     assert together.time.shape == (5,) and len(together.outcome) == 5
 
 
-def test_without_weight_nothing_moves(operated: OperatedFem) -> None:
+def test_resection_without_weight_causes_no_displacement(operated: OperatedFem) -> None:
     at_rest = Loads((Posture(np.array([[0.0, 0.0, -1.0]]), np.array([1.0]), np.ones(1)), Resected(np.array([1]))))
     assert not operated.deform(at_rest).displacement.any()
 
 
-def test_a_wall_is_free(operated: OperatedFem) -> None:
-    """Forces on the cavity's own wall are answered: it is no longer inside."""
+def test_forces_on_wall_of_resection_cavity_move_tissue(operated: OperatedFem) -> None:
+    """The wall of the cavity is part of the surface."""
     wall = np.setdiff1d(np.unique(operated.get_remains(2).anatomy.mesh.surface), np.unique(MESH.surface))
     force = np.zeros((1, len(MESH.nodes), 3))
     force[0, wall, 2] = -0.01
@@ -111,7 +111,7 @@ def test_a_wall_is_free(operated: OperatedFem) -> None:
 
 class TestAcrossCuts:
     @pytest.mark.parametrize("element", ELEMENTS)
-    def test_an_answer_after_other_steps_is_a_start(self, element: str) -> None:
+    def test_result_of_other_steps_is_a_valid_start(self, element: str) -> None:
         made = solver(element=element, live=True)
         cold = {done: made.deform(lying([done])) for done in range(3)}
         last = None
@@ -121,7 +121,7 @@ class TestAcrossCuts:
             size = np.abs(cold[done].displacement).max()
             np.testing.assert_allclose(last.displacement, cold[done].displacement, atol=1e-7 * size)
 
-    def test_answers_are_pure(self, operated: OperatedFem) -> None:
+    def test_resected_results_are_deterministic(self, operated: OperatedFem) -> None:
         start = operated.deform(lying([1]))
         first = operated.deform(lying([2]), start)
         operated.deform(lying([0]))
@@ -129,23 +129,23 @@ class TestAcrossCuts:
         np.testing.assert_array_equal(first.displacement, again.displacement)
         np.testing.assert_array_equal(start.displacement, operated.deform(lying([1])).displacement)
 
-    def test_rows_start_from_their_own(self, operated: OperatedFem) -> None:
+    def test_rows_start_from_their_own_resection_step(self, operated: OperatedFem) -> None:
         start = operated.deform(lying([0, 1, 2]))
         answer = operated.deform(lying([1, 1, 0]), start)
         for row, done in enumerate((1, 1, 0)):
             alone = operated.deform(lying([done]))
             np.testing.assert_allclose(answer.displacement[row], alone.displacement[0], atol=1e-10)
 
-    def test_somebodys_guess_is_a_start(self, operated: OperatedFem) -> None:
-        """It moves vertices of which nothing is left."""
+    def test_guess_is_a_valid_start_of_a_resected_body(self, operated: OperatedFem) -> None:
+        """It also moves vertices without remaining tissue."""
         wild = guess(1e-4 * np.random.default_rng(1).normal(size=(1, len(MESH.nodes), 3)))
         answer = operated.deform(lying([2]), wild)
         exact = operated.deform(lying([2])).displacement
         np.testing.assert_allclose(answer.displacement, exact, atol=1e-8 * np.abs(exact).max())
 
     @pytest.mark.parametrize("element", ELEMENTS)
-    def test_velocities_go_on(self, element: str) -> None:
-        """Those of mid-edge nodes too: a hundredth of a step later nothing has moved elsewhere than it was moving."""
+    def test_velocities_continue_across_a_resection(self, element: str) -> None:
+        """Includes mid-edge nodes: a hundredth of a step later the motion continues in its direction."""
         effects = (*EFFECTS[:3], Inertia(), STEPS)
         made = build_fem(BODY, effects, Accuracy(tolerance=1e-9), "cpu", element=element)
         first = made.deform(replace(lying([0]), time=np.array([0.01])))
@@ -163,42 +163,42 @@ class TestAcrossCuts:
 class TestWhatComesLoose:
     SLICE = within((0, 0, 1), (3, 3, 2))
 
-    def test_it_goes_too_and_is_reported(self) -> None:
-        """A slice through the box leaves its upper third in the air."""
+    def test_loose_piece_is_removed_and_reported(self) -> None:
+        """A slice through the box separates its upper third."""
         _, left = compute_remains(BODY, Resection((self.SLICE,)))
         above = within((0, 0, 2), (3, 3, 4))
         assert tuple(left.loose.tolist()) == above
         assert f"{len(above)} tetrahedra that nothing held any more went too" in str(left)
         np.testing.assert_array_equal(left.anatomy.orphaned, MESH.nodes[:, 2] > 0.03)
 
-    def test_the_rest_answers_as_without_it(self) -> None:
+    def test_remainder_agrees_with_resection_of_loose_piece(self) -> None:
         made, both = solver(Resection((self.SLICE,))), solver(Resection((self.SLICE + within((0, 0, 2), (3, 3, 4)),)))
         answers = [each.deform(lying([1])).displacement for each in (made, both)]
         assert np.abs(answers[0]).max() > 1e-6
         np.testing.assert_array_equal(answers[0], answers[1])
 
-    def test_it_may_be_taken_in_a_later_step(self) -> None:
+    def test_loose_piece_may_be_resected_in_a_later_step(self) -> None:
         left = compute_remains(BODY, Resection((self.SLICE, within((0, 0, 2), (3, 3, 4)))))
         assert len(left[1].loose) and not len(left[2].loose)
         np.testing.assert_array_equal(left[1].anatomy.mesh.tets, left[2].anatomy.mesh.tets)
 
-    def test_what_hangs_by_a_corner_goes_as_well(self) -> None:
+    def test_piece_connected_by_an_edge_only_is_removed(self) -> None:
         """Two cubes of the top layer that share an edge only with the rest."""
         keep = set(within((0, 0, 1), (1, 1, 2)) + within((1, 1, 2), (2, 2, 4)))
         above = [number for number in within((0, 0, 1), (3, 3, 4)) if number not in keep]
         _, left = compute_remains(BODY, Resection((tuple(above),)))
         assert set(left.loose.tolist()) == set(within((1, 1, 2), (2, 2, 4)))
 
-    def test_what_slides_in_place_stays(self) -> None:
-        """A box that nothing holds but three planes that it slides on."""
+    def test_piece_held_by_three_sliding_planes_stays(self) -> None:
+        """A box that only slides on three planes."""
         normal = np.zeros_like(MESH.nodes)
         for axis in range(3):
             normal[(MESH.nodes[:, axis] < 1e-9) & ~normal.any(axis=1), axis] = -1.0
         corner = hold(MESH, np.zeros(len(MESH.nodes), bool), normal)
         assert [len(one.loose) for one in compute_remains(corner, Resection((TOP,)))] == [0, 0]
 
-    def test_a_piece_on_the_skull_alone_goes(self) -> None:
-        """It slides, but nothing stops it."""
+    def test_piece_that_only_slides_on_the_skull_is_removed(self) -> None:
+        """The skull prevents no tangential motion."""
         wall = np.where((MESH.nodes[:, :1] > 0.06 - 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
         sliding = hold(MESH, MESH.nodes[:, 2] < 1e-9, wall)
         _, left = compute_remains(sliding, Resection((self.SLICE,)))
@@ -206,8 +206,8 @@ class TestWhatComesLoose:
 
 
 class TestHardCases:
-    def test_the_rim_of_the_opening_and_what_holds(self) -> None:
-        """A resection down to the held floor through the opening's edge: held, sliding and open vertices go."""
+    def test_resection_of_rim_and_held_vertices_is_solved(self) -> None:
+        """A resection to the held floor through the opening's edge removes held, sliding and open vertices."""
         normal = np.where((MESH.nodes[:, :1] < 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [-1.0, 0.0, 0.0], 0.0)
         opened = MESH.nodes[:, 2] > 0.06 - 1e-9
         body = replace(hold(MESH, MESH.nodes[:, 2] < 1e-9, normal), craniotomy=opened)
@@ -224,7 +224,7 @@ class TestHardCases:
         answer = made.deform(build_posture(DOWN, 0.03))
         np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-12)
 
-    def test_a_tissue_that_is_taken_altogether_needs_no_law(self) -> None:
+    def test_law_of_completely_resected_tissue_is_ignored(self) -> None:
         region = np.zeros(len(MESH.tets), int)
         region[list(TOP)] = 2
         body = base_held(replace(MESH, region=region))
@@ -242,7 +242,7 @@ class TestHardCases:
             (((4, 4),), "tetrahedron 4 in step 1 and again in step 1"),
         ],
     )
-    def test_steps_that_are_none_are_sentences(self, steps: tuple[tuple[int, ...], ...], sentence: str) -> None:
+    def test_invalid_resection_steps_are_rejected(self, steps: tuple[tuple[int, ...], ...], sentence: str) -> None:
         with pytest.raises(InputError, match=sentence):
             Resection(steps)
 
@@ -255,12 +255,12 @@ class TestHardCases:
             (within((0, 0, 0), (3, 3, 1)), "step 2 of Resection cannot be done: all 162 tetrahedra are removed"),
         ],
     )
-    def test_steps_that_the_body_does_not_bear_are_sentences(self, step: tuple[int, ...], sentence: str) -> None:
+    def test_resection_steps_that_do_not_fit_body_are_rejected(self, step: tuple[int, ...], sentence: str) -> None:
         with pytest.raises(InputError, match=sentence):
             compute_remains(BODY, Resection((TOP, step)))
 
-    def test_what_is_left_on_a_hinge_is_a_sentence(self) -> None:
-        """One held edge: the piece turns about it."""
+    def test_remainder_on_a_hinge_is_rejected(self) -> None:
+        """One held edge: the piece can rotate about it."""
         floor = (MESH.nodes[:, 2] < 1e-9) & (MESH.nodes[:, 0] > 0.06 - 1e-9)
         edge = replace(BODY, fixed=np.repeat(((MESH.nodes[:, 2] > 0.06 - 1e-9) | floor)[:, None], 3, axis=1))
         made = build_fem(edge, (*EFFECTS, Resection((self.MIDDLE_LAYER,))), TIGHT, "cpu", element="p1")
@@ -270,15 +270,15 @@ class TestHardCases:
     MIDDLE_LAYER = within((0, 0, 1), (3, 3, 2))
 
     @pytest.mark.parametrize("done", [-1.0, 0.5])
-    def test_steps_are_counted_in_whole_numbers(self, done: float) -> None:
+    def test_negative_or_fractional_resection_step_is_rejected(self, done: float) -> None:
         with pytest.raises(InputError, match="integers >= 0"):
             Loads((Resected(np.array([done])),))
 
-    def test_more_steps_than_there_are_is_a_sentence(self, operated: OperatedFem) -> None:
+    def test_more_resection_steps_than_defined_are_rejected(self, operated: OperatedFem) -> None:
         with pytest.raises(InputError, match="done is 3, but Resection has 2 steps"):
             operated.deform(lying([1, 3]))
 
-    def test_a_plain_solver_says_whose_work_it_is(self) -> None:
+    def test_plain_solver_rejects_resection_and_names_build_fem(self) -> None:
         with pytest.raises(InputError, match=r"sim\.build_fem"):
             compile_problem((*EFFECTS, STEPS), BODY, find_device("cpu", "float64"))
         with pytest.raises(InputError, match="occurs 2 times"):
@@ -286,17 +286,17 @@ class TestHardCases:
         with pytest.raises(InputError, match="Resected, which no effect uses: add the effect Resection"):
             Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(lying([1]))
 
-    def test_without_a_resection_it_is_the_plain_solver(self) -> None:
+    def test_build_fem_without_resection_gives_plain_solver(self) -> None:
         assert isinstance(build_fem(BODY, EFFECTS, TIGHT, "cpu"), Fem)
 
 
-def test_half_a_load_is_of_the_same_body() -> None:
+def test_scaled_load_keeps_its_resection_step() -> None:
     half = lying([1]).scale(0.5)
     assert half.get(Resected).done.tolist() == [1.0] and half.get(Posture).share.tolist() == [0.5]  # type: ignore
 
 
-def test_bone_that_only_bars_the_way_keeps_nothing_on() -> None:
-    """Under `SkullContact` a piece on the wall comes loose; what is left still meets its bone."""
+def test_piece_touching_only_contact_skull_is_removed() -> None:
+    """Under `SkullContact` a piece on the wall comes loose; the remainder still meets its bone."""
     wall = np.where((MESH.nodes[:, :1] > 0.06 - 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
     body, cut = hold(MESH, MESH.nodes[:, 2] < 1e-9, wall), Resection((within((2, 2, 2), (3, 3, 4)),))
     effects = (Elasticity(SOFT), Held(), SkullContact(), Gravity(direction=(0.0, 0.0, -1.0)))
@@ -312,8 +312,8 @@ def test_bone_that_only_bars_the_way_keeps_nothing_on() -> None:
     assert len(list_remaining_bodies(body, (*effects, slice_))[1].loose) == len(within((0, 0, 2), (3, 3, 4)))
 
 
-def test_what_nobody_asks_to_be_held_is_free() -> None:
-    """Of the anatomy's held and sliding vertices those count that the effects ask for."""
+def test_vertices_are_free_without_effects_that_hold_them() -> None:
+    """The anatomy's held and sliding vertices count only with the effects for them."""
     normal = np.zeros_like(MESH.nodes)
     for axis in range(3):
         normal[(MESH.nodes[:, axis] < 1e-9) & ~normal.any(axis=1), axis] = -1.0
@@ -329,12 +329,12 @@ def test_what_nobody_asks_to_be_held_is_free() -> None:
         build_fem(body, (Elasticity(SOFT), Resection((NEXT,))), TIGHT, "cpu").deform(lying([0]).drop(Posture))
 
 
-def test_no_cases_have_no_answers() -> None:
+def test_empty_batch_with_resection_gives_empty_result() -> None:
     fem = build_fem(BODY, (*EFFECTS, Inertia(), STEPS), TIGHT, "cpu")
     assert fem.deform(lying([])).displacement.shape == (0, len(MESH.nodes), 3)
 
 
-def test_a_tool_stays_where_it_is_when_tissue_is_taken() -> None:
+def test_tool_pose_is_kept_across_a_resection() -> None:
     fem = build_fem(BODY, (*EFFECTS[:2], ToolContact((Ball(0.01),)), STEPS), TIGHT, "cpu")
     pose = np.eye(4)
     pose[:3, 3] = [0.01, 0.03, 0.057]

@@ -1,4 +1,4 @@
-"""What is left of a body after a cut goes on remembering what it went through, as if it had always been alone."""
+"""History of a body after a resection: the remainder keeps it as if it had always been separate."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ RELAXING = Material("neo-hookean", 3000.0, 0.4, prony=((0.5, 0.2), (0.2, 5.0)))
 
 @pytest.mark.parametrize("element", ["p1", "p2"])
 def test_batches_of_unequal_steps_keep_their_own_history(element: str) -> None:
-    """What elements went through is kept case by case: another body's beside it, or another's cut, takes none away."""
+    """The history of elements is kept for each case: other cases and their resections do not change it."""
     fem = build_fem(BODY, (*EFFECTS[1:], Elasticity(RELAXING), Inertia(), STEPS), TIGHT, "cpu", element=element)
     frames = [(0, 1), (1, 1), (1, 2)]
 
@@ -65,8 +65,8 @@ class TestMemory:
         return found
 
     @pytest.mark.parametrize("element", ELEMENTS)
-    def test_the_rest_relaxes_on_as_if_nothing_had_been_cut(self, element: str) -> None:
-        """The seam of a layer that relaxes with one that does not creeps; had it forgotten, it would be elsewhere."""
+    def test_remainder_relaxes_as_without_the_resection(self, element: str) -> None:
+        """The interface of a relaxing layer with an elastic one creeps; without its history it would be elsewhere."""
         regions = {2: Material("neo-hookean", 3000.0, 0.4)}
         cut, whole, forgetful = (self.run(element, regions, *how) for how in ((3,), (9,), (3, True)))
         gone = ~cut[-1].displacement[0].any(axis=1) & whole[-1].displacement[0].any(axis=1)
@@ -78,8 +78,8 @@ class TestMemory:
         assert crept > 5e-5 and gone.sum() == (18 if element == "p2" else 4)
 
     @pytest.mark.parametrize("element", ELEMENTS)
-    def test_what_fades_follows_its_series(self, element: str) -> None:
-        """Of a held stretch each part of the stress is g exp(-t / tau) of what it was at once, across the cut."""
+    def test_stress_after_resection_follows_prony_series(self, element: str) -> None:
+        """Each part of the stress at constant strain is g exp(-t / tau) of its initial value, across the cut."""
         found = self.run(element, {}, 3)
         (name,) = (name for name in found[0].memory if "visco" in name)
         at_once = found[0].memory[name][0, :, :6]
@@ -91,8 +91,8 @@ class TestMemory:
                 expected = share * np.exp(-time / tau) * at_once[stretched]
                 np.testing.assert_allclose(left[:, part], expected, atol=1e-6 * np.abs(at_once).max())
 
-    def test_what_is_cut_may_relax_in_a_longer_series(self) -> None:
-        """A share that is next to nothing changes no answer, one step on and one back, in company too."""
+    def test_prony_series_of_resected_tissue_changes_no_result(self) -> None:
+        """A negligible share changes no result, one step forward and one back, also in a batch."""
         cut = np.isin(np.arange(len(MESH.tets)), STEPS.steps[0])
         body = base_held(replace(MESH, region=np.where(cut, 2, 1)))
         longer = replace(RELAXING, prony=(*RELAXING.prony, (1e-13, 1.0)))
@@ -106,8 +106,8 @@ class TestMemory:
             found.append(last.displacement)
         np.testing.assert_allclose(found[1], found[0], atol=1e-8 * np.abs(found[0]).max())
 
-    def test_where_nothing_is_cut_it_is_the_plain_run(self) -> None:
-        """Bit for bit."""
+    def test_run_before_resection_is_bit_identical_to_plain_run(self) -> None:
+        """Compared with a solver without the effect `Resection`."""
         effects = (Elasticity(RELAXING), Held(), Gravity(direction=(0.0, 0.0, -1.0)), Inertia())
         plain, made = (
             Fem(BODY, effects, TIGHT, "cpu", element="p1"),
@@ -122,7 +122,7 @@ class TestMemory:
             for name, value in one.memory.items():
                 np.testing.assert_array_equal(value, other.memory[name])
 
-    def test_a_history_of_another_body_is_a_sentence(self) -> None:
+    def test_history_of_another_body_is_rejected(self) -> None:
         made = build_fem(BODY, (Elasticity(RELAXING), Held(), STEPS), TIGHT, "cpu", element="p1")
         strange = replace(
             guess(np.zeros((1, len(MESH.nodes), 3))), memory={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}

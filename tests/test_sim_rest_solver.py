@@ -1,4 +1,4 @@
-"""The rest stiffness, solved with and without a factor."""
+"""The rest stiffness, solved with and without a factorisation."""
 
 from dataclasses import replace
 
@@ -10,8 +10,8 @@ from sim.errors import InputError
 from sim.linalg.rest_solver import RestStiffnessSolver
 
 
-def test_linear_solution_is_same_without_inverse():
-    """The terms of a series: by a factor, and by conjugate gradients where none pays."""
+def test_linear_solution_without_factorisation_agrees():
+    """Terms of a series: by a factorisation, and by conjugate gradients where it would not pay."""
     problem, preconditioner = built("smoothed", 0.45, (2, 2, 3))
     free = problem.constraint.build_basis()
     force = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 3))

@@ -1,4 +1,4 @@
-"""Synthetic patient: orientation, units, volumes and grey values as another program reads them."""
+"""Synthetic patient: orientation, units, volumes and intensities as another program reads them."""
 
 import gzip
 from dataclasses import replace

@@ -10,7 +10,7 @@ from sim.linalg.schur import condense_exterior
 from sim.local_solvers.batch_elimination import find_near_tetrahedra
 
 
-def test_the_condensed_surroundings_are_the_schur_complement() -> None:
+def test_condensed_stiffness_is_the_schur_complement() -> None:
     problem, space = begun("linear", "smoothed")
     chosen = find_near_tetrahedra(space, problem.constraint)
     assert chosen is not None and 0.15 < chosen.mean() < 0.25

@@ -1,4 +1,4 @@
-"""Condensed surroundings as a term."""
+"""Condensed surroundings as an energy term."""
 
 import numpy as np
 import warp as wp
@@ -7,7 +7,7 @@ from sim.runtime.device import find_device
 from sim.terms.schur_stiffness import Exterior
 
 
-def test_the_surroundings_are_a_potential() -> None:
+def test_exterior_gradient_is_derivative_of_its_energy() -> None:
     device, random = find_device("cpu", "float64"), np.random.default_rng(0)
     root, rows = random.normal(size=(4, 4)), np.array([1, 2, 5, 7])
     exterior = Exterior(rows, root @ root.T, 9, device)

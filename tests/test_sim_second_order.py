@@ -21,11 +21,11 @@ def tiny_box():
     ("law", "element"),
     [("neo-hookean", "smoothed"), ("stable-neo-hookean", "p1"), ("corotational", "p1"), ("neo-hookean", "p2")],
 )
-def test_pairs_are_the_series_second_order(tiny_box, law, element):
+def test_load_pairs_agree_with_second_order_of_series(tiny_box, law, element):
     check(tiny_box, Material(law, 3000.0, 0.45), element)
 
 
-def test_tissue_that_stiffens(tiny_box):
+def test_load_pairs_agree_for_a_stiffening_tissue(tiny_box):
     check(tiny_box, MATERIALS["minutes"].tissue, "p1")
 
 

@@ -5,8 +5,8 @@ import numpy as np
 from sim.bodies.signed_distance import project_onto_level
 
 
-def test_where_a_field_is_flat_nodes_do_not_fly_away():
-    """Its slope there is round-off."""
+def test_projection_keeps_nodes_where_gradient_is_tiny():
+    """The gradient of the flat field is round-off."""
     points = np.random.default_rng(0).normal(scale=0.01, size=(20, 3))
     moved = project_onto_level(lambda at: 2e-3 + 1e-6 * at[:, 0], points, np.zeros(20))
     assert np.abs(moved - points).max() < 1e-6

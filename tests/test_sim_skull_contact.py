@@ -1,4 +1,4 @@
-"""A skull that holds on one side only: what touches it bears, what leaves it is free."""
+"""Contact with the skull: pressure where tissue touches it, no force where tissue separates."""
 
 from functools import cache
 
@@ -46,7 +46,7 @@ def bears(fem: Fem, loads: Loads, found: Deformation) -> np.ndarray:
 
 @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
 @pytest.mark.parametrize("force", [0.2, 2.0, 20.0])
-def test_pressure_and_gap_complement_each_other(element: str, force: float) -> None:
+def test_pressure_and_gap_are_complementary(element: str, force: float) -> None:
     """d > 0, p >= 0 along the normal alone, and p d at most what the barrier leaves: 1.25 mu a, with its reach a."""
     fem = body(element, SkullContact(GAP))
     found = fem.deform(lifted(force))
@@ -68,26 +68,26 @@ def test_pressure_and_gap_complement_each_other(element: str, force: float) -> N
 
 
 @pytest.mark.parametrize("element", ["p1", "p2"])
-def test_skull_never_pulls(element: str) -> None:
+def test_skull_never_pulls_on_tissue(element: str) -> None:
     """Tissue that separates from the skull moves as without a skull."""
     away = body(element, SkullContact(GAP)).deform(lifted(-0.5))
     free = body(element).deform(lifted(-0.5))
     np.testing.assert_allclose(away.displacement, free.displacement, atol=1e-8 * np.abs(free.displacement).max())
 
 
-def test_pressed_on_skull_equals_slide() -> None:
-    """Under 20 N the lid is where `Slide` keeps it, but for the gap."""
+def test_tissue_pressed_on_skull_agrees_with_slide() -> None:
+    """Under 20 N the lid is where `Slide` keeps it, except for the gap."""
     touching = body("p1", SkullContact(1e-5)).deform(lifted(20.0))
     kept = body("p1", Slide()).deform(lifted(20.0))
     assert np.abs(touching.displacement - kept.displacement).max() < 1.1e-5
 
 
-def test_no_load_gives_no_motion() -> None:
+def test_zero_load_with_skull_gives_zero_displacement() -> None:
     np.testing.assert_array_equal(body("p1", SkullContact(GAP)).deform(lifted(0.0)).displacement, 0.0)
 
 
-def test_brain_that_starts_at_rest_may_come_far() -> None:
-    """As far as without a start: where nothing acted, nothing says how far away the next equilibrium is."""
+def test_start_at_rest_does_not_limit_skull_distance() -> None:
+    """The limit is that of a solution without a start: a body at rest does not predict the next equilibrium."""
     skull, rest = body("p1", SkullContact(GAP)).problem.barriers[0], np.zeros((1, len(MESH.nodes), 3))
 
     def far(displacement: np.ndarray | None, restarted: np.ndarray | None = None) -> float:
@@ -97,7 +97,7 @@ def test_brain_that_starts_at_rest_may_come_far() -> None:
     assert far(None) == far(rest) == far(rest + 1e-4, np.ones(1, bool)) > 10.0 * far(rest + 1e-4)
 
 
-def test_the_wall_bends_as_a_sphere_does() -> None:
+def test_skull_curvature_agrees_with_sphere_and_plane() -> None:
     rng = np.random.default_rng(3)
     normal = rng.normal(size=(800, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -109,8 +109,8 @@ def test_the_wall_bends_as_a_sphere_does() -> None:
     np.testing.assert_allclose(bend_of(flat, np.tile([0.0, 0.0, 1.0], (50, 1))), 0.0, atol=1e-12)
 
 
-def test_a_body_that_turns_slides_along_a_round_skull() -> None:
-    """Turned by a twentieth, a ball's point is as near to a round wall as before; from a plane it would have parted."""
+def test_rotating_body_slides_along_a_round_skull() -> None:
+    """Rotated by a twentieth, a point of a ball is as near to a round wall as before, but not to a plane."""
     n, R, angle = np.array([0.6, 0.0, 0.8]), 0.07, 0.05
     turn = np.array([[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]])
     u = R * (turn @ n - n) + 3e-5 * turn @ n
@@ -149,18 +149,18 @@ def test_a_body_that_turns_slides_along_a_round_skull() -> None:
     ("effects", "sentence"),
     [((Slide(), SkullContact()), "Slide and SkullContact"), ((SkullContact(), SkullContact(2e-4)), "2 times")],
 )
-def test_contradictions_are_sentences(effects: tuple[Effect, ...], sentence: str) -> None:
+def test_contradicting_skull_effects_are_rejected(effects: tuple[Effect, ...], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Fem(LID, [Elasticity(), Held(), *effects], REFERENCE, "cpu", element="p1")
 
 
-def test_a_skull_that_touches_nothing_is_pointless() -> None:
+def test_skull_without_nodes_to_touch_is_rejected() -> None:
     bare = Anatomy(MESH, LID.fixed, np.zeros_like(LID.slide_normal), LID.craniotomy)
     with pytest.raises(InputError, match="SkullContact finds no node"):
         Fem(bare, [Elasticity(), Held(), SkullContact()], REFERENCE, "cpu", element="p1")
 
 
-def test_bone_alone_holds_no_body() -> None:
+def test_body_held_by_skull_contact_alone_is_rejected() -> None:
     with pytest.raises(InputError, match="hold at least three nodes"):
         Fem(
             hold(MESH, np.zeros(len(TOP), bool), LID.slide_normal),
@@ -170,6 +170,6 @@ def test_bone_alone_holds_no_body() -> None:
         )
 
 
-def test_gaps_are_positive() -> None:
+def test_skull_gap_must_be_positive() -> None:
     with pytest.raises(InputError, match="gap is 0"):
         SkullContact(0.0)

@@ -1,4 +1,4 @@
-"""The volume that passes the closed skull: the surface's vectors, and what answers say of it."""
+"""Volume that passes through the closed skull: the surface's vectors, and the share that results report."""
 
 import numpy as np
 import pytest
@@ -23,8 +23,8 @@ GRADIENT = 1e-3 * np.array([[3.0, 1.0, -2.0], [0.5, -1.0, 4.0], [2.0, -3.0, 5.0]
 
 
 @pytest.mark.parametrize("kind", ["linear", "quadratic", "curved"])
-def test_the_surface_sweeps_the_volume_that_the_body_gains(kind):
-    """Of a uniform strain the body's volume times its trace; of the positions themselves three times the volume."""
+def test_surface_flux_agrees_with_volume_change(kind):
+    """A uniform strain gives the volume times its trace; the positions themselves give three times the volume."""
     mesh = box((3, 2, 2), distortion=0.2)
     if kind != "linear":
         mesh = quadratic(mesh)
@@ -87,7 +87,7 @@ def test_leak_is_positive_flux_through_averaged_facets(egg, tilt):
 
 
 @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
-def test_leak_shrinks_with_the_size_it_is_averaged_over(egg, element):
+def test_leak_shrinks_with_its_averaging_radius(egg, element):
     """Sums at nodes vanish by construction on the surface's own normals; means over facets do not."""
     answer, space = pressed(egg, element), discretise(egg.mesh, element)
     u = space.interpolate_field(answer.displacement[0])
@@ -103,7 +103,7 @@ def test_leak_shrinks_with_the_size_it_is_averaged_over(egg, element):
     assert shares[0] > 1.5 * shares[1] > 1.5 * shares[2] > 0.0
 
 
-def test_mid_edge_nodes_count(egg):
+def test_leak_includes_mid_edge_nodes(egg):
     answer = pressed(egg, "p2")
     space = discretise(egg.mesh, "p2")
     u = space.interpolate_field(answer.displacement[0])
@@ -116,14 +116,14 @@ def test_mid_edge_nodes_count(egg):
     assert np.abs(swept[: len(egg.mesh.nodes)]).max() < 1e-12 < np.abs(swept).max()
 
 
-def test_a_body_at_rest_lets_nothing_pass(egg):
+def test_body_at_rest_has_no_leak(egg):
     device = find_device("cpu", "float64")
     leak = Leak(egg, discretise(egg.mesh, "p1"), device)
     assert leak.share(device.allocate(3 * len(egg.mesh.nodes), 2)).tolist() == [0.0, 0.0]
 
 
-def test_of_a_skull_without_an_opening_there_is_no_share(egg):
-    """The whole surface is covered: what passes it is a share of nothing."""
+def test_leak_of_skull_without_opening_is_nan(egg):
+    """The whole surface is covered: the share has a zero denominator."""
     whole = np.unique(egg.mesh.surface)
     normal = np.zeros_like(egg.slide_normal)
     normal[whole, 2] = 1.0

@@ -1,4 +1,4 @@
-"""Where bone ends over a brain, and what open cortex may do beside and beneath its edge."""
+"""The bone's edge at a craniotomy, and motion of open cortex next to it and below it."""
 
 from dataclasses import replace
 
@@ -37,8 +37,8 @@ def half_open(opened: np.ndarray = OPEN) -> Anatomy:
     return Anatomy(MESH, below.fixed, below.slide_normal, opened)
 
 
-def test_how_far_inside_a_straight_edge() -> None:
-    """To a tenth of the edge's radius within its blur, and which way it is."""
+def test_distance_inside_a_straight_edge_is_measured() -> None:
+    """To a tenth of the edge's radius within its blur, with its direction."""
     body = half_open()
     edge = compute_edge_radius(MESH.nodes, find_opening_edge(body))
     points = MESH.nodes[TOP & MIDDLE]
@@ -49,8 +49,8 @@ def test_how_far_inside_a_straight_edge() -> None:
     assert (np.sign(inside) == np.sign(points[:, 0] - END)).all()
 
 
-def test_how_far_inside_a_round_opening() -> None:
-    """Of a disc in a flat bone, as large as it has nodes, to a third of the edge's radius: rags are seen through."""
+def test_distance_inside_a_round_opening_is_measured() -> None:
+    """A disc in a flat bone, with the area of its nodes, to a third of the edge's radius: ragged edges are smoothed."""
     mesh = box((14, 14, 2), 0.07)
     top = mesh.nodes[:, 2] > mesh.nodes[:, 2].max() - 1e-9
     away = np.linalg.norm(mesh.nodes[:, :2] - 0.035, axis=1)
@@ -67,7 +67,7 @@ def test_how_far_inside_a_round_opening() -> None:
     assert (way[near, :2] * inwards).sum(axis=1).min() > 0.9
 
 
-def test_a_body_without_an_opening_has_bone_alone() -> None:
+def test_body_without_an_opening_has_only_bone() -> None:
     body = half_open(np.zeros(len(TOP), bool))
     bone = build_bone(body, discretise(MESH, "p1"), GAP)
     np.testing.assert_array_equal(bone.nodes, np.flatnonzero(TOP & ~OPEN))
@@ -87,8 +87,8 @@ def dragged(body: Anatomy, element: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
-def test_open_cortex_slides_under_bone_and_not_into_it(element: str) -> None:
-    """Round an edge as round as the mesh; where the opening is not given, it would be in the bone by millimetres."""
+def test_open_cortex_slides_under_bone_without_penetration(element: str) -> None:
+    """Round an edge as round as the mesh; without the opening, cortex would enter the bone by millimetres."""
     edge = compute_edge_radius(MESH.nodes, find_opening_edge(half_open()))
 
     def depth(u: np.ndarray) -> np.ndarray:
@@ -103,8 +103,8 @@ def test_open_cortex_slides_under_bone_and_not_into_it(element: str) -> None:
     assert barred.max() > -edge, "nothing came near the edge"
 
 
-def test_the_opening_lets_the_brain_rise() -> None:
-    """Far from the edge, and pushed away from it, cortex rises as if there were no bone."""
+def test_cortex_far_from_the_edge_rises_freely() -> None:
+    """Pushed away from the edge, cortex rises as without bone."""
     tissue = Elasticity(Material("neo-hookean", 3000.0, 0.45))
     push = Loads((Nodal((OPEN[:, None] * [0.2, 0.0, 0.6] / OPEN.sum())[None]),))
 

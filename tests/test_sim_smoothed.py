@@ -1,4 +1,4 @@
-"""Locking: a block in bending, where linear tetrahedra are too stiff, the more so the less it can be compressed."""
+"""Locking: a block in bending, where linear tetrahedra are too stiff, the more so the less compressible it is."""
 
 import numpy as np
 import pytest
@@ -36,12 +36,12 @@ def fine() -> dict[float, float]:
 
 @pytest.mark.parametrize("poisson", POISSON)
 @pytest.mark.parametrize(("element", "width"), [("p2", 4), ("smoothed", 6)])
-def test_recommended_elements_do_not_lock(element: str, width: int, poisson: float, fine: dict[float, float]) -> None:
+def test_recommended_elements_avoid_locking(element: str, width: int, poisson: float, fine: dict[float, float]) -> None:
     assert deflection(element, width, poisson) == pytest.approx(fine[poisson], rel=0.05)
 
 
-def test_linear_tetrahedra_lock(fine: dict[float, float]) -> None:
-    """On the mesh on which smoothed strains are right: a tenth too stiff at 0.3, three times at 0.495."""
+def test_linear_tetrahedra_show_volumetric_locking(fine: dict[float, float]) -> None:
+    """On the mesh on which smoothed strains are accurate: a tenth too stiff at 0.3, three times at 0.495."""
     share = [deflection("p1", 6, poisson) / fine[poisson] for poisson in POISSON]
     assert (np.diff(share) < 0.0).all()
     assert share[0] > 0.85

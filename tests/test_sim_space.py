@@ -1,4 +1,4 @@
-"""Mid-edge nodes: where they are held and how they slide, by brute force; they never show outside."""
+"""Mid-edge nodes: their constraints and normals by brute force; results contain vertices only."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -33,7 +33,7 @@ def triangles_round(mesh: TetMesh, ends: np.ndarray) -> list[list[int]]:
     return [list(corners) for corners in mesh.surface.tolist() if set(ends.tolist()) <= set(corners)]
 
 
-def test_every_edge_has_one_node_in_its_middle() -> None:
+def test_every_edge_has_one_node_at_its_midpoint() -> None:
     space = discretise(THIN, "p2")
     edges = {pair for tet in THIN.tets.tolist() for pair in combinations(sorted(tet), 2)}
     assert sorted(edges) == sorted(map(tuple, space.edges.tolist()))
@@ -46,13 +46,13 @@ def test_every_edge_has_one_node_in_its_middle() -> None:
     np.testing.assert_array_equal(space.surface[:, :3], THIN.surface)
 
 
-def test_corners_carry_a_linear_field_to_all_nodes() -> None:
+def test_corner_interpolation_is_exact_for_linear_fields() -> None:
     for space in (discretise(THIN, "p2"), discretise(quadratic(THIN), "p2")):
         carried = space.corner_interpolation @ space.nodes[np.unique(space.table[:, :4])]
         np.testing.assert_allclose(carried, space.nodes, atol=1e-16)
 
 
-def test_an_added_node_is_held_where_a_surface_triangle_is() -> None:
+def test_added_mid_edge_node_is_held_with_its_triangle() -> None:
     """Component by component; not where two held nodes are joined through the body."""
     held = np.random.default_rng(0).uniform(size=THIN.nodes.shape) < 0.8
     space = discretise(THIN, "p2")
@@ -67,7 +67,7 @@ def test_an_added_node_is_held_where_a_surface_triangle_is() -> None:
     assert expected.sum() > 20
 
 
-def test_nodes_that_the_mesh_brings_are_held_as_the_mesh_says() -> None:
+def test_mid_edge_nodes_of_the_mesh_keep_their_constraints() -> None:
     mesh = quadratic(THIN)
     held = np.zeros((len(mesh.nodes), 3), bool)
     held[np.unique(mesh.tets)] = True
@@ -85,8 +85,8 @@ def sliding() -> tuple[Discretisation, np.ndarray, np.ndarray, np.ndarray]:
     return space, held, normal, space.extend_normals(normal, held, FACING)
 
 
-def test_added_node_slides_along_adjacent_triangles() -> None:
-    """Brute force over edges: along all of them where they face as its ends do, else along those of the wall."""
+def test_added_mid_edge_node_slides_along_its_triangles() -> None:
+    """Brute force over edges: along all triangles where they face as its ends do, else along those of the wall."""
     space, held, normal, found = sliding()
     np.testing.assert_array_equal(found[: len(normal)], normal)
     slides = (normal != 0.0).any(axis=1)
@@ -111,8 +111,8 @@ def test_added_node_slides_along_adjacent_triangles() -> None:
     assert between_held and 0 < astray < many
 
 
-def test_through_a_ball_that_slides_nothing_passes() -> None:
-    """Normals are along what a motion of their node sweeps, and as radial as its triangles allow."""
+def test_sliding_normals_of_ball_are_parallel_to_flux_vectors() -> None:
+    """Normals are parallel to the flux vector of their node, and as radial as its triangles allow."""
     surface = np.zeros(len(ROUND.nodes), bool)
     surface[ROUND.surface] = True
     space = discretise(ROUND, "p2")
@@ -126,7 +126,7 @@ def test_through_a_ball_that_slides_nothing_passes() -> None:
     assert not np.delete(found, wall, axis=0).any()
 
 
-def test_beside_the_edge_of_a_box_a_face_slides_in_its_own_plane() -> None:
+def test_box_face_slides_in_its_plane_next_to_an_edge() -> None:
     """Nodes on an edge have one normal between two planes, or slide in one and have a component held."""
     x, y = THIN.nodes[:, 0] == 0.0, THIN.nodes[:, 1] == 0.0
     for bound in (False, True):
@@ -149,7 +149,7 @@ def fem() -> Fem:
     return Fem(base_held(THIN), [Elasticity(), Held(), NodalForce(), ToolForce()], TIGHT, "cpu", element="p2")
 
 
-def test_a_deformation_speaks_of_the_meshs_own_vertices(fem: Fem) -> None:
+def test_deformation_has_rows_of_mesh_vertices_only(fem: Fem) -> None:
     found = fem.deform(push([0.05, 0.05, 0.1 / 3.0], [[0.0, 0.0, -0.3], [0.0, 0.1, 0.0]], 0.02))
     assert found.displacement.shape == (2, len(THIN.nodes), 3)
     np.testing.assert_array_equal(found.nodes, np.arange(len(THIN.nodes)))
@@ -160,8 +160,8 @@ def test_a_deformation_speaks_of_the_meshs_own_vertices(fem: Fem) -> None:
     ).displacement.shape == (1, 2, 3)
 
 
-def test_a_start_without_mid_edge_nodes_serves_too(fem: Fem) -> None:
-    """From elements that have none: they begin in the middle between their ends."""
+def test_start_without_mid_edge_nodes_is_accepted(fem: Fem) -> None:
+    """From elements without them: they begin in the middle between their ends."""
     loads = push([0.05, 0.05, 0.1 / 3.0], [0.0, 0.0, -0.3], 0.02)
     found = fem.deform(loads)
     bare = fem.deform(loads, replace(found, memory={}))
@@ -169,8 +169,8 @@ def test_a_start_without_mid_edge_nodes_serves_too(fem: Fem) -> None:
     np.testing.assert_allclose(bare.displacement, found.displacement, atol=1e-9)
 
 
-def test_a_start_is_split_with_its_batch() -> None:
-    """Mid-edge nodes of every row travel with it: the answer itself is a start from which nothing is left to do."""
+def test_start_is_split_into_the_same_batches_as_loads() -> None:
+    """Mid-edge nodes of every row are passed on: the solution as start needs no iteration."""
     fem = Fem(base_held(THIN), [Elasticity(), Held(), ToolForce()], TIGHT, "cpu", batch=2, element="p2")
     loads = push([0.05, 0.05, 0.1 / 3.0], np.outer([0.1, -0.2, 0.3, 0.2, -0.1], [0.3, 0.1, -1.0]), 0.02)
     np.testing.assert_array_equal(fem.deform(loads, fem.deform(loads)).iterations, 0)
@@ -192,12 +192,12 @@ assert TWO.middles is not None
         (TWO, np.where(np.arange(6)[:, None] == 2, TWO.middles[:, [1, 0, 2, 3, 4, 5]], TWO.middles), "disagree"),
     ],
 )
-def test_middles_that_make_no_mesh_are_refused(mesh: TetMesh, middles: np.ndarray, sentence: str) -> None:
+def test_invalid_mid_edge_nodes_are_rejected(mesh: TetMesh, middles: np.ndarray, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         replace(mesh, middles=np.array(middles))
 
 
-def test_elements_that_a_mesh_cannot_have_are_refused() -> None:
+def test_elements_that_do_not_fit_the_mesh_are_rejected() -> None:
     for element in ("p1", "smoothed"):
         with pytest.raises(InputError, match=f"quadratic tetrahedra, not {element}: use p2"):
             discretise(quadratic(ONE), element)
@@ -205,7 +205,7 @@ def test_elements_that_a_mesh_cannot_have_are_refused() -> None:
         discretise(ONE, "q1")
 
 
-def test_elements_folded_by_their_middles_are_refused() -> None:
+def test_elements_folded_by_mid_edge_nodes_are_rejected() -> None:
     mesh = quadratic(ONE)
     nodes = mesh.nodes.copy()
     nodes[4] = nodes[[0, 1]].mean(axis=0) + [0.04, 0.0, 0.0]  # past the quarter point

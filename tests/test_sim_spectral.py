@@ -1,4 +1,4 @@
-"""Eigenvalues and eigenvectors on the device: exact to the last digits, whatever is equal."""
+"""Eigenvalues and eigenvectors on the device: exact to the last digits, also where eigenvalues are equal."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def matrices() -> np.ndarray:
 
 
 @pytest.mark.parametrize(("precision", "digit"), [("float32", 2.0**-23), ("float64", 2.0**-52)])
-def test_axes_turn_the_matrix_into_its_eigenvalues(precision: Precision, digit: float) -> None:
+def test_principal_axes_diagonalise_the_matrix(precision: Precision, digit: float) -> None:
     device = find_device("cpu", precision)
     mat, vec = device.matrix, device.vector
 

@@ -1,4 +1,4 @@
-"""Steps of cases on their way to the whole load."""
+"""Load steps of cases on the path to the whole load."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Single loads whose descent knows strained tissue: where it ends, how soon, and what the next frame takes over."""
+"""Descent of single loads with the stiffness of strained tissue: result, steps, and data for the next frame."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def hard(element: str = "smoothed") -> tuple[Problem, Discretisation, wp.array]:
 
 
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_it_ends_where_the_whole_does(element: str) -> None:
+def test_strained_descent_agrees_with_whole_body(element: str) -> None:
     problem, space = begun(LAW, element)
     expected, descent = equilibria(problem), descent_on(problem, space)
     for column, total in enumerate(TOTAL):
@@ -68,7 +68,7 @@ def test_it_ends_where_the_whole_does(element: str) -> None:
         np.testing.assert_allclose(found.u.numpy()[:, 0], expected[:, column], atol=1e-5 * np.abs(expected).max())
 
 
-def test_it_takes_half_the_steps() -> None:
+def test_strained_descent_takes_half_the_steps() -> None:
     problem, space, rest = hard()
     factor, tolerance = factor_of(problem), np.full(1, 1e-6)
     plain = Lbfgs(problem, factor).descend(rest, tolerance, 400)
@@ -77,8 +77,8 @@ def test_it_takes_half_the_steps() -> None:
     assert found.steps[0] <= 0.5 * plain.steps[0]
 
 
-def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of all nodes it is the inverse of the whole stiffness where the body is now."""
+def test_preconditioner_inverts_strained_stiffness(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all nodes it is the inverse of the whole stiffness at the present state."""
     problem, space, rest = hard("p1")
     factor = factor_of(problem)
     bent = descent_on(problem, space).descend(rest, np.full(1, 1e-2), 100).u
@@ -106,7 +106,7 @@ def test_the_preconditioner_is_the_inverse_of_what_is_stiffer(monkeypatch: pytes
     assert off < 1e-3 < 0.03 < np.linalg.norm(at_rest - exact) / np.linalg.norm(exact)
 
 
-def test_the_next_frame_begins_with_what_served() -> None:
+def test_next_frame_reuses_the_stiffness_update() -> None:
     problem, space, rest = hard()
     descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {})
@@ -126,7 +126,7 @@ def test_the_next_frame_begins_with_what_served() -> None:
 
 @pytest.mark.parametrize("name", UPDATE_KEYS.values())
 @pytest.mark.parametrize("fault", ["missing", "short", "negative", "large", "kind"])
-def test_what_does_not_fit_is_forgotten(name: str, fault: str) -> None:
+def test_inconsistent_stiffness_update_is_ignored(name: str, fault: str) -> None:
     problem, space, rest = hard()
     descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {}).u
@@ -145,7 +145,7 @@ def test_what_does_not_fit_is_forgotten(name: str, fault: str) -> None:
     np.testing.assert_array_equal(descent.descend(there, np.full(1, 1e-8), 400, learnt).u.numpy(), first.u.numpy())
 
 
-def test_a_factor_that_cannot_be_divided_by_is_forgotten() -> None:
+def test_singular_stiffness_update_is_ignored() -> None:
     problem, space, rest = hard()
     descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {}).u
@@ -154,8 +154,8 @@ def test_a_factor_that_cannot_be_divided_by_is_forgotten() -> None:
     np.testing.assert_array_equal(descent.descend(there, np.full(1, 1e-8), 400, learnt).u.numpy(), first.u.numpy())
 
 
-def test_where_the_model_is_not_positive_the_rest_stands_in() -> None:
-    """A model that takes tissue for a thousand times softer than nothing would send every step uphill."""
+def test_indefinite_update_falls_back_to_rest_stiffness() -> None:
+    """A model with strongly negative stiffness would send every step uphill."""
     problem, space, _ = hard("p1")
     factor, rows = factor_of(problem), np.arange(3 * len(space.nodes))
     preconditioner = StiffenedPreconditioner(factor, problem)
@@ -173,7 +173,7 @@ def test_where_the_model_is_not_positive_the_rest_stands_in() -> None:
     np.testing.assert_array_equal(out.numpy(), plain.numpy())
 
 
-def test_the_budget_leaves_a_finite_state_and_says_so() -> None:
+def test_strained_descent_out_of_budget_is_finite() -> None:
     problem, space, rest = hard()
     descent = descent_on(problem, space)
     found = descent.descend(rest, np.full(1, 1e-12), 3)
@@ -197,7 +197,7 @@ def frames(fem: Fem) -> list[Deformation]:
     return found
 
 
-def test_live_frames_go_the_short_way_to_the_same_place() -> None:
+def test_live_frames_take_fewer_steps_to_same_result() -> None:
     found, expected = frames(live()), frames(live(SolverStep.STRAINED))
     assert {answer.outcome[0] for answer in found} == {Outcome.CONVERGED}
     size = np.abs(expected[-1].displacement).max()
@@ -209,7 +209,7 @@ def test_live_frames_go_the_short_way_to_the_same_place() -> None:
     np.testing.assert_array_equal(frames(live())[-1].displacement, found[-1].displacement)
 
 
-def test_models_have_the_nodes_nearest_to_the_opening() -> None:
+def test_update_has_nodes_nearest_to_the_opening() -> None:
     problem, space, rest = hard()
     strains, kept = replace(SINGLE_LIMITS, max_candidates=200, max_nodes=30), Renewal(max_served=400)
     descent = descent_on(problem, space, strains, kept)

@@ -1,4 +1,4 @@
-"""Frames that stay on the device and know strained tissue: as many steps, the same answers wherever a start stands."""
+"""Frames on the device with the stiffness of strained tissue: same steps and results for every kind of start."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -51,7 +51,7 @@ def ride(fem: Fem, count: int = 7) -> list[Deformation]:
     return answers
 
 
-def test_they_take_fewer_steps_to_the_same_place(fem: Fem) -> None:
+def test_strained_frames_take_fewer_steps_to_same_result(fem: Fem) -> None:
     own, plain = ride(fem), ride(follower(False))
     for one, other in zip(own[1:], plain[1:], strict=True):
         assert isinstance(one.warm, Kept) and one.outcome == other.outcome == (Outcome.CONVERGED,)
@@ -63,7 +63,7 @@ def test_they_take_fewer_steps_to_the_same_place(fem: Fem) -> None:
     assert sum(int(one.iterations[0]) for one in own[2:]) <= 0.6 * sum(int(one.iterations[0]) for one in plain[2:])
 
 
-def test_what_served_stays_and_what_did_not_is_made_anew(fem: Fem) -> None:
+def test_update_is_renewed_only_after_slow_frames(fem: Fem) -> None:
     answers = ride(fem)[1:]
     models = [answer.warm.bent for answer in answers if isinstance(answer.warm, Kept)]
     assert models[0] is not None
@@ -72,21 +72,21 @@ def test_what_served_stays_and_what_did_not_is_made_anew(fem: Fem) -> None:
     assert not all(anew)
 
 
-def test_a_start_is_the_same_on_the_device_and_on_the_host(fem: Fem) -> None:
+def test_start_on_device_and_on_host_give_same_result(fem: Fem) -> None:
     last = ride(fem)[-1]
     here = fem.deform(pressed(7), last)
     brought = fem.deform(pressed(7), replace(last, warm={**last.warm}))
     assert {NODES_KEY, MATRIX_KEY} <= set(here.warm) and same(here, brought)
 
 
-def test_an_older_frame_leads_where_it_led_before(fem: Fem) -> None:
+def test_older_frame_as_start_gives_its_former_result(fem: Fem) -> None:
     answers = ride(fem)
     assert same(fem.deform(pressed(3), answers[2]), answers[3])
     assert same(fem.deform(pressed(6), answers[5]), answers[6])
 
 
 @pytest.mark.parametrize("fault", ["missing", "short", "far", "negative", "nan", "kind"])
-def test_a_model_that_does_not_fit_is_forgotten(fem: Fem, fault: str) -> None:
+def test_inconsistent_update_of_a_frame_is_ignored(fem: Fem, fault: str) -> None:
     last = ride(fem)[-1]
     warm = dict(last.warm)
     plain = {name: warm[name] for name in warm if name not in (NODES_KEY, MATRIX_KEY)}
@@ -107,8 +107,8 @@ def test_a_model_that_does_not_fit_is_forgotten(fem: Fem, fault: str) -> None:
     assert same(fem.deform(pressed(7), replace(last, warm=warm)), none)
 
 
-def test_the_matrix_does_what_the_factors_do(fem: Fem) -> None:
-    """That of live loads on the CPU, which is held against the inverse itself."""
+def test_update_matrix_agrees_with_update_by_factors(fem: Fem) -> None:
+    """The update of live loads on the CPU is tested against the inverse itself."""
     problem, factor = fem.problem, fem.strategy.preconditioner
     assert isinstance(factor, Factor)
     last = ride(fem)[-1]

@@ -1,4 +1,4 @@
-"""The model that knows how stiff strained tissue is: each part against the same by other means."""
+"""Stiffness update of strained tissue: each part against another method."""
 
 from dataclasses import replace
 from functools import cache
@@ -75,8 +75,8 @@ def stiffer(fem: Fem, u: wp.array, column: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("element", "tissue"), [("p1", "plain"), ("smoothed", "plain"), ("p1", "relaxing")])
-def test_added_curvature_is_excess_over_rest(element: str, tissue: str) -> None:
-    """Of all elements, whatever their number of nodes and points, and of some columns alone."""
+def test_update_curvature_is_excess_over_rest_curvature(element: str, tissue: str) -> None:
+    """All elements, for any number of nodes and points, and selected columns."""
     fem, _ = solver(element, tissue)
     problem, count = fem.problem, fem.space.count
     u = bent(problem, 4e-4)
@@ -93,8 +93,8 @@ def test_added_curvature_is_excess_over_rest(element: str, tissue: str) -> None:
     np.testing.assert_allclose(out.numpy()[0], expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_strain_is_the_largest_round_each_node() -> None:
-    """Of elements that lie wholly on the nodes that are asked for."""
+def test_node_strain_is_maximum_over_its_elements() -> None:
+    """Elements whose nodes are all selected."""
     fem, _ = solver()
     problem, table = fem.problem, fem.space.table
     u = bent(problem, 4e-4)
@@ -126,8 +126,8 @@ def find_model(strains: StrainLimits) -> tuple[Fem, ContactDescent, wp.array, St
     return fem, descent, u, model
 
 
-def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
-    """H + H E M E' H, against K0 + D over the free motions; and what it changes between the nodes that are touched."""
+def test_updated_inverse_agrees_with_strained_stiffness() -> None:
+    """H + H E M E' H, against K0 + D over the free motions; and its change between the touched nodes."""
     fem, descent, u, model = find_model(EVERY)
     problem, basis = fem.problem, fem.problem.constraint.build_basis()
     force = np.random.default_rng(4).normal(size=(problem.rows, 2))
@@ -147,8 +147,8 @@ def test_the_model_is_the_inverse_of_the_stiffness_now() -> None:
         np.testing.assert_allclose(now, inverse[np.ix_(touched, touched)], atol=2e-5 * np.abs(inverse).max())
 
 
-def test_those_are_chosen_that_are_strained_most() -> None:
-    """As many as there is room for, and none that is hardly strained."""
+def test_update_selects_the_most_strained_nodes() -> None:
+    """The number is limited, and no node with small strain is selected."""
     fem, descent, u, model = find_model(StrainLimits(min_strain=0.08, max_nodes=20, max_omitted=1.0))
     strain = fem.problem.device.allocate(fem.space.count, 2)
     every, columns = np.ones(fem.space.count, bool), fem.problem.device.upload(BOTH, wp.int32)
@@ -166,7 +166,7 @@ def test_those_are_chosen_that_are_strained_most() -> None:
             assert strain.numpy()[chosen, column].min() > max(0.08, 0.97 * strain.numpy()[others, column].max())
 
 
-def test_columns_of_different_widths_go_together() -> None:
+def test_updates_of_different_width_are_merged() -> None:
     _, _, _, narrow = find_model(StrainLimits(min_strain=0.08, max_nodes=20, max_omitted=1.0))
     _, _, _, wide = find_model(EVERY)
     both = narrow.merge_columns(np.array([1]), wide.select(np.array([0])))
@@ -179,16 +179,16 @@ def test_columns_of_different_widths_go_together() -> None:
     assert both.bent.tolist() == [True, False] and not both.own[1].any()
 
 
-def test_model_is_absent_where_valid_only_in_patches() -> None:
-    """Where its room leaves out tissue that is strained far more than what counts as strained."""
+def test_update_is_discarded_if_it_omits_strained_tissue() -> None:
+    """Its nodes leave out tissue with far more strain than the threshold."""
     fem, descent = solver()
     u, few = bent(fem.problem, 4e-4), StrainLimits(min_strain=0.08, max_nodes=5, max_omitted=0.1)
     part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable), few)
     assert part.build_model(u, BOTH) is None and part.build_model(u, BOTH[1:]) is not None
 
 
-def test_deep_poses_take_fewer_steps_to_the_same_end() -> None:
-    """Than as stiff as at rest: a ball goes down step by step, each from where the last one ended."""
+def test_deep_poses_take_fewer_steps_to_same_result() -> None:
+    """Compared with the rest stiffness: a ball moves down step by step, each from the previous result."""
     ends, steps = [], []
     for strains in (STRAIN_LIMITS, StrainLimits(min_strain=np.inf)):
         fem, _ = solver("smoothed", "plain", strains, 1e-3)

@@ -1,4 +1,4 @@
-"""What is tried when an attempt fails, and what a case that nothing helps still says."""
+"""Fallbacks of failed solutions, and the state that an unsolvable case returns."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def hasty() -> Deformation:
     return fem(HASTY).deform(loads())
 
 
-def test_every_case_climbs_as_far_as_it_must(hasty: Deformation) -> None:
+def test_each_case_ends_with_its_expected_outcome(hasty: Deformation) -> None:
     assert hasty.outcome == (
         Outcome.CONVERGED, Outcome.BUDGET, Outcome.CONVERGED, Outcome.CONVERGED, Outcome.CONVERGED_IN_STEPS,
     )  # fmt: skip
@@ -54,12 +54,12 @@ def test_every_case_climbs_as_far_as_it_must(hasty: Deformation) -> None:
         assert residual(hasty, row) <= 1.01e-8
 
 
-def test_what_fails_is_in_equilibrium_under_its_share(hasty: Deformation) -> None:
+def test_failed_case_is_in_equilibrium_under_its_share(hasty: Deformation) -> None:
     assert residual(hasty, 1, hasty.reached[1]) <= 1.01e-8
     assert hasty.residual[1] == pytest.approx(1.0 - hasty.reached[1], rel=0.2)  # of the load, nobody bears
 
 
-def test_rows_climb_alone_as_together(hasty: Deformation) -> None:
+def test_rows_solved_alone_and_together_agree(hasty: Deformation) -> None:
     for row in range(len(TOTAL)):
         alone = fem(HASTY).deform(loads(TOTAL[[row]]))
         assert alone.outcome[0] is hasty.outcome[row]
@@ -67,7 +67,7 @@ def test_rows_climb_alone_as_together(hasty: Deformation) -> None:
         np.testing.assert_allclose(alone.displacement[0], hasty.displacement[row], atol=1e-8)
 
 
-def test_no_load_steps_if_none_are_asked_for() -> None:
+def test_accuracy_with_zero_steps_disables_load_steps() -> None:
     found = fem(replace(HASTY, steps=0)).deform(loads())
     assert found.outcome[4] is Outcome.BUDGET
     assert (found.iterations <= HASTY.outer).all()
@@ -77,8 +77,8 @@ def test_no_load_steps_if_none_are_asked_for() -> None:
 
 
 @pytest.mark.parametrize("steps", [0, 24])
-def test_a_start_inside_out_is_left_for_rest(steps: int) -> None:
-    """Whatever rescue costs: one row of it among others."""
+def test_inverted_start_is_replaced_with_rest(steps: int) -> None:
+    """At any cost of the fallback: one row among others."""
     start = np.zeros((5, *MESH.nodes.shape))
     start[[0, 4]] = CRUSHED
     cold = fem(replace(ACCURACY, steps=steps)).deform(loads(TOTAL[[0, 2, 0, 3, 2]]))
@@ -88,8 +88,8 @@ def test_a_start_inside_out_is_left_for_rest(steps: int) -> None:
     np.testing.assert_array_equal(found.displacement, cold.displacement)
 
 
-def test_a_start_that_leads_inside_out_is_not_followed() -> None:
-    """Turned over by half it is not inside out yet; what it leads to is compared with what rest leads to."""
+def test_start_that_leads_to_inversion_is_not_used() -> None:
+    """Twisted by three quarters of a turn it is not inverted yet; its result is compared with that from rest."""
     twisted = MESH.nodes.copy()
     angle = np.pi * 1.5 * MESH.nodes[:, 2] / MESH.nodes[:, 2].max()
     middle = MESH.nodes[:, :2].mean(axis=0)
@@ -102,7 +102,7 @@ def test_a_start_that_leads_inside_out_is_not_followed() -> None:
     assert found.inverted[0] == 0
 
 
-def test_a_start_whose_averages_are_inside_out_is_left_for_rest() -> None:
+def test_start_with_inverted_averages_is_replaced_with_rest() -> None:
     effects = (Elasticity(tissue("neo-hookean")), *openings.EFFECTS)
     solver = Fem(openings.body()[0], effects, ACCURACY, "cpu", element="smoothed")
     mesh, load = openings.MESH, openings.loads_of(openings.TOTAL[1:2])

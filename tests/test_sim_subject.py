@@ -11,14 +11,14 @@ from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.geometry.tetmesh import compute_dihedral_angles
 
 
-def test_the_same_volume_gives_the_same_anatomy(tmp_path):
+def test_equal_label_volumes_give_equal_anatomies(tmp_path):
     path, _, _ = labelled(tmp_path / "labels.nii", AFFINES["oblique"])
     first, second = (make_anatomy(build_volume_subject(path, (1, 2), (3, 4)), MeshPlan(nodes=2000)) for _ in range(2))
     assert first.digest == second.digest
 
 
 @pytest.mark.parametrize("rise", [-0.001, 0.006, 0.014])
-def test_a_tumour_that_reaches_or_breaks_the_cortex_is_meshed(tmp_path, rise):
+def test_tumour_at_or_through_the_cortex_is_meshed(tmp_path, rise):
     middle = MIDDLE + [0.0, 0.0, AXES[2] - RADIUS + rise]
     path, labels, affine = labelled(tmp_path / "l.nii", AFFINES["straight"], lambda points: ball(points, middle))
     voxel = 1e-9 * abs(np.linalg.det(affine[:3, :3]))
@@ -31,7 +31,7 @@ def test_a_tumour_that_reaches_or_breaks_the_cortex_is_meshed(tmp_path, rise):
     assert len(touching) > 3 or rise < 0.0
 
 
-def test_components_and_holes(tmp_path):
+def test_tumour_components_are_meshed_and_defects_are_noted(tmp_path):
     affine, places = grid(AFFINES["straight"])
     labels = np.where(ellipsoid(places), 1, 0)
     labels[ball(places)] = 3

@@ -1,4 +1,4 @@
-"""Normals at nodes, and of bodies seen through a blur."""
+"""Normals at nodes, and of bodies smoothed by a Gaussian blur."""
 
 import numpy as np
 import pytest
@@ -22,20 +22,20 @@ def off(normals: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((normals * others).sum(axis=1), -1.0, 1.0)))
 
 
-def test_a_ball_faces_outward_from_its_centre():
+def test_normals_of_ball_point_away_from_its_centre():
     assert off(compute_vertex_normals(BALL.vertices, BALL.faces), ARM).max() < 0.2
     assert off(compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices, 6e-3), ARM).max() < 0.2
 
 
-def test_of_folds_narrower_than_the_blur_little_is_left():
-    """Waves of 18 mm and 1.5 mm height on a radius of 70 mm: Gaussian blurs of 6 mm take 90 % of them and more."""
+def test_blur_removes_folds_narrower_than_its_width():
+    """Waves of 18 mm and 1.5 mm height on a radius of 70 mm: Gaussian blurs of 6 mm remove 90 % of them and more."""
     nodes = folded(1.5e-3, 24)
     belt = np.abs(ARM[:, 2]) < 0.3
     assert off(compute_vertex_normals(nodes, BALL.faces), ARM)[belt].max() > 20.0
     assert off(compute_blurred_normals(nodes, BALL.faces, nodes, 6e-3), ARM)[belt].max() < 4.0
 
 
-def test_what_is_wider_than_the_blur_stays():
+def test_blur_keeps_shapes_wider_than_its_width():
     nodes = folded(4e-3, 3)
     found = compute_blurred_normals(nodes, BALL.faces, nodes, 2.5e-3)
     assert off(found, ARM).max() > 8.0
@@ -43,8 +43,8 @@ def test_what_is_wider_than_the_blur_stays():
 
 
 @pytest.mark.parametrize("blur", [3e-3, 6e-3])
-def test_a_finer_mesh_of_the_same_body_has_the_same_normals(blur):
-    """Every triangle in four without moving anything: only the quadrature changes."""
+def test_blurred_normals_are_independent_of_mesh_size(blur):
+    """Every triangle in four at the same position: only the quadrature changes."""
     coarse = trimesh.creation.box((0.06, 0.05, 0.04))
     for _ in range(4):
         coarse = coarse.subdivide()
@@ -56,8 +56,8 @@ def test_a_finer_mesh_of_the_same_body_has_the_same_normals(blur):
 
 
 @pytest.mark.parametrize("blur", [3e-3, 6e-3])
-def test_the_kernel_is_a_gaussian_of_the_width_asked_for(blur):
-    """Faces, edges and corners of a box against the closed form; a width off by 5 % misses it by 1.5 degrees."""
+def test_blur_agrees_with_gaussian_of_the_given_width(blur):
+    """Faces, edges and corners of a box against the closed form; a width with 5 % error differs by 1.5 degrees."""
     size = (0.06, 0.05, 0.04)
     box = trimesh.creation.box(size)
     for _ in range(5):
@@ -69,8 +69,8 @@ def test_the_kernel_is_a_gaussian_of_the_width_asked_for(blur):
     )
 
 
-def test_a_mesh_far_coarser_than_the_blur_faces_outward_too():
-    """Edges of 40 mm: no triangle's middle is in sight of a corner through a blur of 6 mm."""
+def test_blurred_normals_of_coarse_ball_point_outward():
+    """Edges of 40 mm: no triangle's centre is within a blur of 6 mm of a corner."""
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.07)
     assert (
         off(
@@ -80,7 +80,7 @@ def test_a_mesh_far_coarser_than_the_blur_faces_outward_too():
     )
 
 
-def test_more_points_than_are_summed_at_once():
+def test_chunked_sum_of_many_points_agrees_with_whole():
     whole = compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
     parts = compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3, BlurRange(together=7))
     np.testing.assert_array_equal(parts, whole)

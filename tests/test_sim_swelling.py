@@ -1,4 +1,4 @@
-"""Tissue that swells: freely without stress, against walls with pressure, in time with heart and breath."""
+"""Swelling tissue: free without stress, confined with pressure, in time with heart and breath."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -56,7 +56,7 @@ def forces(problem: Problem, motion: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("theta", [1e-6, 0.3, -0.3])
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_what_swells_freely_has_no_stress(law: str, element: str, theta: float) -> None:
+def test_free_swelling_has_no_stress(law: str, element: str, theta: float) -> None:
     pulsation = Pulsation(Wave(1.0, abs(theta)), STILL)
     problem, nodes = posed(tissue(law), pulsation, element, 0.25 if theta > 0.0 else 0.75)
     wider = np.expm1(np.log1p(theta) / 3.0)
@@ -67,8 +67,8 @@ def test_what_swells_freely_has_no_stress(law: str, element: str, theta: float) 
 
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("law", ["neo-hookean", "ogden"])
-def test_a_block_on_rollers_swells_by_the_cube_root(law: str, element: str) -> None:
-    """It slides along the three planes through a corner. Relaxing tissue does as elastic tissue, at any time."""
+def test_block_on_rollers_swells_by_the_cube_root(law: str, element: str) -> None:
+    """It slides along the three planes through a corner. Relaxing tissue agrees with elastic tissue, at any time."""
     anatomy = hold(MESH, MESH.nodes < 1e-9)
     for made_of in (tissue(law), replace(tissue(law), prony=SERIES)):
         fem = Fem(
@@ -81,16 +81,16 @@ def test_a_block_on_rollers_swells_by_the_cube_root(law: str, element: str) -> N
 
 @pytest.mark.parametrize("made_of", [tissue("stable-neo-hookean"), replace(tissue("ogden"), prony=SERIES)])
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_between_walls_it_presses_with_the_bulk_modulus(element: str, made_of: Tissue) -> None:
-    """-K theta, the same everywhere, however the tissue relaxes: it does so in shape alone."""
+def test_confined_swelling_presses_with_the_bulk_modulus(element: str, made_of: Tissue) -> None:
+    """-K theta, uniform, for any relaxation: only the shape relaxes."""
     problem, nodes = posed(made_of, Pulsation(Wave(0.125, 1e-6), STILL), element, 2.0)
     mu, lam = made_of.lame
     stress = forces(problem, 0.0 * nodes).T @ nodes / MESH.volumes.sum()
     np.testing.assert_allclose(stress, -1e-6 * (lam + 2.0 * mu / 3.0) * np.eye(3), atol=1e-11 * lam)
 
 
-def test_times() -> None:
-    """Nothing at t = 0; heart and breath add up, and come back after the periods that both have."""
+def test_swelling_follows_heart_and_breath_in_time() -> None:
+    """Nothing at t = 0; heart and breath add up, and repeat after their common period."""
     fem = Fem(
         base_held(MESH),
         [Elasticity(), Held(), Pulsation(Wave(1.0, 0.01), Wave(0.25, 0.02))],
@@ -108,7 +108,7 @@ def test_times() -> None:
     np.testing.assert_allclose(swelling, [0.0, 0.01 + 0.02 * np.sin(np.pi / 8.0), 0.02, -0.02], atol=1e-15)
 
 
-def test_only_what_is_named_swells() -> None:
+def test_only_selected_regions_swell() -> None:
     """The lower half pushes the upper one up, which keeps its volume."""
     mesh = box((2, 2, 2), 0.1)
     upper = (mesh.nodes[mesh.tets].mean(axis=1)[:, 2] > 0.05).astype(int)
@@ -140,8 +140,8 @@ def closed(anatomy: Anatomy) -> Anatomy:
     return replace(anatomy, slide_normal=normal)
 
 
-def test_an_opened_brain_bulges_as_much_as_is_observed() -> None:
-    """Peak to peak 0.3 to 0.8 mm in the opening; where the skull is closed far less than a third of that."""
+def test_pulsation_at_craniotomy_has_observed_amplitude() -> None:
+    """Peak to peak 0.3 to 0.8 mm in the opening; with a closed skull less than a third of that."""
     anatomy = read_anatomy(TEMPLATE)
     swings = []
     for body in (anatomy, closed(anatomy)):
@@ -170,12 +170,12 @@ def absent() -> object:
         (absent, r"Pulsation is given for region 7, but the mesh has the regions \[0\]"),
     ],
 )
-def test_what_makes_no_sense_is_refused(build: Callable[[], object], sentence: str) -> None:
+def test_invalid_pulsation_arguments_are_rejected(build: Callable[[], object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         build()
 
 
-def test_tissue_that_is_taken_altogether_swells_no_more() -> None:
+def test_completely_resected_region_stops_swelling() -> None:
     region = (np.arange(len(MESH.tets)) == 0).astype(int)
     body = base_held(replace(MESH, region=region))
     effects = [Elasticity(), Held(), Pulsation(regions=(1,)), Resection(((0,),))]

@@ -11,7 +11,7 @@ from sim.linalg.multifrontal import find_moved_nodes
 from sim.linalg.symbolic import build_fronts, order_by_dissection
 
 
-def test_parts_do_not_touch_one_another_and_share_the_work() -> None:
+def test_dissection_gives_disjoint_parts_of_similar_size() -> None:
     stiffness, motions = system(sliding())
     free = sp.csc_array(motions.T @ stiffness @ motions)
     _, (first, second, last) = build_fronts(free, find_moved_nodes(motions), 2)
@@ -22,8 +22,8 @@ def test_parts_do_not_touch_one_another_and_share_the_work() -> None:
     assert sum(loads) > 1.1 * (max(loads[:2]) + loads[2])
 
 
-def test_a_front_touches_later_unknowns_alone() -> None:
-    """And every entry of the matrix lies within the front of its earlier unknown."""
+def test_front_touches_only_later_unknowns() -> None:
+    """Every entry of the matrix lies within the front of its earlier unknown."""
     stiffness, motions = system(sliding())
     free = sp.csc_array(motions.T @ stiffness @ motions)
     order, parts = build_fronts(free, find_moved_nodes(motions), 2)
@@ -41,7 +41,7 @@ def test_a_front_touches_later_unknowns_alone() -> None:
 
 
 @pytest.mark.parametrize("later", [False, True])
-def test_entries_stored_on_one_side_have_the_same_fronts(later: bool) -> None:
+def test_fronts_of_triangular_and_full_matrix_agree(later: bool) -> None:
     stiffness, motions = system(sliding())
     whole, node = sp.coo_array(motions.T @ stiffness @ motions), find_moved_nodes(motions)
     first, second = node[whole.row], node[whole.col]

@@ -1,4 +1,4 @@
-"""The built-in brain: the figures that its mesh is held to, its tumour, its boundary."""
+"""The built-in brain: quality of its mesh, its tumour, its boundary."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def spread_points(mesh, count):
     return np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), count), corners[chosen])
 
 
-def test_at_17k_nodes_angles_surface_and_volume_are_as_promised():
+def test_template_mesh_at_17k_nodes_meets_quality_bounds():
     subject = build_template_subject(Tumour(shape="lobed", seed=7))
     mesh = make_anatomy(subject, MeshPlan(nodes=17_000)).mesh
     assert abs(len(mesh.nodes) - 17_000) <= 1_700
@@ -63,18 +63,18 @@ def test_at_17k_nodes_angles_surface_and_volume_are_as_promised():
     assert np.percentile(distance, 95) < 1e-3
 
 
-def test_the_mesh_is_searched_for_as_the_plan_says(subject):
+def test_mesh_search_stops_at_the_number_of_trials_of_the_plan(subject):
     meshing = Meshing(max_trials=1, max_deviation=0.0)
     with pytest.raises(InputError, match="3000 nodes are not possible for this anatomy"):
         make_anatomy(subject, MeshPlan(3000, meshing=meshing))
 
 
-def test_it_has_the_volume_of_a_person(anatomy):
+def test_template_has_the_volume_of_a_human_brain(anatomy):
     assert anatomy.mesh.volumes.sum() == pytest.approx(Head().volume, rel=0.005)
     assert abs(len(anatomy.mesh.nodes) - 5300) <= 530
 
 
-def test_the_cap_lies_as_deep_as_asked():
+def test_tumour_lies_at_its_requested_depth():
     for cover in (0.003, 0.025):
         subject = build_template_subject(Tumour(cover=cover, shape="lobed", seed=1))
         inward = subject.tumour.middle - subject.site
@@ -107,7 +107,7 @@ def test_seeds_vary_the_lobed_shape_but_not_its_volume():
         assert np.ptp(shape.compute_radius(directions)) > 3e-3
 
 
-def test_the_craniotomy_is_wider_than_the_tumour(subject):
+def test_craniotomy_is_wider_than_the_tumour(subject):
     assert (
         choose_craniotomy(subject, MeshPlan()) == 0.05 and choose_craniotomy(subject, MeshPlan(craniotomy=0.03)) == 0.03
     )
@@ -115,7 +115,7 @@ def test_the_craniotomy_is_wider_than_the_tumour(subject):
     assert sizes == pytest.approx([0.06, 0.08], abs=1e-3)
 
 
-def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
+def test_template_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
     mesh = anatomy.mesh
     outer = np.unique(mesh.surface)
     stem, skull = anatomy.fixed.all(axis=1), anatomy.slide_normal.any(axis=1)
@@ -135,8 +135,8 @@ def test_the_boundary_is_stem_skull_and_craniotomy(subject, anatomy):
     ).mean() > 0.95
 
 
-def test_skull_normals_integrate_shape_gradients(anatomy):
-    """Summed over the volume: linear shape functions, whose gradient is the same in a whole tetrahedron."""
+def test_skull_normals_agree_with_integrals_of_shape_gradients(anatomy):
+    """Sum over the volume: linear shape functions have a constant gradient in each tetrahedron."""
     mesh, skull = anatomy.mesh, anatomy.slide_normal.any(axis=1)
     a, *others = np.moveaxis(mesh.nodes[mesh.tets], 1, 0)
     edges = np.stack([other - a for other in others], axis=2)
@@ -148,7 +148,7 @@ def test_skull_normals_integrate_shape_gradients(anatomy):
     np.testing.assert_allclose(anatomy.slide_normal[skull], wanted, atol=1e-9)
 
 
-def test_what_cannot_be_placed_is_refused(subject):
+def test_invalid_tumour_or_mesh_plan_is_rejected(subject):
     for values, reason in (
         ({"radius": 0.05}, "radius of 50 mm is outside"),
         ({"cover": float("nan")}, "cover of nan mm"),

@@ -1,4 +1,4 @@
-"""One conformance suite that every term passes: derivatives, batches that shrink, bounds on steps."""
+"""One conformance suite for every term: derivatives, selected columns, bounds on steps."""
 
 import numpy as np
 import pytest
@@ -74,7 +74,7 @@ def assembled(term: Term, device: Device, u: np.ndarray, definite: bool = False)
     return np.hstack([curvature(term, device, unit[:, None]) for unit in np.eye(len(u))])
 
 
-def test_name_is_a_word(term: Term) -> None:
+def test_term_has_a_name(term: Term) -> None:
     assert term.name
 
 
@@ -95,7 +95,7 @@ def test_curvature_is_the_derivative_of_the_gradient(term: Term, example: Exampl
         assert np.linalg.norm(exact - change) <= 1e-6 * max(np.linalg.norm(change), 1.0)
 
 
-def test_curvature_is_symmetric_and_its_blocks_are_the_diagonal(term: Term, example: Example, device: Device) -> None:
+def test_curvature_is_symmetric_and_contains_diagonal_blocks(term: Term, example: Example, device: Device) -> None:
     term.keep(np.array([1]))
     K = assembled(term, device, example.u[:, 1])
     assert np.abs(K - K.T).max() <= 1e-10 * max(np.abs(K).max(), 1.0)
@@ -105,7 +105,7 @@ def test_curvature_is_symmetric_and_its_blocks_are_the_diagonal(term: Term, exam
     np.testing.assert_allclose(out.numpy()[:, 0], blocks, atol=1e-10 * max(np.abs(K).max(), 1.0))
 
 
-def test_everything_is_added_to_what_is_there(term: Term, example: Example, device: Device) -> None:
+def test_term_results_are_added_to_the_output(term: Term, example: Example, device: Device) -> None:
     already = noise(*example.u.shape)
     out = device.upload(already)
     term.add_gradient(device.upload(example.u), out)
@@ -129,7 +129,7 @@ def test_definite_curvature_is_positive(term: Term, example: Example, device: De
 
 @pytest.mark.parametrize("law", ["corotational", "neo-hookean", "stable-neo-hookean", "ogden"])
 def test_plain_curvature_of_crushed_tissue_is_indefinite(law: str, device: Device) -> None:
-    """Otherwise the test above could not fail."""
+    """Without indefinite curvature the test above could not fail."""
     example = EXAMPLES[law]
     term = example.build(device)
     term.begin(example.cases)
@@ -137,7 +137,7 @@ def test_plain_curvature_of_crushed_tissue_is_indefinite(law: str, device: Devic
     assert np.linalg.eigvalsh(K).min() < -1e-3 * np.abs(K).max()
 
 
-def test_definite_is_asked_column_by_column(term: Term, example: Example, device: Device) -> None:
+def test_definite_curvature_is_selected_for_each_column(term: Term, example: Example, device: Device) -> None:
     u = np.repeat(example.crushed[:, None], 3, axis=1)
     p = np.repeat(noise(example.rows, 1), 3, axis=1)
     linearise(term, device, u)
@@ -150,7 +150,7 @@ def test_definite_is_asked_column_by_column(term: Term, example: Example, device
 
 
 @pytest.mark.parametrize("columns", [[0], [2, 0], [1, 2]])
-def test_keeping_columns_is_starting_with_them(
+def test_term_with_selected_columns_agrees_with_new_term(
     term: Term, example: Example, device: Device, columns: list[int]
 ) -> None:
     index = np.array(columns)
@@ -183,7 +183,7 @@ def test_rest_curvature_is_the_curvature_at_rest(term: Term, example: Example, d
     np.testing.assert_allclose(offered.toarray(), K, atol=1e-10 * np.abs(K).max())
 
 
-def test_longest_step_stays_inside(term: Term, example: Example, device: Device) -> None:
+def test_longest_step_stays_in_the_domain(term: Term, example: Example, device: Device) -> None:
     longest = longest_step(term, device, example.u, example.flung)
     assert ((longest > 0.0) & (longest <= 1.0)).all()
     for fraction in np.linspace(0.0, 1.0, 23):
@@ -200,18 +200,18 @@ def test_longest_step_stays_inside(term: Term, example: Example, device: Device)
         assert np.isfinite(beyond).all()
 
 
-def test_longest_step_of_a_tiny_motion_is_all_of_it(term: Term, example: Example, device: Device) -> None:
+def test_longest_step_of_a_tiny_motion_is_one(term: Term, example: Example, device: Device) -> None:
     assert (longest_step(term, device, example.u, 1e-6 * example.flung) == 1.0).all()
 
 
-def test_longest_step_only_lowers(term: Term, example: Example, device: Device) -> None:
+def test_longest_step_never_raises_the_bound(term: Term, example: Example, device: Device) -> None:
     out = wp.full(3, 1e-9, dtype=device.scalar, device="cpu")
     term.longest_step(device.upload(example.u), device.upload(example.flung), out)
     assert (out.numpy() <= 1e-9).all()
 
 
-def test_linearisation_does_not_follow_the_state(term: Term, example: Example, device: Device) -> None:
-    """The outer iteration moves u in place: the curvature stays where it was taken."""
+def test_curvature_is_unchanged_by_later_changes_of_state(term: Term, example: Example, device: Device) -> None:
+    """The outer iteration changes u in place: the curvature remains that of the linearisation."""
     u, p = device.upload(example.u), noise(*example.u.shape)
     term.linearise(u, wp.zeros(3, dtype=wp.int32, device="cpu"))
     before = curvature(term, device, p)
@@ -222,7 +222,7 @@ def test_linearisation_does_not_follow_the_state(term: Term, example: Example, d
 @pytest.mark.parametrize("law", LOGARITHMIC)
 @pytest.mark.parametrize("size", [1e-3, 1e-2, 0.1, 10.0])
 def test_log_law_steps_keep_a_tenth_of_volume(law: str, device: Device, size: float) -> None:
-    """At every point of the way; and twice the step would not, so that nothing is given away."""
+    """At every point of the path; twice the step would not, so that the bound is sharp."""
     example = EXAMPLES[law]
     term = example.build(device)
     term.begin(example.cases)
@@ -242,8 +242,8 @@ def test_log_law_steps_keep_a_tenth_of_volume(law: str, device: Device, size: fl
 
 
 @pytest.mark.parametrize("name", CONTACTS)
-def test_every_tool_of_the_examples_is_felt(name: str, device: Device) -> None:
-    """In every column, else what is tested of contact would be nothing; what tools exert is what the tissue bears."""
+def test_every_example_tool_has_a_contact_force(name: str, device: Device) -> None:
+    """In every column, else the tests of contact would be empty; the forces of tools balance those on the tissue."""
     example = EXAMPLES[name]
     term = example.build(device)
     assert isinstance(term, ToolContactTerm)
@@ -254,7 +254,7 @@ def test_every_tool_of_the_examples_is_felt(name: str, device: Device) -> None:
     np.testing.assert_allclose(force.sum(axis=1), bears, atol=1e-9)
 
 
-def test_history_creeps_and_travels_rows_first(device: Device) -> None:
+def test_spring_history_creeps_and_is_returned_rows_first(device: Device) -> None:
     example = EXAMPLES["spring"]
     spring = example.build(device)
     spring.begin(example.cases)

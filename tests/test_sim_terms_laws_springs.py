@@ -1,4 +1,4 @@
-"""Mass-spring model: its law, its stiffness at small strain, and what it refuses."""
+"""Mass-spring model: its law, its stiffness at small strain, and rejected input."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def run(H, D):
     return [each.numpy() for each in out]
 
 
-def test_stress_and_its_change_are_derivatives(device):
+def test_spring_stress_and_its_change_are_derivatives(device):
     random = np.random.default_rng(0)
     H, D = random.normal(0.0, 0.3, (20, 3, 3)), random.normal(0.0, 1.0, (20, 3, 3))
     _, stress, change = run(H, D)
@@ -55,7 +55,7 @@ def test_stress_and_its_change_are_derivatives(device):
     np.testing.assert_allclose((up[1] - down[1]) / 2e-6, change, rtol=1e-5, atol=1e-3)
 
 
-def test_a_regular_tetrahedron_has_the_springs_of_the_literature():
+def test_regular_tetrahedron_has_published_spring_stiffness():
     """15 mu V / sum L^2 = 0.118 E L at Poisson's ratio 1/4; Lloyd et al. 2007: 2 root 2 / 25 = 0.113."""
     mesh, edge = REGULAR, 2e-2 * np.sqrt(2.0)
     mu = 1000.0
@@ -64,7 +64,7 @@ def test_a_regular_tetrahedron_has_the_springs_of_the_literature():
     assert k == pytest.approx(2.0 * np.sqrt(2.0) / 25.0 * 2.5 * mu * edge, rel=0.05)
 
 
-def test_many_directions_have_the_tissues_stiffness():
+def test_springs_over_all_directions_agree_with_hookes_law():
     """The mean over rotations of a strain's energy is Hooke's: mu e:e + lambda/2 (tr e)^2."""
     random = np.random.default_rng(1)
     turns = np.linalg.qr(random.normal(size=(4000, 3, 3)))[0]
@@ -75,15 +75,15 @@ def test_many_directions_have_the_tissues_stiffness():
         assert energy == pytest.approx(hooke, rel=0.01)
 
 
-def test_rigid_motion_has_no_energy():
+def test_rigid_motion_of_springs_has_no_energy():
     angle = 0.7
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     energy, stress, _ = run((turn - np.eye(3))[None], np.zeros((1, 3, 3)))
     assert abs(energy[0]) < 1e-12 and np.abs(stress).max() < 1e-9
 
 
-def test_a_bar_stretches_within_the_error_of_springs():
-    """Kuhn's tetrahedra have all long diagonals in one direction, which makes springs softer by a half here."""
+def test_bar_of_springs_stretches_within_model_error():
+    """Kuhn's tetrahedra have all long diagonals in one direction, which makes springs softer by a half."""
     mesh = make_mesh((4, 4, 12), 0.06, distortion=0.2)
     anatomy = base_held(mesh)
     top = mesh.nodes[:, 2] > 0.06 - 1e-9
@@ -96,7 +96,7 @@ def test_a_bar_stretches_within_the_error_of_springs():
     assert both[0].mean() == pytest.approx(both[1].mean(), rel=0.6)
 
 
-def test_what_springs_cannot_be_is_rejected():
+def test_unsupported_tissue_of_springs_is_rejected():
     with pytest.raises(InputError, match=r"Poisson's ratio 0\.25 or more"):
         coefficients(lame=np.array([[1000.0, 500.0]]))
     anatomy = base_held(make_mesh((2, 2, 2), 0.06))

@@ -1,4 +1,4 @@
-"""Meshes and anatomies: what is refused, what is warned of, and identity by digest."""
+"""Meshes and anatomies: rejected input, warnings, and identity by digest."""
 
 import warnings
 
@@ -41,33 +41,33 @@ def changed(**fields: np.ndarray) -> TetMesh:
         ({"tets": np.array([[0, 1, 2, 2]])}, "zero or negative"),
     ],
 )
-def test_bad_meshes_are_refused(fields: dict, sentence: str) -> None:
+def test_bad_meshes_are_rejected(fields: dict, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         changed(**fields)
 
 
 @pytest.mark.parametrize(("scale", "unit"), [(0.009, "m if it has metres"), (101.0, "mm if it has millimetres")])
-def test_doubtful_sizes_are_warned_of(scale: float, unit: str) -> None:
+def test_doubtful_mesh_size_causes_a_warning(scale: float, unit: str) -> None:
     with pytest.warns(MeshWarning, match=f"Read it with unit {unit}"):
         changed(nodes=scale * CORNERS)
 
 
-def test_stray_nodes_do_not_count_for_the_size() -> None:
+def test_unused_nodes_do_not_count_for_the_size() -> None:
     changed(nodes=np.vstack([CORNERS, [[500.0, 0.0, 0.0]]]))
 
 
-def test_slivers_are_warned_of() -> None:
+def test_slivers_cause_a_warning() -> None:
     with pytest.warns(MeshWarning, match="1 tetrahedra have a dihedral angle below 1 degree"):
         changed(nodes=np.where(CORNERS == 0.1, [0.1, 0.1, 0.001], 0.0))
 
 
-def test_a_good_mesh_is_silent() -> None:
+def test_good_mesh_causes_no_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         changed()
 
 
-def test_volumes_and_orientation() -> None:
+def test_mirrored_tetrahedra_are_reoriented_to_same_volume() -> None:
     mesh = box((3, 2, 4), 0.2, distortion=0.2)
     assert mesh.volumes.sum() == pytest.approx(0.15 * 0.1 * 0.2)
     mirrored = mesh.nodes * [-1.0, 1.0, 1.0]
@@ -90,7 +90,7 @@ def test_surface_is_closed_and_points_outwards() -> None:
     assert len(mesh.surface) == 2 * 2 * (3 * 2 + 2 * 4 + 3 * 4)
 
 
-def test_boundary_of_a_region_inside() -> None:
+def test_boundary_of_an_inner_region_is_found() -> None:
     mesh = box((4, 4, 4), 0.1)
     inner = (np.abs(mesh.nodes[mesh.tets].mean(axis=1) - 0.05) < 0.025).all(axis=1)
     mesh = TetMesh(mesh.nodes, mesh.tets, np.where(inner, 2, 1))
@@ -104,7 +104,7 @@ def _centre(mesh: TetMesh) -> np.ndarray:
     return np.flatnonzero(np.linalg.norm(mesh.nodes - 0.05, axis=1) < 1e-9)
 
 
-def test_dihedral_angles_of_known_tetrahedra() -> None:
+def test_dihedral_angles_of_known_tetrahedra_are_exact() -> None:
     np.testing.assert_allclose(
         np.sort(compute_dihedral_angles(CORNERS, ONE)[0]), [np.degrees(np.arccos(1.0 / np.sqrt(3.0)))] * 3 + [90.0] * 3
     )
@@ -112,13 +112,13 @@ def test_dihedral_angles_of_known_tetrahedra() -> None:
     np.testing.assert_allclose(compute_dihedral_angles(regular, ONE), np.degrees(np.arccos(1.0 / 3.0)))
 
 
-def test_arrays_cannot_be_written_to() -> None:
+def test_mesh_arrays_are_read_only() -> None:
     mesh = changed()
     with pytest.raises(ValueError, match="read-only"):
         mesh.nodes[0, 0] = 1.0
 
 
-def test_a_mesh_does_not_follow_its_callers_array() -> None:
+def test_mesh_copies_the_arrays_of_its_caller() -> None:
     nodes = CORNERS.copy()
     mesh = changed(nodes=nodes)
     nodes[3, 2] = 0.5
@@ -142,14 +142,14 @@ def test_digest_is_stable() -> None:
         {"region": np.ones(1, int)},
     ],
 )
-def test_digest_feels_every_bit(fields: dict) -> None:
+def test_digest_depends_on_every_bit(fields: dict) -> None:
     other = changed(**fields)
     assert any(not np.array_equal(getattr(other, name), getattr(changed(), name)) for name in fields)
     assert other.digest != changed().digest
 
 
 class TestAnatomy:
-    def test_digest_feels_the_constraints(self) -> None:
+    def test_digest_depends_on_the_constraints(self) -> None:
         mesh = changed()
         base = hold(mesh, np.zeros(4, bool))
         held = hold(mesh, np.eye(4, 3, dtype=bool))
@@ -167,7 +167,7 @@ class TestAnatomy:
             (np.zeros((4, 3)), np.full((4, 3), np.nan), np.zeros(4), "normalise"),
         ],
     )
-    def test_what_does_not_fit_is_refused(
+    def test_anatomy_with_inconsistent_arrays_is_rejected(
         self, held: np.ndarray, normal: np.ndarray, opened: np.ndarray, sentence: str
     ) -> None:
         with pytest.raises(InputError, match=sentence):

@@ -1,4 +1,4 @@
-"""Threads: a limit that belongs to the whole process, and tasks that are all done, with errors raised at the end."""
+"""Threads: a limit for the whole process, and tasks that all run, with errors raised at the end."""
 
 import threading
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ def threads() -> set[int]:
     return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
 
 
-def test_it_lasts_until_the_last_has_left_and_then_is_gone() -> None:
+def test_thread_limit_lasts_until_last_context_exits() -> None:
     with threadpool_limits(2, "blas"):
         first, second = limit_to_one_thread(), limit_to_one_thread()
         first.__enter__()
@@ -34,20 +34,20 @@ def test_it_lasts_until_the_last_has_left_and_then_is_gone() -> None:
         assert threads() == {2}
 
 
-def test_every_task_is_done_when_it_returns():
+def test_run_together_returns_after_every_task():
     done: list[int] = []
     for _ in range(50):
         run_together([lambda number=number: done.append(number) for number in range(3)])
     assert sorted(done) == sorted([0, 1, 2] * 50)
 
 
-def test_tasks_run_at_the_same_time():
+def test_run_together_runs_tasks_concurrently():
     meeting = threading.Barrier(2, timeout=5.0)
     run_together([meeting.wait, meeting.wait])
 
 
 @pytest.mark.parametrize("bad", [0, 1])
-def test_errors_come_out_and_the_threads_stay(bad: int):
+def test_error_of_a_task_is_raised_after_the_others(bad: int):
     def fail():
         raise ValueError("no")
 
@@ -61,13 +61,13 @@ def test_errors_come_out_and_the_threads_stay(bad: int):
     assert done == [1, 2, 2]
 
 
-def test_one_core_at_least_and_one_for_little() -> None:
+def test_thread_count_is_positive_and_one_for_small_work() -> None:
     assert choose_threads(10**6) >= 1
     assert choose_threads(Sharing().min_size - 1) == 1
     assert choose_threads(10**6, Sharing(max_threads=1)) == 1
 
 
-def test_background_waits_for_the_foreground() -> None:
+def test_background_thread_waits_for_foreground_work() -> None:
     passed = threading.Event()
 
     def work():
@@ -84,7 +84,7 @@ def test_background_waits_for_the_foreground() -> None:
     thread.join()
 
 
-def test_kernels_of_the_background_wait(monkeypatch) -> None:
+def test_kernel_launch_waits_for_the_foreground(monkeypatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr("sim.runtime.device.wait_for_foreground", lambda: asked.append(1))
     monkeypatch.setattr("sim.runtime.device.wp.launch", lambda *_, **__: None)

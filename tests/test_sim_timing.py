@@ -1,4 +1,4 @@
-"""Seconds by stage: whoever listens hears what lies inside its block."""
+"""Seconds by stage: a listener records the stages inside its block."""
 
 import time
 
@@ -16,7 +16,7 @@ def test_stages_add_up_and_keep_their_order() -> None:
     assert seconds["mesh"] >= 0.02 and seconds["solve"] >= 0.01
 
 
-def test_every_listener_hears_its_own_block() -> None:
+def test_every_listener_records_its_own_block() -> None:
     with listen_to_stages() as outer:
         with time_stage("before"):
             pass
@@ -27,7 +27,7 @@ def test_every_listener_hears_its_own_block() -> None:
     assert list(outer) == ["before", "inside"] and list(inner) == ["inside"]
 
 
-def test_a_stage_that_fails_is_reported() -> None:
+def test_stage_that_fails_is_recorded() -> None:
     with pytest.raises(KeyError), listen_to_stages() as seconds, time_stage("lost"):
         raise KeyError
     assert list(seconds) == ["lost"]

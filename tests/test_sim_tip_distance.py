@@ -1,4 +1,4 @@
-"""The distance from a resting tool's tip to the tumour: measured, as the tool is drawn."""
+"""Distance from a resting tool's tip to the tumour: measured at the drawn position of the tool."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def surface(positions, triangles):
     return trimesh.Trimesh(positions, triangles, process=False)
 
 
-def test_distance_is_measured_from_resting_ball(box, pretender, gauge):
+def test_tip_distance_is_measured_from_resting_ball(box, pretender, gauge):
     loads = draw("palpation", box, 6, 3)
     answer = pretender.deform(loads)
     pushed, axis = get_only_pushes(loads), open_cortex(box).axis
@@ -48,7 +48,7 @@ def test_distance_is_measured_from_resting_ball(box, pretender, gauge):
         assert found[row] == pytest.approx(to[0], abs=1e-8) and lifted[row] == pytest.approx(to[1], abs=1e-8)
 
 
-def test_of_a_pose_the_tip_is_where_the_pose_has_it(box, gauge):
+def test_tip_distance_of_posed_tool_uses_its_pose(box, gauge):
     loads = draw_poses("palpation", box, 5, 0, Ball(6e-3))
     still = np.zeros((5, len(gauge.nodes), 3))
     touching = loads.get(Touching)

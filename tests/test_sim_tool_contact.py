@@ -1,4 +1,4 @@
-"""Tools moved by pose: distances, ways, and what contact with elastic bodies is known to be."""
+"""Tools moved by pose: distances, paths, and known properties of contact with elastic bodies."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -88,8 +88,8 @@ def test_no_point_of_the_surface_is_inside_a_tool(name: str, element: str) -> No
 
 @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
 @pytest.mark.parametrize("name", TOOLS)
-def test_a_tool_reads_what_the_base_bears(name: str, element: str) -> None:
-    """Force and moment: the tool's and the held nodes' are in balance."""
+def test_tool_reaction_balances_reaction_of_the_base(name: str, element: str) -> None:
+    """Force and moment of the tool and of the held nodes are in equilibrium."""
     fem, found = body(name, element), answer(name, element)
     force, moment = found.reaction[0, 0, :3], found.reaction[0, 0, 3:]
     assert force[2] < -0.003
@@ -107,8 +107,8 @@ def test_a_tool_reads_what_the_base_bears(name: str, element: str) -> None:
     np.testing.assert_allclose(moment, -np.cross(arm, bears).sum(axis=0), atol=1e-6 * size * SIDE)
 
 
-def test_a_tool_of_two_cores_is_two_tools_that_move_as_one() -> None:
-    """Two balls apart: the same motion, and its reaction is theirs about its own origin."""
+def test_tool_with_two_cores_agrees_with_two_tools() -> None:
+    """Two balls: the same motion, and its reaction is theirs about its own origin."""
 
     @dataclass(frozen=True)
     class Pair:

@@ -1,4 +1,4 @@
-"""The way of a tool: how long it is, and in how few strides it is flown."""
+"""Path of a tool: its length, and the number of strides along it."""
 
 import numpy as np
 from test_sim_contact_descent import BODY, HEIGHT, RADIUS, at, solver, touching
@@ -21,7 +21,7 @@ def test_stride_is_clearance_plus_part_of_the_radius() -> None:
 
 
 def test_tool_in_air_needs_few_strides() -> None:
-    """Beside the body, and away from it: from 9 cm off it, seven cm are free whichever way."""
+    """Next to the body, and moving away: at 9 cm distance, 7 cm are free in every direction."""
     fem = solver(TRAIN)
     term = fem.problem.barriers[0]
     poses = at(-0.09, 0.03, HEIGHT + 5e-3), at(-0.33, 0.03, HEIGHT + 5e-3)

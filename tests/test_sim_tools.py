@@ -56,7 +56,7 @@ def test_foremost_point_is_farthest_on_tool() -> None:
         ((Core(np.array([np.nan, 0.0, 0.0]), np.zeros(3), 1e-3),), "not finite or has no radius"),
     ],
 )
-def test_a_tool_of_no_shape_is_a_sentence(cores: tuple[Core, ...], words: str) -> None:
+def test_tool_without_valid_cores_is_rejected(cores: tuple[Core, ...], words: str) -> None:
     with pytest.raises(InputError, match=words):
         ToolContact((type("Shapeless", (), {"cores": cores})(),))
 
@@ -72,7 +72,7 @@ BLADE = Spatula(0.012, 0.026, 1.5e-3)
         (Ball(7e-3), [[0, 0, 0], [0, 0, 0.014], [0, 7e-3, 7e-3]]),
     ],
 )
-def test_tool_surface_lies_where_its_sizes_say(tool, ends):
+def test_tool_surface_agrees_with_its_sizes(tool, ends):
     turn = np.eye(4)
     turn[:3, :3], turn[:3, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.1, -0.2, 0.3]
     signs = np.array([[x, y, 1.0] for x in (-1, 1) for y in (-1, 1)])

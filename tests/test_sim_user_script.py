@@ -1,4 +1,4 @@
-"""What a researcher adds from a file of their own: a tissue law, an effect, a cause; and several pushing tools."""
+"""Extensions in a user's own file: a tissue law, an effect, a cause; and several pushing tools."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,7 +50,7 @@ class Pull:
 
 class TestEffect:
     @pytest.mark.parametrize("element", ["p1", "smoothed", "p2"])
-    def test_veins_hold_the_cortex_back(self, element):
+    def test_veins_reduce_displacement_of_the_cortex(self, element):
         loads = push(TOP, np.array([0.0, 0.0, -0.4]), 15e-3)
         free = answer(Elasticity(), loads=loads, element=element, live=True)
         veins = VEINS.Veins(surface_vertices(), 60.0, 5e-4)
@@ -59,8 +59,8 @@ class TestEffect:
         assert np.abs(tied).max() < 0.8 * np.abs(free).max()
         assert np.abs(slack - free).max() < 1e-6 * np.abs(free).max()
 
-    def test_their_force_is_what_the_tissue_answers(self):
-        """The same motion without veins, under the tool and the force that each vein takes."""
+    def test_vein_forces_reproduce_the_displacement(self):
+        """The same motion without veins, under the tool and the force of each vein."""
         veins, loads = VEINS.Veins(surface_vertices(), 60.0, 5e-4), push(TOP, np.array([0.0, 0.0, -0.4]), 15e-3)
         tied = answer(Elasticity(), veins, loads=loads)
         at = list(veins.vertices)
@@ -87,7 +87,7 @@ class TestEffect:
             answer(Elasticity(), Glue())
         assert VEINS.Veins not in BuiltIn.__args__
 
-    def test_what_makes_no_term_or_takes_a_name_is_a_sentence(self):
+    def test_invalid_or_duplicate_terms_of_effects_are_rejected(self):
         class Nothing(VEINS.Veins):
             def term(self, body):
                 return 7
@@ -105,7 +105,7 @@ class TestEffect:
         with pytest.raises(InputError, match=r"occurs 2 times"):
             answer(Elasticity(), VEINS.Veins((5,)), VEINS.Veins((6,)))
 
-    def test_a_cause_of_ones_own_reaches_its_effect_and_no_other(self):
+    def test_custom_cause_reaches_only_its_own_effect(self):
         seen = []
 
         class Pulled(VEINS.Veins):
@@ -124,7 +124,7 @@ class TestEffect:
         with pytest.raises(InputError, match=r"loads hold Pull, which no effect uses: add the effect that it is for"):
             answer(Elasticity(), loads=loads)
 
-    def test_what_is_no_cause_is_a_sentence(self):
+    def test_invalid_causes_are_rejected(self):
         with pytest.raises(InputError, match=r"float is no cause: choose from Pushed, .*Retracted; or make your own"):
             Loads((3.0,))  # pyright: ignore[reportArgumentType]
         with pytest.raises(InputError, match=r"Pull.share has a value that is not finite"):
@@ -146,7 +146,7 @@ TOOLS = pushed(LEFT, [0.0, 0.05, -0.25], 12e-3), pushed(RIGHT, [-0.1, 0.0, -0.15
 class TestTwoTools:
     @pytest.mark.parametrize("element", ["p1", "smoothed"])
     @pytest.mark.parametrize("live", [False, True])
-    def test_answer_is_that_of_the_sum_as_nodal_forces(self, element, live):
+    def test_two_tools_agree_with_their_sum_as_nodal_forces(self, element, live):
         both = answer(Elasticity(), loads=Loads(TOOLS), element=element, live=live)
         force = np.zeros((2, len(MESH.nodes), 3))
         for tool in TOOLS:
@@ -157,8 +157,8 @@ class TestTwoTools:
         assert np.abs(both - first).max() > 0.2 * np.abs(both).max()
         assert np.abs(both - summed).max() < 1e-6 * np.abs(summed).max()
 
-    def test_frame_after_frame_goes_on_from_the_last(self):
-        """Neither the way that a push came on nor a patch around it is followed: what is left answers both."""
+    def test_frames_of_two_tools_converge_from_previous_frame(self):
+        """Neither the path of one push nor a patch around it is followed: the other solvers handle both."""
         fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), TRAIN, "cpu", live=True, element="p1")
         last = None
         for size in (0.4, 0.7, 1.0):
@@ -176,7 +176,7 @@ class TestTwoTools:
         for number, tool in enumerate(TOOLS):
             assert np.allclose(reaction[:, number, :3], tool.force)
 
-    def test_who_takes_one_says_so(self):
+    def test_single_cause_lookup_rejects_several_tools(self):
         loads = Loads(TOOLS)
         assert loads.get_all(Pushed) == loads.causes and loads.get_only(Pushed) is None
         with pytest.raises(InputError, match=r"2 causes Pushed, but one is supported"):

@@ -9,13 +9,13 @@ from sim.runtime import versions
 from sim.runtime.versions import DISTRIBUTION, get_version
 
 
-def test_distribution_has_one_name():
+def test_project_and_extras_use_the_same_distribution_name():
     assert PROJECT["name"] == DISTRIBUTION and DISTRIBUTION != "sulcus"
     own = [one for extra in EXTRAS.values() for one in extra if re.match(r"sulcus\b", one)]
     assert own == [f"{DISTRIBUTION}[camera,data,docs,gym,onnx,report,slicer]"]
 
 
-def test_version_of_uninstalled_checkout_is_the_projects(monkeypatch):
+def test_version_without_installation_is_that_of_pyproject(monkeypatch):
     def gone(name):
         raise versions.PackageNotFoundError(name)
 

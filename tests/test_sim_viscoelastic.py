@@ -1,4 +1,4 @@
-"""Tissue that relaxes: the curves of a Prony series, what does not relax, rotations, and a past that travels."""
+"""Tissue that relaxes: the curves of a Prony series, constant volume, rotations, and history carried with results."""
 
 from dataclasses import replace
 
@@ -56,8 +56,8 @@ def stresses(problem: Problem, nodes: np.ndarray, path: np.ndarray, times: np.nd
 
 
 @pytest.mark.parametrize("law", HYPERELASTIC)
-def test_held_shape_relaxes_by_the_series_and_volume_never(law: str) -> None:
-    """Exactly at every step, however long: what is held is convolved with a step."""
+def test_constant_strain_relaxes_by_series_except_volume(law: str) -> None:
+    """Exactly at every step of any length: a constant strain is convolved with a step function."""
     problem, nodes = posed(relaxing(law))
     times = np.array([0.0, 0.01, 0.3, 1.0, 4.0, 50.0])
     mu, lam = tissue(law).lame
@@ -69,7 +69,7 @@ def test_held_shape_relaxes_by_the_series_and_volume_never(law: str) -> None:
 
 
 @pytest.mark.parametrize("strain", [SHEAR, STRETCH - np.trace(STRETCH) / 3.0 * np.eye(3)])
-def test_a_ramp_is_of_second_order_in_the_step(strain: np.ndarray) -> None:
+def test_linear_strain_error_is_of_second_order_in_the_step(strain: np.ndarray) -> None:
     """Strain that grows with t: sigma = 2 mu (t - sum g (t - tau (1 - exp(-t / tau))))."""
     problem, nodes = posed(relaxing("neo-hookean"))
     left = 1.0 - sum(g * (1.0 - tau * (1.0 - np.exp(-1.0 / tau))) for g, tau in SERIES)
@@ -86,7 +86,7 @@ def test_a_ramp_is_of_second_order_in_the_step(strain: np.ndarray) -> None:
 
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("law", HYPERELASTIC)
-def test_at_once_it_is_the_law_itself(law: str, element: str) -> None:
+def test_relaxing_tissue_at_time_zero_agrees_with_its_law(law: str, element: str) -> None:
     """At finite strain: forces and curvature."""
     mesh = box((1, 1, 2), 0.1)
     (plain, nodes), (viscous, _) = posed(tissue(law), element, mesh), posed(relaxing(law), element, mesh)
@@ -105,8 +105,8 @@ def test_at_once_it_is_the_law_itself(law: str, element: str) -> None:
 
 
 @pytest.mark.parametrize("law", HYPERELASTIC)
-def test_a_turned_history_turns_the_answer(law: str) -> None:
-    """Whether the body was turned from the start or in between."""
+def test_rotated_history_rotates_the_stress(law: str) -> None:
+    """With a rotation of the body from the start or in between."""
     problem, nodes = posed(relaxing(law))
     rng, times = np.random.default_rng(2), np.array([0.2, 0.5, 1.1, 3.0])
     path = 0.2 * rng.normal(size=(4, 3, 3))
@@ -122,7 +122,7 @@ def test_a_turned_history_turns_the_answer(law: str) -> None:
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_a_pulled_block_creeps_to_what_is_left_of_its_stiffness(element: str) -> None:
+def test_pulled_block_creeps_to_its_long_term_stiffness(element: str) -> None:
     mesh = box((1, 1, 2), 0.1)
     anatomy, effects = base_held(mesh), (Held(), NodalForce())
     pull = (Nodal(top_forces(mesh, np.array([2e-4, 0.0, 2e-4]))),)
@@ -153,8 +153,8 @@ def test_a_pulled_block_creeps_to_what_is_left_of_its_stiffness(element: str) ->
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_one_step_may_be_as_long_as_a_day(precision: str) -> None:
-    """It ends near what is left of the stiffness, and no number overflows."""
+def test_time_step_of_a_day_reaches_long_term_stiffness(precision: str) -> None:
+    """The result is near the long-term stiffness, and no number overflows."""
     pull = (Nodal(top_forces(MESH, np.array([1e-4, 0.0, 0.0]))),)
     accuracy = replace(TIGHT, tolerance=1e-4, precision=precision)
     fem = Fem(
@@ -168,8 +168,8 @@ def test_one_step_may_be_as_long_as_a_day(precision: str) -> None:
     assert left == pytest.approx(1.0 / modulus(np.inf), rel=0.2)
 
 
-def test_a_run_may_be_cut_and_tissues_mixed() -> None:
-    """Another solver goes on as if it had been there from the start; regions that do not relax have no memory."""
+def test_second_solver_continues_relaxation_exactly() -> None:
+    """Another solver continues as from the start; regions that do not relax have no memory."""
     halves = TetMesh(MESH.nodes, MESH.tets, np.arange(len(MESH.tets)) % 2)
     anatomy, force = base_held(halves), Nodal(top_forces(halves, np.array([[0.5, 0.0, 0.2], [0.0, 0.3, -0.2]])))
     law = Ogden(((900.0, -4.7),), 2e4)
@@ -192,8 +192,8 @@ def test_a_run_may_be_cut_and_tissues_mixed() -> None:
     assert [term.name for term in one.problem.terms] == ["elasticity ogden", name, "nodal force"]
 
 
-def test_held_all_round_it_needs_no_solver() -> None:
-    """A series of one pair in a body that cannot move: nothing acts, nothing is remembered but zeros."""
+def test_fully_held_relaxing_body_needs_no_solver() -> None:
+    """A series of one pair in a body that cannot move: no forces, and a history of zeros."""
     anatomy = hold(MESH, np.ones(len(MESH.nodes), bool))
     fem = Fem(anatomy, [Elasticity(relaxing("ogden", SERIES[:1])), Held()], TIGHT, "cpu", element="p1")
     answer = fem.deform(Loads((), np.array([3.0])))
@@ -202,8 +202,8 @@ def test_held_all_round_it_needs_no_solver() -> None:
 
 
 @pytest.mark.parametrize("law", HYPERELASTIC)
-def test_crushed_tissue_pushes_back_however_long_it_relaxes(law: str) -> None:
-    """To a fifth of its height between walls, at a Poisson's ratio at which volume resists little more than shape."""
+def test_crushed_tissue_pushes_back_at_any_relaxation_time(law: str) -> None:
+    """To a fifth of its height between walls, at a Poisson's ratio with little resistance of volume."""
     soft = replace(tissue(law, 3000.0, 0.3), prony=SERIES)
     problem, nodes = posed(soft)
     times = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
@@ -222,7 +222,7 @@ def softened(left: float, poisson: float = 0.45) -> Material:
 
 
 def test_stable_law_at_large_strain_only_softens() -> None:
-    """At every moment, sheared, squashed and inside out."""
+    """At every moment, sheared, compressed and inverted."""
     soft = replace(softened(1.0), prony=SERIES)
     path = np.array([[[0.2, 0.5, 0.0], [-0.1, -0.3, 0.2], [0.0, 0.1, 0.4]], np.diag([-0.7, 0.5, -0.6])])
     path = np.concatenate([path, np.diag([0.1, -1.3, 0.2])[None]])
@@ -237,8 +237,8 @@ def test_stable_law_at_large_strain_only_softens() -> None:
 
 
 @pytest.mark.parametrize(("force", "element"), [(0.3, "p1"), (0.8, "p1"), (0.3, "p2")])
-def test_the_stable_law_bears_what_it_bears_relaxed(force: float, element: str) -> None:
-    """A push that sinks half as deep as the block is high, held until nothing fades any more."""
+def test_relaxed_stable_law_agrees_with_its_elastic_limit(force: float, element: str) -> None:
+    """A push to half the depth of the block, held until the relaxation has ended."""
     anatomy, effects = base_held(box((4, 4, 3), 0.05)), (Held(), ToolForce())
     pushed = push(np.array([0.026, 0.024, 0.0375]), np.array([0.01, 0.0, -force]), 7e-3)
     tight = Accuracy(tolerance=1e-8, limit_strain=False)
@@ -253,8 +253,8 @@ def test_the_stable_law_bears_what_it_bears_relaxed(force: float, element: str) 
     np.testing.assert_allclose(answer.displacement, still, atol=1e-5 * np.abs(still).max())
 
 
-def test_tissue_that_relaxed_stands_a_push_that_folds_it() -> None:
-    """The default law by its other name: where its elastic self is in equilibrium, if inside out, so is it."""
+def test_relaxing_tissue_converges_under_an_inverting_push() -> None:
+    """The default law by its other name: it has the equilibria of its elastic limit, including inverted ones."""
     anatomy = base_held(box((5, 5, 3), 0.05))
     fem = Fem(
         anatomy,

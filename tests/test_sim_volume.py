@@ -1,4 +1,4 @@
-"""Volumes of voxels from outside: bounded memory, and a sentence for what is wrong."""
+"""Voxel volumes of input files: bounded memory, and a message for every defect."""
 
 import gzip
 import struct
@@ -31,27 +31,27 @@ def header_with(path: Path, place: int, form: str, *values: float) -> Path:
 
 class TestVolumes:
     @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
-    def test_voxels_that_are_not_there_take_no_memory(self, tmp_path: Path, name: str) -> None:
+    def test_truncated_volume_is_rejected_before_allocation(self, tmp_path: Path, name: str) -> None:
         path = header_with(volume(tmp_path / name), 40, "<4h", 3, 700, 700, 700)
         with memory_below(2**24), pytest.raises(InputError, match=r"ends after 568 of 343,000,352 bytes"):
             read_volume(path)
 
-    def test_no_volume_is_larger_than_the_limit(self, tmp_path: Path) -> None:
+    def test_volume_above_the_size_limit_is_rejected(self, tmp_path: Path) -> None:
         path = header_with(volume(tmp_path / "a.nii.gz"), 40, "<4h", 3, 1600, 1600, 1600)
         with pytest.raises(InputError, match=r"4\.1e\+09 voxels; the maximum is 5\.37e\+08"):
             read_volume(path)
 
     @pytest.mark.parametrize("numbers", [(np.nan, 0.0), (-np.inf, 0.0)])
-    def test_a_slope_is_a_number(self, tmp_path: Path, numbers: tuple[float, float]) -> None:
+    def test_volume_with_non_finite_slope_is_rejected(self, tmp_path: Path, numbers: tuple[float, float]) -> None:
         with pytest.raises(InputError, match=r"slope .* which are no numbers"):
             read_volume(header_with(volume(tmp_path / "a.nii"), 112, "<2f", *numbers))
 
-    def test_voxels_have_a_size(self, tmp_path: Path) -> None:
+    def test_volume_with_tiny_voxels_is_rejected(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"measure 1e-20 mm along an axis; 0\.01 mm is the least"):
             read_volume(volume(tmp_path / "a.nii", edge=1e-20))
         assert read_volume(volume(tmp_path / "b.nii", edge=0.1)).values.shape == (6, 6, 6)
 
-    def test_damage_is_a_sentence(self, tmp_path: Path) -> None:
+    def test_damaged_volume_is_rejected_with_its_path(self, tmp_path: Path) -> None:
         whole = volume(tmp_path / "a.nii.gz", (20, 20, 20)).read_bytes()
         for place in range(0, len(whole), 7):
             path = tmp_path / "b.t1.nii.gz"

@@ -1,4 +1,4 @@
-"""Volumes of files that are packed, or without an orientation."""
+"""Volumes of files that are compressed, or without an orientation."""
 
 import bz2
 import gzip
@@ -17,7 +17,7 @@ from sim.bodies.voxels import Voxels
 from sim.errors import InputError
 
 
-def test_volume_without_orientation_needs_axes(tmp_path):
+def test_volume_without_orientation_requires_axes(tmp_path):
     _, places = grid(AFFINES["thick slices"])
     labels = np.where(ball(places), 3, ellipsoid(places)).astype(np.int16)
     path = tmp_path / "l.nii"
