@@ -52,12 +52,12 @@ def page(heard):
     page.close()
 
 
-def test_the_page_is_served(page):
+def test_page_is_served_as_html(page):
     with urllib.request.urlopen(page.address) as answer:
         assert answer.status == 200 and b"<html" in answer.read().lower()
 
 
-def test_the_address_names_the_host_that_serves(heard):
+def test_address_contains_the_given_host(heard):
     """A page on one interface is not to be found at localhost."""
     page = open_page(heard, free_port(), host="127.0.0.2")
     assert page.address.startswith("http://127.0.0.2:")
@@ -66,7 +66,7 @@ def test_the_address_names_the_host_that_serves(heard):
     page.close()
 
 
-def test_a_port_that_is_taken_is_left_to_its_owner(page, heard):
+def test_occupied_port_selects_another_port(page, heard):
     second = open_page(heard, int(page.address.rsplit(":", 1)[1]))
     assert second.address != page.address
     with urllib.request.urlopen(second.address) as answer:
@@ -74,7 +74,7 @@ def test_a_port_that_is_taken_is_left_to_its_owner(page, heard):
     second.close()
 
 
-def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, heard):
+def test_page_sends_latest_frame_and_updates_slider(page, heard):
     for number in range(50):
         page.show(number, np.full((48, 64, 3), number, np.uint8), f"frame {number}")
     assert wait_for(lambda: int(page.frame.value) == 49)
@@ -82,7 +82,7 @@ def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, heard):
     assert heard["frame"] == []
 
 
-def test_picture_and_words_travel_as_one(page):
+def test_image_and_text_are_sent_in_one_update(page):
     """A slow browser shows the two of one frame, or neither; words alone bring the picture that they are beside."""
     visitor = Visitor(page, 1600)
     assert wait_for(lambda: page.visitors == 1)
@@ -107,7 +107,7 @@ def test_picture_and_words_travel_as_one(page):
     assert not any("said" in str(each) for each in visitor.updates if "sulcus-next" not in str(each))
 
 
-def test_what_is_shown_already_is_not_sent_again(page):
+def test_unchanged_frame_is_not_sent_again(page):
     """A paused page says the same thirty times a second; the slider is left to the visitor who may be moving it."""
     visitor, picture = Visitor(page, 1600), np.full((48, 64, 3), 7, np.uint8)
     page.show(7, picture, "said")
@@ -122,7 +122,7 @@ def test_what_is_shown_already_is_not_sent_again(page):
     visitor.wire.close()
 
 
-def test_bodies_move_and_reports_change(page):
+def test_page_updates_vertices_report_and_input_value(page):
     page.move("tumour", TRIANGLE + 0.01)
     page.report("render <b>12 ms</b>")
     page.put("force [N]", 0.35)
@@ -130,12 +130,12 @@ def test_bodies_move_and_reports_change(page):
     assert np.allclose(page.meshes["tumour"].vertices, TRIANGLE + 0.01)
 
 
-def test_an_unknown_body_is_an_error_at_once(page):
+def test_move_of_unknown_body_raises_key_error(page):
     with pytest.raises(KeyError):
         page.move("liver", TRIANGLE)
 
 
-def test_several_visitors_see_the_page_and_are_heard(page, heard):
+def test_several_visitors_receive_frames_and_send_inputs(page, heard):
     wide, narrow = Visitor(page, 1600), Visitor(page, 420)
     assert wait_for(lambda: page.visitors == 2)
     assert wait_for(lambda: wide.received > 0 and narrow.received > 0)
@@ -153,7 +153,7 @@ def test_several_visitors_see_the_page_and_are_heard(page, heard):
     narrow.wire.close()
 
 
-def test_who_came_first_leads_and_what_others_set_is_put_back(page, heard):
+def test_only_the_first_visitor_controls_the_page(page, heard):
     """They may ask; who leads lets them, and the lead passes on when its owner leaves."""
     first, second = Visitor(page, 1600), Visitor(page, 420)
     page.show_line(lambda visitor: f"number {visitor}")
@@ -185,7 +185,7 @@ def test_who_came_first_leads_and_what_others_set_is_put_back(page, heard):
     first.wire.close()
 
 
-def test_keys_play_step_and_choose(heard):
+def test_hotkeys_play_step_and_select_deformer(heard):
     page = open_page(heard, free_port())
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -204,7 +204,7 @@ def test_keys_play_step_and_choose(heard):
     page.close()
 
 
-def test_a_recording_is_one_whole_film_as_long_as_it_took(page, monkeypatch):
+def test_recording_is_downloaded_as_one_video(page, monkeypatch):
     """Its owner gets it; nobody gets one whose owner has left."""
     sent: list[tuple] = []
     monkeypatch.setattr("viser.ClientHandle.send_file_download", lambda client, *file, **how: sent.append(file))
@@ -263,7 +263,7 @@ def test_user_input_wins_over_concurrent_page_update(heard):
     page.close()
 
 
-def test_the_button_pauses_and_plays(page, heard):
+def test_play_button_toggles_playback(page, heard):
     visitor = Visitor(page, 900)
     assert wait_for(lambda: page.visitors == 1)
     for wanted in ([False], [False, True]):
@@ -272,14 +272,14 @@ def test_the_button_pauses_and_plays(page, heard):
     visitor.wire.close()
 
 
-def test_scripts_do_not_take_over_from_themselves(page, heard):
+def test_value_set_by_program_triggers_no_callback(page, heard):
     page.put("force [N]", 0.5)
     assert wait_for(lambda: page.inputs["force [N]"].value == 0.5)
     time.sleep(0.2)
     assert heard["force"] == []
 
 
-def test_the_page_is_filled_anew(page, heard):
+def test_fill_replaces_bodies_and_controls(page, heard):
     """Another scene: other bodies and controls, nothing of the old ones, and what was on its way to them is dropped."""
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -304,7 +304,7 @@ def test_the_page_is_filled_anew(page, heard):
     visitor.wire.close()
 
 
-def test_a_visitor_saves_the_picture_as_it_is_shown(page, monkeypatch):
+def test_save_button_downloads_the_displayed_image(page, monkeypatch):
     sent: list[tuple] = []
     monkeypatch.setattr("viser.ClientHandle.send_file_download", lambda client, *file, **how: sent.append(file))
     shown = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
@@ -320,7 +320,7 @@ def test_a_visitor_saves_the_picture_as_it_is_shown(page, monkeypatch):
     visitor.wire.close()
 
 
-def test_low_window_keeps_save_button_before_controls(page):
+def test_save_button_precedes_the_controls(page):
     after = [handle.order for handle in page.inputs.values()]
     assert page.frame.order < page.saver.order < min(after)
 
@@ -338,12 +338,12 @@ def test_phone_layout_puts_distance_and_playback_first(page):
     assert page.folder.order < page.words.order
 
 
-def test_no_new_line_parts_a_number_from_its_unit():
+def test_number_and_unit_are_joined_by_nonbreaking_space():
     kept = keep_together('<p style="top: 3 px">in 4.72 mm (95 %)')
     assert kept == '<p style="top: 3 px">in&nbsp;4.72&nbsp;mm (95&nbsp;%)'
 
 
-def test_a_wide_window_has_its_controls_in_two_columns(page):
+def test_wide_window_shows_controls_in_two_columns(page):
     """All of them in sight in 1280 x 720, and the words over them as wide as both."""
     wide = build_style(4 / 3).split("@media (min-width: 75em) and (min-aspect-ratio: 13/10) {")[1].split("@media")[0]
     holder = f"div:has(> div > #{SAID})"
@@ -351,7 +351,7 @@ def test_a_wide_window_has_its_controls_in_two_columns(page):
     assert wide.index(f"{holder} > * {{ grid-column: 1 / -1 }}") < wide.index(f"{holder} > div:has(> button)")
 
 
-def test_the_line_over_the_picture_comes_and_goes(page):
+def test_status_line_is_shown_and_cleared(page):
     page.show_status("solving ... 3 s")
     assert wait_for(lambda: "<span>solving ... 3 s</span>" in page.line.content)
     page.show_status("")
@@ -364,7 +364,7 @@ def test_status_line_leaves_header_visible():
     assert "right: calc(100vw - var(--w)" in rule and "left:" not in rule
 
 
-def test_a_note_is_there_while_it_has_words(page):
+def test_note_is_visible_only_with_text(page):
     page.fill([], Playback(30, print, print), [Note("how"), Note("why", "<p>known</p>")])
     folder, text = page.controls.notes["how"]
     assert (
@@ -379,14 +379,14 @@ def test_a_note_is_there_while_it_has_words(page):
     assert wait_for(lambda: not folder.visible)
 
 
-def test_the_button_says_whether_it_plays(page):
+def test_play_button_label_follows_playback_state(page):
     page.show_playback(False)
     assert wait_for(lambda: page.button.label == "Play")
     page.show_playback(True)
     assert wait_for(lambda: page.button.label == "Pause")
 
 
-def test_a_body_changes_its_colour(page):
+def test_tint_changes_the_colour_of_a_body(page):
     page.tint("tumour", (0.5, 0.0, 1.0))
     assert wait_for(lambda: tuple(page.meshes["tumour"].color) == (128, 0, 255))
 

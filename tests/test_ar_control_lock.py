@@ -22,7 +22,7 @@ class TestLead:
         lead.see({4, 5}, 5.0)
         assert lead.leader == 4 and not lead.describe_control(4, {4})
 
-    def test_who_does_nothing_for_long_hands_over_on_being_asked(self):
+    def test_idle_leader_loses_control_on_request(self):
         lead = ControlLock()
         lead.see({1, 2}, 0.0)
         lead.record_change(1, 10.0)

@@ -26,7 +26,7 @@ def corners_of(camera, noise, seed, faces=(0, 1)):
     return DetectedCorners(points, pixels + noise * np.random.default_rng(seed).standard_normal(pixels.shape), face)
 
 
-def test_a_focal_length_is_found_by_the_relief_of_a_target():
+def test_focal_length_is_estimated_from_cube_corners():
     """Of a camera that is stated a tenth too long, and of the true one; of few corners nothing is known."""
     camera = read_calibration(FILM / "camera.yaml").build_camera(np.eye(4))
     seen = [(CUBE, corners_of(camera, 0.1, seed)) for seed in range(12)]

@@ -36,11 +36,11 @@ from ar.overlay.text_placement import BORDER_DISTANCE
         ((-0.8, 0.6, 0.1), "LA"),
     ],
 )
-def test_a_direction_has_the_letters_of_its_greatest_parts(direction, letters):
+def test_direction_is_named_by_its_largest_components(direction, letters):
     assert name_direction(np.array(direction)) == letters
 
 
-def test_what_lies_at_the_edges_follows_from_the_camera():
+def test_edge_labels_follow_the_camera_orientation():
     """From the patient's right side, crown upwards: the face is on the right."""
     aside = look_at(np.array([0.3, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     assert name_bearings(aside.T_camera_world[:3, :3]) == {"left": "P", "right": "A", "top": "S", "bottom": "I"}
@@ -51,7 +51,7 @@ def test_what_lies_at_the_edges_follows_from_the_camera():
     assert name_bearings(below.T_camera_world[:3, :3]) == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
 
 
-def test_letters_stand_at_the_edges():
+def test_orientation_labels_are_drawn_at_image_edges():
     plain = np.full((240, 320, 3), 90, np.uint8)
     turn = np.eye(3)
     letters = draw_orientation_labels(plain, turn, np.zeros(plain.shape[:2], np.uint8))
@@ -84,7 +84,7 @@ def test_length_is_printed_in_millimetres_with_error(length, error, text):
     assert format_millimetres(length, error) == text
 
 
-def test_letters_at_an_edge_give_way_along_it():
+def test_orientation_label_shifts_along_its_edge():
     """A line that leaves the picture where the upper letter stands moves that letter aside, and no other."""
     plain = np.full((240, 320, 3), 90, np.uint8)
     taken = np.zeros(plain.shape[:2], np.uint8)
@@ -100,7 +100,7 @@ def test_letters_at_an_edge_give_way_along_it():
     assert np.array_equal(letters[:40], plain[:40]) and np.array_equal(letters[60:], free[60:])
 
 
-def test_labels_take_place_and_optional_ones_drop():
+def test_optional_labels_without_room_are_dropped():
     colour, taken = np.zeros((100, 200, 3), np.uint8), np.zeros((100, 200), np.uint8)
     lay(colour, taken, ["first"], (0, 100))
     (low,) = np.nonzero(taken.any(axis=1))[0][[-1]]
@@ -117,7 +117,7 @@ def test_labels_take_place_and_optional_ones_drop():
 
 
 @pytest.mark.parametrize("room", [1.0, 60.0, 130.0, 150.0, 1000.0])
-def test_a_folded_line_keeps_its_words_and_its_room(room):
+def test_wrapped_line_keeps_its_words_and_width_limit(room):
     text = "the bone's edge stops the tool 17.5 mm short"
     lines = wrap_line(text, room)
     wide = [cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines]
@@ -126,7 +126,7 @@ def test_a_folded_line_keeps_its_words_and_its_room(room):
     assert (len(lines) == 1) is (room == 1000.0) and (room != 150.0 or max(wide) < 1.4 * min(wide))
 
 
-def test_a_panel_folds_lines_that_are_wider_than_the_picture():
+def test_panel_wraps_lines_wider_than_the_image():
     colour = np.full((150, 200, 3), 90, np.uint8)
     shown = draw_text_panel(colour, ["a line that is much wider than so narrow a picture", "short"])
     changed = (shown != colour).any(axis=2)
@@ -144,13 +144,13 @@ def test_a_panel_folds_lines_that_are_wider_than_the_picture():
         ("blue 95 % of its middle", ["blue 95 %"]),
     ],
 )
-def test_a_number_stays_beside_its_name_and_its_unit(text, held):
+def test_wrapping_keeps_number_with_name_and_unit(text, held):
     for room in (1.0, 60.0, 100.0):
         lines = wrap_line(text, room)
         assert " ".join(lines) == text and all(any(each in line for line in lines) for each in held)
 
 
-def test_panel_drops_last_lines_before_required_marks():
+def test_panel_drops_lines_instead_of_covering_marks():
     colour, hidden = np.full((300, 400, 3), 90, np.uint8), np.ones((300, 400), np.uint8)
     hidden[40:120, 200:] = 0
     lines = ["the first line", "the second", "the third", "the fourth", "the fifth", "the sixth"]

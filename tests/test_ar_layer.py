@@ -8,7 +8,7 @@ from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.renderer import Lamp, render
 
 
-def test_a_solid_texture_sticks_to_the_material():
+def test_solid_texture_moves_with_the_material():
     """Colour is read at the rest point: moving the vertices moves the stripe with them."""
     values = np.zeros((19, 2, 2))
     values[9] = 1.0

@@ -29,7 +29,7 @@ def test_legend_names_lines_and_keeps_cortex_clear():
     assert np.array_equal(crowded, without)  # there is cortex everywhere: no room
 
 
-def test_a_cut_leaves_the_foot_to_its_words():
+def test_section_inset_leaves_bottom_rows_for_text():
     covered = np.zeros((480, 640), bool)
     covered[:270, 400:] = True  # the inset stands low
     over = composite(

@@ -10,7 +10,7 @@ from ar.rendering.raycast import raycast
 
 
 @each_lens
-def test_the_rasteriser_sees_what_rays_see(lens):
+def test_lens_rasteriser_matches_ray_casting(lens):
     """Of triangles as large as the picture, which reach behind the camera and beyond the lens, and of small ones."""
     camera, (vertices, triangles) = seen_by(lens), build_sphere(20, 30, 0.02)
     vertices = np.concatenate([vertices + [0.01, 0.0, 0.03], [[-9.0, -9, -0.3], [9, -8, -0.3], [0, 9, 0.3]]])

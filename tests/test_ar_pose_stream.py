@@ -8,7 +8,7 @@ from scenes.tracked.external_tracker import ExternalTracker
 
 
 @pytest.mark.parametrize(("error", "expected"), [(0.0, 0.0), (0.01, 2e-3)])
-def test_tracker_clock_error_is_in_the_covariance(error, expected):
+def test_tracker_clock_error_increases_the_covariance(error, expected):
     """A tool at 0.2 m/s, and a clock that is known to 10 ms."""
     times = np.arange(0.0, 1.0, 0.02)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
@@ -19,7 +19,7 @@ def test_tracker_clock_error_is_in_the_covariance(error, expected):
     assert np.abs(found.covariance[1:, 1:]).max() < 1e-12
 
 
-def test_pose_between_samples_weighs_their_covariances():
+def test_interpolated_pose_weights_sample_covariances():
     stream = build_pose_stream(
         np.array([0.0, 0.04]), np.tile(np.eye(4), (2, 1, 1)), np.stack([np.eye(6), 4.0 * np.eye(6)])
     )

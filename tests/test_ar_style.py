@@ -51,7 +51,7 @@ def window(demo):
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-def test_the_page_fits_and_is_in_register(demo, window, size):
+def test_page_fits_the_window_and_matches_server_image(demo, window, size):
     """Nothing is cut off or complained of, and both errors are in sight; the picture is the server's to a pixel."""
     window.size(*size)
     said = f"document.getElementById('{SAID}')"
@@ -79,7 +79,7 @@ def test_physics_switches_are_visible_in_a_low_window(demo, window):
     assert box_of(window, fold)[3] + 5 * 16 <= view[1]
 
 
-def test_keys_and_names(demo, window):
+def test_keyboard_controls_and_accessible_names_work(demo, window):
     """Keys step, choose and open their list; a slider keeps its own; whatever can be set has a name."""
     window.size(1280, 720)
     demo.wish.set(plays=False, number=40)

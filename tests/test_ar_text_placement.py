@@ -7,7 +7,7 @@ from ar.overlay.text_placement import BORDER_DISTANCE, GRID_SPACING, SIDEWAYS_WE
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_free_place_is_the_nearest(seed):
+def test_free_place_is_nearest_to_the_wish(seed):
     """Held against every place on the same grid, tried one by one."""
     rng = np.random.default_rng(seed)
     taken = np.zeros((120, 160), np.uint8)
@@ -38,7 +38,7 @@ def test_the_free_place_is_the_nearest(seed):
     assert far(*found) == (0 if free(*there) else min(far(*place) for place in places))
 
 
-def test_without_room_there_is_no_place():
+def test_full_image_has_no_free_place():
     taken = np.zeros((100, 200), np.uint8)
     assert find_free_place(taken, (184, 84), (0, 0)) == (BORDER_DISTANCE, BORDER_DISTANCE)
     assert find_free_place(taken, (185, 84), (0, 0)) is None and find_free_place(taken, (20, 85), (0, 0)) is None

@@ -19,18 +19,18 @@ COMPARISONS = {
 
 
 @pytest.mark.parametrize("name", COMPARISONS)
-def test_comparison_of_nothing_fails(name):
+def test_comparison_of_empty_arrays_fails(name):
     with pytest.raises(AssertionError, match="array without elements"):
         COMPARISONS[name]()
 
 
 @pytest.mark.empty
 @pytest.mark.parametrize("name", COMPARISONS)
-def test_comparison_of_nothing_in_marked_test_passes(name):
+def test_comparison_of_empty_arrays_in_marked_test_passes(name):
     COMPARISONS[name]()
 
 
-def test_comparison_with_written_empty_list_passes():
+def test_comparison_with_literal_empty_list_passes():
     np.testing.assert_array_equal(EMPTY[:, 0], [])
     assert not np.array_equal(EMPTY, SOME) and pytest.approx(SOME) == SOME and pytest.approx([]) == []
 

@@ -24,13 +24,13 @@ def test_step_grows_where_whole_numbers_would_overflow():
     np.testing.assert_allclose(rounded.values, TABLE, atol=largest.max() / 32767)
 
 
-def test_rows_and_products_are_those_of_the_values():
+def test_rounded_rows_and_products_equal_those_of_values():
     rounded, rows = Rounded.round_table(TABLE, 0.01), np.array([3, 1, 3])
     np.testing.assert_array_equal(take_rows_of(rows, rounded), rounded.values[rows])
     np.testing.assert_array_equal(multiply_rows(np.ones((1, 3)), rounded, rows)[0], rounded.values[rows].sum(axis=0))
 
 
-def test_half_precision_keeps_eleven_bits_of_any_size():
+def test_half_precision_keeps_eleven_bits_at_any_magnitude():
     numbers = np.array([1.0, -3.14159, 6.1e-9, 2.5e20, 0.0])
     found = round_to_half(numbers)
     assert found.dtype == np.float32

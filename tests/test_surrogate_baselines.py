@@ -6,7 +6,7 @@ from test_surrogate_protocol import RANDOM, rows
 from surrogate.regressors.baselines import Pcr, Svr
 
 
-def test_principal_components_of_little_variance_are_left_out():
+def test_pcr_drops_components_of_small_variance():
     """A component of a thousandth of the variance is dropped, and with it what hangs on it alone."""
     scores = np.random.default_rng(5).normal(size=(200, 3)) * [10.0, 3.0, 0.1]
     turned = np.linalg.qr(RANDOM.normal(size=(6, 3)))[0]
@@ -17,7 +17,7 @@ def test_principal_components_of_little_variance_are_left_out():
     assert np.linalg.matrix_rank(few.map_, tol=1e-9) == 2
 
 
-def test_svr_has_the_published_settings():
+def test_svr_matches_scikit_learn_with_published_settings():
     """The same machine as scikit-learn's with MATLAB's defaults, in the output's own units."""
     from sklearn.svm import SVR
 

@@ -81,7 +81,7 @@ def test_patch_trials_give_covariance_growth(evidence):
     assert compute_covering_factor(tried, small) == pytest.approx(9.0 * compute_covering_factor(tried, evidence))
 
 
-def test_a_cloud_is_like_no_named_points(evidence):
+def test_cloud_likeness_differs_from_named_points(evidence):
     """One row a point, as clouds have, and three."""
     cloud = evidence.select(np.arange(0, 180, 3))
     assert np.array_equal(compute_likeness(cloud)[1:3], compute_likeness(evidence)[1:3])
@@ -102,7 +102,7 @@ def some_members(body, skull, group):
     return Ensemble(body, still, np.zeros(count, int), np.array(skull), np.array(group))
 
 
-def test_whole_groups_are_left_out_one_of_each_skull(body):
+def test_held_out_folds_take_whole_groups_of_each_skull(body):
     """A trial's tissue is unknown to its estimator, and each skull is known to every estimator."""
     some = some_members(body, [0, 0, 0, 0, 0, 1, 1, 1, 2, 2], [0, 0, 1, 1, 2, 3, 4, 4, 5, 5])
     turn = assign_held_out(some)
@@ -111,7 +111,7 @@ def test_whole_groups_are_left_out_one_of_each_skull(body):
         run_trials(some_members(body, [0, 0, 1], [0, 0, 1]), None)
 
 
-def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
+def test_trial_prior_excludes_the_group_of_the_trial(body, monkeypatch):
     """A spy sees which members each prior has, and which member each trial is made of."""
     random, group = np.random.default_rng(0), np.repeat(np.arange(6), 4)
     motion = random.normal(scale=2e-3, size=(24, *body.mesh.nodes.shape)).astype(np.float32)
@@ -137,7 +137,7 @@ def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 4.0])
-def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
+def test_covering_factor_gives_95_percent_coverage(evidence, times):
     """Squares that are chi-square of three degrees, times a number, need just that number: by 115 of 120."""
     random = np.random.default_rng(1)
     squares = times * chi2.ppf((np.arange(NEAREST_TRIALS) + 0.5) / NEAREST_TRIALS, 3)
@@ -150,7 +150,7 @@ def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
     assert compute_covering_factor(np.concatenate([other, tried]), evidence) == compute_covering_factor(tried, evidence)
 
 
-def test_what_was_never_tried_is_said(evidence):
+def test_evidence_outside_the_trials_is_detected(evidence):
     around = compute_likeness(evidence) + np.array([[-0.1, -0.1, -0.1, 0.0], [0.1, 0.1, 0.1, 0.0]])
     assert is_within_trials(np.column_stack([around, [1.0, 1.0]]), evidence)
     assert not is_within_trials(np.column_stack([around + [0.2, 0.0, 0.0, 0.0], [1.0, 1.0]]), evidence)
@@ -160,7 +160,7 @@ def test_what_was_never_tried_is_said(evidence):
         assert is_within_trials(np.column_stack([around + [0.0, 0.0, larger, 0.0], [1.0, 1.0]]), evidence) == known
 
 
-def test_the_tumours_middle_is_that_of_its_volume(body):
+def test_tumour_centre_is_its_volume_centroid(body):
     """A motion that grows with x moves it as far as its middle's x says."""
     inside = body.mesh.region == 2
     middle = np.average(body.mesh.nodes[body.mesh.tets[inside]].mean(axis=1), axis=0, weights=body.mesh.volumes[inside])

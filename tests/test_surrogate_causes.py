@@ -9,7 +9,7 @@ from test_surrogate_locator import FEW
 from surrogate.locating.causes import SEPARATING_SKULL, build_drainages, build_groups, build_pushes
 
 
-def test_draws_depend_on_the_seed_and_the_group_alone(body):
+def test_draws_depend_only_on_seed_and_group(body):
     first, second = build_groups(body, 0, FEW)[:2]
     draws = [(first, 0), (first, 0), (second, 0), (first, 1)]
     force, again, other, later = (build_pushes(group, body, seed, FEW).causes[0].force for group, seed in draws)

@@ -6,7 +6,7 @@ import pytest
 from surrogate.data.cortex_patch import Patch
 
 
-def test_places_are_uniform_within_a_triangle_too():
+def test_sampled_points_are_uniform_within_triangles():
     """Two triangles, one nine times as large: each quarter of the large one gets its share."""
     points = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     two = Patch(np.arange(5), np.array([[0, 1, 2], [0, 3, 4]]), points)

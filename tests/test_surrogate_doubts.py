@@ -45,7 +45,7 @@ def sideways(body, length):
 
 
 @pytest.mark.parametrize("length", [8e-3, 12e-3, 20e-3])
-def test_sideways_slip_is_marked_and_within_error(locator, length):
+def test_lateral_registration_slip_is_reported_within_error(locator, length):
     """Nothing moved but the registration."""
     seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), NAMED, (0, 0))
     found = locator.locate(replace(seen, now=seen.now + sideways(locator.anatomy, length)))
@@ -55,7 +55,7 @@ def test_sideways_slip_is_marked_and_within_error(locator, length):
 
 
 @pytest.mark.parametrize("way", ["right", "axis"])
-def test_points_that_are_turned_are_in_doubt_as_those_that_slip(locator, way):
+def test_rotated_points_are_reported_as_possible_slip(locator, way):
     """By 10 degrees about their middle, tilted or twisted. They are shifted by 0.5 mm, as a brain that sinks."""
     axis = open_cortex(locator.anatomy).axis
     seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), PointsSeen(100, 90, 0), (0, 0))
@@ -79,7 +79,7 @@ def test_shift_is_judged_by_the_given_registration_error(locator):
     assert far.slipped and "where 4 mm and 1.5 degrees are reported" in far.doubt
 
 
-def test_checked_registration_is_not_suspected(locator):
+def test_verified_registration_is_not_suspected(locator):
     """Then even an observation that resembles a registration shift is a motion."""
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
@@ -100,7 +100,7 @@ def test_axial_shift_is_reported_as_ambiguous_with_sinking(locator):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("skull", range(3))
-def test_locate_true_motion_warns_of_no_registration(locator, skull, seed):
+def test_locate_true_motion_gives_no_registration_warning(locator, skull, seed):
     """Drained, with a dent of the last shape of a tool; most of it looks like a shift of all points."""
     prior, body = locator.prior, locator.anatomy
     random, motion = np.random.default_rng([skull, seed]), np.zeros_like(body.mesh.nodes)
@@ -123,7 +123,7 @@ def test_locate_shifted_registration_warns(locator, sight, seed):
 
 
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])
-def test_a_brain_that_sinks_is_not_taken_for_a_slip(locator, sunk, sight):
+def test_sinking_brain_is_not_reported_as_slip(locator, sunk, sight):
     """Its tumour is found, and the error holds."""
     found = locator.locate(observed(locator.anatomy, sunk, sight, (0, 0)))
     off = np.linalg.norm(found.centroid - compute_middle(locator.anatomy, sunk[None])[0])
@@ -139,7 +139,7 @@ def test_locate_cloud_rounding_changes_no_result(locator, sunk, seed):
     assert again == pytest.approx(found, abs=1e-8)
 
 
-def test_point_cloud_drainage_and_atrophy_look_alike(locator):
+def test_point_cloud_does_not_separate_drainage_and_shrinking(locator):
     """All of it by 5 mm, along the opening's axis."""
     body = locator.anatomy
     still = observed(body, np.zeros_like(body.mesh.nodes), PointsSeen(100, 90, 1, named=False), (0, 0))
@@ -150,13 +150,13 @@ def test_point_cloud_drainage_and_atrophy_look_alike(locator):
 
 
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])
-def test_where_nothing_moved_no_cause_is_named(locator, sight):
+def test_motionless_observation_names_no_cause(locator, sight):
     found = locator.locate(observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), sight, (0, 0)))
     assert found.within_errors and not found.cause_shares and not any(found.causes.values())
     assert found.named_causes == "none, as what was seen is within its errors"
 
 
-def test_dent_of_error_size_is_seen_by_its_form(locator):
+def test_dent_of_error_size_is_detected_by_its_shape(locator):
     """Of 3 mm, 12 mm wide, at 60 points that are off by less than is stated; and such points without a dent."""
     body, random = locator.anatomy, np.random.default_rng(0)
     cortex = body.mesh.nodes[np.unique(body.open_surface)]
@@ -169,7 +169,7 @@ def test_dent_of_error_size_is_seen_by_its_form(locator):
     assert not dented.within_errors and dented.cause_shares and still.within_errors
 
 
-def test_points_on_a_few_millimetres_were_not_tried(locator, sunk):
+def test_points_on_tiny_patch_are_marked_uncalibrated(locator, sunk):
     """On all of the open cortex they were, and on a tenth of it, named or not."""
     body = locator.anatomy
     for cover, known in ((0.12, True), (0.9, True), (0.01, False)):
@@ -181,7 +181,7 @@ def test_points_on_a_few_millimetres_were_not_tried(locator, sunk):
 
 
 @pytest.mark.parametrize("kind", [SWELLING, OEDEMA])
-def test_what_swells_may_be_oedema_and_that_is_said(locator, sunk, kind):
+def test_swelling_gives_an_oedema_warning(locator, sunk, kind):
     prior, body = locator.prior, locator.anatomy
     motion = np.zeros_like(body.mesh.nodes)
     motion[prior.nodes] = prior.shape[np.flatnonzero((prior.kind == kind) & (prior.skull == 0))[0]]

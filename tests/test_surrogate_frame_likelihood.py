@@ -17,7 +17,7 @@ def locator(body):
     return locator_of(body)
 
 
-def test_points_that_no_other_supports_are_left_out(body, locator, monkeypatch):
+def test_unsupported_points_are_excluded_from_the_fit(body, locator, monkeypatch):
     """They are those that `locate` leaves out, and nothing is fitted to them; more than a third is refused."""
     clean = build_tool_frame(body, dent(body, np.random.default_rng(1)))
     clean = replace(clean, observation=replace(clean.observation, sigma=np.full(60, 3e-4)))

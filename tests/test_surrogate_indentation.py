@@ -24,7 +24,7 @@ def samples(patch: Patch) -> np.ndarray:
     return np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
 
 
-def test_a_pose_is_where_the_ball_is_deepest(box):
+def test_pose_point_is_the_deepest_contact_of_the_ball(box):
     """Its point is on the surface, nowhere else is nearer to its middle, and depth is what is left of the radius."""
     patch = open_patch(box)
     bumpy = replace(patch, points=domed(patch.points))
@@ -53,7 +53,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def test_how_a_ball_came_there_is_nothing(box):
+def test_indentation_is_independent_of_the_approach_path(box):
     """On a flat cortex an oblique way is a straight one to beside it; a ball sunk to its middle has the normal."""
     patch = open_patch(box)
     forces = draw("palpation", box, 40, 0).get(Pushed)
@@ -68,7 +68,7 @@ def test_how_a_ball_came_there_is_nothing(box):
     np.testing.assert_allclose(sunk.force, BALL.radius * normal, atol=1e-9)
 
 
-def test_ball_without_contact_has_no_depth(box):
+def test_ball_without_contact_has_zero_depth(box):
     patch = open_patch(box)
     point = patch.points[[3, 3]] + [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
     away = compute_poses(BALL, point, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[0.0, 0.0, -1e-3]] * 2))

@@ -28,7 +28,7 @@ def test_locator_without_patch_sizes_is_rejected(locator, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["header", "tried", "shape", "kind", "place", "centre", "nodes"])
-def test_locator_of_another_content_than_sealed_is_rejected(locator, tmp_path, name):
+def test_locator_file_with_wrong_digest_is_rejected(locator, tmp_path, name):
     with np.load(to_locator_path(get_template_path())) as file:
         arrays = {name: file[name] for name in file.files}
     if name == "header":

@@ -8,7 +8,7 @@ from sim.errors import InputError
 from surrogate.locating.observation import Observation, to_evidence
 
 
-def test_points_far_from_vertices_lie_on_the_cortex_all_the_same():
+def test_points_inside_large_triangles_are_on_the_cortex():
     """In the middle of triangles of 40 mm, and as far above them as may be; farther ones are left out."""
     body = make_box(cells=(4, 4, 2), spacing=40e-3, tumour=60e-3, depth=40e-3, opening=70e-3)
     middle = body.mesh.nodes[body.open_surface].mean(axis=1)

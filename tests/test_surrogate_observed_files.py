@@ -7,7 +7,7 @@ from sim.bodies.markups import read_markup
 from surrogate.locating.observed_files import read_observation
 
 
-def test_markup_and_table_that_begin_with_a_mark_are_read(tmp_path):
+def test_files_with_byte_order_mark_are_read(tmp_path):
     """Editors of Windows begin UTF-8 with a byte order mark; a table may name its points."""
     path = markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0]])
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())

@@ -16,7 +16,7 @@ def body():
     return small_body()
 
 
-def test_killed_process_loses_no_finished_case(tmp_path, body):
+def test_killed_solver_process_loses_no_finished_case(tmp_path, body):
     """Resume after one of two processes died at the sixth of ten batches: the bytes are those of an undisturbed run."""
     loads, whole, path = draw("palpation", body, COUNT, 0), tmp_path / "whole.h5", tmp_path / "data.h5"
     undisturbed = mortal("cpu", COUNT, 0, tmp_path)

@@ -52,7 +52,7 @@ def model(box):
     return Learned(box, (part,), known, tool=BLADE, force=ForceModel())
 
 
-def test_a_blade_goes_on_from_where_it_was(model, box):
+def test_warm_started_blade_reaches_the_direct_contact(model, box):
     """To the contact that it finds straight from the air; the same start gives the same bytes."""
     first, second = over(box, (0.0, 2.5)), over(box, (0.4, 3.0))
     start = model.deform(first)
@@ -70,7 +70,7 @@ def test_a_blade_goes_on_from_where_it_was(model, box):
     assert dropped.displacement.tobytes() == straight.displacement.tobytes()
 
 
-def test_it_comes_straight_in_where_that_is_nearer(model, box):
+def test_distant_start_gives_the_direct_contact(model, box):
     """From the air, from far aside, and out of the tissue again; each row goes its own way."""
     starts = [model.deform(over(box, place)) for place in ((0.0, -2.0), (9.0, 0.5), (0.3, 1.5))]
     there = over(box, (0.0, 1.0), (0.0, 1.0), (0.0, 1.5))
@@ -87,7 +87,7 @@ def test_it_comes_straight_in_where_that_is_nearer(model, box):
     assert model.deform(alone, spoiled).displacement.tobytes() == model.deform(alone).displacement.tobytes()
 
 
-def test_pressure_is_that_of_the_finite_elements(model, box):
+def test_tool_pressure_matches_finite_elements(model, box):
     """Its sum over areas is the force; its highest is that of the barrier's forces."""
     loads = over(box, (0.0, 2.0), (2.0, 3.0), (0.0, -1.0))
     answer = model.deform(loads)
@@ -104,7 +104,7 @@ def test_pressure_is_that_of_the_finite_elements(model, box):
         compute_tool_pressure(replace(model, force=None), loads, answer)
 
 
-def test_the_spatula_that_ships_has_the_finite_elements_answers():
+def test_shipped_spatula_model_matches_finite_elements():
     """Fresh poses, two of which have contacts whose single precision is no longer positive definite."""
     model = load(get_gym_model_path(), read_anatomy(get_template_path()))["contact-gp"]
     kept = np.load(Path(__file__).parent / "data" / "spatula_poses.npz")
