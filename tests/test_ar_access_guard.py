@@ -1,4 +1,4 @@
-"""The page's server: whom it lets in, and what it hears from them. All on this machine; no tunnel is ever opened."""
+"""Access control of the page's server: requests, tokens and messages, on this machine only."""
 
 import http.client
 import math
@@ -73,14 +73,14 @@ def visitor(page):
 
 
 def still_heard(page, visitor):
-    """Whether a visitor's messages arrive, and none before did: they come in order, so all others were dealt with."""
+    """True if a visitor's next message arrives and none before it did; messages are handled in order."""
     value = 0.1 if page.inputs["force [N]"].value != 0.1 else 0.2
     visitor.set(page.inputs["force [N]"], value)
     return wait_for(lambda: value in page.heard) and page.heard == [value]
 
 
 def ask(page, path="/", method="GET", **headers):
-    """Status and headers of an answer."""
+    """Status and headers of an HTTP response."""
     wire = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
     wire.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
     answer = wire.getresponse()
@@ -90,7 +90,7 @@ def ask(page, path="/", method="GET", **headers):
 
 
 def knock(page, path="", **settings):
-    """Status of a handshake: 101 where it is let in."""
+    """Status of a web-socket handshake; 101 if it is accepted."""
     try:
         connect(f"ws://127.0.0.1:{page.port}{path}", subprotocols=PROTOCOL, **settings).close()
     except InvalidStatus as error:
@@ -199,7 +199,7 @@ class TestDoor:
 
 @pytest.fixture(scope="module")
 def far():
-    """A page that others than this machine reach; the test comes to it from here."""
+    """Page on a network address, requested here from this machine."""
     page = Page("0.0.0.0")
     yield page
     page.close()

@@ -1,4 +1,4 @@
-"""The page: served, shared by several visitors, whose actions it hears. A visitor here is a bare web socket."""
+"""Page server with several visitors and their inputs; a visitor is a plain web socket."""
 
 import re
 import time
@@ -58,7 +58,7 @@ def test_page_is_served_as_html(page):
 
 
 def test_address_contains_the_given_host(heard):
-    """A page on one interface is not to be found at localhost."""
+    """A page bound to one interface is not available at localhost."""
     page = open_page(heard, free_port(), host="127.0.0.2")
     assert page.address.startswith("http://127.0.0.2:")
     with urllib.request.urlopen(page.address) as answer:
@@ -83,7 +83,7 @@ def test_page_sends_latest_frame_and_updates_slider(page, heard):
 
 
 def test_image_and_text_are_sent_in_one_update(page):
-    """A slow browser shows the two of one frame, or neither; words alone bring the picture that they are beside."""
+    """A slow browser shows image and text of the same frame; new text is sent with its image."""
     visitor = Visitor(page, 1600)
     assert wait_for(lambda: page.visitors == 1)
     pictures = [np.full((48, 64, 3), number, np.uint8) for number in range(40)]
@@ -108,7 +108,7 @@ def test_image_and_text_are_sent_in_one_update(page):
 
 
 def test_unchanged_frame_is_not_sent_again(page):
-    """A paused page says the same thirty times a second; the slider is left to the visitor who may be moving it."""
+    """A paused page repeats its frame thirty times a second; the slider stays free for the visitor."""
     visitor, picture = Visitor(page, 1600), np.full((48, 64, 3), 7, np.uint8)
     page.show(7, picture, "said")
     assert wait_for(lambda: page.visitors == 1 and int(page.frame.value) == 7)
@@ -154,7 +154,7 @@ def test_several_visitors_receive_frames_and_send_inputs(page, heard):
 
 
 def test_only_the_first_visitor_controls_the_page(page, heard):
-    """They may ask; who leads lets them, and the lead passes on when its owner leaves."""
+    """Others may request control; the leader grants it, and it passes on when the leader leaves."""
     first, second = Visitor(page, 1600), Visitor(page, 420)
     page.show_line(lambda visitor: f"number {visitor}")
     assert wait_for(lambda: set(page.crowd.rows) == {0, 1} and page.crowd.rows[1].ask.visible)
@@ -205,7 +205,7 @@ def test_hotkeys_play_step_and_select_deformer(heard):
 
 
 def test_recording_is_downloaded_as_one_video(page, monkeypatch):
-    """Its owner gets it; nobody gets one whose owner has left."""
+    """Only the visitor who started it receives it, and none does if that visitor has left."""
     sent: list[tuple] = []
     monkeypatch.setattr("viser.ClientHandle.send_file_download", lambda client, *file, **how: sent.append(file))
     visitor, button = Visitor(page, 1200), page.recorder.button
@@ -280,7 +280,7 @@ def test_value_set_by_program_triggers_no_callback(page, heard):
 
 
 def test_fill_replaces_bodies_and_controls(page, heard):
-    """Another scene: other bodies and controls, nothing of the old ones, and what was on its way to them is dropped."""
+    """A new scene replaces bodies and controls, and pending updates of the old ones are dropped."""
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
     old = page.inputs["force [N]"]
@@ -326,7 +326,7 @@ def test_save_button_precedes_the_controls(page):
 
 
 def test_phone_layout_puts_distance_and_playback_first(page):
-    """There all stands in one column: the report, which scrolls by itself on a low one, then controls, then words."""
+    """One column: the report (scrolls in a low window), then controls, then descriptions."""
     assert page.folder is not None
     assert page.text.order < page.folder.order < page.words.order
     # The distance, and eight lines more: whom to trust, what acts, and the verdict even on an earlier load.
@@ -344,7 +344,7 @@ def test_number_and_unit_are_joined_by_nonbreaking_space():
 
 
 def test_wide_window_shows_controls_in_two_columns(page):
-    """All of them in sight in 1280 x 720, and the words over them as wide as both."""
+    """All controls are visible at 1280 x 720, and the text above them spans both columns."""
     wide = build_style(4 / 3).split("@media (min-width: 75em) and (min-aspect-ratio: 13/10) {")[1].split("@media")[0]
     holder = f"div:has(> div > #{SAID})"
     assert 75 * 16 <= 1280 and f"{holder} {{ display: grid; grid-template-columns: 1fr 1fr;" in wide
@@ -359,7 +359,6 @@ def test_status_line_is_shown_and_cleared(page):
 
 
 def test_status_line_leaves_header_visible():
-    """They stand at the left."""
     (rule,) = re.findall(rf"#{STATUS} {{ position: fixed; (.*?) }}", build_style(4 / 3))
     assert "right: calc(100vw - var(--w)" in rule and "left:" not in rule
 

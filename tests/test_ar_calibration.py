@@ -1,4 +1,4 @@
-"""Calibrations as text: what OpenCV and ROS write is read, and what is wrong is refused by name."""
+"""Calibration files of OpenCV and ROS: reading, writing and messages for invalid files."""
 
 import re
 
@@ -178,7 +178,7 @@ def test_invalid_calibration_is_rejected_with_remedy(text, reason):
 
 
 def test_damaged_calibration_raises_only_value_error():
-    """Cut off anywhere, or with other characters in it: a sentence of ours, or a calibration."""
+    """Truncated text or replaced characters give a ValueError or a finite calibration."""
     random, signs = np.random.default_rng(0), list("\n\t :-[]{}\"'#&*!|>%@0.9eé\\")
     for text in (ROS, OPENCV, to_opencv_text(RATIONAL)):
         damaged = [text[:cut] for cut in range(0, len(text), 7)]

@@ -1,4 +1,4 @@
-"""The pinhole model: against OpenCV, and against what a picture must do."""
+"""Pinhole camera model compared with OpenCV, and rolling-shutter images."""
 
 from dataclasses import dataclass, replace
 
@@ -157,7 +157,7 @@ def test_zoom_magnifies_about_the_principal_point():
 
 
 def test_refocus_scales_focal_length_by_thin_lens_equation():
-    """1 / f = 1 / d + 1 / b, and what is drawn is as large as b."""
+    """1 / f = 1 / d + 1 / b; the size of the image is proportional to b."""
     camera = some_camera()
     for d in (0.2, 0.3, 1e9):
         b = 1.0 / (1.0 / 50e-3 - 1.0 / d)
@@ -192,7 +192,7 @@ def test_converging_stereo_axes_meet_at_working_distance():
 
 
 def test_points_are_triangulated_from_distorted_stereo_images():
-    """By OpenCV: undistorted and triangulated."""
+    """Undistorted and triangulated with OpenCV."""
     for pair in (build_stereo_pair(seen_by(SOME)), build_stereo_pair(seen_by(SOME), working_distance=0.14)):
         seen = []
         for one in pair:

@@ -1,4 +1,4 @@
-"""The document of the page: title and icon from the start, and a script for browsers without WebGL."""
+"""HTML document of the page: title, icon and a script for browsers without WebGL."""
 
 import gzip
 import http.client

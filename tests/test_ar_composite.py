@@ -1,4 +1,4 @@
-"""Kernels of pictures are loaded ahead: all of them, and by one thread at a time."""
+"""Loading of all rendering kernels in advance, by one thread at a time."""
 
 import ast
 import threading

@@ -1,4 +1,4 @@
-"""Who leads a page."""
+"""Control of a page by one visitor at a time."""
 
 from ar.page.control_lock import MAX_IDLE_TIME, ControlLock
 

@@ -1,4 +1,4 @@
-"""Cuts through camera, tip and tumour."""
+"""Sections through camera, tip and tumour."""
 
 import numpy as np
 import pytest

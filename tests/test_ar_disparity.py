@@ -1,4 +1,4 @@
-"""Depth from two eyes, and points that are followed: against the places that were drawn."""
+"""Stereo depth and point tracking compared with the rendered positions."""
 
 from dataclasses import replace
 
@@ -180,7 +180,7 @@ def test_invalid_stereo_inputs_are_rejected(pair, geometry, pictures):
 
 
 def test_points_are_tracked_over_30_pixels(pair, geometry, view):
-    """By 5 mm, 30 pixels, in each direction in turn: where they come to is found in three dimensions."""
+    """Displacements of 5 mm (30 pixels) in two directions are measured in three dimensions."""
     pixels = grid(geometry.size)
     known = triangulate_cloud(view, pixels)
     for seed, motion in enumerate(np.array([[5e-3, 0.0, 0.0], [-2e-3, 4e-3, -2e-3]]), start=5):
@@ -202,7 +202,7 @@ def test_points_are_not_tracked_into_unrelated_image(geometry, view):
 
 
 def test_point_with_inconsistent_backward_flow_is_dropped(geometry, view, monkeypatch):
-    """As where a texture repeats: each point is found, and every other one leads back 5 pixels from its start."""
+    """Simulates a repeating texture: the backward flow of every second point ends 5 pixels from its start."""
     pixels = grid(geometry.size)
     ends = []
 

@@ -1,4 +1,4 @@
-"""Rings of distance: their lines and their numbers."""
+"""Distance rings and their labels."""
 
 import cv2
 import numpy as np

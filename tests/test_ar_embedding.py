@@ -1,4 +1,4 @@
-"""A fine surface embedded in a coarse one follows it, and stays inside its facets."""
+"""Fine surface embedded in a coarse one: it follows the motion and stays inside the facets."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The focal length that a target's relief tells."""
+"""Focal length estimated from a target with depth."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def corners_of(camera, noise, seed, faces=(0, 1)):
 
 
 def test_focal_length_is_estimated_from_cube_corners():
-    """Of a camera that is stated a tenth too long, and of the true one; of few corners nothing is known."""
+    """Cases: a focal length that is 10 % too long, a correct one, and too few corners."""
     camera = read_calibration(FILM / "camera.yaml").build_camera(np.eye(4))
     seen = [(CUBE, corners_of(camera, 0.1, seed)) for seed in range(12)]
     for factor in (1.0, 1.1):

@@ -1,4 +1,4 @@
-"""The gauge: the number beside the tip."""
+"""Distance label at the tip."""
 
 import numpy as np
 import pytest

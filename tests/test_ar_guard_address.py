@@ -1,4 +1,4 @@
-"""A page behind a proxy or another port: addresses that are allowed, each with the token."""
+"""Page behind a proxy or a forwarded port: allowed addresses and the token."""
 
 import pytest
 from test_ar_access_guard import Page, ask, knock

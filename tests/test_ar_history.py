@@ -1,4 +1,4 @@
-"""The chart of the last seconds."""
+"""Chart of the last seconds."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Words on a picture: the patient's sides at its edges, lines where there is room, lengths as they are read."""
+"""Text on an image: orientation labels, panels and lengths."""
 
 import cv2
 import numpy as np
@@ -41,7 +41,7 @@ def test_direction_is_named_by_its_largest_components(direction, letters):
 
 
 def test_edge_labels_follow_the_camera_orientation():
-    """From the patient's right side, crown upwards: the face is on the right."""
+    """Seen from the patient's right with the crown up, the face is on the right."""
     aside = look_at(np.array([0.3, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     assert name_bearings(aside.T_camera_world[:3, :3]) == {"left": "P", "right": "A", "top": "S", "bottom": "I"}
     # From above, face upwards in the picture: the patient's right is on the right; from below it is on the left.
@@ -85,7 +85,7 @@ def test_length_is_printed_in_millimetres_with_error(length, error, text):
 
 
 def test_orientation_label_shifts_along_its_edge():
-    """A line that leaves the picture where the upper letter stands moves that letter aside, and no other."""
+    """A line through the top label shifts this label sideways, and no other."""
     plain = np.full((240, 320, 3), 90, np.uint8)
     taken = np.zeros(plain.shape[:2], np.uint8)
     free = draw_orientation_labels(plain, np.eye(3), taken)
@@ -161,7 +161,7 @@ def test_panel_drops_lines_instead_of_covering_marks():
 
 
 def test_labels_may_cover_thin_lines():
-    """As a number does rings: without that it went far below the line that it belongs to."""
+    """Example: a number over rings; otherwise it would be placed far below its line."""
     rows = {}
     for name, thin in (("far", None), ("near", True)):
         colour, taken = np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.uint8)

@@ -1,4 +1,4 @@
-"""Pictures of folders: their order, and their pixels as stored."""
+"""Order and pixels of images in folders."""
 
 import struct
 
@@ -38,7 +38,7 @@ def test_folder_in_alphabetical_order_gives_no_warning(tmp_path):
 
 
 def test_rotation_metadata_does_not_rotate_pixels(tmp_path):
-    """A quarter turn in a video's track header and in EXIF moves no pixel."""
+    """A rotation by 90 degrees in a video's track header or in EXIF is ignored."""
     still = np.zeros((64, 96, 3), np.uint8)
     still[:32, :48] = 200
     film, turned = tmp_path / "film.mp4", tmp_path / "turned.mp4"

@@ -1,4 +1,4 @@
-"""A camera from views of the board: found as it was, as surely as repeated calibrations say, or refused."""
+"""Camera intrinsics from views of the board: values, covariance and rejected input."""
 
 from dataclasses import replace
 
@@ -91,7 +91,7 @@ def test_calibration_rejects_insufficient_views():
 
 
 def test_calibration_error_accounts_for_pose_compensation():
-    """A focal length that is 0.2 % off: the pose is fitted again, and a place beside the target is seen elsewhere."""
+    """Focal length wrong by 0.2 %: the pose is fitted again, and a point next to the target moves in the image."""
     T, corners, place = turned("x", 25.0), build_patient_reference().faces[0].corners, np.array([0.1, 0.05, 0.03])
     T[:3, 3], own = (0.0, 0.02, 0.4), np.zeros((9, 9))
     own[:2, :2] = 4.0

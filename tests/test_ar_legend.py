@@ -1,4 +1,4 @@
-"""The legend: it names lines and leaves the cortex in sight."""
+"""Legend: it names lines and leaves the cortex visible."""
 
 import numpy as np
 from test_ar_styles import CAMERA, DRAPE, GREEN, OPENING, seen, tumour

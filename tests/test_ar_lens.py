@@ -1,4 +1,4 @@
-"""Cameras with a lens: against OpenCV's own distortion, and against what a picture must do."""
+"""Cameras with lens distortion compared with OpenCV and with undistorted images."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def test_distortion_equals_opencv_and_is_inverted(lens):
 
 
 def test_points_beyond_the_distortion_fold_are_nan():
-    """By calculus r - r^3 / 2 turns back at r = sqrt(2 / 3), where it is 2 / 3 of that."""
+    """Radial polynomial r - r^3 / 2 has its maximum at r = sqrt(2 / 3); its value there is 2 / 3 of that."""
     lens, turn = LENSES["folding"], np.sqrt(2.0 / 3.0)
     assert lens.reach == pytest.approx(turn, rel=2e-3) and lens.reach < turn
     beyond = np.array([[1.2, 0.0], [0.0, -1.5], [4.0, 3.0], [np.nan, 0.0]])
@@ -72,7 +72,7 @@ def test_points_beyond_the_distortion_fold_are_nan():
 
 @each_lens
 def test_distortion_is_monotonic_along_rays(lens):
-    """Along rays of all directions, with the tangential part: places are kept in their order."""
+    """Rays in all directions, with tangential distortion: radii keep their order."""
     angles = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
     ways = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     radii = np.linspace(0.0, min(0.999 * lens.reach, 5.0), 500)[:, None, None]
@@ -183,7 +183,7 @@ def test_overlay_outline_is_registered_through_lens(lens):
 
 
 def test_objects_beyond_the_distortion_limit_are_not_drawn():
-    """OpenCV's polynomial has it in the picture."""
+    """OpenCV's polynomial would project them into the image."""
     camera = replace(look_at(np.zeros(3), np.array([0.0, 0, 1]), np.array([0.0, 1, 0])), lens=LENSES["folding"])
     vertices, triangles = build_sphere(20, 30, 0.05)
     aside = Layer("ball", BALL, vertices + [1.2, 0.0, 1.0], triangles)

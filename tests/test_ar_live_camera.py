@@ -1,4 +1,4 @@
-"""Cameras that are unplugged or silent."""
+"""Live cameras that are unplugged or send no image."""
 
 import time
 from itertools import islice

@@ -1,4 +1,4 @@
-"""What is drawn beside a hidden surface: outlines of others with their dots, and points that are seen."""
+"""Marks next to a hidden surface: traces with dots, and visible points."""
 
 from dataclasses import replace
 

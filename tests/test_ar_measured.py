@@ -1,4 +1,4 @@
-"""Rings and their numbers."""
+"""Distance rings and their labels next to the line from the tip."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""The lit view and what is drawn into it: order, register, occlusion."""
+"""Rendered image and its overlay: order, registration, occlusion."""
 
 from dataclasses import replace
 
@@ -95,7 +95,7 @@ def test_tool_casts_a_shadow_on_the_cortex():
 
 
 def test_flat_surface_casts_no_shadow_on_itself():
-    """No surface shades itself: under a lamp far away, a flat sheet that casts shadows looks as one that does not."""
+    """Under a distant lamp a flat sheet looks the same with and without casting shadows."""
     lamp = Lamp(np.array([-0.2, 0.1, 0.3]), np.zeros(3), 0.1)
     one, other = (render(camera(), [cortex(casts_shadow=casts)], lamp).colour.astype(int) for casts in (True, False))
     assert np.abs(one - other).max() <= 1
@@ -168,7 +168,6 @@ def test_margin_line_is_outside_the_contour_by_its_width():
 
 @pytest.mark.parametrize("side", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.04), (0.0, -0.04)])
 def test_clipped_margin_is_not_drawn_along_the_image_edge(side):
-    """Strokes end near the edge."""
     here, centre = camera(), (*side, -0.02)
     picture = render(here, [cortex()], LAMP)
     plain, wide = (composite(picture, here, tumour(centre), style="contour", marks=Marks(each)) for each in (0.0, 0.02))
@@ -209,7 +208,7 @@ def test_gauge_distance_is_euclidean_distance():
 
 
 def test_image_label_shows_mean_tumour_displacement():
-    """The mean motion of the surface. Its margin is no error of the motion, but of the place."""
+    """Mean displacement of the surface; the margin is an error of the position, not of the displacement."""
     here, now = camera(400, 300), tumour()
     picture = render(here, [cortex()], LAMP)
     far = np.linspace(0.002, 0.004, len(now.vertices))[:, None] * [1.0, 0.0, 0.0]
@@ -234,7 +233,7 @@ def test_motion_arrow_points_to_the_current_tumour_position():
 
 
 def test_motion_and_warning_are_on_separate_lines():
-    """A margin that nobody knows is not drawn."""
+    """An unknown margin is not drawn."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
@@ -248,7 +247,7 @@ def test_motion_and_warning_are_on_separate_lines():
 
 
 def test_unreliable_overlay_is_amber_without_error_margin():
-    """The reason stands in the picture, the outline is amber, and there is neither margin nor +-."""
+    """The image shows the reason and an amber outline, with neither margin nor +-."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
@@ -296,7 +295,7 @@ def test_without_overlay_only_the_warning_is_drawn():
 
 
 def test_taken_mask_covers_lines_and_text():
-    """Every pixel of outline, arrow and number, and no other but a margin round letters."""
+    """All pixels of outline, arrow and number, and no others except a margin around letters."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
@@ -345,7 +344,7 @@ def test_invalid_overlay_inputs_are_rejected(attempt, reason):
 
 
 def test_outline_error_counts_misplaced_and_missing_pixels():
-    """One that stands 12 pixels off beside the true one, and one of which the right half is not drawn."""
+    """Cases: an outline shifted by 12 pixels, and one without its right half."""
     here, ink = camera(400, 300), (20.0, 240.0, 60.0)
     true = compute_silhouette(here, tumour().vertices, tumour().triangles)
     nothing = np.zeros(true.shape, bool)

@@ -1,4 +1,4 @@
-"""Pages of markers: exact on paper, found by OpenCV where they say, and a net that folds into the cube's corner."""
+"""Pages of markers: printed size, corner positions and the net of the cube."""
 
 import io
 import re
@@ -55,7 +55,7 @@ def edges(line):
 
 @pytest.mark.parametrize("number", range(3))
 def test_squares_and_markers_have_nominal_printed_size(pages, number):
-    """From the PNG's own dots per inch; along the first row and column of squares, and through a marker."""
+    """Size from the PNG's dots per inch, along the first row and column of squares and through a marker."""
     page = pages[number]
     with Image.open(io.BytesIO(to_png(page))) as picture:
         pixels, per_mm = np.asarray(picture.convert("L")), picture.info["dpi"][0] / 25.4
@@ -106,7 +106,7 @@ def on_paper(each, places):
 
 
 def test_adjacent_faces_on_paper_are_adjacent_on_the_cube(pages):
-    """Corners of the faces' borders: what is one place on the net is one place in space; the tab joins the rest."""
+    """Border corners at one place of the net coincide in space; a tab joins the remaining edge."""
     spots = []
     for each in pages[0].placed:
         T, size, border = each.face.T_target_face, each.face.size, BORDER_WIDTH
@@ -129,7 +129,7 @@ def test_adjacent_faces_on_paper_are_adjacent_on_the_cube(pages):
 
 
 def test_cut_lines_surround_the_face_borders(pages):
-    """Most of each outer side of the net and of the plate is drawn, and nothing of the white between."""
+    """Most of each outer side of net and plate is drawn, and nothing in the white area between."""
     for page, names in ((pages[0], "+z"), (pages[1], "-z")):
         (each,) = [each for each in page.placed if to_face_name(each.face) == names]
         left, top = (round(20.0 * (at - 1e3 * BORDER_WIDTH)) for at in (each.left, each.top))

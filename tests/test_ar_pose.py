@@ -1,4 +1,4 @@
-"""Printed targets: drawn as a camera sees them, found again, and where they are, with what is not known."""
+"""Poses of printed targets: detection, covariance, ambiguity and tracking."""
 
 from dataclasses import replace
 
@@ -114,7 +114,7 @@ def test_tip_error_lies_within_its_covariance(scene):
 
 
 def test_pose_covariance_matches_repeated_noise():
-    """Corners of known noise, many times: squared errors in units of the covariance have their mean at 6."""
+    """Repeated corners with known noise: the mean squared Mahalanobis error is 6."""
     rng, T = np.random.default_rng(1), looking((10.0, 5.0, -20.0), (0.0, 0.02, 0.3))
     found = []
     for _ in range(150):
@@ -128,7 +128,7 @@ def test_pose_covariance_matches_repeated_noise():
 
 
 def test_relative_pose_covariance_includes_both_poses():
-    """The tip in the patient's frame, many times: what noise does to both poses is what the covariance says."""
+    """Tip in the patient's frame: noise of both poses gives the reported covariance."""
     rng, T = np.random.default_rng(6), looking((10.0, 5.0, -20.0), (0.0, 0.02, 0.3))
     plate = flat((30.0, 20.0, 0.0), (-0.1, 0.0, 0.3))
     true = (np.linalg.inv(plate) @ T @ [0.0, 0.0, -TIP_DISTANCE, 1.0])[:3]
@@ -143,7 +143,7 @@ def test_relative_pose_covariance_includes_both_poses():
 
 
 def test_mirrored_pose_is_never_rated_good():
-    """A plate far away and nearly square to the view has two poses that fit: whichever is given is the right one."""
+    """A distant plate that faces the camera has two fitting poses; a returned pose is the true one."""
     rng, verdicts = np.random.default_rng(2), []
     for _ in range(300):
         T = flat(tuple(rng.uniform(-25.0, 25.0, 3)), (0.05 * rng.normal(), 0.05 * rng.normal(), rng.uniform(0.4, 1.5)))

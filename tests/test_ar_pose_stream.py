@@ -1,4 +1,4 @@
-"""Streams of poses: errors of clocks, and covariances between samples."""
+"""Streams of poses: clock errors, and covariances between samples."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scenes.tracked.external_tracker import ExternalTracker
 
 @pytest.mark.parametrize(("error", "expected"), [(0.0, 0.0), (0.01, 2e-3)])
 def test_tracker_clock_error_increases_the_covariance(error, expected):
-    """A tool at 0.2 m/s, and a clock that is known to 10 ms."""
+    """Tool at 0.2 m/s; clock error of 10 ms (standard deviation)."""
     times = np.arange(0.0, 1.0, 0.02)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     still, none = build_pose_stream(times, poses.copy(), np.zeros((len(times), 6, 6))), np.zeros((len(times), 6, 6))

@@ -1,4 +1,4 @@
-"""The rasteriser: against the ray cast, against analytic planes, and on the meshes that break rasterisers."""
+"""Rasteriser compared with ray casting and analytic planes, with degenerate meshes."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_rasteriser_matches_ray_casting(seed):
 
 @pytest.mark.parametrize("depth", [5e-4, 0.0, -5e-4, -0.2])
 def test_triangle_crossing_near_plane_reaches_all_rows(depth):
-    """Where a corner is nearer than the near plane, its own row says nothing: it may lie on the other side."""
+    """The projected row of a corner nearer than the near plane is no bound."""
     here = camera(height=41)
     corners = np.array([[-0.1, 0.02, 0.3], [0.1, 0.02, 0.3], [0.0, 0.02, depth]])
     assert find_rows_reached(corners @ here.K.T, 1e-3, here.height) == (0, here.height)
@@ -71,7 +71,7 @@ def test_closed_surface_has_no_cracks_and_ray_cast_depth():
 
 
 def test_pixel_centres_on_shared_edges_and_vertices_are_covered():
-    """A grid whose every edge and vertex lies exactly on pixel centres."""
+    """Grid whose edges and vertices lie exactly on pixel centres."""
     K = np.array([[8.0, 0.0, 16.0], [0.0, 8.0, 16.0], [0.0, 0.0, 1.0]])
     here = Camera(K, np.eye(4), 33, 33)
     x, y = np.meshgrid(np.linspace(-2.0, 2.0, 9), np.linspace(-2.0, 2.0, 9), indexing="ij")
@@ -95,7 +95,7 @@ def test_nearer_surface_is_visible_in_any_order():
 
 
 def test_interpolation_is_perspective_correct():
-    """A tilted plane: the value at a pixel is the linear function of the world point that the pixel's ray meets."""
+    """Tilted plane: the value at a pixel is the linear function at the point hit by its ray."""
     vertices = np.array([[-0.2, -0.2, -0.1], [0.2, -0.2, -0.1], [0.2, 0.25, 0.4], [-0.2, 0.25, 0.4]])
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     here = camera()
@@ -112,7 +112,7 @@ def test_interpolation_is_perspective_correct():
 
 
 def test_triangles_are_clipped_at_the_near_plane():
-    """A floor that starts far behind the eye: only its part beyond the near plane shows, and every ray agrees."""
+    """Floor that starts far behind the camera: only its part beyond the near plane is drawn, as by ray casting."""
     vertices = np.array([[-1.0, 0.05, -2.0], [1.0, 0.05, -2.0], [0.0, 0.05, 3.0], [0.0, 0.0, -0.4], [0.1, 0.1, -0.5]])
     triangles = np.array([[0, 1, 2], [3, 4, 0]])
     here = camera()

@@ -1,4 +1,4 @@
-"""The round field of a microscope, and enlarged images."""
+"""Circular field of a microscope, and enlarged images."""
 
 import numpy as np
 import pytest

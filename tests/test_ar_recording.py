@@ -1,4 +1,4 @@
-"""A recording of the page."""
+"""Video recording of the page."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Registration of a scan to the patient's reference: exact without noise, as sure as it says, and refused by name."""
+"""Registration of a scan to the patient's reference: accuracy, coverage and rejected input."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Pictures of many cameras and frames: as rays and formulas have them, alone and together, on any device."""
+"""Images of many cameras and frames compared with ray casting, formulas and single images, on any device."""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ def test_depth_and_segmentation_match_ray_casting():
 
 
 def test_colours_follow_the_shading_formulas():
-    """Without texture and shadow, in NumPy: base (ambient + wrapped Lambert) + Fresnel x lobe, under the lamp's rim."""
+    """NumPy formula without texture and shadow: base (ambient + wrapped Lambert) + Fresnel x lobe."""
     here, layer, light = camera(0.0, 320, 240), ball(gloss=0.4, shininess=30.0), as_light(LAMP)
     picture, cast = render(here, [layer], LAMP), raycast(here, layer.vertices, layer.triangles)
     normals, on = compute_vertex_normals(layer.vertices, layer.triangles), cast.mask
@@ -100,7 +100,7 @@ def test_colours_follow_the_shading_formulas():
 
 
 def test_cached_static_layers_render_identically():
-    """Also where the shadow of what moves falls on it, and from another camera."""
+    """Cases: a moving layer's shadow falls on the static one, and the camera changes."""
     renderer, backdrops = Renderer(scene(still=True), LAMP), []
     here, there = camera(), camera(0.4)
     aside, middle = (0.02, 0.01, 0.02), (0.0, 0.0, 0.03)
@@ -125,7 +125,7 @@ def test_static_scene_without_shadows_renders_identically():
 
 
 def test_batched_images_equal_single_images():
-    """Of several cameras and frames, or of one camera; a layer that stands still is seen by all."""
+    """Several cameras or one, several frames, and a static layer."""
     renderer = Renderer(scene(still=True), LAMP)
     centres = [(0.0, 0.0, 0.03), (0.03, 0.0, 0.02), (-0.02, 0.02, 0.04)]
     moved = np.stack([ball(centre).vertices for centre in centres])
@@ -142,7 +142,7 @@ def test_batched_images_equal_single_images():
 
 
 def test_rows_shared_by_threads_give_the_same_depths():
-    """As on a card, where several threads draw each triangle."""
+    """Same partition as on a GPU, with several threads per triangle."""
     here, layer = camera(), scene()[0]
     whole = rasterise_surface(here, layer.vertices, layer.triangles)
     for parts, begin, end in ((3, 0, 120), (8, 0, 120), (7, 31, 90)):

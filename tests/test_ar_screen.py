@@ -1,4 +1,4 @@
-"""Screens: what goes in is what lies in the folder, and nothing half-written stays."""
+"""Image and video output: complete files with the given frames, and no partial files."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""What stands beside the 3-D view: slices of a scan."""
+"""Slices of a scan next to the 3-D view."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def ball(radius: float, middle=(0.0, 0.0, 0.0), colour=(0.3, 0.95, 0.55)) -> Lay
 
 class TestSection:
     def test_plane_section_of_sphere_is_a_circle(self):
-        """Closed, on the plane, and of the radius that Pythagoras says."""
+        """Closed, in the plane, with the radius of Pythagoras' theorem."""
         layer, normal = ball(12e-3), np.array([0.6, 0.0, 0.8])
         (line,) = cut_surface(layer.vertices, layer.triangles, 5e-3 * normal, normal)
         assert np.array_equal(line[0], line[-1]) and len(line) > 30
@@ -51,7 +51,7 @@ class TestSection:
 class TestViews:
     @pytest.mark.parametrize("plane", PLANES, ids=lambda plane: plane.name)
     def test_scan_is_resampled_at_its_affine_position(self, plane):
-        """A volume whose grey grows along R, A or S grows that way in the view, by as much."""
+        """A volume whose grey value increases along R, A or S increases by the same amount in the view."""
         for axis in range(3):
             index = np.indices((51, 51, 51))[axis] / 50.0
             scan = Solid(index.astype(np.float32), np.linalg.inv(np.array(np.diag([2e-3, 2e-3, 2e-3, 1.0]) - OFF)))

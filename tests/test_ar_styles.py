@@ -1,4 +1,4 @@
-"""Each style shows what it says: in register, under tools, broken where it is not seen through the opening."""
+"""Overlay styles: registration, occlusion by tools, and dashed lines outside the opening."""
 
 from dataclasses import replace
 
@@ -190,7 +190,7 @@ def test_header_lines_wrap_next_to_a_tool():
 
 
 def test_ring_caption_keeps_clear_of_tip_number():
-    """Right under the number, it would read as its explanation."""
+    """Directly below the number the caption would look like its explanation."""
     at, said = tumour((0.0, 0.0, -0.014)), "rings: mm to the surface; error not known"
     tip = CAMERA.unproject(np.array([[440.0, 20.0]]), np.array([0.2]))[0]
     shown = composite(
@@ -215,7 +215,7 @@ def test_ring_caption_keeps_clear_of_tip_number():
 
 @pytest.mark.parametrize(("covered", "middle"), [(460, -0.014), (640, -0.014), (0, 0.3)])
 def test_cut_is_drawn_without_visible_surface_along_it(covered, middle):
-    """A hand covers all that is seen of it, or the whole picture; or all of it lies behind the camera."""
+    """Cases: a hand covers all visible parts or the whole image, or all parts are behind the camera."""
     hand = np.zeros((480, 640), bool)
     hand[:, :covered] = True
     at = tumour((0.0, 0.0, middle))

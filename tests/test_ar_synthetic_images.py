@@ -1,4 +1,4 @@
-"""Pictures of printed targets and stamps of time."""
+"""Images of printed targets and time stamps."""
 
 import numpy as np
 from test_ar_pose import CAMERA, PLATE, flat

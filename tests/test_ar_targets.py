@@ -1,4 +1,4 @@
-"""Targets with faces of markers, and their corners in a picture."""
+"""Targets with marker faces, and their corners in an image."""
 
 import numpy as np
 import pytest

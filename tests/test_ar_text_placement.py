@@ -1,4 +1,4 @@
-"""Free places in a picture."""
+"""Free places in an image."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from ar.overlay.text_placement import BORDER_DISTANCE, GRID_SPACING, SIDEWAYS_WE
 
 @pytest.mark.parametrize("seed", range(5))
 def test_free_place_is_nearest_to_the_wish(seed):
-    """Held against every place on the same grid, tried one by one."""
+    """Compared with a search of all places on the same grid."""
     rng = np.random.default_rng(seed)
     taken = np.zeros((120, 160), np.uint8)
     for row, column in rng.integers(0, (120, 160), (14, 2)):

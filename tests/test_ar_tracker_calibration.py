@@ -1,4 +1,4 @@
-"""Hand-eye: exact without noise, as sure as they say with it, and refused where motion is lacking."""
+"""Hand-eye and pivot calibration: accuracy, deviation and rejected motions."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_hand_eye_is_exact_without_noise(turn, shift):
 
 
 def test_hand_eye_error_with_noise_is_as_published():
-    """0.3 degrees and 0.5 mm of noise: 0.2 degrees and 0.5 mm."""
+    """Noise of 0.3 degrees and 0.5 mm gives errors of 0.2 degrees and 0.5 mm."""
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
     turns, shifts = [], []
     for seed in range(8):
@@ -74,7 +74,7 @@ def test_underdetermined_hand_eye_motions_are_rejected():
 
 @pytest.mark.parametrize(("tilt", "is_parallel"), [(1.9, True), (2.2, False)])
 def test_hand_eye_rotation_axes_within_8_degrees_are_rejected(tilt, is_parallel):
-    """Turns about the z axis, tilted to both sides: the axes of motions scatter just below and just above 8 degrees."""
+    """Rotations about axes tilted to both sides of z scatter just below and just above 8 degrees."""
     X, rng = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12]), np.random.default_rng(1)
     axes = [Rotation.from_euler("x", side * tilt, degrees=True).apply([0.0, 0.0, 1.0]) for side in (-1.0, 1.0)]
     turns = [0.0 * axes[0], *(angle * axis for angle in np.linspace(0.5, 2.0, 8) for axis in axes)]

@@ -1,4 +1,4 @@
-"""The window of a picture in which outlines are drawn."""
+"""Window of an image in which outlines are drawn."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def test_chamfer_distance_equals_opencv_near_the_edge():
 
 
 def test_window_overlay_matches_its_numpy_formula():
-    """In NumPy, pixel by pixel: dimmed round the silhouette, and darker the deeper the hidden surface lies."""
+    """NumPy reference, pixel by pixel: dimmed around the silhouette, and darker for deeper surfaces."""
     here = camera()
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG, colour=(0.2, 0.9, 0.3))
     picture = render(here, [floor()], LAMP)
@@ -54,7 +54,7 @@ def test_window_overlay_matches_its_numpy_formula():
 
 
 def test_outline_follows_the_silhouette_edge():
-    """Its ink is where the silhouette ends, a dark rim on both sides; nothing else changes, nor what stays as it is."""
+    """The line is at the silhouette's edge with a dark rim on both sides; no other pixel changes."""
     here, ink = camera(), (40.0, 220.0, 90.0)
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG)
     picture = render(here, [floor()], LAMP)

@@ -1,4 +1,4 @@
-"""sulcus beside other packages: one routine judges all, and who is not there is said to be missing."""
+"""sulcus compared with other packages by one evaluation, with missing packages reported."""
 
 import json
 from dataclasses import replace
@@ -75,7 +75,7 @@ def test_case_fixes_sliding_nodes_and_keeps_total_force(box, case):
 
 
 def test_invalid_and_failed_engines_get_no_good_result(case, judge, tmp_path):
-    """An engine that is wrong, one that fails and one that dies count for nothing, and do not stop the others."""
+    """An engine with wrong results, one that fails and one that crashes do not stop the others."""
     engines = (
         OWN,
         engine(tmp_path, "wrong", WRONG),
@@ -128,7 +128,7 @@ def test_each_row_states_its_requested_tolerance(box, tmp_path, capsys):
 @pytest.mark.parametrize("name", ["tled", "modified-newton", "scikit-fem"])
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-10])
 def test_peer_engine_finds_the_same_displacement(case, judge, name, tolerance):
-    """Each engine stops at the tolerance that is asked for, near the reference by so much."""
+    """Each engine stops at the requested tolerance, near the reference solution."""
     peer = next(peer for peer in PEERS if peer.name == name)
     if peer.missing:
         pytest.skip(peer.missing)

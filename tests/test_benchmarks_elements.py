@@ -1,4 +1,4 @@
-"""The benches: what they measure is what they say, and an interrupted trial goes on."""
+"""Element benchmarks: their statistics, and resuming of an interrupted trial."""
 
 import json
 import re
@@ -28,7 +28,7 @@ def anatomy():
 
 
 def test_timing_statistics_exclude_warm_up(monkeypatch):
-    """By a clock of its own: calls take 100 s while they warm up, and 1, 2, ... 20 s afterwards."""
+    """Simulated clock: 100 s for each warm-up call, then 1, 2, ... 20 s."""
     now, calls = [0.0], []
     monkeypatch.setattr(measurement.time, "perf_counter", lambda: now[0])
 
@@ -42,7 +42,7 @@ def test_timing_statistics_exclude_warm_up(monkeypatch):
 
 
 def test_nearly_incompressible_tissue_locks_only_p1_elements():
-    """Nearly incompressible: the linear element loses half of the motion, the others little."""
+    """Nearly incompressible tissue: P1 elements lose half of the motion, the others little."""
     anatomy = make_box(cells=(6, 6, 4), spacing=12e-3, tumour=12e-3, opening=45e-3)
     press = Press(law="linear", force=0.02, footprint=12e-3)
     found = list(rows([anatomy], ["p1", "smoothed"], [0.495], press, "cpu"))
@@ -152,7 +152,7 @@ def test_element_benches_reject_invalid_input(words, reason, capsys, tmp_path, m
 
 
 def test_random_loads_converge(anatomy):
-    """Half of them far beyond surgery; on the template, to 1e-4 in single precision."""
+    """Half of the loads are far above surgical ones; template to 1e-4 in single precision."""
     effects = (Elasticity(), Held(), Slide(), ToolForce())
     found = [record for some in records(Trial(anatomy, effects, "p1", "cpu", 30), 60, 1, ()) for record in some]
     assert len(found) == 60

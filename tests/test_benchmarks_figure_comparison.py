@@ -1,4 +1,4 @@
-"""`python -m benchmarks all`: what a record lacks compared with another one."""
+"""`python -m benchmarks all`: figures missing from a record, and former command names."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`python -m benchmarks all`: figures in processes of their own, records, tables of pages, and what got slower."""
+"""`python -m benchmarks all`: processes of figures, records, tables on pages, and slower numbers."""
 
 import json
 import re
@@ -132,7 +132,6 @@ def test_stopped_run_keeps_its_measurements(number, tmp_path, capsys, monkeypatc
 
 
 def test_interrupted_run_ends_its_child_process(tmp_path):
-    """No bench goes on that nobody waits for."""
     said = []
 
     def heard(line):

@@ -1,4 +1,4 @@
-"""The list of figures: every command parses, its numbers are what its bench gives, no bench of a page is missing."""
+"""List of figures: commands parse, numbers exist in the results, and pages name no other benchmark."""
 
 import re
 from dataclasses import fields
@@ -45,7 +45,7 @@ def test_every_figure_command_parses(name):
 
 
 def test_every_figure_number_is_a_field_of_its_bench():
-    """The commands parse; here, what is read of their answers is what they answer."""
+    """Numbers read from results are fields of these results."""
     for figure in FIGURES:
         row = ROWS[figure.command.split()[0]]
         known = {field.name for field in fields(row)} | {

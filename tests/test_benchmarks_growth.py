@@ -1,4 +1,4 @@
-"""`python -m benchmarks growth`: rows, the plot, and a run that goes on where it was stopped."""
+"""`python -m benchmarks growth`: rows, the plot, and resuming of a stopped run."""
 
 import json
 from dataclasses import replace
@@ -47,7 +47,7 @@ def test_growth_row_describes_the_solved_case(folder):
 
 
 def test_recorded_rows_are_not_measured_again(folder, tmp_path, monkeypatch, capsys):
-    """The first row is taken from the record; the other is measured in a process of its own."""
+    """The first row comes from the record; the other is measured in a separate process."""
     words = ["growth", "--sizes", "2000", "--batch", "1", "2", "--device", "cpu"]
     out = folder / "growth.png"
     asked = []
@@ -77,7 +77,7 @@ def test_recorded_rows_are_not_measured_again(folder, tmp_path, monkeypatch, cap
 
 
 def test_row_process_passes_its_error_on(folder):
-    """What it refuses comes back as it is."""
+    """An error in the process is raised unchanged in the parent."""
     said = []
     with pytest.raises(InputError, match="no element"):
         list(rows(Trial("abacus", "cpu", folder), [2000], [1], [], said.append))

@@ -1,4 +1,4 @@
-"""The bench of live frames: the tool moves as it says, each frame starts from the last, errors are seen."""
+"""Benchmark of live frames: tool motion, warm start and measured errors."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The script that reads another group's liver, held against a folder of that form with a box in it."""
+"""Script for a published liver data set, tested with a box in a folder of that form."""
 
 import importlib.util
 import sys

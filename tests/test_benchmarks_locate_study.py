@@ -1,4 +1,4 @@
-"""Twin experiments: rivals on motions that are known by formula, figures by hand, and twins that are kept."""
+"""Synthetic test cases (twins) for `locate`: rival estimators, statistics and stored cases."""
 
 import json
 from dataclasses import replace
@@ -113,7 +113,7 @@ def test_kelvinlets_equal_kelvin_solution_and_are_symmetric():
 
 
 def test_kelvinlet_estimator_recovers_point_forces(tumour):
-    """All but what the ridge takes; forces that differ along each axis, so that no axis is mistaken for another."""
+    """Recovered except for the ridge term; forces differ along each axis, which detects swapped axes."""
     rest = scatter_columns(12)
     force = np.random.default_rng(2).standard_normal((12, 3)) * [1e-5, 2e-5, 3e-5]
     seen, there = (np.einsum("nivj,ni->vj", compute_kelvinlets(at, rest, 10e-3, 0.49), force) for at in (rest, tumour))
@@ -134,7 +134,7 @@ def test_spring_estimator_depends_on_skull_stiffness(body):
 
 
 def test_stiff_spring_compliance_matches_bonded_fem(body):
-    """As the finite elements have it, of linear tissue under a force at one vertex."""
+    """Reference: finite elements of linear tissue with a force at one vertex."""
     cortex = np.unique(body.open_surface)
     force = np.zeros((1, len(body.mesh.nodes), 3))
     force[0, cortex[7]] = [0.0, 0.02, -0.01]
@@ -204,7 +204,7 @@ def test_observations_use_same_points_at_any_noise(locator, body):
 
 
 def test_noise_levels_have_their_rigid_translations(locator, body):
-    """Mean squares over many observations: those of white and smooth errors are the same at both levels."""
+    """Mean squares over many observations: white and smooth errors are equal at both levels."""
     still, square = np.zeros_like(body.mesh.nodes), []
     for noise in (1, 2):
         seen = [observed(body, still, PointsSeen(60, 60, noise), (0, number)) for number in range(60)]
@@ -241,7 +241,7 @@ def test_every_twin_is_observed_at_its_own_points(locator, body):
 
 @pytest.mark.parametrize("translation", [1e-3, 2e-3])
 def test_observation_errors_have_nominal_size(translation):
-    """Of pairs far from other pairs: white and smooth errors by their differences, the rigid one by a fit."""
+    """White and smooth errors by differences of point pairs, the rigid error by a fit."""
     random = np.random.default_rng(0)
     site = random.uniform(-0.6, 0.6, (250, 3))
     way = random.standard_normal(site.shape)
@@ -291,7 +291,7 @@ def test_twins_have_drawn_tissue_and_single_cause(body):
 
 
 def test_twin_motion_follows_the_push_of_its_tool(body):
-    """A tool that pushes moves the open cortex along its push, and the tumour less."""
+    """The push moves the open cortex along its direction, and the tumour less."""
     draw = replace(drawn(0, 0), skull="slide", stiffness=1.0)
     motion = solved(body, draw, "cpu", "p1")
     pushed = loads_of(body, draw).get(Pushed)

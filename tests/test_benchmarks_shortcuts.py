@@ -1,4 +1,4 @@
-"""`python -m benchmarks shortcuts`: both solvers answer the same loads, and only what a solver has is measured."""
+"""`python -m benchmarks shortcuts`: equal loads for both solvers, and no row without a shortcut."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What the skull decides, as the bench measures it."""
+"""Influence of the skull model, as measured by its benchmark."""
 
 import json
 from dataclasses import asdict
@@ -34,7 +34,7 @@ def brain(tmp_path_factory):
 
 
 def test_skull_bench_matches_independent_finite_elements(brain, capsys):
-    """By the bench, and by finite elements and a mean over the tumour's volume put together here."""
+    """Compared with finite elements and a volume mean over the tumour, computed in this test."""
     path, anatomy = brain
     words = [path, "--loads", "2", "--poisson", "0.49", "--device", "cpu", "--json"]
     assert main(["benchmarks", "skull", *words]) == 0
@@ -89,7 +89,7 @@ def test_skull_bench_rejects_invalid_input(brain, capsys, words, reason):
 
 
 def test_learner_fem_uses_the_skull_model_of_the_data(tmp_path):
-    """From the command to the finite elements that a learner asks: they slide where the data did."""
+    """Simulated data with a sliding or bonded skull: the learner's finite elements use the same model."""
     write_anatomy(
         tmp_path / "brain.vtu", make_anatomy(build_template_subject(Tumour()), MeshPlan(2000, craniotomy=0.03))
     )

@@ -1,4 +1,4 @@
-"""`python -m benchmarks throughput`: a row for each tissue and set of loads, every count and second accounted for."""
+"""`python -m benchmarks throughput`: a row for each tissue and preset, with counts and times."""
 
 import json
 from dataclasses import replace
@@ -76,7 +76,7 @@ def test_throughput_prints_a_row_for_each_tissue_and_preset(words, capsys):
 
 
 def test_two_devices_each_solve_all_loads_concurrently(words, capsys):
-    """Twice the loads, each checked; the rate is of all of them over one clock."""
+    """Twice the loads, each checked; the rate is that of all loads over one clock."""
     few = [
         "--presets",
         "bipolar",
@@ -110,7 +110,7 @@ def test_throughput_measures_ball_poses(words, capsys):
 
 
 def test_unconverged_loads_are_counted_with_exit_code_1(words, monkeypatch, capsys):
-    """Where no tool is asked for there is no sum over the tools."""
+    """Without a tool preset there is no sum over the tools."""
     deform = Fem.deform
 
     def failing(fem, loads, **at):

@@ -1,4 +1,4 @@
-"""What the trial of tracking measures, and the command that prints it."""
+"""Study of tracking: its statistics and its command."""
 
 import json
 
@@ -45,7 +45,7 @@ def test_relative_error_ignores_a_common_offset():
 
 
 def test_generated_poses_satisfy_the_protocols():
-    """All in view and within the turns; where one point is touched the tip is there in every pose."""
+    """All poses are in view and within the tilt limit; in pivot protocols the tip is the same in every pose."""
     camera, evenly = trial_camera(), list(spread(40, 0))
     middle = np.mean([T[:3, 3] for T in evenly], axis=0)
     np.testing.assert_allclose(middle, [0.0, 0.0, AWAY], atol=0.01)

@@ -1,4 +1,4 @@
-"""The house rules, read from the code itself: who imports whom, whose job a library is, how a file looks."""
+"""Rules of the repository, read from its code: imports, owners of libraries, form of files."""
 
 import ast
 import re
@@ -143,7 +143,7 @@ def importers(library):
 
 
 def test_import_reader_finds_known_imports():
-    """What all other tests here stand on."""
+    """All other tests of this file depend on this reader."""
     assert "sim.errors.InputError" in imports(HOUSE / "sim/geometry/tetmesh.py")
     assert "surrogate.regressors.baselines.Ann" in imports(HOUSE / "surrogate/training/learners.py")
     assert "sim.terms.dead_force.DeadForce" in imports(HOUSE / "sim/compile.py")
@@ -269,7 +269,7 @@ def test_public_definitions_have_docstrings():
 
 
 def test_identifiers_avoid_nonstandard_words():
-    """Of packages, tests and examples: what a model was trained on is not what it was taught."""
+    """Names in packages, tests and examples: training words of the field only."""
     ours = re.compile(r"(?:^|_)(?:(?:un)?taught|told|teach(?:er|es|ing)?)(?:_|$)", re.IGNORECASE)
     search = cache(ours.search)
     assert ours.search("taught") and ours.search("FEWEST_TAUGHT") and ours.search("Told") and not ours.search("untold")
@@ -293,7 +293,7 @@ def test_identifiers_avoid_vague_words():
 
 
 def test_tests_use_no_constants_or_private_names():
-    """What a test must set is an argument, and what it must see is public."""
+    """A test sets values by arguments and reads public names."""
     own = {name for path in FILES for name in re.findall(r"(?:def |class |self\.)(_[a-z]\w*)", path.read_text())}
     private = re.compile(r"(?:(?<!\bself)\.|\bimport .*)\b(_[a-z]\w*)")
     constant = re.compile(r"setattr\(\s*.*?[.\"]([A-Z][A-Z_\d]+)\",|^\s*[\w.]+\.([A-Z][A-Z_\d]+) = ", re.MULTILINE)
@@ -312,7 +312,7 @@ def test_files_contain_no_machine_specific_path():
 
 
 def test_linter_checks_every_source_file():
-    """What .gitignore names, ruff passes over: a folder of artefacts there must not be one of ours too."""
+    """Ruff skips paths listed in .gitignore; no source folder may be among them."""
     shown = [sys.executable, "-m", "ruff", "check", "--show-files", "."]
     read = subprocess.run(shown, cwd=HOUSE, capture_output=True, text=True, check=True).stdout.splitlines()
     assert {str(path) for path in FILES} <= set(read)
@@ -328,7 +328,7 @@ def test_makefile_lists_existing_tests():
 
 
 def test_referenced_files_exist():
-    """In documents and docstrings; a name in a folder that was just named stands alone."""
+    """In documents and docstrings; a bare file name may follow the name of its folder."""
     named = re.compile(r"(?<![\w/.-])(?:sim|surrogate|ar|scenes|tests|examples|benchmarks)/[\w/]+\.py\b")
     alone = re.compile(r"`([A-Za-z_]+\.py)`")
     readers = {"my_scene.py", "MY_SCENE.py", "NAME.py", "nearest.py"}  # files that a reader writes

@@ -1,4 +1,4 @@
-"""Comparisons in tests compare something, and tests are skipped for known reasons alone."""
+"""Comparisons in tests have elements to compare, and tests are skipped only for listed reasons."""
 
 from types import SimpleNamespace
 

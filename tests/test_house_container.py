@@ -1,4 +1,4 @@
-"""The container recipe: its instructions, the files that it copies, the documented commands, and a build."""
+"""Container recipe: instructions, copied files, documented commands, and a build."""
 
 import ast
 import os

@@ -1,4 +1,4 @@
-"""Examples in the docstrings of public names: each runs as it is printed."""
+"""Examples in docstrings of public names: each prints its documented output."""
 
 import doctest
 import importlib

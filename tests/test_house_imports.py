@@ -1,4 +1,4 @@
-"""What importing costs and changes, each in an interpreter of its own."""
+"""Cost and side effects of imports, each in a separate interpreter."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Names that point elsewhere: of the installed package, of code in docstrings and comments, of cited works."""
+"""Names of the installed package, of code in docstrings and comments, and of cited works."""
 
 import ast
 import builtins
@@ -102,7 +102,7 @@ def test_former_public_names_are_aliases_of_current_names(package):
 
 
 def test_cited_titles_match_the_verified_list():
-    """A new citation, or one that a rename has changed, is compared with its source, then listed."""
+    """A new or changed citation is compared with its source, then listed."""
     listed = set((HOUSE / "tests/data/citations.txt").read_text().splitlines())
     paths = [
         path

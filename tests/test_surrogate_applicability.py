@@ -1,4 +1,4 @@
-"""What a learnt model may be asked: effects, causes, bodies and tissue that it was trained on."""
+"""Applicability of a trained model: effects, causes, bodies and tissue of its training."""
 
 from dataclasses import replace
 

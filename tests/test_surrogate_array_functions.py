@@ -1,4 +1,4 @@
-"""Rounding of a model's tables, which decides the bytes of its file."""
+"""Rounding of a model's tables, which makes the bytes of its file reproducible."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def test_half_precision_keeps_eleven_bits_at_any_magnitude():
 
 
 def test_tables_of_earlier_versions_are_read():
-    """They have shares in half precision, and the rows of a Gaussian process in lengths."""
+    """They store ratios in half precision, and rows of a Gaussian process divided by length scales."""
     share = (TABLE[:, :3] / TABLE[:, :3].max(axis=0)).astype(np.float16)
     unit = TABLE[:, :3].max(axis=0).astype(np.float32)
     pairs = ForcePairs.restored({"pairs": np.zeros((50, 2), int), "share": share, "unit": unit})

@@ -7,7 +7,7 @@ from surrogate.regressors.baselines import Pcr, Svr
 
 
 def test_pcr_drops_components_of_small_variance():
-    """A component of a thousandth of the variance is dropped, and with it what hangs on it alone."""
+    """A component with 0.1 % of the variance is dropped, and outputs that depend only on it are lost."""
     scores = np.random.default_rng(5).normal(size=(200, 3)) * [10.0, 3.0, 0.1]
     turned = np.linalg.qr(RANDOM.normal(size=(6, 3)))[0]
     X, Y = scores @ turned.T + 7.0, scores / [10.0, 3.0, 0.1] + 2.0
@@ -18,7 +18,7 @@ def test_pcr_drops_components_of_small_variance():
 
 
 def test_svr_matches_scikit_learn_with_published_settings():
-    """The same machine as scikit-learn's with MATLAB's defaults, in the output's own units."""
+    """Reference: scikit-learn's SVR with MATLAB's defaults, in the units of the output."""
     from sklearn.svm import SVR
 
     X, Y = rows(300, 0)

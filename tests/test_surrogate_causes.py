@@ -1,4 +1,4 @@
-"""Causes of an ensemble: draws of them, and the skulls that they are solved in."""
+"""Causes of an ensemble: random draws, and skull models in which they are solved."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ def test_separating_skull_rejects_swollen_fluid_tissue(body):
 
 
 def test_each_skull_has_soft_and_stiff_tumours(body):
-    """One in each part of the range, for every seed; at small strain all have what their group says."""
+    """Each third of the range has one for every seed; at small strain tissues have the parameters of their group."""
     for seed in range(20):
         for skull in ("bonded", "slide"):
             some = [

@@ -1,4 +1,4 @@
-"""The choice among learners: the Pareto front."""
+"""Choice among learners: the Pareto front."""
 
 from surrogate.evaluation.choose import find_pareto_front
 

@@ -1,4 +1,4 @@
-"""Bounds: they hold as often as they say, class by class, and grow where nothing was promised."""
+"""Conformal error bounds: coverage in each force class, and growth outside the training range."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Data sets: nothing is lost to a kill, nothing is mixed, failed cases stay."""
+"""Data sets: resuming after a kill, no mixed parameters, and marked failed cases."""
 
 import subprocess
 import sys

@@ -1,6 +1,6 @@
-"""What `sulcus locate` does not know, it says: registrations that slip, causes that look alike, and stillness.
+"""Warnings of `sulcus locate`: registration slip, inseparable causes, and no motion.
 
-Of the template and the locator that ship.
+With the shipped template and locator.
 """
 
 from dataclasses import replace
@@ -46,7 +46,7 @@ def sideways(body, length):
 
 @pytest.mark.parametrize("length", [8e-3, 12e-3, 20e-3])
 def test_lateral_registration_slip_is_reported_within_error(locator, length):
-    """Nothing moved but the registration."""
+    """Only the registration is displaced."""
     seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), NAMED, (0, 0))
     found = locator.locate(replace(seen, now=seen.now + sideways(locator.anatomy, length)))
     assert found.slipped and not found.calibrated and "may have slipped" in found.doubt
@@ -56,7 +56,7 @@ def test_lateral_registration_slip_is_reported_within_error(locator, length):
 
 @pytest.mark.parametrize("way", ["right", "axis"])
 def test_rotated_points_are_reported_as_possible_slip(locator, way):
-    """By 10 degrees about their middle, tilted or twisted. They are shifted by 0.5 mm, as a brain that sinks."""
+    """Rotated by 10 degrees about their centre (tilt or twist) and shifted by 0.5 mm as by sinking."""
     axis = open_cortex(locator.anatomy).axis
     seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), PointsSeen(100, 90, 0), (0, 0))
     turn = Rotation.from_rotvec(np.radians(10.0) * getattr(open_cortex(locator.anatomy), way))
@@ -80,7 +80,7 @@ def test_shift_is_judged_by_the_given_registration_error(locator):
 
 
 def test_verified_registration_is_not_suspected(locator):
-    """Then even an observation that resembles a registration shift is a motion."""
+    """With a verified registration an observation that resembles a shift counts as motion."""
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
     seen = replace(seen, now=seen.now + sideways(body, 12e-3))
@@ -101,7 +101,7 @@ def test_axial_shift_is_reported_as_ambiguous_with_sinking(locator):
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("skull", range(3))
 def test_locate_true_motion_gives_no_registration_warning(locator, skull, seed):
-    """Drained, with a dent of the last shape of a tool; most of it looks like a shift of all points."""
+    """Drainage with a dent of the last tool shape; most of it resembles a shift of all points."""
     prior, body = locator.prior, locator.anatomy
     random, motion = np.random.default_rng([skull, seed]), np.zeros_like(body.mesh.nodes)
     for kind, size in ((DRAINAGE, 4.0), (SWELLING, 1.0), (TOOL, 1.0)):
@@ -114,7 +114,7 @@ def test_locate_true_motion_gives_no_registration_warning(locator, skull, seed):
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])
 def test_locate_shifted_registration_warns(locator, sight, seed):
-    """Nothing moved but the registration, by 7 mm along the axis and across it."""
+    """Only the registration is displaced, by 7 mm along and across the axis."""
     body, axis = locator.anatomy, open_cortex(locator.anatomy).axis
     seen = observed(body, np.zeros_like(body.mesh.nodes), sight, (0, seed))
     shift = 5e-3 * axis + sideways(body, 5e-3)
@@ -124,7 +124,7 @@ def test_locate_shifted_registration_warns(locator, sight, seed):
 
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])
 def test_sinking_brain_is_not_reported_as_slip(locator, sunk, sight):
-    """Its tumour is found, and the error holds."""
+    """The tumour is located, and its error is within the bound."""
     found = locator.locate(observed(locator.anatomy, sunk, sight, (0, 0)))
     off = np.linalg.norm(found.centroid - compute_middle(locator.anatomy, sunk[None])[0])
     assert not found.slipped and found.calibrated and not found.doubt and off < found.p95
@@ -133,14 +133,14 @@ def test_sinking_brain_is_not_reported_as_slip(locator, sunk, sight):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_locate_cloud_rounding_changes_no_result(locator, sunk, seed):
-    """Over an edge of the surface two triangles are equally near, so that rounding selects one."""
+    """Two triangles are equally near at an edge of the surface, and rounding selects one."""
     seen = observed(locator.anatomy, sunk / 2.0, PointsSeen(300, 28, 2, named=False), (0, seed))
     found, again = (locator.locate(replace(seen, now=seen.now * factor)).centroid for factor in (1.0, 1.0 + 4e-16))
     assert again == pytest.approx(found, abs=1e-8)
 
 
 def test_point_cloud_does_not_separate_drainage_and_shrinking(locator):
-    """All of it by 5 mm, along the opening's axis."""
+    """All points move by 5 mm along the axis of the opening."""
     body = locator.anatomy
     still = observed(body, np.zeros_like(body.mesh.nodes), PointsSeen(100, 90, 1, named=False), (0, 0))
     found = locator.locate(replace(still, now=still.now + 5e-3 * open_cortex(body).axis))
@@ -157,7 +157,7 @@ def test_motionless_observation_names_no_cause(locator, sight):
 
 
 def test_dent_of_error_size_is_detected_by_its_shape(locator):
-    """Of 3 mm, 12 mm wide, at 60 points that are off by less than is stated; and such points without a dent."""
+    """Dent of 3 mm depth and 12 mm width at 60 noisy points, compared with no dent."""
     body, random = locator.anatomy, np.random.default_rng(0)
     cortex = body.mesh.nodes[np.unique(body.open_surface)]
     rest = cortex[random.choice(len(cortex), 60, replace=False)]
@@ -170,7 +170,7 @@ def test_dent_of_error_size_is_detected_by_its_shape(locator):
 
 
 def test_points_on_tiny_patch_are_marked_uncalibrated(locator, sunk):
-    """On all of the open cortex they were, and on a tenth of it, named or not."""
+    """The trials cover patches of a tenth to all of the open cortex, with named and unnamed points."""
     body = locator.anatomy
     for cover, known in ((0.12, True), (0.9, True), (0.01, False)):
         evidence = sample_seen_patch(body, sunk, np.random.default_rng(3), 60, cover)

@@ -1,4 +1,4 @@
-"""Oedema among the causes of an ensemble: which tissue swells, how it is drawn and solved, and what sees it."""
+"""Oedema among the causes of an ensemble: swelling tissue, draws, solves and observation."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def test_oedema_bulges_more_than_brain_swelling(body):
 
 
 def test_group_members_share_one_preconditioner(body, monkeypatch):
-    """Only changes of volume differ; results agree with those of factors of their own within the tolerance."""
+    """Only volume changes differ; results agree with separate preconditioners within the tolerance."""
     group, made, choose = build_groups(body, 0, FEW)[0], [], fem.choose_preconditioner
     monkeypatch.setattr(fem, "choose_preconditioner", lambda *given: made.append(given) or choose(*given))
     motion, kind = solve_members(body, group, 0, "cpu", FEW)
@@ -65,7 +65,7 @@ def test_group_members_share_one_preconditioner(body, monkeypatch):
 
 
 def test_unnamed_points_are_not_attributed_to_oedema(body):
-    """Its errors look like it (docs/locate.md). The same points with names may be."""
+    """Errors of clouds resemble oedema (docs/locate.md); the same points with names may indicate it."""
     locator = locator_of(body)
     prior = locator.prior
     moved = 4.0 * prior.shape[np.flatnonzero(prior.kind == OEDEMA)[0]].astype(float)

@@ -1,4 +1,4 @@
-"""The tabulated series, and what is learnt of its remainder."""
+"""Tabulated series, and learning of its remainder."""
 
 from dataclasses import replace
 
@@ -127,7 +127,7 @@ def test_table_matches_fem_series_in_its_basis(data, expansion, box, patch):
 
 
 def test_two_series_orders_are_exact_for_any_tool(expansion, box):
-    """Of loads inside the rim nothing is left of them; over it the table holds what is missing."""
+    """Inside the rim no remainder is left; over the rim the table holds the missing part."""
     fem = Fem(box, build_push_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     loads = pushes(expansion.patch, 40, 8, (7e-3, 7e-3))
     inside = expansion.patch.compute_edge_distance(loads.point) > loads.footprint
@@ -180,9 +180,9 @@ def test_series_has_smaller_error_than_linear_table(trained):
 
 
 def test_gp_halves_series_error_on_known_cortex(tmp_path):
-    """What `series-gp` is there for: nine open nodes, 300 loads among them, every fourth tested wherever it lies.
+    """Benefit of `series-gp`: nine open nodes and 300 loads, every fourth a test load anywhere.
 
-    A process that has lost its units leaves the series as it is.
+    A Gaussian process with wrong units would leave the error of the series unchanged.
     """
     small = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=15e-3)
     data = simulated(tmp_path / "data.h5", small, 300)
@@ -193,7 +193,7 @@ def test_gp_halves_series_error_on_known_cortex(tmp_path):
 
 
 def test_series_training_ignores_held_out_discs(trained, data, expansion, tmp_path):
-    """Bit for bit: wild answers to all loads that were not trained on, and wild series at all places of the discs."""
+    """Bit-identical with random displacements of untrained loads and random series in held-out discs."""
     split = trained.split
     rows = np.flatnonzero(data.good)[~split.train]
     wild = read_dataset(poisoned(data.path, tmp_path / "wild.h5", rows)[0])
@@ -212,7 +212,7 @@ def test_series_training_ignores_held_out_discs(trained, data, expansion, tmp_pa
 
 
 def test_training_solve_counts_match_hand_count(trained, data):
-    """By hand: 19 terms at each place and radius outside the discs, 3 unit forces a node, and the loads.
+    """Hand count: 19 terms at each place and radius outside the discs, 3 unit forces a node, and the loads.
 
     Unit forces on nodes inside the discs are counted once more.
     """

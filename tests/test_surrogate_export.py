@@ -1,4 +1,4 @@
-"""Exported models: ONNX Runtime answers as they do."""
+"""Exported models: ONNX Runtime predicts the same values."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""A ball on condensed linear tissue: what it must obey, whatever else answers the same, and what is learnt on top."""
+"""Ball on condensed linear tissue: contact conditions, reference solutions and learned corrections."""
 
 import shutil
 from dataclasses import dataclass, replace
@@ -55,10 +55,10 @@ def pressed(box):
 
 
 def test_ball_contact_satisfies_signorini_conditions(box, pressed):
-    """Signorini's conditions: a dense lattice of every facet is outside, and every force goes away from the middle.
+    """A dense lattice of every facet is outside the ball, which pushes and does not pull (Signorini's conditions).
 
-    Forces through the middle have no moment about it; those of bent facets alone are at their nodes, which are given
-    apart by it.
+    Contact forces act along lines through the centre, with no moment about it. Nodes far from the ball bear no
+    force.
     """
     contact, loads = pressed[0], draw_poses("palpation", box, 30, 2)
     X = features(box, loads)
@@ -80,7 +80,7 @@ def test_ball_contact_satisfies_signorini_conditions(box, pressed):
 
 
 def test_ball_contact_matches_linear_finite_elements(box, pressed):
-    """The same body, condensed or not, deep and oblique: what differs is how the barrier keeps its gap."""
+    """Same body with and without condensation, deep and oblique; the difference is the gap of the barrier."""
     contact, bases = pressed
     fem = Fem(box, [Elasticity(SOFT), Held(), ToolContact((BALL,))], device="cpu", batch=1, element="p1")
     loads, cortex = draw_poses("palpation", box, 8, 5), bases[1].nodes
@@ -100,7 +100,7 @@ def test_ball_contact_matches_linear_finite_elements(box, pressed):
 
 
 def test_bone_nodes_under_the_ball_give_bounded_force(box, pressed):
-    """Over the rim the ball is in what cannot give: what can is pushed away, and no force grows beyond all bounds."""
+    """Over the rim the ball overlaps rigid bone: soft nodes are displaced, and forces stay bounded."""
     contact, rim = pressed[0], open_patch(box).points
     middle, pose = 0.5 * (rim.min(axis=0) + rim.max(axis=0)), np.tile(np.eye(4), (8, 1, 1, 1))
     pose[:, 0, :3, 3] = middle + np.linspace([0.0, 0.0, -4e-3], [1.25 * (rim[:, 0].max() - middle[0]), 0.0, -4e-3], 8)
@@ -124,7 +124,7 @@ def test_contact_motion_is_independent_of_tissue_stiffness(box, pressed):
 
 
 def test_unit_responses_match_fem_under_small_forces(box):
-    """Against solves under nodal forces."""
+    """Reference: solves under nodal forces."""
     nodes, at = open_patch(box).nodes[[3, 20]], box.tumour_nodes[:9]
     found = compute_unit_responses(bodily(box, SOFT), nodes, at)
     force = np.zeros((6, len(box.mesh.nodes), 3))
@@ -184,7 +184,7 @@ def trained(data):
 
 
 def test_contact_models_reach_error_and_coverage_limits(trained, elements, box):
-    """On discs left out and on fresh poses; and bounds hold about as often as they say."""
+    """On held-out discs and new poses; bounds have about their nominal coverage."""
     contact, both = (trained.models[name] for name in CONTACT_MODELS)
     regressor = contact.parts[0].regressor
     assert isinstance(regressor, RigidContact)
@@ -234,7 +234,7 @@ def test_tool_force_is_predicted_with_its_own_bound(data, trained, elements, box
 
 
 def test_dataset_without_reactions_gives_no_force_model(tmp_path, data, box):
-    """Files of earlier versions, whose rows end before the reaction, are read and train models all the same."""
+    """Files of older versions end their rows before the reaction; they are read and train models."""
     older = tmp_path / "older.h5"
     shutil.copy(data.path, older)
     with h5py.File(older, "r+") as file:

@@ -1,4 +1,4 @@
-"""Fitting tissue to several frames: a small body whose motions obey the tissue that is to be found, and bad input."""
+"""Fit of tissue to several frames: a small body with known tissue, and invalid input."""
 
 from dataclasses import replace
 

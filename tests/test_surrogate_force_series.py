@@ -1,4 +1,4 @@
-"""The power series of a force: its forms, and what lies between its places."""
+"""Power series of a force: its forms, and interpolation between its places."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_forms_span_polynomials_of_their_degree():
 
 
 def test_omitted_table_entries_are_interpolated(patch):
-    """Fields that are linear in the place are met, on a flat cortex too; what is left out has no say."""
+    """Linear fields are reproduced, on a flat cortex too; omitted entries have no influence."""
     places = add_edge_midpoints(patch)[1]
     left_out = np.linalg.norm(places[:, :2] - [5e-3, 0.0], axis=1) < 6e-3
     wanted = (places @ np.random.default_rng(0).normal(size=(3, 4)) + 2.0).reshape(-1, 2, 2)

@@ -1,4 +1,4 @@
-"""Gaussian processes: their likelihood, their features and their deviation."""
+"""Gaussian processes: likelihood, features and limits."""
 
 import numpy as np
 from test_surrogate_protocol import RANDOM, rows

@@ -1,4 +1,4 @@
-"""A model with finite elements behind it: who answers which load, and what is said of the answer."""
+"""Model with finite elements as fallback: choice for each load, and description of the source."""
 
 import argparse
 import threading
@@ -59,7 +59,7 @@ def test_fem_solves_loads_with_bound_above_limit(guarded, loads, solved):
 
 
 def test_each_load_is_compared_with_its_own_bound(guarded, loads, predicted, solved):
-    """Bounds of their own: half of the loads lie below the limit; asked at vertices, in the order asked for."""
+    """Half of the bounds are below the limit; result at vertices in the requested order."""
     bounds = np.linspace(1e-4, 6e-4, len(loads))
     bounds[2] = np.nan
     marked = replace(predicted, bound=np.stack([bounds, bounds]), outcome=(Outcome.PREDICTED,) * len(loads))
@@ -157,7 +157,7 @@ def test_held_out_errors_count_fem_solutions_as_exact():
 
 
 def test_guard_limit_is_chosen_from_held_out_errors(theatre):
-    """The widest limit that leaves 1 % of the motion, and 0.2 mm at 99.9 % of the vertices; at none all are solved."""
+    """Largest limit that leaves 1 % of the motion, and 0.2 mm at 99.9 % of the vertices; otherwise FEM solves all."""
     bound, inside = 1e-3 * np.array([0.15, 0.08, 0.03, 0.005]), np.zeros(4, bool)
     distance = 1e-3 * np.array([[0.30], [0.06], [0.02], [0.004]])
     wide, middle, none = (measure_held_out(distance, np.full(4, size), bound, inside) for size in (1e-2, 1e-3, 5e-5))

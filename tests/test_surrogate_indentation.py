@@ -25,7 +25,7 @@ def samples(patch: Patch) -> np.ndarray:
 
 
 def test_pose_point_is_the_deepest_contact_of_the_ball(box):
-    """Its point is on the surface, nowhere else is nearer to its middle, and depth is what is left of the radius."""
+    """The point is the nearest one on the surface; depth is the radius minus this distance."""
     patch = open_patch(box)
     bumpy = replace(patch, points=domed(patch.points))
     loads = draw_poses("palpation", box, 60, 3)
@@ -54,7 +54,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def test_indentation_is_independent_of_the_approach_path(box):
-    """On a flat cortex an oblique way is a straight one to beside it; a ball sunk to its middle has the normal."""
+    """Flat cortex: an oblique path equals a vertical one at the end point; a half-embedded ball has the normal."""
     patch = open_patch(box)
     forces = draw("palpation", box, 40, 0).get(Pushed)
     assert forces is not None

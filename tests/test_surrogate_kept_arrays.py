@@ -1,4 +1,4 @@
-"""Arrays that a folder keeps while a run computes."""
+"""Cached arrays of a run in a folder."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Learned deformers: what they were trained on, what they refuse, how they are scored and stored."""
+"""Learned deformers: training, rejected input, scores and storage."""
 
 import json
 import threading
@@ -76,7 +76,7 @@ def test_zero_load_gives_zero_motion_and_weak_loads_scale(model, fresh):
 
 
 def test_learner_errors_do_not_regress(trained):
-    """Each within a fifth to a third of what it scored when this was written; the table does not depend on luck."""
+    """Each is within a fifth to a third of its recorded score; the table is deterministic."""
     mean = {row.name: row.mean_percent for row in trained.scores}
     assert mean["linear"] == pytest.approx(7.15, rel=0.01)
     known = {"pcr": 16.0, "ann": 10.0, "svr": 8.5, "gp": 1.3, "residual": 1.4}
@@ -105,7 +105,7 @@ def arrays_of(model):
 
 
 def test_scored_model_ignores_held_out_displacements(trained, scored, data, tmp_path):
-    """Bit for bit: wild answers to the loads of the discs and to those apart change scores alone."""
+    """Bit-identical: random displacements of loads in and out of the discs change only scores."""
     wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[~trained.split.train])
     again = train(read_dataset(wild), ["linear", "pcr", "svr"], split=trained.split)
     for row in again.scores:
@@ -116,7 +116,7 @@ def test_scored_model_ignores_held_out_displacements(trained, scored, data, tmp_
 
 
 def test_model_ignores_calibration_displacements(trained, data, tmp_path):
-    """Bit for bit; the bounds themselves must follow."""
+    """Bit-identical parameters, while the bounds change."""
     apart = np.arange(data.good.sum()) >= data.good.sum() - trained.calibrated
     wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[apart])
     again = train(read_dataset(wild), ["linear", "svr"])
@@ -155,7 +155,7 @@ def test_bounds_are_calibrated_on_untrained_loads(trained, data, fresh, pretende
 
 
 def test_held_out_coverage_is_reported(trained, scored, data):
-    """Recomputed: the scored model, bounds from the loads that are apart and outside every disc."""
+    """Computed again: scored model, and bounds from calibration loads outside every disc."""
     good = data.loads.select(np.flatnonzero(data.good))
     truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good]
     place = np.linalg.norm(good.get(Pushed).point[:, None] - trained.split.centres, axis=2).min(axis=1)
@@ -207,7 +207,7 @@ def test_training_uses_at_most_the_given_load_count(data):
 
 
 def test_scores_equal_errors_of_held_out_loads(trained, scored, data, box):
-    """Recomputed here in another way, from the data file."""
+    """Computed again in another way, from the data file."""
     name, model = "linear", scored.models["linear"]
     row = next(row for row in trained.scores if row.name == name)
     held_out = np.flatnonzero(data.good)[trained.split.test]
@@ -227,7 +227,7 @@ def test_scores_equal_errors_of_held_out_loads(trained, scored, data, box):
 
 
 def test_coverage_of_each_level_uses_its_own_bound(trained, fresh, box):
-    """Of four loads in turn one misses by less than the bound at 95 %, two by less than that at 99 %, one by more."""
+    """Among four loads one error is below the bound at 95 %, two are below that at 99 %, and one is above."""
     known = trained.models["linear"]
     quantile = known.bounds.quantile[0] * np.array([[1.0], [2.0]])
     model = replace(known, bounds=replace(known.bounds, quantile=quantile))
@@ -282,7 +282,7 @@ def test_loads_outside_training_range_are_extrapolated(trained, box):
 
 @pytest.mark.parametrize("name", ["svr", "residual"])
 def test_invalid_load_is_rejected_alone_and_in_a_batch(trained, box, name):
-    """Only the tumour is asked for: nothing that integrates over a footprint is there to complain."""
+    """Only the tumour is requested, which needs no integral over a footprint."""
     model = trained.models[name]
     here, down, radius = model.envelope.points[0].astype(float), np.array([0.0, 0.0, -0.2]), 6e-3
     strongest = model.envelope.force[1]
@@ -305,7 +305,7 @@ def test_invalid_load_is_rejected_alone_and_in_a_batch(trained, box, name):
 
 @pytest.mark.parametrize("name", ["linear", "residual", "ann", "svr", "gp"])
 def test_threads_sharing_a_model_get_their_own_results(trained, fresh, name):
-    """Each begins with nothing prepared, and presses the cortex elsewhere than the others do at the same time."""
+    """Each thread starts without prepared data and presses another place at the same time."""
     wanted = [trained.models[name].deform(fresh.select(slice(k, k + 1))).displacement for k in range(60)]
     model, ready = replace(trained.models[name]), threading.Barrier(4)
 

@@ -1,4 +1,4 @@
-"""How long a tool is held: histories, and finite elements of the same share."""
+"""Histories of loads in relaxing tissue, and finite elements of the same relaxed share."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def test_single_step_history_equals_two_played_steps():
 
 
 def test_fem_response_depends_only_on_the_relaxed_share(box):
-    """A tool that came in one long step, and one that stayed: of equal shares they move and press alike."""
+    """A slow approach and a held tool with equal shares give equal motion and force."""
     fem = Fem(box, list(EFFECTS), device="cpu", batch=1, element="p1")
     causes = draw_poses("palpation", box, 1, 5, BALL).causes
     slow = solve_histories(fem, Loads(causes, np.array([2.0])))

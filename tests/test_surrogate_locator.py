@@ -1,4 +1,4 @@
-"""Locating a tumour from what is seen: a small body's ensemble, motions that it does not hold, bad observations."""
+"""Locating a tumour from observations: small ensemble, motions outside it, and invalid observations."""
 
 from dataclasses import replace
 
@@ -99,7 +99,7 @@ def test_stopped_ensemble_run_resumes(body, tmp_path, monkeypatch, ensemble):
 
 
 def test_small_locator_agrees_with_full_one(locator, body, truth, tmp_path):
-    """Points with names, a cloud, and tips; read from its file, which is much smaller on a body with more inside."""
+    """Named points, a cloud and tips, with a locator read from its smaller file."""
     save_locator(tmp_path / "small.npz", locator.restrict())
     small = load_locator(tmp_path / "small.npz", body)
     nodes = small.prior.nodes
@@ -166,7 +166,7 @@ def test_locator_files_round_trip_and_reject_foreign_nodes(locator, body, tmp_pa
 
 
 def test_most_tumour_motion_is_found_within_ellipsoids(locator, body, truth):
-    """Other tissue, loads and errors than the ensemble knows; the covariance holds for nine of ten at least."""
+    """Tissue, loads and errors outside the ensemble; the ellipsoid covers at least 85 % of them."""
     left, all_of_it, held = 0.0, 0.0, []
     for seed, (motion, _) in enumerate(truth):
         found = locator.locate(observed(body, motion, seed))
@@ -182,7 +182,7 @@ def test_most_tumour_motion_is_found_within_ellipsoids(locator, body, truth):
 
 
 def test_covariances_scale_with_trial_errors(locator, body, truth):
-    """Errors twice as large in trials make covariances four times as large, and the radius twice."""
+    """Doubled errors in trials give fourfold covariances and a doubled radius."""
     seen = observed(body, truth[0][0])
     found = locator.locate(seen)
     wider = Locator(locator.prior, locator.tried * [1.0, 1.0, 1.0, 1.0, 4.0]).locate(seen)
@@ -195,7 +195,7 @@ def test_covariances_scale_with_trial_errors(locator, body, truth):
 
 
 def test_rigid_error_is_not_attributed_to_tumour_motion(locator, body, truth):
-    """Most of a translation of 2 mm along the surface goes into the bias, and little of it into the tumour."""
+    """Most of a translation by 2 mm along the surface is estimated as bias, and little as tumour motion."""
     moved, known = [], []
     for seed, (motion, _) in enumerate(truth[::2]):
         without = locator.locate(observed(body, motion, seed))
@@ -206,7 +206,7 @@ def test_rigid_error_is_not_attributed_to_tumour_motion(locator, body, truth):
 
 
 def test_reported_rigid_error_is_estimated(locator, body, truth):
-    """One of 4 mm is believed if it is said that there may be one. If not, none is, or one that makes doubtful."""
+    """4 mm of rigid error are estimated if reported as possible; otherwise none is, or a slip is reported."""
     off = np.zeros(3)
     for seed, (motion, _) in enumerate(truth[::2]):
         seen = observed(body, motion, seed, bias=4e-3)
@@ -230,7 +230,7 @@ def test_point_cloud_gives_normal_motion(locator, body, truth):
 
 
 def test_point_cloud_may_lie_14_mm_below_the_cortex(locator, body):
-    """Its points are where the surface is now; named points are looked for at rest, and not so far off."""
+    """A cloud lies on the displaced surface; named points are searched at rest, within a smaller distance."""
     rest = observed(body, np.zeros_like(body.mesh.nodes)).rest
     sunk = rest - [0.0, 0.0, 14e-3]
     assert to_evidence(body, Observation(sunk)).value == pytest.approx(-14e-3)
@@ -250,7 +250,7 @@ def test_gross_outliers_change_the_result_little(locator, body, truth):
 
 
 def test_points_off_the_cortex_are_excluded_and_reported(locator, body, truth):
-    """They change nothing but the number of points; more than a third of them are refused."""
+    """They change only the number of points; more than a third of them are rejected."""
     clean = observed(body, truth[0][0], 3)
     few, many = (np.arange(60) % 10 < number for number in (1, 4))
     spoilt = [
@@ -277,7 +277,7 @@ def test_unsupported_tool_tip_is_excluded(locator, body, truth):
 
 @pytest.mark.parametrize("rigid", [0.0, 0.8e-3])
 def test_motionless_observation_gives_zero_displacement(locator, body, rigid):
-    """Without a rigid error too: what is smaller than the noise is not known."""
+    """With and without rigid error: motion below the noise is unknown."""
     seen = observed(body, np.zeros_like(body.mesh.nodes))
     found = locator.locate(replace(seen, now=seen.rest, rigid=rigid))
     assert not found.centroid.any() and found.explained == 0.0 and not found.calibrated
@@ -285,7 +285,7 @@ def test_motionless_observation_gives_zero_displacement(locator, body, rigid):
 
 
 def test_rigid_error_reports_its_explained_share(locator, body, truth):
-    """All of a shift of the whole; little of a dent, for points and clouds."""
+    """Nearly all of a uniform shift, and less of a dent, for points and clouds."""
     shifted = replace(observed(body, np.zeros_like(body.mesh.nodes)), rigid=0.8e-3)
     shifted = replace(shifted, now=shifted.rest + [0.0, 0.0, -4e-3])
     for seen in (shifted, replace(shifted, rest=None)):
@@ -295,7 +295,7 @@ def test_rigid_error_reports_its_explained_share(locator, body, truth):
 
 
 def test_drainage_motion_is_attributed_to_drainage(locator, body, truth):
-    """Of motions by fluid that drains, drainage has the largest share, more often than not."""
+    """Drainage has the largest share in more than half of the drained motions."""
     found = [(kind, locator.locate(observed(body, motion, 1, noise=0.2)).causes) for motion, kind in truth]
     drained = [max(causes, key=causes.get) for kind, causes in found if kind == "drainage"]
     assert np.mean([name == "drainage" for name in drained]) > 0.5

@@ -1,4 +1,4 @@
-"""Archives of arrays: sizes that are refused before memory is taken."""
+"""Archives of arrays: size limits before allocation."""
 
 import zipfile
 
@@ -21,7 +21,7 @@ def test_arrays_above_the_size_limit_are_rejected(tmp_path):
 
 
 def test_oversized_array_is_rejected_before_allocation(tmp_path):
-    """As many bytes as the header has numbers, each of eight."""
+    """The file holds fewer bytes than its header declares."""
     np.savez(tmp_path / "m.npz", many=np.zeros(2**20))
     with zipfile.ZipFile(tmp_path / "m.npz") as source:
         raw = source.read("many.npy")

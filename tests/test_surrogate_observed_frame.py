@@ -1,4 +1,4 @@
-"""Frames of a fit: what is refused, and tables of tools."""
+"""Frames of a fit: invalid input, and tables of tools."""
 
 from dataclasses import replace
 

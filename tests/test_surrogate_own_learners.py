@@ -1,4 +1,4 @@
-"""Learners of a user's own: a file or a package brings them, and they are trained, stored and read like the others."""
+"""Learners of users: a file or package registers them; they are trained, stored and loaded like others."""
 
 import json
 import re
@@ -94,7 +94,7 @@ READING = "train judge export patient scenes effects demo render collect sensiti
 
 @pytest.mark.parametrize("command", READING.split())
 def test_model_commands_accept_the_plugin_option(command, capsys):
-    """The sentences of `load` and `check_learners` name the option."""
+    """Messages of `load` and `check_learners` refer to this option."""
     with pytest.raises(SystemExit):
         main([*command.split("-"), "--help"])
     assert "--plugin FILE.py" in capsys.readouterr().out

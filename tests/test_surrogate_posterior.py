@@ -1,4 +1,4 @@
-"""The Gaussian that is left of a prior once points are seen: against closed formulas, draws and planted faults."""
+"""Gaussian posterior of observed points compared with closed formulas, random draws and outliers."""
 
 from dataclasses import replace
 
@@ -100,9 +100,9 @@ def test_hypotheses_cover_all_causes_skulls_and_tools(prior):
 
 @pytest.mark.parametrize("single", [False, True])
 def test_posterior_matches_normal_equations_and_evidence(prior, single):
-    """Bayes' formula by precisions instead of covariances, and the density of what is seen, with a place or without.
+    """Bayes' formula with precisions instead of covariances, and the evidence, with and without a tool place.
 
-    Of whole motions, and of one with a row less, so that axes are not alike. A skull has fewer shapes of swelling.
+    Cases: complete motions, and one row less, with unequal axes. One skull model has fewer shapes of swelling.
     """
     _, evidence = drawn(prior, np.random.default_rng(1), 3)
     evidence = evidence.select(np.arange(len(evidence) - single))
@@ -131,7 +131,7 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
 
 
 def test_whitening_by_axis_equals_whitening_of_all_rows(prior):
-    """The shortcut for points with three equal axes agrees with the general method."""
+    """The fast method for points with three equal axes agrees with the general method."""
     _, evidence = drawn(prior, np.random.default_rng(2))
     short = evidence.build_whitening(1e-3)
     turned = evidence.select(np.random.default_rng(0).permutation(len(evidence)))
@@ -151,7 +151,7 @@ def test_whitening_by_axis_equals_whitening_of_all_rows(prior):
 
 @pytest.mark.parametrize("count", [12, 90])
 def test_block_rows_match_products_of_all_points(prior, count):
-    """Of fewer points than vertices and of more, which are seen as fewer rows; of whole motions, and of single rows."""
+    """Fewer and more points than vertices, with whole motions and single rows."""
     box, random = prior.anatomy, np.random.default_rng(0)
     some = random.integers(40, size=(count, 4))
     place = Located(box.mesh.tets[some[:, 0]], random.dirichlet(np.ones(4), count))
@@ -217,7 +217,7 @@ def test_gross_errors_are_excluded_and_reported(prior):
 
 @pytest.mark.parametrize(("deviations", "left_out"), [(2.3, []), (4.2, [7])])
 def test_points_beyond_1e_4_probability_are_excluded(prior, deviations, left_out):
-    """The root of chi-square of three numbers is 4.6 at 1e-4, and 7.9 at 1e-12; half of the error is predictable."""
+    """The root of chi-square (3 degrees of freedom) is 4.6 at 1e-4, and 7.9 at 1e-12."""
     still = seen(prior, np.zeros(prior.anatomy.mesh.nodes.shape))
     far = np.where(still.point == 7, deviations * still.sigma / np.sqrt(3.0), 0.0)
     found = condition_prior(prior, replace(still, value=still.value + far))
@@ -225,7 +225,7 @@ def test_points_beyond_1e_4_probability_are_excluded(prior, deviations, left_out
 
 
 def test_outlier_with_one_row_is_excluded(prior):
-    """Motions along one axis only, as those of a cloud."""
+    """Motions along one axis only, as in a cloud."""
     _, evidence = drawn(prior, np.random.default_rng(6))
     single = replace(evidence.select(np.arange(0, len(evidence), 3)), point=np.arange(POINTS))
     assert not len(condition_prior(prior, single).outliers)
@@ -241,7 +241,7 @@ def test_motion_outside_the_prior_gives_large_surprise(prior):
 
 
 def test_tool_place_odds_decrease_with_tip_distance(prior):
-    """The odds of a place fall with its distance from the nearest tip; without tips all are alike."""
+    """The odds of a place decrease with its distance from the nearest tip; without tips all are equal."""
     _, evidence = drawn(prior, np.random.default_rng(8))
     without, near = (
         build_observed_prior(prior, evidence),
@@ -254,7 +254,7 @@ def test_tool_place_odds_decrease_with_tip_distance(prior):
 
 
 def test_prior_scale_includes_rigid_error(prior):
-    """Motions may then be as large as a rigid error: its prior's translation has a length of 1.4 mm."""
+    """Motion may be as large as the rigid error, whose prior translation has a length of 1.4 mm."""
     little, much = (seen(prior, np.full_like(prior.anatomy.mesh.nodes, each)) for each in (1e-5, 3e-3))
     assert build_observed_prior(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
     assert build_observed_prior(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
@@ -263,7 +263,7 @@ def test_prior_scale_includes_rigid_error(prior):
 
 
 def test_estimated_rigid_error_follows_reported_size(prior):
-    """A shift beyond what was stated moves the tumour; of none, none is found."""
+    """A shift above the reported error moves the tumour; with zero reported error none is estimated."""
     truth, evidence = drawn(prior, np.random.default_rng(10), 3)
     shifted = replace(evidence, value=evidence.value + evidence.rigid[:, :3] @ [2e-3, -2e-3, 2e-3])
     off, bias = [], []

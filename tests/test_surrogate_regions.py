@@ -1,4 +1,4 @@
-"""Regions of known stiffness in a brain of unknown one: what a locator of them knows, keeps and refuses."""
+"""Regions of known stiffness in a brain of unknown stiffness: locators, files and checks."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def locators(body):
 
 
 def test_known_stiff_region_reduces_the_locator_error(body, locators):
-    """Motions by other draws of a brain with the slab, seen at all nodes of the open cortex, without errors."""
+    """Motions of new draws with the slab, observed without error at all nodes of the open cortex."""
     nodes, off = np.unique(body.open_surface), []
     for group in build_groups(body, seed=5, causes=replace(FEW, regions=(STIFF,)))[:2]:
         motion, _ = solve_members(body, group, seed=5, device="cpu", causes=FEW)
@@ -72,7 +72,7 @@ def test_known_stiff_region_reduces_the_locator_error(body, locators):
 
 
 def test_known_region_is_in_every_group_and_force_solve(body):
-    """Its stiffness goes with the brain's; its Poisson's ratio is its own where it is given."""
+    """Its stiffness is relative to the brain's; its Poisson's ratio is its own if given."""
     known = (replace(STIFF, poisson=0.3),)
     for group in build_groups(body, causes=replace(FEW, regions=known)):
         tissue = group.build_effects(FEW.swellings)[0]
@@ -119,7 +119,7 @@ def test_known_regions_are_listed_and_checked(body):
 
 
 def test_scene_regions_are_compared_with_the_locator(body):
-    """But for the tumour; a region as stiff as the brain is none."""
+    """The tumour is ignored; a region as stiff as the brain does not count."""
     own, tumour = Region(OEDEMA, 0.5, 0.45), Region(2, 3.0)
     scene = Elasticity(BRAIN, {OEDEMA: Material("neo-hookean", 1500.0, 0.45), 2: replace(BRAIN, young=5000.0)})
     assert not find_differing_regions(scene, (own,)) and not find_differing_regions(scene, (own, tumour))

@@ -1,4 +1,4 @@
-"""Models of poses in tissue that relaxes: the past that they carry, what they learn of it, and where they play."""
+"""Models of poses in relaxing tissue: history, training and playback."""
 
 from dataclasses import replace
 
@@ -65,7 +65,7 @@ def played(depths: list[float], times: list[float], x: list[float] | None = None
 
 
 def test_relaxed_share_equals_the_hereditary_integral():
-    """Of a tool that comes evenly within a second and stays, against its closed form; a frame is 30 ms."""
+    """Tool that approaches linearly within one second and stays: closed form, frames of 30 ms."""
     times = list(np.arange(1, 91) / 30.0)
     found = played([4e-3 * min(t, 1.0) for t in times], times)
     for frame in (14, 29, 89):
@@ -77,7 +77,7 @@ def test_relaxed_share_equals_the_hereditary_integral():
 
 
 def test_histories_outside_training_are_marked():
-    """A tool that was held and goes back, or that slid far; what it does for the first time is not."""
+    """A held tool that retracts, or one that slides far; a first contact is not marked."""
     back = played([4e-3, 4e-3, 3e-3, 0.0], [0.5, 6.0, 6.1, 6.2])
     assert [bool(each.strange[0]) for each in back] == [False, False, True, True]
     assert back[3].share[0] == 0.0
@@ -131,7 +131,7 @@ def model(data):
 
 
 def test_relaxation_model_predicts_and_round_trips(tmp_path, model, box):
-    """Motion and force at fresh places and times, from a file too; `train` cannot know this without the times."""
+    """Motion and force at new poses and times, from a file too; training needs the times."""
     assert model.series == SERIES
     causes, nodes = draw_poses("palpation", box, 30, 77, BALL).causes, box.tumour_nodes
     fresh, truth = Loads(causes, sample_times(30, 77)), Fading(box)
@@ -148,7 +148,7 @@ def test_relaxation_model_predicts_and_round_trips(tmp_path, model, box):
 
 
 def test_predictions_follow_the_load_history(model, box):
-    """A tool that is held: its force goes on falling, as its own history has it; lifted off it is not relied on."""
+    """The force of a held tool decreases with its history; after lifting off it is extrapolated."""
     loads = draw_poses("palpation", box, 3, 5, BALL)
     touching = loads.get(Touching)
     assert touching is not None
@@ -196,7 +196,7 @@ def test_model_rejects_other_prony_series(model, box):
 
 
 def test_relaxation_model_plays_frame_by_frame_without_fem(model, box):
-    """Finite elements cannot stand behind it, and a frame of a straight run depends on those before."""
+    """Finite elements are no fallback for it, and a frame depends on those before it."""
     scene = replace(find_scene("palpate"), effects=EFFECTS, tool=Probe(BALL.radius))
     theatre = PatientSetup(box, None, {"contact": model}, "cpu")
     scene = replace(scene, element="p1")

@@ -1,4 +1,4 @@
-"""Rods and blades moved by pose: how they are drawn, what contact says of them, and models that learn them."""
+"""Rods and blades moved by pose: draws, contact and trained models."""
 
 from dataclasses import replace
 
@@ -79,7 +79,7 @@ def test_drawn_poses_penetrate_from_first_contact(box, preset):
 
 
 def test_upright_rod_equals_the_ball_at_its_end(box):
-    """Where its side touches nothing: the same indentation, the same forces, and how it is turned does not matter."""
+    """Without contact of its side: equal indentation and forces, independent of rotation."""
     loads, ball = upright(box, ROD_OF_4, 1.2e-3), Ball(ROD_OF_4.radius)
     rod, round_ = asked(box, loads, ROD_OF_4), to_indentation(loads, ball, open_patch(box))
     for name in ("point", "force", "footprint"):
@@ -96,7 +96,7 @@ def test_upright_rod_equals_the_ball_at_its_end(box):
 
 
 def test_retracted_blade_uses_its_final_pose(box):
-    """`Retracted` loads are the pose that they end in; either way round the blade is the same to a learner."""
+    """`Retracted` loads equal their final pose; a blade rotated by half a turn has the same features."""
     there = upright(box, SMALL_BLADE, 2e-3)
     pose = get_poses(there, SMALL_BLADE)
     above = pose.copy()
@@ -120,7 +120,7 @@ def test_retracted_blade_uses_its_final_pose(box):
 
 @pytest.mark.parametrize("preset", TOOLS)
 def test_rigid_contact_enters_no_facet_and_matches_fem(box, preset):
-    """Signorini's conditions on a dense lattice of every facet; and against the barrier of the finite elements."""
+    """Signorini's conditions on a dense lattice of every facet, and the finite elements with a barrier."""
     tool, patch = TOOLS[preset], open_patch(box)
     contact, bases = condensed_box(box, tool)
     loads = draw_poses(preset, box, 5, 5, tool)

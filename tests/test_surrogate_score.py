@@ -1,4 +1,4 @@
-"""How deformers are scored: over all vertices, and by the worst vertex of each load."""
+"""Scores of deformers: over all vertices, and by the worst vertex of each load."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_score_of_single_model_names_no_smallest_error(pretender, box, fresh):
 
 
 def test_permille_error_is_omitted_below_1000_loads(pretender, box, fresh):
-    """A dash stands in its columns, and a line says why; of 1,000 loads it is the percentile."""
+    """A dash and a note replace it; from 1,000 loads on it is the 99.9th percentile."""
     distance = np.random.default_rng(0).uniform(size=(1000, 3))
     few, many = compute_spread(distance[:999]), compute_spread(distance)
     assert few[2] is None and many[2] == pytest.approx(np.percentile(distance, 99.9)) and few[3] <= 1.0

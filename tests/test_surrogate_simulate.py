@@ -1,4 +1,4 @@
-"""`sulcus simulate` and `sulcus train`, with the finite elements, as a user gives them."""
+"""Commands `sulcus simulate` and `sulcus train` with finite elements."""
 
 import json
 import re
@@ -44,7 +44,7 @@ def test_dataset_records_its_provenance(folder, small_box):
 
 
 def test_simulate_keeps_strained_results_of_brutal_loads(folder, tmp_path):
-    """The published protocol's are kept too; its loads find no room on small bodies."""
+    """So are those of the published protocol, whose loads do not fit on small bodies."""
     out = tmp_path / "data.h5"
     words = f"simulate {folder / 'box.vtu'} --tool-preset brutal --count 2 --device cpu --json".split()
     assert main([*words, "--out", str(out)]) == 0 and OVERLOAD_PRESETS == ("seed", "brutal")
@@ -195,7 +195,7 @@ def test_judge_rejects_loads_of_the_training(folder, small_box, capsys):
 
 
 def test_interrupt_message_is_on_its_own_line(folder, tmp_path, monkeypatch, capsys):
-    """A bar of progress ends before; of a command that goes on nowhere it is said that it stopped."""
+    """The progress bar is ended first; a command that cannot resume reports only that it stopped."""
 
     def stopped(path, deformer, loads, provenance, batch, progress):
         progress(3, 40)

@@ -1,4 +1,4 @@
-"""Data sets that were damaged, cut short or made up: no row of theirs is believed, and the sentence names it."""
+"""Damaged, truncated or forged data sets: their rows are rejected with a message."""
 
 import json
 import shutil
@@ -173,7 +173,7 @@ class TestFinished:
         assert str(caught.value).startswith(str(path))
 
     def test_array_above_the_byte_limit_is_rejected(self, whole):
-        """Not one whose length the file alone decides."""
+        """Also an array whose length only the file determines."""
         with h5py.File(whole) as file:
             shape = read_stored(file, "anatomy/nodes", "f").shape
             assert read_stored(file, "anatomy/nodes", "f", shape, 10_000).nbytes > 10_000
@@ -280,7 +280,7 @@ class TestRoom:
         ],
     )
     def test_file_size_limit_is_reported_as_error(self, tmp_path, pretender, loads, monkeypatch, size, asked, sentence):
-        """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
+        """HDF5 aborts the process if its own write fails; Python therefore writes the file."""
         if not asked:
             monkeypatch.setattr("surrogate.data.simulate.check_disk_space", lambda *sizes: None)
         with files_below(size), pytest.raises(InputError, match=sentence):
@@ -291,7 +291,7 @@ class TestRoom:
 
 
 def test_displacement_is_reproduced_from_file_attributes(tmp_path):
-    """By h5py and the attributes alone, one displacement is computed again."""
+    """Only h5py and the attributes are used to compute one displacement again."""
     body = base_held(cube((4, 4, 3), 0.02))
     top = np.isclose(body.mesh.nodes[:, 2], body.mesh.nodes[:, 2].max())
     inside = np.linalg.norm(body.mesh.nodes[body.mesh.tets].mean(axis=1) - [0.04, 0.04, 0.03], axis=1) < 0.015

@@ -1,4 +1,4 @@
-"""Directions and discs of the cortex left out for tests; and training on a split of one's own."""
+"""Held-out directions and discs of the cortex, and training with a given split."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def pushed(box):
 
 
 def test_sector_split_holds_out_whole_sectors(box, pushed):
-    """The box's cortex looks up: azimuths in the plane and angles from the normal are those of the axes."""
+    """The cortex of the box faces +z: azimuth and tilt are those of the axes."""
     split = leave_sectors_out(pushed, open_patch(box))
     first = np.degrees(np.arctan2(split.centres[0, 1], split.centres[0, 0]))
     azimuth = np.degrees(np.arctan2(pushed.force[:, 1], pushed.force[:, 0])) - first

@@ -1,4 +1,4 @@
-"""Model files from outside: bounded, believed only where a training could have made them, and refused in sentences."""
+"""Untrusted model files: size limits, checks of contents, and messages for rejected files."""
 
 import json
 import re
@@ -71,7 +71,7 @@ def test_regressor_with_nan_parameters_is_rejected(models, box, tmp_path):
 
 
 def test_unreferenced_arrays_are_not_read(stored, box, tmp_path):
-    """64 MB of zeros beside the models, in 64 kB."""
+    """64 MB of zeros next to the models, compressed to 64 kB."""
     path = tmp_path / "model.npz"
     path.write_bytes(stored.read_bytes())
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("bomb.npy", "w") as member:

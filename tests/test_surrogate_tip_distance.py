@@ -1,4 +1,4 @@
-"""The distance from tip to tumour: measured as the tool is drawn, learnt with a correction, bounded and stored."""
+"""Distance from tip to tumour: geometry, learned correction, bounds and storage."""
 
 from dataclasses import replace
 
@@ -105,7 +105,7 @@ def test_distance_bound_covers_every_force_decile(model, pretender, gauge):
 
 
 def test_held_out_distance_coverage_is_reported(trained, data, gauge):
-    """Recomputed: the scored model, a bound from the loads that are apart and outside every disc."""
+    """Computed again: scored model, and a bound from calibration loads outside every disc."""
     good, split = data.loads.select(np.flatnonzero(data.good)), trained.split
     distance = gauge.compute_distances(good, data.read_displacement(gauge.nodes)[data.good], gauge.nodes)
     place = np.linalg.norm(get_only_pushes(good).point[:, None] - split.centres, axis=2).min(axis=1)

@@ -1,4 +1,4 @@
-"""Fitted tissue: draws from it, and its file."""
+"""Fitted tissue: random draws from it, and its file."""
 
 import numpy as np
 import pytest

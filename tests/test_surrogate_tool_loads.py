@@ -1,4 +1,4 @@
-"""Loads are those of the tools, spread over the open cortex; tests are whole discs."""
+"""Loads of surgical tools on the open cortex, and rejected nominal loads."""
 
 import numpy as np
 import pytest
@@ -112,7 +112,7 @@ def test_covered_share_equals_disc_area_share(box, patch):
 
 @pytest.mark.parametrize("name", TOOLS)
 def test_rejected_share_matches_random_recount(name):
-    """Recounted on random ones, with the limits written out here."""
+    """Counted again with random loads and the limits written in this test."""
     tool, random = TOOLS[name], np.random.default_rng(0)
     radius = random.uniform(*tool.footprint, 40_000)
     force = np.exp(random.uniform(*np.log(tool.force), 40_000))

@@ -1,4 +1,4 @@
-"""Models that are given where the tool is: poses as indentations, how they are drawn, learnt, stored and refused."""
+"""Models of tool poses: indentations, draws, training, storage and rejected input."""
 
 from dataclasses import dataclass, replace
 
@@ -79,7 +79,7 @@ def trained(data):
 
 
 def test_pose_models_train_without_reaction_forces(data, trained, pretender, box):
-    """Fresh poses, as drawn: learnt to a few per cent, and bounds hold about as often as they say."""
+    """Errors of a few per cent on new poses, and bounds with about their nominal coverage."""
     assert list_learners(data) == POSE_MODELS
     model, fresh = trained.models["gp"], draw_poses("palpation", box, 100, 77)
     nodes = box.tumour_nodes
@@ -116,7 +116,7 @@ def test_stored_model_keeps_its_tool(tmp_path, trained, box):
 
 
 def test_poses_sharing_a_nearest_vertex_stay_distinct():
-    """A data set to judge by is told apart from the training's own by what is not a vertex of the cortex."""
+    """Points that are no vertices of the cortex distinguish a test data set from the training set."""
     template = read_anatomy(get_template_path())
     patch, corners = open_patch(template), template.mesh.nodes
     first, same, other = (

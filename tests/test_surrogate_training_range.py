@@ -1,4 +1,4 @@
-"""The range of loads that a model was trained on."""
+"""Range of loads in the training of a model."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The wheel holds what it must, and its commands run where the dependencies are and no checkout is."""
+"""Contents of the wheel, and its commands without a checkout."""
 
 import os
 import shutil
