@@ -151,7 +151,7 @@ class TestDoor:
             assert b" 403 " in wire.recv(4096).split(b"\r\n")[0]
 
     @pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LOCALHOST", "[::1]"])
-    def test_own_origin_is_accepted(self, page, name):
+    def test_requests_from_the_page_origin_are_accepted(self, page, name):
         place = f"{name}:{page.port}"
         assert ask(page, Host=place)[0] == 200
         assert knock(page, origin=f"http://{place}") == 101
@@ -228,7 +228,7 @@ class TestToken:
         assert ask(far, Cookie=f"page-{far.port}=wrong")[0] == 403
         assert ask(far, f"/?token={token}", Host="evil.example")[0] == 403
 
-    def test_page_needs_token_and_socket_needs_cookie(self, far):
+    def test_page_requires_token_and_web_socket_requires_cookie(self, far):
         status, headers = ask(far, urlsplit(far.address).path + "?" + urlsplit(far.address).query)
         assert status == 200 and "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
         cookie = headers["Set-Cookie"].split(";")[0]

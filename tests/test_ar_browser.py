@@ -227,7 +227,7 @@ def test_recording_is_downloaded_as_one_video(page, monkeypatch):
     assert wait_for(lambda: page.recorder.recording is None and button.label == RECORD_LABEL) and len(sent) == 1
 
 
-def test_slices_and_history_arrive_together_at_limited_rate(page):
+def test_slices_and_history_are_sent_together_at_limited_rate(page):
     drawn: list[int] = []
 
     def draw(number: int) -> tuple[np.ndarray, str]:
@@ -248,7 +248,7 @@ def test_slices_and_history_arrive_together_at_limited_rate(page):
     visitor.wire.close()
 
 
-def test_user_input_wins_over_concurrent_page_update(heard):
+def test_user_input_has_priority_over_page_updates(heard):
     page = open_page(heard, free_port(), limits=ConnectionLimits(sendings=2000.0))
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -358,7 +358,7 @@ def test_status_line_is_shown_and_cleared(page):
     assert wait_for(lambda: page.line.content == "")
 
 
-def test_status_line_leaves_header_visible():
+def test_status_line_does_not_cover_the_header():
     (rule,) = re.findall(rf"#{STATUS} {{ position: fixed; (.*?) }}", build_style(4 / 3))
     assert "right: calc(100vw - var(--w)" in rule and "left:" not in rule
 
@@ -390,7 +390,7 @@ def test_tint_changes_the_colour_of_a_body(page):
     assert wait_for(lambda: tuple(page.meshes["tumour"].color) == (128, 0, 255))
 
 
-def test_style_rules_use_image_shape_and_page_elements(page):
+def test_style_sheet_uses_image_shape_and_page_elements(page):
     sheet = build_style(4 / 3)
     assert "--aspect: 1.3333" in sheet and sheet.startswith("<style>") and sheet.count("{") == sheet.count("}")
     assert f".{NOTE}" in sheet

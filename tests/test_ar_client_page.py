@@ -15,7 +15,7 @@ from ar.page.style import build_style
 
 
 @pytest.mark.parametrize("encoding", ["gzip", "identity"])
-def test_page_has_own_title_icon_and_script(encoding):
+def test_page_document_contains_title_icon_and_script(encoding):
     with closing(Page()) as page, closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)) as wire:
         wire.request("GET", "/", headers={"Accept-Encoding": encoding})
         answer = wire.getresponse()
@@ -62,7 +62,7 @@ console.log(JSON.stringify(drawn));
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
 @pytest.mark.parametrize("name", ["ANGLE (Google, Vulkan 1.3 (SwiftShader Device))", "NVIDIA H200"])
-def test_software_webgl_draws_at_reduced_rate(name):
+def test_software_rendered_view_is_drawn_at_reduced_rate(name):
     code = COUNTING.replace("NAME", json.dumps(name)).replace(
         "eval(SCRIPT)", SCRIPT.replace("PERIOD", str(SOFTWARE_PERIOD))
     )

@@ -4,7 +4,7 @@ from ar.page.control_lock import MAX_IDLE_TIME, ControlLock
 
 
 class TestLead:
-    def test_control_passes_to_first_request_then_oldest(self):
+    def test_control_passes_to_first_request_then_oldest_visitor(self):
         lead = ControlLock()
         lead.see({2, 3, 4}, 0.0)
         assert lead.leader == 2 and lead.record_change(2, 1.0) and not lead.record_change(3, 1.0)

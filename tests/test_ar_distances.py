@@ -52,7 +52,7 @@ def test_each_long_ring_segment_is_labelled():
         assert [written(sheet, number) >= least for number in ("5", "10", "15")] == [True] * 3
 
 
-def test_separated_rings_exclude_number_pixels():
+def test_ring_mask_excludes_the_pixels_of_ring_labels():
     drawn = np.zeros((80, 120, 4), np.uint8)
     distance = np.repeat(np.linspace(0.0, 8e-3, 120, dtype=np.float32)[None], 80, axis=0)
     assert draw_rings(drawn, distance, np.ones((80, 120), bool), [5e-3]) == ["5"]

@@ -61,7 +61,7 @@ def test_orientation_labels_are_drawn_at_image_edges():
     assert not changed[40:200, 40:280].any() and (plain == 90).all()
 
 
-def test_panel_drops_lines_that_do_not_fit():
+def test_text_panel_drops_lines_that_do_not_fit():
     plain = np.full((100, 320, 3), 90, np.uint8)
     lines = ["first", "second", "third", "fourth", "fifth"]
     few = draw_text_panel(plain, lines, below=30)
@@ -150,7 +150,7 @@ def test_wrapping_keeps_number_with_name_and_unit(text, held):
         assert " ".join(lines) == text and all(any(each in line for line in lines) for each in held)
 
 
-def test_panel_drops_lines_instead_of_covering_marks():
+def test_text_panel_drops_lines_instead_of_covering_marks():
     colour, hidden = np.full((300, 400, 3), 90, np.uint8), np.ones((300, 400), np.uint8)
     hidden[40:120, 200:] = 0
     lines = ["the first line", "the second", "the third", "the fourth", "the fifth", "the sixth"]
@@ -160,7 +160,7 @@ def test_panel_drops_lines_instead_of_covering_marks():
     assert (draw_text_panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()
 
 
-def test_labels_may_cover_thin_lines():
+def test_text_labels_may_cover_thin_lines():
     """Example: a number over rings; otherwise it would be placed far below its line."""
     rows = {}
     for name, thin in (("far", None), ("near", True)):

@@ -10,7 +10,7 @@ from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.outlines import compute_ink, find_ink
 
 
-def test_legend_names_lines_and_keeps_cortex_clear():
+def test_legend_names_lines_and_does_not_cover_the_cortex():
     picture, at = seen(0.0), tumour()
     names = LegendNames("it", "its error", "before")
     plain, named = (

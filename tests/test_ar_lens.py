@@ -98,7 +98,7 @@ def test_distorted_projection_equals_opencv_and_is_inverted(lens):
     assert np.abs(pixels - replace(one, lens=None).project(points_in_view())[0])[there].max() > 1.0
 
 
-def test_scaled_cropped_and_padded_cameras_see_the_same():
+def test_scaled_cropped_and_padded_cameras_project_equally():
     camera, points = seen_by(), points_in_view()
     pixels, _ = camera.project(points)
     assert np.allclose(camera.scale(2.0).project(points)[0] + 0.5, 2.0 * (pixels + 0.5))
@@ -159,7 +159,7 @@ def test_static_and_batched_images_agree_through_lens():
             assert np.array_equal(getattr(together, name).numpy()[row], getattr(other, name))
 
 
-def test_identity_lens_draws_as_no_lens():
+def test_identity_lens_renders_the_same_as_no_lens():
     assert seen_by(Lens()).lens is None
     one, other = (render(seen_by(lens), scene(), LAMP) for lens in (None, Lens(k3=1e-15)))
     assert (one.segmentation == other.segmentation).mean() > 0.9999

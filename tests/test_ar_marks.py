@@ -31,7 +31,7 @@ def tumour(centre=(0.0, 0.0, -0.02)) -> Layer:
     return Layer("tumour", 3, ball.vertices + np.array(centre), ball.faces, (0.2, 0.9, 0.3))
 
 
-def test_traces_lie_under_outline_at_the_given_motion():
+def test_displacement_trace_is_drawn_below_the_outline():
     here, at = camera(640, 480), tumour()
     picture = ground(here)
     blue = replace(tumour((0.004, 0.0, -0.02)), colour=np.array((0.2, 0.4, 1.0)))

@@ -72,7 +72,7 @@ def test_squares_and_markers_have_nominal_printed_size(pages, number):
         assert np.diff(across) / per_mm == pytest.approx(750.0 * face.square)
 
 
-def test_rulers_are_100_mm(pages):
+def test_printed_rulers_are_100_mm_long(pages):
     for page in pages:
         black = page.pixels == 0
         right, down = ([edges(line) for line in side] for side in (black, black.T))

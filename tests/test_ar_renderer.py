@@ -141,7 +141,7 @@ def test_batched_images_equal_single_images():
     assert not np.array_equal(together.colour.numpy()[0], together.colour.numpy()[1])
 
 
-def test_rows_shared_by_threads_give_the_same_depths():
+def test_triangles_split_over_threads_render_equal_depth():
     """Same partition as on a GPU, with several threads per triangle."""
     here, layer = camera(), scene()[0]
     whole = rasterise_surface(here, layer.vertices, layer.triangles)

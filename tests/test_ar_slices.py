@@ -50,7 +50,7 @@ class TestSection:
 
 class TestViews:
     @pytest.mark.parametrize("plane", PLANES, ids=lambda plane: plane.name)
-    def test_scan_is_resampled_at_its_affine_position(self, plane):
+    def test_slice_is_resampled_with_the_affine_matrix_of_the_scan(self, plane):
         """A volume whose grey value increases along R, A or S increases by the same amount in the view."""
         for axis in range(3):
             index = np.indices((51, 51, 51))[axis] / 50.0

@@ -110,7 +110,7 @@ def test_opening_describes_tissue_above_the_tumour():
     assert OPENING.describe({DRAPE: 95, CORTEX: 5}) == "under the drape"
 
 
-def test_depth_colour_is_stronger_when_nearer_and_has_scale():
+def test_depth_style_is_stronger_when_nearer_and_has_a_scale():
     picture = seen(0.0)
     row, column = CAMERA.project(np.array([[-0.004, 0.0, -0.02]]))[0][0, ::-1].round().astype(int)
     red = []
@@ -143,7 +143,7 @@ def test_signed_distance_is_nan_beyond_its_limit():
         assert found[:3] == pytest.approx([-0.01, 0.01, -0.005], abs=2e-4) and np.isnan(found[3])
 
 
-def test_panel_avoids_hidden_regions():
+def test_text_panel_is_placed_outside_hidden_regions():
     colour, hidden = np.full((360, 640, 3), 90, np.uint8), np.zeros((360, 640), np.uint8)
     hidden[:, :400] = 1
     lines = ["a line that is as wide as more than half of the picture, or wider", "another"]
@@ -153,12 +153,12 @@ def test_panel_avoids_hidden_regions():
     assert np.array_equal(draw_text_panel(colour, lines, sights=[np.ones_like(hidden)]), draw_text_panel(colour, lines))
 
 
-def test_mask_of_other_size_is_rejected():
+def test_occlusion_mask_of_other_size_is_rejected():
     with pytest.raises(ValueError, match="covered"):
         composite(seen(), CAMERA, tumour(), cover=Cover(covered=np.zeros((4, 4), bool)))
 
 
-def test_cut_has_letters_at_both_ends_despite_tool():
+def test_section_has_letters_at_both_ends_next_to_a_tool():
     at = tumour((0.0, 0.0, -0.014))
     for tool in (False, True):
         picture = seen()
@@ -189,7 +189,7 @@ def test_header_lines_wrap_next_to_a_tool():
     assert format_head_lines(texts, tool) == texts  # there is no room beside it
 
 
-def test_ring_caption_keeps_clear_of_tip_number():
+def test_ring_caption_is_separated_from_the_tip_distance():
     """Directly below the number the caption would look like its explanation."""
     at, said = tumour((0.0, 0.0, -0.014)), "rings: mm to the surface; error not known"
     tip = CAMERA.unproject(np.array([[440.0, 20.0]]), np.array([0.2]))[0]
@@ -214,7 +214,7 @@ def test_ring_caption_keeps_clear_of_tip_number():
 
 
 @pytest.mark.parametrize(("covered", "middle"), [(460, -0.014), (640, -0.014), (0, 0.3)])
-def test_cut_is_drawn_without_visible_surface_along_it(covered, middle):
+def test_section_inset_is_drawn_unless_the_image_is_covered(covered, middle):
     """Cases: a hand covers all visible parts or the whole image, or all parts are behind the camera."""
     hand = np.zeros((480, 640), bool)
     hand[:, :covered] = True

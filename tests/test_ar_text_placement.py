@@ -7,7 +7,7 @@ from ar.overlay.text_placement import BORDER_DISTANCE, GRID_SPACING, SIDEWAYS_WE
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_free_place_is_nearest_to_the_wish(seed):
+def test_free_place_is_nearest_to_the_requested_position(seed):
     """Compared with a search of all places on the same grid."""
     rng = np.random.default_rng(seed)
     taken = np.zeros((120, 160), np.uint8)
@@ -38,7 +38,7 @@ def test_free_place_is_nearest_to_the_wish(seed):
     assert far(*found) == (0 if free(*there) else min(far(*place) for place in places))
 
 
-def test_full_image_has_no_free_place():
+def test_full_image_has_no_free_place_for_text():
     taken = np.zeros((100, 200), np.uint8)
     assert find_free_place(taken, (184, 84), (0, 0)) == (BORDER_DISTANCE, BORDER_DISTANCE)
     assert find_free_place(taken, (185, 84), (0, 0)) is None and find_free_place(taken, (20, 85), (0, 0)) is None

@@ -42,7 +42,7 @@ def test_hand_eye_is_exact_without_noise(turn, shift):
     assert found.turn < 1e-6 and found.shift < 1e-12 and found.motions > 300
 
 
-def test_hand_eye_error_with_noise_is_as_published():
+def test_hand_eye_error_with_noise_matches_published_error():
     """Noise of 0.3 degrees and 0.5 mm gives errors of 0.2 degrees and 0.5 mm."""
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
     turns, shifts = [], []

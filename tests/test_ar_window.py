@@ -53,7 +53,7 @@ def test_window_overlay_matches_its_numpy_formula():
     assert agree(shown, picture.colour) < 0.95 and not taken.any()
 
 
-def test_outline_follows_the_silhouette_edge():
+def test_overlay_outline_follows_the_silhouette_edge():
     """The line is at the silhouette's edge with a dark rim on both sides; no other pixel changes."""
     here, ink = camera(), (40.0, 220.0, 90.0)
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG)

@@ -67,7 +67,7 @@ def test_peer_list_matches_the_command_choices():
     assert all(peer.words[0].endswith(".py") and Path(peer.words[0]).exists() for peer in PEERS)
 
 
-def test_case_fixes_sliding_nodes_and_keeps_total_force(box, case):
+def test_comparison_case_fixes_sliding_nodes_and_keeps_force(box, case):
     assert case.held.sum() == (box.fixed.any(axis=1) | box.slide_normal.any(axis=1)).sum() > 0
     assert not case.held.all()
     total = np.linalg.norm(case.force.sum(axis=1), axis=1)

@@ -151,7 +151,7 @@ def test_element_benches_reject_invalid_input(words, reason, capsys, tmp_path, m
     assert not list(tmp_path.iterdir())
 
 
-def test_random_loads_converge(anatomy):
+def test_random_surgical_and_brutal_loads_converge(anatomy):
     """Half of the loads are far above surgical ones; template to 1e-4 in single precision."""
     effects = (Elasticity(), Held(), Slide(), ToolForce())
     found = [record for some in records(Trial(anatomy, effects, "p1", "cpu", 30), 60, 1, ()) for record in some]

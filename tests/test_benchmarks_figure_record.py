@@ -45,7 +45,7 @@ def brain(tmp_path_factory):
     return path
 
 
-def test_failed_and_skipped_figures_resume(brain, tmp_path, capsys, monkeypatch):
+def test_failed_and_skipped_figures_are_measured_on_resume(brain, tmp_path, capsys, monkeypatch):
     out = tmp_path / "new.json"
     names = ("elements-limit-cpu", "live-cuda", "throughput-cpu")
     for name in names:  # small counts, as nobody waits for more
@@ -177,13 +177,13 @@ def said_by(script, figure=NAMED["live-cpu"], before=None, **more):
         ("print(SAID)\nsys.exit(1)", "missed", "not all that it measures came out as it asks"),
     ],
 )
-def test_entry_states_outcome_and_reason_of_its_process(script, state, reason):
+def test_record_entry_states_outcome_and_reason(script, state, reason):
     found = said_by(f"SAID = {spoken(NAMED['live-cpu'])!r}\n{script}")
     assert found.state == state and reason in found.reason and bool(found.reason) == bool(reason)
     assert bool(found.values) == (state in ("measured", "missed"))
 
 
-def test_bench_runs_in_a_temporary_folder(tmp_path, monkeypatch):
+def test_benchmark_process_runs_in_a_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     script = "open('growth.png', 'w'); print(*sys.argv[1:], file=sys.stderr)\nsys.exit(2)"
     found = said_by(script, anatomy=Path("box.vtu"), quick=True)
@@ -209,7 +209,7 @@ def test_recorded_entry_is_kept_when_modules_are_missing():
     assert said_by("sys.exit(2)", before=before).state == "failed"  # of another machine, so measured anew
 
 
-def test_number_is_looked_up_by_row_names():
+def test_figure_number_is_selected_by_the_names_of_its_row():
     said = {"rows": [{"engine": "tled", "x": 1.0}, {"engine": "felupe 11.3", "x": True}, {"engine": "b", "x": -1.0}]}
     assert number_at(said, ("rows", {"engine": "tled"}, "x")) == 1.0
     assert number_at({"rows": [{"engine": "felupe 11.3", "x": 2}]}, ("rows", {"engine": "felupe"}, "x")) == 2.0

@@ -76,7 +76,7 @@ def test_recorded_rows_are_not_measured_again(folder, tmp_path, monkeypatch, cap
     assert "growth.png: exists. Give --force" in capsys.readouterr().err
 
 
-def test_row_process_passes_its_error_on(folder):
+def test_child_process_error_is_raised_in_the_parent(folder):
     """An error in the process is raised unchanged in the parent."""
     said = []
     with pytest.raises(InputError, match="no element"):

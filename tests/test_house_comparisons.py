@@ -39,6 +39,6 @@ def test_comparison_with_literal_empty_list_passes():
     ("reason", "outcome"),
     [("no CUDA device here", "skipped"), ("needs SULCUS_PVPYTHON, ParaView's pvpython", "skipped"), ("slow", "failed")],
 )
-def test_skip_for_unlisted_reason_fails(reason, outcome):
+def test_skipped_test_with_unlisted_reason_fails(reason, outcome):
     report = SimpleNamespace(skipped=True, outcome="skipped", longrepr=("test_a.py", 1, f"Skipped: {reason}"))
     assert as_failed(report).outcome == outcome

@@ -86,7 +86,7 @@ def texts_and_names():
     return said, known
 
 
-def test_names_in_backticks_exist():
+def test_names_in_backticks_exist_in_the_code():
     said, known = texts_and_names()
     found = [(place, name) for place, text in said for name in re.findall(r"(?<!`)`([A-Za-z_][\w.]*)`(?!`)", text)]
     assert len(found) > 1000

@@ -11,13 +11,13 @@ TABLE = np.random.default_rng(0).normal(size=(50, 4)) * [1.0, 10.0, 1e-3, 0.0]
 
 
 @pytest.mark.parametrize("step", [0.01, np.array([0.01, 0.1, 1e-5, 1.0])])
-def test_rounded_table_is_within_half_a_step(step):
+def test_rounded_table_error_is_at_most_half_a_step(step):
     rounded = Rounded.round_table(TABLE, step)
     assert rounded.whole.dtype == np.int16 and rounded.values.flags.c_contiguous
     assert (np.abs(rounded.values - TABLE) <= 0.5001 * np.asarray(step)).all()
 
 
-def test_step_grows_where_whole_numbers_would_overflow():
+def test_rounding_step_increases_to_avoid_integer_overflow():
     rounded = Rounded.round_table(TABLE, 1e-6)
     largest = np.abs(TABLE).max(axis=0)
     assert rounded.step == pytest.approx(np.maximum(1e-6, largest / 32767))

@@ -35,7 +35,7 @@ def evidence(body):
     return sample_seen_patch(body, motion, np.random.default_rng(0), 60, 0.5)
 
 
-def test_patch_points_lie_on_moving_open_cortex(body, evidence):
+def test_sampled_patch_points_lie_on_the_open_cortex(body, evidence):
     assert len(evidence) == 180 and evidence.value.reshape(60, 3) == pytest.approx(np.tile(MOTION, (60, 1)))
     places = evidence.at[::3]
     on = body.mesh.nodes[np.unique(body.open_surface)]
@@ -70,7 +70,7 @@ def test_likeness_uses_patch_size_not_point_count(body, evidence):
     assert max(sizes[0]) < min(sizes[1]) and max(sizes[1]) < min(sizes[2])
 
 
-def test_patch_trials_give_covariance_growth(evidence):
+def test_covering_factor_follows_trials_of_similar_patches(evidence):
     small = replace(evidence, at=0.5 * evidence.at)
     tried = np.concatenate(
         [

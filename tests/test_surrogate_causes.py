@@ -20,12 +20,12 @@ def test_draws_depend_only_on_seed_and_group(body):
     assert np.array_equal(*down) and (falling[1].causes[1].csf_level < falling[0].causes[1].csf_level).all()
 
 
-def test_separating_skull_rejects_swollen_fluid_tissue(body):
+def test_separating_skull_excludes_nearly_incompressible_tissue(body):
     made = {(group.skull, group.poisson) for group in build_groups(body, 0, FEW)}
     assert (SEPARATING_SKULL, 0.45) in made and (SEPARATING_SKULL, 0.485) not in made and ("slide", 0.485) in made
 
 
-def test_each_skull_has_soft_and_stiff_tumours(body):
+def test_each_skull_model_has_soft_and_stiff_tumours(body):
     """Each third of the range has one for every seed; at small strain tissues have the parameters of their group."""
     for seed in range(20):
         for skull in ("bonded", "slide"):

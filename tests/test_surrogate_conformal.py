@@ -116,7 +116,7 @@ def placed(count, seed, discs=None):
 
 
 @pytest.mark.parametrize("curved", [True, False])
-def test_scale_from_few_discs_stays_bounded_between_them(curved):
+def test_bound_scale_from_few_discs_is_bounded_between_them(curved):
     discs = np.array([[-12.0, -9.0, 5.0], [2.0, 11.0, -8.0], [13.0, -4.0, 9.0]])
     features, _, error = placed(400, 5, discs)
     bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(curved=curved))

@@ -78,7 +78,7 @@ def test_unit_responses_superpose_to_small_loads(tmp_path, box, pretender, loads
     assert np.linalg.norm(predicted - truth) < 1e-3 * np.linalg.norm(truth)
 
 
-def test_failed_cases_stay_marked(tmp_path, pretender, loads):
+def test_failed_cases_are_stored_with_their_outcome(tmp_path, pretender, loads):
     size = np.linalg.norm(loads.get(Pushed).force, axis=1)
     limit = np.median(size)
     simulate(tmp_path / "data.h5", type(pretender)(pretender.anatomy, limit), loads, SAID)
@@ -142,7 +142,7 @@ def undated(path):
     return raw
 
 
-def test_killed_run_resumes_to_the_same_bytes(tmp_path, pretender, loads):
+def test_killed_run_resumes_to_an_identical_file(tmp_path, pretender, loads):
     whole, killed = tmp_path / "whole.h5", tmp_path / "killed.h5"
     simulate(whole, pretender, loads, SAID, 8)
     # Before the first batch; in the middle of one of unit responses, and one of answers; while the file is written.
@@ -160,7 +160,7 @@ def test_killed_run_resumes_to_the_same_bytes(tmp_path, pretender, loads):
     assert sorted(tmp_path.iterdir()) == [killed, whole] and undated(killed) == undated(whole)
 
 
-def test_finished_dataset_is_kept_or_extended(tmp_path, box, pretender, loads):
+def test_finished_dataset_is_unchanged_or_extended(tmp_path, box, pretender, loads):
     path, direct = tmp_path / "data.h5", tmp_path / "direct.h5"
     simulate(path, pretender, loads, SAID, 8)
     before = path.read_bytes()

@@ -69,7 +69,7 @@ def test_rotated_points_are_reported_as_possible_slip(locator, way):
     assert "The two cannot be distinguished" in found.doubt and found.warnings == (found.doubt,)
 
 
-def test_shift_is_judged_by_the_given_registration_error(locator):
+def test_slip_report_depends_on_given_registration_error(locator):
     """A shift of 12 mm is plausible with 8 mm per axis, and suspected with 4 mm."""
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
@@ -89,7 +89,7 @@ def test_verified_registration_is_not_suspected(locator):
     assert np.linalg.norm(believed.centroid) > np.linalg.norm(doubted.centroid) and believed.p95 < doubted.p95
 
 
-def test_axial_shift_is_reported_as_ambiguous_with_sinking(locator):
+def test_axial_shift_warning_names_sinking_as_alternative(locator):
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
     found = locator.locate(replace(seen, now=seen.now + 12e-3 * open_cortex(body).axis))
@@ -100,7 +100,7 @@ def test_axial_shift_is_reported_as_ambiguous_with_sinking(locator):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("skull", range(3))
-def test_locate_true_motion_gives_no_registration_warning(locator, skull, seed):
+def test_true_motion_gives_no_registration_warning(locator, skull, seed):
     """Drainage with a dent of the last tool shape; most of it resembles a shift of all points."""
     prior, body = locator.prior, locator.anatomy
     random, motion = np.random.default_rng([skull, seed]), np.zeros_like(body.mesh.nodes)
@@ -113,7 +113,7 @@ def test_locate_true_motion_gives_no_registration_warning(locator, skull, seed):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])
-def test_locate_shifted_registration_warns(locator, sight, seed):
+def test_shifted_registration_gives_a_registration_warning(locator, sight, seed):
     """Only the registration is displaced, by 7 mm along and across the axis."""
     body, axis = locator.anatomy, open_cortex(locator.anatomy).axis
     seen = observed(body, np.zeros_like(body.mesh.nodes), sight, (0, seed))
@@ -132,7 +132,7 @@ def test_sinking_brain_is_not_reported_as_slip(locator, sunk, sight):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_locate_cloud_rounding_changes_no_result(locator, sunk, seed):
+def test_rounding_of_cloud_points_changes_no_result(locator, sunk, seed):
     """Two triangles are equally near at an edge of the surface, and rounding selects one."""
     seen = observed(locator.anatomy, sunk / 2.0, PointsSeen(300, 28, 2, named=False), (0, seed))
     found, again = (locator.locate(replace(seen, now=seen.now * factor)).centroid for factor in (1.0, 1.0 + 4e-16))

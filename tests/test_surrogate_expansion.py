@@ -105,7 +105,7 @@ def trained(data, expansion):
     return train(data, ["linear", *SERIES_MODELS], expansion=expansion)
 
 
-def test_table_matches_fem_series_in_its_basis(data, expansion, box, patch):
+def test_tabulated_series_matches_fem_in_the_example_basis(data, expansion, box, patch):
     pushed = data.loads.get(Pushed)
     some = np.flatnonzero(data.good)[:90]
     loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
@@ -126,7 +126,7 @@ def test_table_matches_fem_series_in_its_basis(data, expansion, box, patch):
             assert miss < 0.06 * np.linalg.norm(wanted[:, terms])  # rounded to 1 in 500 of the largest
 
 
-def test_two_series_orders_are_exact_for_any_tool(expansion, box):
+def test_first_two_series_orders_are_exact_for_any_tool(expansion, box):
     """Inside the rim no remainder is left; over the rim the table holds the missing part."""
     fem = Fem(box, build_push_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     loads = pushes(expansion.patch, 40, 8, (7e-3, 7e-3))
@@ -149,7 +149,7 @@ def test_two_series_orders_are_exact_for_any_tool(expansion, box):
         np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
 
 
-def test_resumed_run_has_same_table_without_seconds(tmp_path):
+def test_resumed_series_has_equal_table_and_no_solve_time(tmp_path):
     small = make_box(cells=(8, 8, 4), spacing=8e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
     data = simulated(tmp_path / "data.h5", small, 100)
     whole, later = (Expansion(data, "cpu", begun=tmp_path / "rows", most_pairs=0) for _ in range(2))
@@ -179,7 +179,7 @@ def test_series_has_smaller_error_than_linear_table(trained):
     assert series.mean_mm < 0.2 * linear.mean_mm and learnt.mean_mm < 1.5 * series.mean_mm
 
 
-def test_gp_halves_series_error_on_known_cortex(tmp_path):
+def test_gp_correction_halves_series_error_on_trained_cortex(tmp_path):
     """Benefit of `series-gp`: nine open nodes and 300 loads, every fourth a test load anywhere.
 
     A Gaussian process with wrong units would leave the error of the series unchanged.

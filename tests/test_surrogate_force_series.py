@@ -45,7 +45,7 @@ def _row(loads, k):
     return Pushed(loads.point[k : k + 1], loads.force[k : k + 1], loads.footprint[k : k + 1])
 
 
-def test_forms_span_polynomials_of_their_degree():
+def test_force_forms_span_polynomials_of_their_degree():
     random = np.random.default_rng(0)
     direction = random.normal(size=(40, 3))
     values = compute_forms(direction, np.ones(40))

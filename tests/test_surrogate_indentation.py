@@ -78,7 +78,7 @@ def test_ball_without_contact_has_zero_depth(box):
     assert np.isfinite(found.point).all()
 
 
-def test_half_embedded_ball_presses_inwards(box):
+def test_half_embedded_ball_has_inward_indentation(box):
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -BALL.radius]  # its middle is on the box's top
     pushed = to_indentation(Loads((Touching(pose[None, None]),)), BALL, open_patch(box))

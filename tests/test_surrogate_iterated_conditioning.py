@@ -17,7 +17,7 @@ def prior():
 
 
 @pytest.mark.parametrize(("named", "lost"), [(True, (0,)), (True, (1,)), (True, (0, 2)), (False, ())])
-def test_conditioning_round_starts_from_the_last_result(prior, monkeypatch, named, lost):
+def test_each_conditioning_round_starts_from_the_last_result(prior, monkeypatch, named, lost):
     """Its motion and rigid error give new positions; unsupported tips no longer locate a tool."""
     body = prior.anatomy
     cortex = np.unique(body.open_surface)

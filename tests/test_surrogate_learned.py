@@ -115,7 +115,7 @@ def test_scored_model_ignores_held_out_displacements(trained, scored, data, tmp_
         assert row.mean_mm > 5.0
 
 
-def test_model_ignores_calibration_displacements(trained, data, tmp_path):
+def test_model_parameters_ignore_calibration_displacements(trained, data, tmp_path):
     """Bit-identical parameters, while the bounds change."""
     apart = np.arange(data.good.sum()) >= data.good.sum() - trained.calibrated
     wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[apart])

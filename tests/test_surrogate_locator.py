@@ -98,7 +98,7 @@ def test_stopped_ensemble_run_resumes(body, tmp_path, monkeypatch, ensemble):
         assert np.array_equal(getattr(found, name), getattr(ensemble, name)), name
 
 
-def test_small_locator_agrees_with_full_one(locator, body, truth, tmp_path):
+def test_restricted_locator_agrees_with_the_full_locator(locator, body, truth, tmp_path):
     """Named points, a cloud and tips, with a locator read from its smaller file."""
     save_locator(tmp_path / "small.npz", locator.restrict())
     small = load_locator(tmp_path / "small.npz", body)
@@ -165,7 +165,7 @@ def test_locator_files_round_trip_and_reject_foreign_nodes(locator, body, tmp_pa
             load_locator(tmp_path / "wild.npz", body)
 
 
-def test_most_tumour_motion_is_found_within_ellipsoids(locator, body, truth):
+def test_located_tumour_motion_is_within_error_ellipsoids(locator, body, truth):
     """Tissue, loads and errors outside the ensemble; the ellipsoid covers at least 85 % of them."""
     left, all_of_it, held = 0.0, 0.0, []
     for seed, (motion, _) in enumerate(truth):
@@ -219,7 +219,7 @@ def test_reported_rigid_error_is_estimated(locator, body, truth):
     assert off[2] < off[1] < off[0]
 
 
-def test_point_cloud_gives_normal_motion(locator, body, truth):
+def test_point_cloud_recovers_the_normal_displacement(locator, body, truth):
     left, all_of_it = 0.0, 0.0
     for seed, (motion, _) in enumerate(truth):
         named = observed(body, motion, seed, count=150, noise=0.2)
@@ -284,7 +284,7 @@ def test_motionless_observation_gives_zero_displacement(locator, body, rigid):
     assert found.causes == dict.fromkeys(KINDS, 0.0) and found.p95 > 0.0
 
 
-def test_rigid_error_reports_its_explained_share(locator, body, truth):
+def test_rigid_fit_reports_its_share_of_the_observed_motion(locator, body, truth):
     """Nearly all of a uniform shift, and less of a dent, for points and clouds."""
     shifted = replace(observed(body, np.zeros_like(body.mesh.nodes)), rigid=0.8e-3)
     shifted = replace(shifted, now=shifted.rest + [0.0, 0.0, -4e-3])

@@ -224,7 +224,7 @@ def test_points_beyond_1e_4_probability_are_excluded(prior, deviations, left_out
     assert found.outliers.tolist() == left_out
 
 
-def test_outlier_with_one_row_is_excluded(prior):
+def test_outlier_observed_along_one_axis_is_excluded(prior):
     """Motions along one axis only, as in a cloud."""
     _, evidence = drawn(prior, np.random.default_rng(6))
     single = replace(evidence.select(np.arange(0, len(evidence), 3)), point=np.arange(POINTS))

@@ -73,7 +73,7 @@ def test_batch_prediction_equals_row_predictions(fitted):
     assert np.allclose(model.predict(X), single, rtol=1e-5, atol=1e-8)
 
 
-def test_predictions_are_smooth(fitted):
+def test_predictions_are_continuous_in_the_features(fitted):
     """A relative step of 1e-6 in the features changes no output by more than 0.1 % of its deviation."""
     _, model = fitted
     X, Y = rows(20, 5)

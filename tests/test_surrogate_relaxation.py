@@ -169,7 +169,7 @@ def test_predictions_follow_the_load_history(model, box):
     assert lifted.outcome == (Outcome.EXTRAPOLATED,) * 3 and np.abs(lifted.displacement).max() == 0.0
 
 
-def test_features_end_with_the_relaxed_share(box):
+def test_pose_features_end_with_the_relaxed_share(box):
     pushed = to_indentation(draw_poses("palpation", box, 2, 0, BALL), BALL, open_patch(box))
     assert get_relaxation(pushed) is None
     known = add_relaxation(pushed, np.array([0.1, 0.2]))

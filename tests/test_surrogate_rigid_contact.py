@@ -206,7 +206,7 @@ def test_rod_tilted_beyond_training_is_extrapolated(model, box):
     assert model.deform(Loads((Touching(pose[:, None]),))).outcome == (Outcome.EXTRAPOLATED,)
 
 
-def test_blade_models_play_retraction_without_relaxation(model):
+def test_blade_model_supports_retraction_but_no_relaxation(model):
     blade = SMALL_BLADE
     tissue = to_tissue_json(BRAIN)
     effects = (Elasticity(), Held(), ToolContact((blade,)))

@@ -128,7 +128,7 @@ def test_simulate_rejects_invalid_options(folder, tmp_path, capsys, options, wor
     assert words in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
-def test_commands_reject_missing_files_and_bad_suffixes(folder, tmp_path, capsys):
+def test_commands_reject_missing_files_and_wrong_suffixes(folder, tmp_path, capsys):
     assert main(["simulate", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "data.h5")]) == 2
     assert "no such file" in capsys.readouterr().err
     assert main(["simulate", str(folder / "box.vtu"), "--out", str(tmp_path / "data.txt")]) == 2

@@ -177,7 +177,7 @@ def test_shipped_models_bound_the_distance_of_strong_presses():
     assert np.isnan(replace(model, tip=None).predict_distance(loads).bound).all()  # a model of before promises nothing
 
 
-def test_frame_distance_has_the_bound_of_its_model(model, pretender, gauge, fresh):
+def test_frame_distance_uses_the_error_bound_of_its_model(model, pretender, gauge, fresh):
     loads, tool = fresh[0].select(slice(2, 3)), Probe()
     answer, truth = model.deform(loads), pretender.deform(loads)
     predicted = model.predict_distance(loads)

@@ -97,7 +97,7 @@ def make_small_opening(box):
     return Anatomy(box.mesh, box.fixed | ~near[:, None], box.slide_normal, near)
 
 
-def test_spread_points_are_far_from_each_other():
+def test_spread_selects_points_far_from_each_other():
     points = np.random.default_rng(0).random((400, 3)) * [1, 1, 0]
     chosen = points[spread(points, 9)]
     gaps = np.linalg.norm(chosen[:, None] - chosen, axis=2) + np.eye(9) * 9

@@ -115,7 +115,7 @@ def test_stored_model_keeps_its_tool(tmp_path, trained, box):
     np.testing.assert_array_equal(again.deform(fresh).displacement, trained.models["gp"].deform(fresh).displacement)
 
 
-def test_poses_sharing_a_nearest_vertex_stay_distinct():
+def test_training_poses_are_identified_despite_shared_vertices():
     """Points that are no vertices of the cortex distinguish a test data set from the training set."""
     template = read_anatomy(get_template_path())
     patch, corners = open_patch(template), template.mesh.nodes
